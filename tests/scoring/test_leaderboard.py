@@ -1,0 +1,127 @@
+"""Averages over runs and datasets, and the pooled J of random strategies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from traps_pipeline.partitions import DATASETS
+from traps_pipeline.scoring.bootstrap import pecs_intervals
+from traps_pipeline.scoring.leaderboard import leaderboard, pooled_j
+from traps_pipeline.scoring.metrics import cell_metrics
+from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.tables import LEADERBOARD
+
+STRATEGIES = ["oracle", "always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle"]
+
+
+def board_of(verdicts, version="v1"):
+    """The leaderboard; `version` is one for all datasets or one a dataset."""
+    parts = [
+        cell_metrics(rows, version if isinstance(version, str) else version[dataset])
+        for dataset, rows in verdicts.groupby("dataset")
+    ]
+    return leaderboard(pd.concat(parts, ignore_index=True), pecs_intervals(verdicts, resamples=100))
+
+
+def entry(board, dataset="occlusion", model="m", regime="standard"):
+    return board.set_index(["model", "regime", "dataset"]).loc[(model, regime, dataset)]
+
+
+def test_pecs_is_averaged_per_run_and_not_computed_from_averages(rows):
+    # Run 1: Acc 1, J 1, PECS 1. Run 2: Acc 0, J 0, PECS 0. Mean 0.5; the averages would give 0.5 x 0.5 = 0.25.
+    verdicts = pd.concat([rows([(True, False, True)]), rows([(False, False, False)], run=2)], ignore_index=True)
+    row = entry(board_of(verdicts))
+    assert (row.n_runs, row.acc, row.j, row.pecs) == (2, 0.5, 0.5, 0.5)
+
+
+def test_the_deviation_over_runs_divides_by_the_number_of_runs(rows):
+    # Acc 1, 0.5, 0 over three runs: population sd = sqrt((0.25 + 0 + 0.25) / 3).
+    runs = {1: [True, True], 2: [True, False], 3: [False, False]}
+    parts = [rows([(c, False, True) for c in correct], run=run) for run, correct in runs.items()]
+    row = entry(board_of(pd.concat(parts, ignore_index=True)))
+    assert row.acc_std == pytest.approx(np.sqrt(0.5 / 3))
+    assert (row.abs_rec_std, row.false_abs_std, row.j_std) == (0.0, 0.0, 0.0)
+
+
+def test_one_run_has_deviation_zero(rows):
+    assert entry(board_of(rows([(True, False, True), (False, False, True)]))).pecs_std == 0.0
+
+
+def test_overall_weighs_datasets_equally_within_each_run(rows):
+    # PECS per run = AbsRec here. Run 1: 1, 0, 0, 0 -> 0.25. Run 2: 1, 1, 1, 0 -> 0.75. Sizes differ and do not matter.
+    recognised = {1: (True, False, False, False), 2: (True, True, True, False)}
+    parts = [
+        rows([(True, False, yes)] * (5 if dataset == "chaotic" else 2), dataset=dataset, run=run)
+        for run, flags in recognised.items()
+        for dataset, yes in zip(DATASETS, flags, strict=True)
+    ]
+    row = entry(board_of(pd.concat(parts, ignore_index=True)), "overall")
+    assert (row.pecs, row.pecs_std) == (0.5, 0.25)
+    assert (row.n_pairs, row.n_runs) == (2 + 2 + 5 + 2, 2)
+    assert row.pecs_ci_low <= 0.5 <= row.pecs_ci_high
+
+
+def test_a_model_that_lacks_a_dataset_has_no_overall_row(rows):
+    whole = [rows([(True, False, True)], dataset=d) for d in DATASETS]
+    partial = [rows([(True, False, True)], dataset=d, model="n") for d in DATASETS[1:]]
+    board = board_of(pd.concat([*whole, *partial], ignore_index=True))
+    assert set(board.loc[board["model"] == "m", "dataset"]) == {*DATASETS, "overall"}
+    assert set(board.loc[board["model"] == "n", "dataset"]) == set(DATASETS[1:])
+
+
+def test_a_run_that_lacks_a_dataset_stays_out_of_overall(rows):
+    parts = [rows([(True, False, True)], dataset=d) for d in DATASETS]
+    parts.append(rows([(False, False, True)], dataset="chaotic", run=2))
+    row = entry(board_of(pd.concat(parts, ignore_index=True)), "overall")
+    assert (row.n_runs, row.acc, row.pecs_ci_low, row.pecs_ci_high) == (1, 1.0, 1.0, 1.0)
+
+
+def test_a_null_run_makes_the_mean_null_instead_of_resting_on_fewer_runs(rows):
+    verdicts = pd.concat([rows([(True, False, True)]), rows([(True, False, None)], run=2)], ignore_index=True)
+    row = entry(board_of(verdicts))
+    assert (row.acc, row.n_missing) == (1.0, 1)
+    assert np.isnan([row.abs_rec, row.pecs, row.pecs_std, row.pecs_ci_low]).all()
+
+
+def test_degenerate_strategies_score_zero_overall_and_the_oracle_one(rows, strategy, tmp_path):
+    parts = [rows(strategy(s, 10), dataset=d, model=s, run=r) for s in STRATEGIES for d in DATASETS for r in (1, 2)]
+    board = board_of(pd.concat(parts, ignore_index=True))
+    overall = board[board["dataset"] == "overall"].set_index("model")
+    assert overall["pecs"].to_dict() == {s: float(s == "oracle") for s in STRATEGIES}
+    assert entry(board, "overall", "oracle")[["pecs_ci_low", "pecs_ci_high"]].to_list() == [1.0, 1.0]
+    assert entry(board, "overall", "inverse-oracle").j == -1.0
+    store = TableStore(tmp_path)
+    store.write(LEADERBOARD, {}, board, {})
+    assert len(store.read(LEADERBOARD, {})) == len(STRATEGIES) * 5
+
+
+def test_overall_names_every_version_and_epoch_it_rests_on(rows):
+    parts = [rows([(True, False, True)], dataset=d, epoch="e2" if d == "chaotic" else "e1") for d in DATASETS]
+    versions = {d: "v1+ab12" if d == "chaotic" else "v1" for d in DATASETS}
+    board = board_of(pd.concat(parts, ignore_index=True), versions)
+    assert tuple(entry(board, "overall")[["benchmark_version", "epoch"]]) == ("v1 + v1+ab12", "e1+e2")
+    assert tuple(entry(board, "chaotic")[["benchmark_version", "epoch"]]) == ("v1+ab12", "e2")
+
+
+def test_nothing_scored_gives_an_empty_board(rows, tmp_path):
+    verdicts = rows([])
+    board = leaderboard(cell_metrics(verdicts, "v1"), pecs_intervals(verdicts, 10))
+    assert board.empty
+    TableStore(tmp_path).write(LEADERBOARD, {}, board, {})
+
+
+def test_pooled_j_and_its_standard_error(rows):
+    # AbsRec 3/4 over 2 runs x 2 voids, FalseAbs 1/4 over 2 x 2 controls: J = 0.5, se = sqrt(2 x 0.25 x 0.75 / 4).
+    runs = [rows([(True, False, True), (True, False, True)]), rows([(True, True, True), (True, False, False)], run=2)]
+    pooled = pooled_j(pd.concat(runs, ignore_index=True)).set_index("model").loc["m"]
+    assert [pooled.j, pooled.standard_error, pooled.n] == pytest.approx([0.5, np.sqrt(2 * 0.25 * 0.75 / 4), 8])
+
+
+@pytest.mark.parametrize("name", ["random-50", "confidence-noise"])
+def test_random_strategies_are_indistinguishable_from_zero(name, rows, strategy):
+    parts = [rows(strategy(name, 200, seed=k), dataset=d, model=name) for k, d in enumerate(DATASETS)]
+    pooled = pooled_j(pd.concat(parts, ignore_index=True)).iloc[0]
+    assert abs(pooled.j) < 3 * pooled.standard_error
+    assert pooled.standard_error == pytest.approx({"random-50": 0.025, "confidence-noise": 0.0229}[name], rel=0.05)

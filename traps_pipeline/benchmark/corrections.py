@@ -1,0 +1,207 @@
+"""Review decisions folded over the released records: released + corrections -> a benchmark version.
+
+`scene_specs/corrections/*.jsonl` is append-only, one decision a line, read in the order of file names and lines:
+
+    {"scenario_id": "plinko-0003", "action": "correct", "question": "...", "who": "jd", "when": "2026-11-21", "why": "..."}
+
+keep: reviewed, nothing changes. correct: any of question, labels, aliases, answer, ill_posed_question,
+answerable_question, params. discard: the pair leaves the benchmark (its answers stay in the ledger). add: a new
+scenario of a known family with `family` and `params`; words that are not given are drawn from the family.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.partitions import CATEGORIES
+from traps_pipeline.paths import CORRECTIONS
+from traps_pipeline.scenes.registry import family_names, get_family
+from traps_pipeline.scenes.spec import Answerable, SceneSpec, Slug
+from traps_pipeline.storage.workspace import Study
+from traps_pipeline.yamlfile import explain
+
+WORDS = ("question", "labels", "aliases", "ill_posed_question", "answerable_question")
+
+
+class Correction(BaseModel):
+    """One review decision."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    scenario_id: str = Field(pattern=Slug)
+    action: Literal["keep", "correct", "discard", "add"]
+    family: str | None = None
+    params: dict[str, Any] | None = None
+    question: str | None = None
+    labels: list[str] | None = None
+    aliases: dict[str, str] | None = None
+    answer: str | None = None
+    ill_posed_question: str | None = None
+    answerable_question: Answerable | None = None
+    who: str = Field(min_length=1)
+    when: date
+    why: str = Field(min_length=1)
+
+    def changes(self) -> dict[str, Any]:
+        """What the decision rewrites: words, answer, params."""
+        fields = (*WORDS, "answer", "params")
+        return {f: v for f, v in self.model_dump(mode="json", include=set(fields)).items() if v is not None}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A scenario after folding: the released record (None for an added one) and what corrections changed.
+
+    `params` is not None when the scene itself has to be resolved anew; that is left to the scene_specs stage.
+    """
+
+    scenario_id: str
+    family: str
+    category: str
+    released: SceneSpec | None
+    words: Mapping[str, Any] = field(default_factory=dict)
+    params: Mapping[str, Any] | None = None
+    where: str = ""
+
+    @property
+    def version(self) -> str:
+        """Digest of the released record and every effective change."""
+        base = self.released.spec_hash if self.released else self.family
+        return digest([base, dict(self.words), dict(self.params) if self.params is not None else None])[:16]
+
+    def changed_words(self) -> SceneSpec:
+        """The released record with the words of the corrections. Raises TrapsError naming the correction."""
+        if self.released is None:
+            raise ValueError(f"{self.scenario_id} was added; it has no released record")
+        return apply_words(self.released, self.words, self.where)
+
+
+def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
+    """A record with other words; labels and answer are checked against each other. Raises TrapsError."""
+    if not words:
+        return spec
+    record = spec.model_dump(mode="json") | {name: value for name, value in words.items() if name != "answer"}
+    if "answer" in words:
+        record["ground_truth"] = words["answer"]
+        record["evidence"] = record["evidence"] | {"answer_from": "correction"}
+    try:
+        return SceneSpec.model_validate(record)
+    except ValidationError as error:
+        raise TrapsError(f"{where}: {spec.scenario_id}: {explain(error)}; correct that line") from error
+
+
+def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]:
+    """All decisions with `file:line`. Raises TrapsError naming the line."""
+    found = []
+    for path in sorted(folder.glob("*.jsonl")):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            if not line.strip():
+                continue
+            where = f"{path}:{number}"
+            try:
+                found.append((where, Correction.model_validate(json.loads(line))))
+            except ValidationError as error:
+                raise TrapsError(f"{where}: not a valid correction ({explain(error)}); correct that line") from error
+            except ValueError as error:
+                raise TrapsError(f"{where}: not JSON ({error}); correct that line") from error
+    return found
+
+
+def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Correction]]) -> dict[str, Scenario]:
+    """The benchmark after all decisions, by scenario id in sorted order. Raises TrapsError naming the line."""
+    scenarios = {
+        id_: Scenario(id_, spec.family, spec.category, spec, where="released") for id_, spec in released.items()
+    }
+    for where, correction in corrections:
+        known = scenarios.get(correction.scenario_id)
+        if correction.action == "add":
+            if known is not None or correction.scenario_id in released:
+                raise TrapsError(f"{where}: cannot add {correction.scenario_id!r}: the id is taken; choose a free number")
+            scenarios[correction.scenario_id] = _added(where, correction)
+            continue
+        if known is None:
+            gone = "was discarded" if correction.scenario_id in released else "is unknown"
+            raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {gone}; name a scenario of the benchmark")
+        if correction.action == "discard":
+            del scenarios[correction.scenario_id]
+        elif correction.action == "correct":
+            scenarios[correction.scenario_id] = _corrected(where, known, correction)
+        elif correction.changes():
+            raise TrapsError(f"{where}: `keep` changes nothing, yet gives {sorted(correction.changes())}; use `correct`")
+    return dict(sorted(scenarios.items()))
+
+
+def _corrected(where: str, known: Scenario, correction: Correction) -> Scenario:
+    changes = correction.changes()
+    if not changes:
+        raise TrapsError(f"{where}: `correct` gives no change; give words, answer or params, or use `keep`")
+    params = known.params
+    if "params" in changes:
+        base = params if params is not None else (known.released.params if known.released else {})
+        unknown = sorted(set(changes["params"]) - set(base))
+        if unknown:
+            raise TrapsError(f"{where}: family {known.family} has no parameters {unknown}; it has {sorted(base)}")
+        params = dict(base) | changes.pop("params")
+    words = dict(known.words) | changes
+    scenario = Scenario(known.scenario_id, known.family, known.category, known.released, words, params, where)
+    if scenario.released is not None and params is None:
+        scenario.changed_words()  # an unknown label is an error of this line, found before anything runs
+    return scenario
+
+
+def _added(where: str, correction: Correction) -> Scenario:
+    changes = correction.changes()
+    if correction.family not in family_names() or "params" not in changes:
+        raise TrapsError(
+            f"{where}: `add` needs params and a known family, not {correction.family!r}; known: {', '.join(family_names())}"
+        )
+    family = get_family(str(correction.family))
+    try:
+        family.params_from(changes["params"])
+    except (ValueError, TypeError) as error:
+        raise TrapsError(f"{where}: {error}") from error
+    params = changes.pop("params")
+    return Scenario(correction.scenario_id, family.name, family.category, None, changes, params, where)
+
+
+def load_scenarios(study: Study) -> dict[str, Scenario]:
+    """The scenarios of a study: folded, then the study's subset. Raises TrapsError for an unknown named scenario."""
+    return subset(_folded(), study)
+
+
+@cache
+def _folded() -> dict[str, Scenario]:
+    return fold(load_released(), read_corrections())
+
+
+def subset(scenarios: Mapping[str, Scenario], study: Study) -> dict[str, Scenario]:
+    """Named scenarios (discarded ones fall away), or the first n of each family, or all."""
+    if study.scenarios is not None:
+        released = load_released()
+        unknown = [s for s in study.scenarios if s not in scenarios and s not in released]
+        if unknown:
+            raise TrapsError(f"study.yaml: unknown scenarios {unknown}; `ls scene_specs/released` shows the families")
+        return {s: scenarios[s] for s in sorted(study.scenarios) if s in scenarios}
+    if study.per_family is None:
+        return dict(scenarios)
+    taken: dict[str, list[str]] = {}
+    for id_, scenario in scenarios.items():
+        taken.setdefault(scenario.family, []).append(id_)
+    chosen = {id_ for ids in taken.values() for id_ in ids[: study.per_family]}
+    return {id_: scenario for id_, scenario in scenarios.items() if id_ in chosen}
+
+
+def categories_of(scenarios: Mapping[str, Scenario]) -> list[str]:
+    """The categories that have scenarios, in their fixed order."""
+    present = {scenario.category for scenario in scenarios.values()}
+    return [category for category in CATEGORIES if category in present]

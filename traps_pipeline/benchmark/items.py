@@ -1,0 +1,104 @@
+"""The items stage: scenarios and clips to the questions put to models, two a pair (`benchmark.md` sections 1 and 2)."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from traps_pipeline.benchmark.specs import released_in_study
+from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.partitions import CATEGORIES, SIDES, datasets_of_category, is_ill_posed
+from traps_pipeline.scenes.clips import check_clip
+from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import SCENE_SPECS, VIDEOS
+
+Record = Mapping[str, Any]
+
+
+def categories_of_dataset(dataset: str) -> list[str]:
+    """The categories whose scenarios make a dataset."""
+    return [category for category in CATEGORIES if dataset in datasets_of_category(category)]
+
+
+def build_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
+    """Rows of a dataset's items. Clips are checked against their digests. Raises TrapsError."""
+    specs: list[Record] = []
+    clips: dict[tuple[str, str], Record] = {}
+    for category in categories_of_dataset(dataset):
+        if workspace.tables.state(SCENE_SPECS, {"category": category}) is None:
+            continue
+        specs += workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
+        for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records"):
+            clips[row["scenario_id"], row["side"]] = row
+    if not specs:
+        raise TrapsError(f"items {dataset}: no scene_specs yet; materialize scene_specs and videos first")
+    _check_clips(workspace, dataset, specs, clips)
+    released = [s for c in categories_of_dataset(dataset) for s in released_in_study(workspace, c).values()]
+    version = version_of(
+        (item_content(dataset, spec_record(spec)) for spec in released), (item_content(dataset, row) for row in specs)
+    )
+    commonest = commonest_answers(specs)
+    return [_item(dataset, spec, side, clips, commonest, version) for spec in specs for side in SIDES]
+
+
+def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:
+    """The commonest control answer of each sub-scenario; the first in alphabetical order where several are."""
+    counts: dict[str, Counter[str]] = {}
+    for spec in specs:
+        counts.setdefault(spec["sub_scenario"], Counter())[spec["ground_truth"]] += 1
+    return {name: min(count, key=lambda answer: (-count[answer], answer)) for name, count in counts.items()}
+
+
+def _check_clips(workspace: Workspace, dataset: str, specs: Sequence[Record], clips: Mapping[tuple[str, str], Record]) -> None:
+    for spec in specs:
+        for side in SIDES:
+            clip = clips.get((spec["scenario_id"], side))
+            if clip is None or clip["scene_hash"] != spec["scene_hash"]:
+                raise TrapsError(
+                    f"items {dataset}: the {side} clip of {spec['scenario_id']} is not of its current scene; "
+                    f"materialize videos for {spec['category']}"
+                )
+            try:
+                check_clip(workspace.resolve(clip["path"]), clip["file_sha256"], clip["size_bytes"])
+            except DamagedClip as error:
+                raise TrapsError(str(error)) from error
+
+
+def _item(
+    dataset: str,
+    spec: Record,
+    side: str,
+    clips: Mapping[tuple[str, str], Record],
+    commonest: Mapping[str, str],
+    version: str,
+) -> dict[str, Any]:
+    unanswerable = side == "void" and is_ill_posed(dataset)
+    clip = clips[spec["scenario_id"], "control" if is_ill_posed(dataset) else side]
+    item: dict[str, Any] = {
+        "item_id": f"{dataset}:{spec['scenario_id']}:{side}",
+        "pair_id": f"{dataset}:{spec['scenario_id']}",
+        "dataset": dataset,
+        "scenario_id": spec["scenario_id"],
+        "side": side,
+        "taxonomy": spec["taxonomy"],
+        "category": spec["category"],
+        "sub_scenario": spec["sub_scenario"],
+        "question": spec["ill_posed_question"] if unanswerable else spec["question"],
+        "labels": list(spec["labels"]),
+        "aliases": spec["aliases"],
+        "answer_type": spec["answer_type"],
+        "ground_truth": spec["ground_truth"] if side == "control" else None,
+        "control_answer": spec["ground_truth"],
+        "media_digest": clip["file_sha256"],
+    }
+    return item | {
+        "item_hash": digest(item | {"aliases": json.loads(item["aliases"])}),
+        "commonest_answer": commonest[spec["sub_scenario"]],
+        "clip": clip["path"],
+        "benchmark_version": version,
+    }

@@ -1,0 +1,63 @@
+"""Released records: `scene_specs/released/*.jsonl`, one fully resolved scenario a line, and the benchmark's name."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.partitions import CATEGORIES
+from traps_pipeline.paths import RELEASED, SCENE_SPECS
+from traps_pipeline.scenes.registry import family_names
+from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
+
+
+class Release(BaseModel):
+    """`scene_specs/benchmark.yaml`: what the released records are called, and a canary for contamination checks."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    name: str
+    version: str
+    canary: str
+
+
+@cache
+def load_release(path: Path = SCENE_SPECS / "benchmark.yaml") -> Release:
+    """Name and version of the released benchmark."""
+    return parse_yaml_model(Release, read_yaml(path), path)
+
+
+@cache
+def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
+    """All released records by scenario id. Raises TrapsError naming file, line and what to do."""
+    records: dict[str, SceneSpec] = {}
+    for path in sorted(folder.glob("*.jsonl")):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            if not line.strip():
+                continue
+            spec = parse_record(line, f"{path}:{number}")
+            if spec.scenario_id in records:
+                raise TrapsError(f"{path}:{number}: scenario {spec.scenario_id!r} occurs twice; remove one of the lines")
+            records[spec.scenario_id] = spec
+    if not records:
+        raise TrapsError(f"{folder}: holds no released records; restore it from git or draw some with `traps sample`")
+    return records
+
+
+def parse_record(line: str, where: str) -> SceneSpec:
+    """One line of a released file. Raises TrapsError."""
+    try:
+        spec = SceneSpec.model_validate(json.loads(line))
+    except ValidationError as error:
+        raise TrapsError(f"{where}: not a valid record ({explain(error)}); restore the line from git") from error
+    except ValueError as error:
+        raise TrapsError(f"{where}: not JSON ({error}); restore the line from git") from error
+    if spec.family not in family_names():
+        raise TrapsError(f"{where}: {spec.scenario_id}: unknown family {spec.family!r}; known: {', '.join(family_names())}")
+    if spec.category not in CATEGORIES:
+        raise TrapsError(f"{where}: {spec.scenario_id}: unknown category {spec.category!r}; known: {', '.join(CATEGORIES)}")
+    return spec

@@ -1,0 +1,167 @@
+"""The scene_specs stage: folded scenarios to fully resolved records with their trajectories."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline import progress
+from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, fold, load_scenarios, subset
+from traps_pipeline.benchmark.records import load_released, parse_record
+from traps_pipeline.benchmark.versions import spec_content, version_of
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.paths import CHECKOUT, CORRECTIONS, RELEASED
+from traps_pipeline.scenes.kit import Physics
+from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory
+from traps_pipeline.storage.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """A record and the file of its trajectory."""
+
+    spec: SceneSpec
+    trajectory: Path
+
+
+def resolve_scenario(workspace: Workspace, scenario: Scenario) -> Resolved:
+    """The record after corrections. Only a changed or added scene is simulated, once; everything else is read."""
+    if scenario.params is None:
+        spec = scenario.changed_words()
+        return Resolved(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
+    name = f"{scenario.scenario_id}-{scenario.version}"
+    for folder in (CORRECTIONS / "trajectories", workspace.trajectories):
+        if (folder / f"{name}.json").is_file():
+            record = (folder / f"{name}.json").read_text(encoding="utf-8")
+            return Resolved(parse_record(record, str(folder / f"{name}.json")), folder / f"{name}.npz")
+    spec, qpos = _simulate(scenario)
+    save_trajectory(workspace.trajectories, name, qpos)
+    part = workspace.trajectories / f".{name}.{os.getpid()}.part"
+    part.write_text(json.dumps(spec.model_dump(mode="json")), encoding="utf-8")
+    os.replace(part, workspace.trajectories / f"{name}.json")
+    progress.current().note(
+        f"{scenario.scenario_id}: simulated here after {scenario.where}; to freeze it for other machines copy "
+        f"trajectories/{name}.* of the workspace to {CORRECTIONS.relative_to(CHECKOUT)}/trajectories/"
+    )
+    return Resolved(spec, workspace.trajectories / f"{name}.npz")
+
+
+def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray]:
+    """Resolve a scene whose parameters a correction gave. Raises TrapsError naming the correction."""
+    from traps_pipeline.scenes.resolve import Rejected, resolve
+
+    family = get_family(scenario.family)
+    released = scenario.released
+    seed = released.seed if released else 0
+    try:
+        params = family.params_from(scenario.params or {})
+        wording = family.word(params, np.random.default_rng([seed, *scenario.scenario_id.encode()]))
+        physics = Physics(**released.physics) if released else family.physics
+        spec, qpos = resolve(family, params, wording, scenario_id=scenario.scenario_id, seed=seed, physics=physics)
+    except (Rejected, ValueError, TypeError) as error:
+        raise TrapsError(
+            f"{scenario.where}: {scenario.scenario_id}: these parameters make no valid pair ({error}); change them or discard it"
+        ) from error
+    words = dict(scenario.words)
+    if released is not None and released.labels == spec.labels:  # where they still fit, the released words stand
+        words = released.model_dump(mode="json", include=set(WORDS)) | words
+    answer = words.pop("answer", spec.ground_truth)
+    if answer != spec.ground_truth:
+        raise TrapsError(
+            f"{scenario.where}: {scenario.scenario_id}: the correction says {answer!r}, the simulation {spec.ground_truth!r}; "
+            "leave the answer out or change the parameters"
+        )
+    return apply_words(spec, words, scenario.where), qpos
+
+
+def build_specs(workspace: Workspace, category: str) -> tuple[list[dict[str, Any]], list[Resolved]]:
+    """Rows of scene_specs of a category, and the resolved records behind them. Trajectories are checked by digest."""
+    scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
+    resolved = [resolve_scenario(workspace, scenario) for scenario in scenarios]
+    released = released_in_study(workspace, category).values()
+    version = version_of(map(spec_content, released), (spec_content(r.spec) for r in resolved))
+    for item in resolved:
+        try:
+            load_trajectory(item.trajectory, item.spec.trajectory_sha256)
+        except ValueError as error:
+            raise TrapsError(str(error)) from error
+    return [_row(workspace, item, version) for item in resolved], resolved
+
+
+def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpec]:
+    """Released records of a category that the study would have without any correction."""
+    plain = subset(fold(load_released(), ()), workspace.study)
+    return {id_: s.released for id_, s in plain.items() if s.category == category and s.released is not None}
+
+
+def void_from_s(spec: SceneSpec) -> float:
+    """Time (s) from which the void shows nothing decisive: hiding (occluder) or the cut (truncation)."""
+    frame = spec.void["hidden_from_frame"] if spec.void_kind == "occluder" else spec.void["cut_frame"]
+    return frame / spec.physics["fps"]
+
+
+def _row(workspace: Workspace, item: Resolved, version: str) -> dict[str, Any]:
+    spec = item.spec
+    record = spec.model_dump(mode="json", exclude={"evidence"})
+    for name in ("params", "physics", "camera", "void", "aliases", "answerable_question"):
+        record[name] = json.dumps(record[name], sort_keys=True, ensure_ascii=False)
+    inside = item.trajectory.is_relative_to(workspace.root)
+    return record | {
+        "scene_hash": spec.scene_hash,
+        "spec_hash": spec.spec_hash,
+        "trajectory": item.trajectory.relative_to(workspace.root if inside else CHECKOUT).as_posix(),
+        "commit_s": float(spec.evidence["commit_s"]),
+        "margin_m": float(spec.evidence["margin_m"]),
+        "void_from_s": void_from_s(spec),
+        "evidence": json.dumps(spec.evidence, sort_keys=True),
+        "benchmark_version": version,
+    }
+
+
+def spec_of(row: dict[str, Any]) -> SceneSpec:
+    """A row of scene_specs back to its record."""
+    record = {name: row[name] for name in SceneSpec.model_fields}
+    for name in ("params", "physics", "camera", "void", "aliases", "answerable_question", "evidence"):
+        record[name] = json.loads(record[name])
+    record["labels"] = list(record["labels"])
+    return SceneSpec.model_validate(record)
+
+
+def trajectory_of(workspace: Workspace, row: dict[str, Any]) -> np.ndarray:
+    """The frozen qpos (F, nq) of a row of scene_specs. Raises TrapsError."""
+    candidates: Sequence[Path] = (CHECKOUT / row["trajectory"], workspace.resolve(row["trajectory"]))
+    path = next((p for p in candidates if p.is_file()), candidates[0])
+    try:
+        return load_trajectory(path, row["trajectory_sha256"])
+    except ValueError as error:
+        raise TrapsError(str(error)) from error
+
+
+def unsettled(resolved: Sequence[Resolved]) -> list[str]:
+    """Problems with outcomes: replay each frozen trajectory and compare what it shows with the record."""
+    from traps_pipeline.scenes.resolve import Rejected, compile_scene, read_outcome
+    from traps_pipeline.scenes.simulate import replay
+
+    problems = []
+    for item in resolved:
+        spec, family, physics = item.spec, get_family(item.spec.family), Physics(**item.spec.physics)
+        if spec.evidence.get("answer_from") == "correction":
+            continue  # the reviewer's answer stands above the simulator's
+        params = family.params_from(spec.params)
+        model, _ = compile_scene(family, params, physics)
+        qpos = load_trajectory(item.trajectory, spec.trajectory_sha256)
+        try:
+            outcome = read_outcome(family, replay(model, qpos, physics), params)
+        except Rejected as error:
+            problems.append(f"{spec.scenario_id}: {error}")
+            continue
+        if outcome.label != spec.ground_truth:
+            problems.append(f"{spec.scenario_id}: shows {outcome.label!r}, the record says {spec.ground_truth!r}")
+    return problems

@@ -1,0 +1,46 @@
+"""Benchmark versions: a function of content, so that a study rebuilt from nothing and one corrected in place agree.
+
+A part (a category's specs or clips, a dataset's items) has the release's version while it equals the release, and
+`release+digest` once a correction has touched it. What a correction did not touch keeps its version.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from traps_pipeline.benchmark.records import load_release
+from traps_pipeline.digests import digest
+from traps_pipeline.partitions import is_ill_posed
+from traps_pipeline.scenes.spec import SceneSpec
+
+
+def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:
+    """`0.1.0`, or `0.1.0+3f2a9c01` when the current content is not the released one."""
+    release = load_release().version
+    now = sorted(digest(part) for part in current)
+    return release if now == sorted(digest(part) for part in released) else f"{release}+{digest(now)[:8]}"
+
+
+def spec_content(spec: SceneSpec) -> str:
+    """What the specs' version depends on: everything."""
+    return spec.spec_hash
+
+
+def clip_content(scenario_id: str, scene_hash: str) -> list[str]:
+    """What the clips' version depends on."""
+    return [scenario_id, scene_hash]
+
+
+def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:
+    """What a dataset's version depends on, of one scenario; `record` is a spec or a row of scene_specs."""
+    aliases = record["aliases"] if isinstance(record["aliases"], dict) else json.loads(record["aliases"])
+    content = [record["scenario_id"], record["scene_hash"], record["question"], list(record["labels"]), aliases]
+    content.append(record["ground_truth"])
+    return [*content, record["ill_posed_question"]] if is_ill_posed(dataset) else content
+
+
+def spec_record(spec: SceneSpec) -> dict[str, Any]:
+    """A spec as `item_content` reads it."""
+    return spec.model_dump(mode="json") | {"scene_hash": spec.scene_hash}

@@ -1,0 +1,76 @@
+"""The videos stage: rows of scene_specs to clips and their table. What is rendered once is never rendered again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from traps_pipeline import progress
+from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
+from traps_pipeline.benchmark.versions import clip_content, version_of
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.partitions import SIDES
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH
+from traps_pipeline.scenes.clips import Job, read_clip, render_pairs, rendered
+from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import SCENE_SPECS, VIDEOS
+
+
+def build_videos(workspace: Workspace, category: str) -> tuple[list[dict[str, Any]], int, dict[str, float]]:
+    """Rows of the category's clips, the frames drawn for them, and the leaked pixels of each occluded void."""
+    specs: list[dict[str, Any]] = workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
+    jobs = [_job(workspace, row) for row in specs]
+    drawn = 0
+    try:
+        for done, (_, frames) in enumerate(render_pairs(jobs), start=1):
+            drawn += frames
+            progress.current().tick("videos", f"{category}, scenarios", done, len(jobs))
+        version = version_of(
+            (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
+            (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
+        )
+        rows = [row for spec, job in zip(specs, jobs, strict=True) for row in _rows(workspace, spec, job, version)]
+        leaks = {job.spec.scenario_id: clip.leaked_pixels for job in jobs if (clip := read_clip(job.void))}
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
+    return rows, drawn, {id_: pixels for id_, pixels in leaks.items() if pixels is not None}
+
+
+def _job(workspace: Workspace, row: dict[str, Any]) -> Job:
+    spec = spec_of(row)
+    control, void = (workspace.clip(spec.scenario_id, side, row["scene_hash"]) for side in SIDES)
+    return Job(spec, trajectory_of(workspace, row), control, void)
+
+
+def _rows(workspace: Workspace, row: dict[str, Any], job: Job, version: str) -> list[dict[str, Any]]:
+    rows = []
+    for side, path in zip(SIDES, (job.control, job.void), strict=True):
+        clip = read_clip(path)
+        if clip is None:
+            raise TrapsError(f"{path}: was not rendered; run again")
+        rows.append(
+            {
+                "scenario_id": row["scenario_id"],
+                "category": row["category"],
+                "side": side,
+                "path": workspace.relative(path),
+                "file_sha256": clip.file_sha256,
+                "frames_sha256": clip.frames_sha256,
+                "n_frames": clip.n_frames,
+                "fps": clip.fps,
+                "width": WIDTH,
+                "height": HEIGHT,
+                "duration_s": clip.duration_s,
+                "size_bytes": clip.size_bytes,
+                "scene_hash": row["scene_hash"],
+                "benchmark_version": version,
+            }
+        )
+    return rows
+
+
+def missing_clips(workspace: Workspace, category: str) -> Sequence[str]:
+    """Clips of the category's table that are gone or have another size: reasons for `traps status`."""
+    table = workspace.tables.read(VIDEOS, {"category": category}, ["path"])
+    return [path for path in table["path"] if not rendered(workspace.resolve(path))]

@@ -1,0 +1,238 @@
+"""The `traps` command. Nothing heavy is imported before a subcommand needs it: `traps --help` answers at once."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from traps_pipeline.errors import TrapsError
+
+if TYPE_CHECKING:
+    from traps_pipeline.experiment import Experiment
+    from traps_pipeline.storage.workspace import Workspace
+
+OK, FAILED, BAD_USAGE, INTERRUPTED = 0, 1, 2, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a subcommand; returns the exit code: 0 done, 1 something failed, 2 bad usage, 130 interrupted."""
+    arguments = build_parser().parse_args(argv)
+    command: Callable[[argparse.Namespace], int] = arguments.command
+    try:
+        return command(arguments)
+    except TrapsError as error:
+        print(f"traps: {error}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("\ntraps: interrupted; everything answered or rendered is kept. Run the same command to go on.", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()
+        return FAILED
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="traps", description="TRAPSBench: do vision-language models know when not to answer?"
+    )
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    def add(name: str, command: Callable[[argparse.Namespace], int], text: str, *, workspace: bool = True) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(command=command)
+        if workspace:
+            sub.add_argument("--workspace", type=Path, help="study folder (default: $TRAPS_WORKSPACE, else .workspaces/default)")
+        return sub
+
+    add("doctor", doctor, "render one frame, encode it, and name what is missing")
+    add("init", init, "make a workspace for an experiment without running it").add_argument("experiment", nargs="?", default="demo")
+    add("plan", plan, "count the calls of an experiment: wanted, known, new; nothing is sent").add_argument("experiment")
+    add("run", run, "materialize whatever of an experiment is missing or stale").add_argument("experiment")
+    add("status", status, "what is there, missing and stale, and why").add_argument("experiment", nargs="?")
+    add("why", why, "why an item's answers stand or will be asked again").add_argument("item", help="dataset:scenario:side")
+    sample = add("sample", sample_scenarios, "draw scenarios of a family and write them as released records", workspace=False)
+    sample.add_argument("family")
+    sample.add_argument("--count", type=int, default=8)
+    sample.add_argument("--seed", type=int, default=1)
+    sample.add_argument("--out", type=Path, required=True, help="folder of records, e.g. scene_specs/released")
+    return parser
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+
+def doctor(arguments: argparse.Namespace) -> int:
+    """See `traps doctor --help`."""
+    from traps_pipeline.doctor import examine
+
+    problems = 0
+    for finding in examine(_root(arguments)):
+        print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.detail}")
+        problems += not finding.ok
+    print("everything that the demo needs is here" if not problems else f"{problems} problem(s); the demo will not run")
+    return FAILED if problems else OK
+
+
+def init(arguments: argparse.Namespace) -> int:
+    """See `traps init --help`."""
+    workspace = _create(arguments, _experiment(arguments))
+    print(f"workspace {workspace.root} (study.yaml names its benchmark, panel and budget)")
+    print(f"next: export TRAPS_WORKSPACE={workspace.root} DAGSTER_HOME={workspace.dagster_home}; traps run {arguments.experiment}")
+    return OK
+
+
+def plan(arguments: argparse.Namespace) -> int:
+    """See `traps plan --help`."""
+    from traps_pipeline.plan import Count, plan_calls
+
+    experiment, root = _experiment(arguments), _root(arguments)
+    workspace = _open(root) if (root / "study.yaml").exists() else None
+    rows = plan_calls(workspace, experiment)
+    total = (Count(), Count())
+    print(f"{experiment.name} in {root if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
+    print(f"{'model':<24} {'answers':>9} {'known':>9} {'new':>9}   {'votes':>9} {'known':>9} {'new':>9}")
+    for model, counts in rows.items():
+        for sum_, count in zip(total, counts, strict=True):
+            sum_.add(count.wanted, count.known)
+        print(_plan_line(model, counts))
+    print(_plan_line("all", total))
+    if workspace is None:
+        print("votes are an upper bound: an answer that never comes is not judged")
+    return OK
+
+
+def _plan_line(name: str, counts: tuple) -> str:
+    answers, votes = ((count.wanted, count.known, count.new) for count in counts)
+    return f"{name:<24} {answers[0]:>9,} {answers[1]:>9,} {answers[2]:>9,}   {votes[0]:>9,} {votes[1]:>9,} {votes[2]:>9,}"
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """See `traps run --help`."""
+    from traps_pipeline.driver import run_experiment
+    from traps_pipeline.progress import Tally, TerminalProgress, clock, reporting
+
+    experiment = _experiment(arguments)
+    workspace = _create(arguments, experiment)
+    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
+    with reporting(TerminalProgress()) as progress:
+        outcome = run_experiment(workspace, experiment)
+    total = progress.totals
+    asked, voted, drawn = (total.get(stage, Tally()) for stage in ("responses", "votes", "videos"))
+    print(
+        f"\n{asked.asked} answers asked ({asked.cached} from the ledger), {voted.asked} votes asked ({voted.cached} from the "
+        f"ledger), {drawn.frames} frames rendered, {clock(outcome.seconds)} min"
+    )
+    if outcome.problems:
+        for problem in outcome.problems:
+            print(f"traps: {problem}", file=sys.stderr)
+        print(f"traps: {len(outcome.problems)} problem(s); what is done is kept: run the same command to go on", file=sys.stderr)
+        return FAILED
+    _print_results(workspace)
+    return OK
+
+
+def _print_results(workspace: Workspace) -> None:
+    from traps_pipeline.report.page import leaderboard_text
+    from traps_pipeline.tables import LEADERBOARD
+
+    print(leaderboard_text(workspace.tables.read(LEADERBOARD, {})))
+    for name in ("leaderboard.html", "leaderboard.md", "pecs_landscape.png", "contact_sheet.png"):
+        print(workspace.reports / name)
+
+
+def status(arguments: argparse.Namespace) -> int:
+    """See `traps status --help`."""
+    import dagster as dg
+
+    from traps_pipeline.defs.common import observe_sources
+    from traps_pipeline.driver import enter, wanted_keys
+    from traps_pipeline.lineage import STAGES
+    from traps_pipeline.plan import stage_statuses
+
+    workspace = _open(_root(arguments))
+    experiment = _experiment(arguments) if arguments.experiment else None
+    wanted = {stage: wanted_keys(workspace, experiment, stage) for stage in STAGES} if experiment else None
+    enter(workspace)
+    with dg.DagsterInstance.get() as instance:
+        observe_sources(instance, workspace)  # so that Dagster's UI shows the same partitions stale
+    print(f"workspace {workspace.root}\n{'stage':<18} {'fresh':>6} {'stale':>6} {'missing':>8}")
+    for row in stage_statuses(workspace, wanted):
+        missing = f"{row.missing:>8}" if wanted else f"{'-':>8}"
+        print(f"{row.stage:<18} {row.fresh:>6} {len(row.stale):>6} {missing}")
+        for key, reasons in list(row.stale.items())[:SHOWN]:
+            print(f"    {key}: {'; '.join(reasons[:3])}{' ...' if len(reasons) > 3 else ''}")
+        if len(row.stale) > SHOWN:
+            print(f"    ... and {len(row.stale) - SHOWN} more")
+    print("stale means made from something that has changed since; `traps run EXPERIMENT` makes it anew")
+    return OK
+
+
+SHOWN = 8
+
+
+def why(arguments: argparse.Namespace) -> int:
+    """See `traps why --help`."""
+    from traps_pipeline.plan import why as explain
+
+    for line in explain(_open(_root(arguments)), arguments.item):
+        print(line)
+    return OK
+
+
+def sample_scenarios(arguments: argparse.Namespace) -> int:
+    """See `traps sample --help`."""
+    from traps_pipeline.scenes.registry import get_family
+    from traps_pipeline.scenes.sample import sample_family, write_released
+
+    try:
+        family = get_family(arguments.family)
+        drawn = sample_family(family, arguments.count, arguments.seed, report=lambda line: print(line, flush=True))
+    except (KeyError, RuntimeError) as error:
+        raise TrapsError(str(error.args[0])) from error
+    write_released(arguments.out, family, drawn)
+    for reason, count in drawn.rejections.most_common():
+        print(f"rejected {count}: {reason}")
+    print(f"{len(drawn.scenarios)} scenarios written to {arguments.out}")
+    return OK
+
+
+# --- shared -----------------------------------------------------------------------------------------------------------
+
+
+def _root(arguments: argparse.Namespace) -> Path:
+    from traps_pipeline.storage.workspace import Workspace
+
+    return arguments.workspace.absolute() if arguments.workspace else Workspace.default_root()
+
+
+def _open(root: Path) -> Workspace:
+    from traps_pipeline.storage.workspace import Workspace
+
+    return Workspace.open(root)
+
+
+def _create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
+    from traps_pipeline.storage.workspace import Workspace
+
+    workspace = Workspace.create(_root(arguments), experiment.study)
+    import dagster as dg
+
+    from traps_pipeline.driver import enter
+
+    enter(workspace)
+    dg.DagsterInstance.get().dispose()  # two processes that open a fresh history at once would corrupt it
+    return workspace
+
+
+def _experiment(arguments: argparse.Namespace) -> Experiment:
+    from traps_pipeline.experiment import load_experiment
+
+    return load_experiment(arguments.experiment)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

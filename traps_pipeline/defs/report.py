@@ -1,0 +1,109 @@
+"""The report group: a figure, a contact sheet of pairs, the leaderboard page; and whether they are current."""
+
+import base64
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import dagster as dg
+
+from traps_pipeline import progress
+from traps_pipeline.defs import common
+from traps_pipeline.defs.benchmark import items
+from traps_pipeline.defs.common import OWNERS, Events
+from traps_pipeline.defs.scoring import leaderboard
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.lineage import Lineage, write_report_state
+from traps_pipeline.progress import Tally
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS, LEADERBOARD
+
+GROUP = "report"
+Files = dict[str, bytes]
+
+
+def _report(name: str, doc: str, deps: Sequence[dg.AssetsDefinition], make: Callable[[Workspace], Files]) -> dg.AssetsDefinition:
+    """An unpartitioned asset that writes files for people into the workspace's `reports` folder."""
+
+    @dg.asset(name=name, description=doc, deps=deps, group_name=GROUP, kinds={"png" if "page" not in name else "html"}, owners=OWNERS, output_required=False)
+    def report(context: dg.AssetExecutionContext) -> Events:
+        workspace = Workspace.open()
+        provenance = common.provenance(context, workspace)
+        inputs = Lineage(workspace).inputs(name, None)
+        files = make(workspace)
+        for file, content in files.items():
+            _write(workspace.reports / file, content)
+        version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
+        write_report_state(workspace, name, version, inputs)
+        progress.current().partition(name, "", Tally())
+        metadata = {file: dg.MetadataValue.path(str(workspace.reports / file)) for file in files}
+        pictures = {f"preview of {f}": _preview(content) for f, content in files.items() if f.endswith(".png")}
+        yield common.materialized(context, None, version, provenance, **metadata, **pictures)
+
+    return report
+
+
+def _write(path: Path, content: bytes) -> None:
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part.write_bytes(content)
+    os.replace(part, path)
+
+
+def _preview(png: bytes) -> dg.MarkdownMetadataValue:
+    return dg.MetadataValue.md(f"![preview](data:image/png;base64,{base64.b64encode(png).decode()})")
+
+
+def _landscape(workspace: Workspace) -> Files:
+    from traps_pipeline.report.figures import pecs_landscape
+
+    board = workspace.tables.read(LEADERBOARD, {})
+    return {f"pecs_landscape.{kind}": pecs_landscape(board, kind) for kind in ("png", "svg")}
+
+
+def _sheet(workspace: Workspace) -> Files:
+    from traps_pipeline.report.contact_sheet import contact_sheet
+
+    rows = workspace.tables.read_all(ITEMS)
+    if rows.empty:
+        raise TrapsError("contact_sheet: no items yet; materialize items first")
+    return {"contact_sheet.png": contact_sheet(rows, workspace.root)}
+
+
+def _page(workspace: Workspace) -> Files:
+    from traps_pipeline.report.page import leaderboard_html, leaderboard_markdown
+
+    board = workspace.tables.read(LEADERBOARD, {})
+    pictures = {
+        "Accuracy against discrimination": (workspace.reports / "pecs_landscape.png").read_bytes(),
+        "Pairs: control above, void below": (workspace.reports / "contact_sheet.png").read_bytes(),
+    }
+    return {
+        "leaderboard.html": leaderboard_html(board, pictures).encode(),
+        "leaderboard.md": leaderboard_markdown(board).encode(),
+    }
+
+
+pecs_landscape = _report(
+    "pecs_landscape", "Acc against J with iso-PECS contours, one marker a model and regime.", [leaderboard], _landscape
+)
+contact_sheet = _report(
+    "contact_sheet", "Control and void frames of one pair of each sub-scenario, with question and ground truth.", [items], _sheet
+)
+leaderboard_page = _report(
+    "leaderboard_page", "The leaderboard as a page that opens from disk (HTML) and as Markdown.", [leaderboard, pecs_landscape, contact_sheet], _page
+)
+
+
+def _inputs_current(asset: dg.AssetsDefinition) -> dg.AssetChecksDefinition:
+    name = asset.key.to_user_string()
+
+    @dg.asset_check(asset=asset, name="inputs_current", description="Made from what is there now; Dagster itself never calls an unpartitioned asset stale.")
+    def current() -> dg.AssetCheckResult:
+        status = Lineage(Workspace.open()).status(name, None)
+        return dg.AssetCheckResult(passed=status.kind == "fresh", metadata={"status": status.kind, "changed": list(status.reasons)})
+
+    return current
+
+
+inputs_current = [_inputs_current(asset) for asset in (leaderboard, pecs_landscape, contact_sheet, leaderboard_page)]

@@ -1,0 +1,109 @@
+"""`traps doctor`: what this machine can do, and what to install where it cannot."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+MIN_FREE_GB = 1.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing examined."""
+
+    ok: bool
+    what: str
+    detail: str
+
+
+def examine(workspace_root: Path) -> Iterator[Finding]:
+    """Everything that the demo needs, one finding each."""
+    for what, look in (
+        ("python", _python),
+        ("checkout", _checkout),
+        ("rendering", _rendering),
+        ("encoding", _encoding),
+        ("disk", lambda: _disk(workspace_root)),
+        ("workspace", lambda: _workspace(workspace_root)),
+    ):
+        yield _finding(what, look)
+
+
+def _finding(what: str, look: Callable[[], str]) -> Finding:
+    try:
+        return Finding(True, what, look())
+    except Exception as error:  # a doctor reports whatever it meets
+        return Finding(False, what, f"{error}")
+
+
+def _python() -> str:
+    if sys.version_info < (3, 11):
+        raise RuntimeError(f"Python {sys.version.split()[0]} is too old; install 3.11 or later")
+    return sys.version.split()[0]
+
+
+def _checkout() -> str:
+    from traps_pipeline.benchmark.corrections import read_corrections
+    from traps_pipeline.benchmark.records import load_release, load_released
+    from traps_pipeline.models.registry import load_models
+    from traps_pipeline.paths import require_checkout
+
+    root, release = require_checkout(), load_release()
+    counts = f"{len(load_released())} scenarios, {len(read_corrections())} corrections, {len(load_models())} models"
+    return f"{root}: {release.name} {release.version}, {counts}"
+
+
+def _rendering() -> str:
+    import os
+
+    import numpy as np
+
+    from traps_pipeline.scenes.camera import fit_camera
+    from traps_pipeline.scenes.kit import Physics, View, add_ball, new_spec
+    from traps_pipeline.scenes.render import Renderer
+
+    spec = new_spec(Physics())
+    add_ball(spec, "ball", (0, 0, 0.1), 0.1, "red")
+    model = spec.compile()
+    with Renderer(model, fit_camera(View(), np.array([[-0.3, 0, 0], [0.3, 0, 0.4]]))) as renderer:
+        frame = next(renderer.frames([model.qpos0]))
+    red = int((frame[..., 0].astype(int) - frame[..., 1] > 60).sum())
+    if red < 100:
+        raise RuntimeError(f"a red ball was drawn with {red} red pixels; this OpenGL does not render MuJoCo scenes")
+    return f"MUJOCO_GL={os.environ['MUJOCO_GL']}, one frame drawn ({red} red pixels of the ball)"
+
+
+def _encoding() -> str:
+    import numpy as np
+
+    from traps_pipeline.scenes.encode import decode, encode
+
+    frames = [np.full((360, 480, 3), shade, np.uint8) for shade in (40, 80, 120)]
+    with tempfile.TemporaryDirectory() as folder:
+        encode(frames, Path(folder) / "probe.mp4", fps=10)
+        decoded, _ = decode(Path(folder) / "probe.mp4")
+    if len(decoded) != len(frames):
+        raise RuntimeError(f"{len(decoded)} of {len(frames)} frames came back; reinstall the pinned av")
+    return "H.264 written and read back"
+
+
+def _disk(root: Path) -> str:
+    existing = next(path for path in (root, *root.parents) if path.exists())
+    free = shutil.disk_usage(existing).free / 1e9
+    if free < MIN_FREE_GB:
+        raise RuntimeError(f"{free:.1f} GB free at {existing}; free at least {MIN_FREE_GB} GB or choose another workspace")
+    return f"{free:.1f} GB free at {existing}"
+
+
+def _workspace(root: Path) -> str:
+    from traps_pipeline.storage.workspace import Workspace
+
+    if not (root / "study.yaml").exists():
+        return f"{root} not made yet (`traps init` or `traps run demo` makes it)"
+    study = Workspace.open(root).study
+    return f"{root}: benchmark {study.benchmark}, panel {study.panel}, budget {study.budget_usd} dollars"

@@ -1,0 +1,166 @@
+"""`traps run`: walk the stages of an experiment through Dagster, materializing what is missing or stale, and no more."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+from traps_pipeline import progress
+from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
+from traps_pipeline.experiment import Experiment
+from traps_pipeline.lineage import PARTITIONED_BY, STAGES, Lineage, Node, name_of, upstream
+from traps_pipeline.models.registry import all_evaluations
+from traps_pipeline.partitions import CATEGORIES, DATASETS, Cell, datasets_of_category
+from traps_pipeline.storage.workspace import VARIABLE, Workspace
+from traps_pipeline.tables import SCENE_SPECS
+
+if TYPE_CHECKING:
+    import dagster as dg
+
+AGGREGATES = ("metrics", "leaderboard")  # made from whatever verdicts are there
+_QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
+
+
+def enter(workspace: Workspace) -> None:
+    """Make every asset and Dagster itself use this workspace."""
+    os.environ[VARIABLE] = str(workspace.root)
+    os.environ["DAGSTER_HOME"] = str(workspace.dagster_home)
+
+
+def wanted_keys(workspace: Workspace, experiment: Experiment, stage: str) -> list[str | None]:
+    """Partition keys of a stage that an experiment needs, in key order."""
+    scenarios = load_scenarios(workspace.study)
+    present = categories_of(scenarios)
+    match PARTITIONED_BY.get(stage):
+        case "category":
+            made = [c for c in CATEGORIES if workspace.tables.state(SCENE_SPECS, {"category": c}) is not None]
+            return [c for c in CATEGORIES if c in present or c in made]
+        case "dataset":
+            return [d for d in DATASETS if d in _datasets(experiment, present)]
+        case "cell":
+            return [cell.key for cell in experiment.cells() if cell.dataset in _datasets(experiment, present)]
+    return [None]
+
+
+def _datasets(experiment: Experiment, categories: Sequence[str]) -> list[str]:
+    there = {dataset for category in categories for dataset in datasets_of_category(category)}
+    return [dataset for dataset in experiment.datasets if dataset in there]
+
+
+@dataclass
+class Outcome:
+    """What a run did: problems by partition, and checks that did not pass."""
+
+    problems: list[str] = field(default_factory=list)
+    failed: set[Node] = field(default_factory=set)
+    seconds: float = 0.0
+
+
+def run_experiment(workspace: Workspace, experiment: Experiment) -> Outcome:
+    """Materialize whatever of the experiment is missing or stale, stage by stage. KeyboardInterrupt passes through."""
+    import dagster as dg
+
+    from traps_pipeline.defs.common import observe_sources
+
+    enter(workspace)
+    outcome, began = Outcome(), time.monotonic()
+    with dg.DagsterInstance.get() as instance:
+        observe_sources(instance, workspace)
+        for stage in STAGES:
+            _run_stage(instance, workspace, experiment, stage, outcome)
+    outcome.seconds = time.monotonic() - began
+    return outcome
+
+
+def _run_stage(
+    instance: dg.DagsterInstance, workspace: Workspace, experiment: Experiment, stage: str, outcome: Outcome
+) -> None:
+    lineage = Lineage(workspace)
+    todo = [key for key in wanted_keys(workspace, experiment, stage) if lineage.status(stage, key).kind != "fresh"]
+    blocked = [key for key in todo if stage not in AGGREGATES and outcome.failed & set(upstream(stage, key))]
+    outcome.failed |= {(stage, key) for key in blocked}
+    todo = [key for key in todo if key not in blocked]
+    if not todo:
+        return
+    progress.current().stage(stage, len(todo))
+    for batch in batches(stage, todo):
+        outcome.problems += _materialize(instance, stage, batch)
+    after = Lineage(workspace)
+    for key in todo:
+        status = after.status(stage, key)
+        lasting = [reason for reason in status.reasons if "calls failed" not in reason]
+        if status.kind == "missing" or lasting:
+            outcome.failed.add((stage, key))
+            outcome.problems.append(f"{name_of((stage, key))} is {status.kind}{': ' + '; '.join(lasting) if lasting else ''}")
+        elif status.reasons:
+            outcome.problems.append(f"{name_of((stage, key))}: {'; '.join(status.reasons)}")
+
+
+def batches(stage: str, keys: Sequence[str | None]) -> Iterator[tuple[str | None, str | None]]:
+    """Ranges (first key, last key) that together are exactly the keys: one run each. A range of cells is a rectangle of
+    neighbouring datasets and evaluations; other stages take one partition a run."""
+    if PARTITIONED_BY.get(stage) != "cell":
+        yield from ((key, key) for key in keys)
+        return
+    order = {evaluation: number for number, evaluation in enumerate(all_evaluations())}
+    by_dataset: dict[int, list[int]] = {}
+    for key in keys:
+        cell = Cell.parse(str(key))
+        by_dataset.setdefault(DATASETS.index(cell.dataset), []).append(order[cell.evaluation])
+    spans = sorted((span, dataset) for dataset, numbers in by_dataset.items() for span in _spans(numbers))
+    for span, group in groupby(spans, key=lambda pair: pair[0]):
+        for first, last in _spans([dataset for _, dataset in group]):
+            evaluations = all_evaluations()
+            yield Cell(DATASETS[first], evaluations[span[0]]).key, Cell(DATASETS[last], evaluations[span[1]]).key
+
+
+def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """Maximal runs of neighbouring numbers, as (first, last)."""
+    spans: list[tuple[int, int]] = []
+    for number in sorted(numbers):
+        if spans and spans[-1][1] == number - 1:
+            spans[-1] = (spans[-1][0], number)
+        else:
+            spans.append((number, number))
+    return spans
+
+
+def _materialize(instance: dg.DagsterInstance, stage: str, batch: tuple[str | None, str | None]) -> list[str]:
+    """One Dagster run; what went wrong in it, one sentence each."""
+    import dagster as dg
+
+    from traps_pipeline.definitions import ASSETS, SOURCES
+    from traps_pipeline.defs.report import inputs_current
+
+    first, last = batch
+    ranged = PARTITIONED_BY.get(stage) == "cell"
+    tags = {"dagster/asset_partition_range_start": str(first), "dagster/asset_partition_range_end": str(last)}
+    result = dg.materialize(
+        [*SOURCES, *ASSETS, *inputs_current],
+        selection=dg.AssetSelection.assets(stage),
+        instance=instance,
+        partition_key=None if ranged else first,
+        tags=tags if ranged else None,
+        raise_on_error=False,
+        run_config=_QUIET,
+    )
+    problems = [_reason(event) for event in result.all_events if event.is_step_failure]
+    for evaluation in result.get_asset_check_evaluations():
+        if not evaluation.passed:
+            details = {name: value.value for name, value in evaluation.metadata.items()}
+            problems.append(f"check {evaluation.check_name} of {stage} {first or ''} did not pass: {details}")
+    if not result.success and not problems:
+        problems.append(f"{stage} {first or ''}: the run failed; see its log in Dagster")
+    return problems
+
+
+def _reason(event: dg.DagsterEvent) -> str:
+    """The innermost error of a failed step."""
+    error = event.step_failure_data.error
+    while error is not None and error.cause is not None:
+        error = error.cause
+    return "the step failed" if error is None else error.message.strip().removeprefix("traps_pipeline.errors.TrapsError: ")

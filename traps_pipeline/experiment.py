@@ -1,0 +1,80 @@
+"""An experiment: which models are asked what, as a YAML file under `assets/experiments` or anywhere else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.registry import get_model
+from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
+from traps_pipeline.paths import ASSETS
+from traps_pipeline.storage.workspace import Study
+from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
+
+EXPERIMENTS = ASSETS / "experiments"
+
+
+class Experiment(BaseModel):
+    """What `traps plan` counts and `traps run` does. benchmark, scenarios, per_family and panel become the study's."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    name: str = Field(pattern=r"^[a-z0-9-]+$")
+    description: str = ""
+    benchmark: str = "released"
+    scenarios: list[str] | None = None
+    per_family: int | None = None
+    datasets: list[str] = list(DATASETS)
+    models: list[str] = Field(min_length=1)
+    regimes: list[str] = list(REGIMES)
+    runs: list[int] = [1]
+    panel: str = "rules"
+    epoch: str = "1"
+    budget_usd: float = 0.0
+
+    @field_validator("datasets")
+    @classmethod
+    def _datasets(cls, values: list[str]) -> list[str]:
+        return _known(values, DATASETS)
+
+    @field_validator("regimes")
+    @classmethod
+    def _regimes(cls, values: list[str]) -> list[str]:
+        return _known(values, REGIMES)
+
+    @property
+    def study(self) -> Study:
+        """The study that a new workspace for this experiment holds."""
+        fields = ("benchmark", "scenarios", "per_family", "panel", "epoch", "budget_usd")
+        return Study(**{name: getattr(self, name) for name in fields})
+
+    def cells(self) -> list[Cell]:
+        """All cells asked for, model outermost; a model that has fewer runs has fewer cells. Raises TrapsError."""
+        cells = []
+        for model in self.models:
+            available = get_model(model).runs
+            for regime in self.regimes:
+                for run in self.runs:
+                    if run <= available:
+                        cells += [Cell(dataset, Evaluation(model, regime, run)) for dataset in self.datasets]
+        return cells
+
+
+def _known(values: list[str], known: tuple[str, ...]) -> list[str]:
+    unknown = [value for value in values if value not in known]
+    if unknown or not values:
+        raise ValueError(f"{unknown or 'nothing'} given; choose from {', '.join(known)}")
+    return values
+
+
+def load_experiment(name: str) -> Experiment:
+    """An experiment by name (`demo`) or path (`my.yaml`). Raises TrapsError with the known names."""
+    path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in EXPERIMENTS.glob("*.yaml")))
+        raise TrapsError(f"no experiment {name!r}: {path} is not there; known: {known}, or give the path of a YAML file")
+    experiment = parse_yaml_model(Experiment, read_yaml(path), path)
+    for model in experiment.models:
+        get_model(model)
+    return experiment

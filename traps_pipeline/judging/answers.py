@@ -1,0 +1,48 @@
+"""Correctness by code: an extracted value against the ground truth (`benchmark.md` section 4)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+NUMERIC_TOLERANCE = 0.5
+NUMBER_WORDS = {
+    word: str(n)
+    for n, word in enumerate("zero one two three four five six seven eight nine ten eleven twelve".split())
+}
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
+
+
+def normalise(text: str) -> str:
+    """Lower case, no articles, no punctuation but the hyphen and point inside a number or range, single spaces."""
+    text = text.lower().replace("–", "-").replace("—", "-").replace("’", "'")
+    text = re.sub(r"(?<=\d)\s*(?:-|to)\s*(?=\d)", "-", text)
+    text = re.sub(r"(?<!\d)[.\-]|[.\-](?!\d)|[^\w\s.\-]", " ", text)
+    return " ".join(word for word in text.split() if word not in ("a", "an", "the"))
+
+
+def to_number(text: str) -> float | None:
+    """The number that a value is or names; None if it holds none or several."""
+    words = [NUMBER_WORDS.get(word, word) for word in normalise(text).split()]
+    numbers = _NUMBER.findall(" ".join(words))
+    return float(numbers[0]) if len(numbers) == 1 else None
+
+
+def to_label(text: str, labels: Sequence[str], aliases: Mapping[str, str]) -> str | None:
+    """The label that a value names, exactly or through an alias; None if it names none."""
+    table = {normalise(label): label for label in labels}
+    table |= {normalise(alias): label for alias, label in aliases.items()}
+    return table.get(normalise(text))
+
+
+def is_correct(
+    extracted: str | None, ground_truth: str, answer_type: str, labels: Sequence[str], aliases: Mapping[str, str]
+) -> bool:
+    """Numeric: within 0.5 of the ground truth. Others: the label named is the ground truth; an unmapped value is wrong."""
+    if extracted is None:
+        return False
+    if answer_type == "numeric":
+        label = to_label(extracted, labels, aliases)
+        number = to_number(label if label is not None else extracted)
+        return number is not None and abs(number - float(ground_truth)) <= NUMERIC_TOLERANCE
+    return to_label(extracted, labels, aliases) == ground_truth

@@ -1,0 +1,254 @@
+"""Asking: wanted keys minus known keys, call the difference, append to the ledger, hand on what is complete.
+
+The same code asks models and judges, reference ones and paid ones. There is no resume mode: a crash, a second run and
+a correction are the same operation (`design.md` section 5).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from itertools import groupby
+from typing import Any, Generic, TypeVar
+
+from traps_pipeline import progress
+from traps_pipeline.models.backends import make_backend
+from traps_pipeline.models.registry import Limits
+from traps_pipeline.models.request import Backend, Outcome, Request, TransientError
+from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.progress import Tally
+from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, SegmentWriter
+
+Row = dict[str, Any]
+Finished = TypeVar("Finished")
+MAX_BACKOFF_S = 60.0
+
+
+@dataclass(frozen=True)
+class Participant:
+    """A model or judge as it is asked: its backend, its limits, its free connections."""
+
+    backend: Backend
+    limits: Limits
+    free: asyncio.Semaphore
+
+
+class Participants:
+    """Backends by participant, made when first asked; concurrency is shared by all evaluations of a run."""
+
+    def __init__(self, entries: Mapping[str, tuple[str, Limits]]) -> None:
+        self._entries = entries
+        self._made: dict[str, Participant] = {}
+
+    def __getitem__(self, name: str) -> Participant:
+        if name not in self._made:
+            kind, limits = self._entries[name]
+            self._made[name] = Participant(make_backend(kind), limits, asyncio.Semaphore(limits.concurrency))
+        return self._made[name]
+
+
+@dataclass(frozen=True)
+class Work(Generic[Finished]):
+    """What a stage asks. requests(cell): all calls it wants. finish(cell, rows by key, tally): writes the cell's table."""
+
+    stage: str
+    ledger: Ledger
+    participants: Participants
+    epoch: str
+    requests: Callable[[Cell], Sequence[Request]]
+    finish: Callable[[Cell, Mapping[str, Row], Tally], Finished]
+
+
+async def attempt(participant: Participant, request: Request) -> tuple[Outcome, int, float]:
+    """An outcome, the calls it took, the seconds of the last one. The one retry layer: exponential with full jitter."""
+    for number in range(1, participant.limits.retries + 2):
+        began = time.monotonic()
+        try:
+            outcome = await participant.backend.ask(request)
+        except TransientError as error:
+            outcome = Outcome("error", error=error.kind)
+            if number <= participant.limits.retries:
+                longest = min(participant.limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
+                await asyncio.sleep(max(error.retry_after_s or 0.0, random.uniform(0, longest)))
+                continue
+        return outcome, number, time.monotonic() - began
+    raise AssertionError("unreachable: the last attempt returns")
+
+
+def ledger_row(request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str) -> tuple[Row, str | None]:
+    """The row that stands for an answer, and its reasoning trace."""
+    fields = asdict(outcome)
+    reasoning = fields.pop("reasoning")
+    row = {"key": request.key, "outcome": fields.pop("kind"), **fields, "attempts": attempts, "latency_s": round(latency_s, 6)}
+    row |= {"epoch": epoch, "created_at": datetime.now(UTC).isoformat(), "components": request.components}
+    return row, reasoning
+
+
+@dataclass
+class _Asking:
+    """Workers over the missing requests of one evaluation."""
+
+    work: Work[Any]
+    writer: SegmentWriter
+    missing: deque[Request]
+    stop: asyncio.Event
+    rows: dict[str, Row] = field(default_factory=dict)
+
+    async def worker(self, participant: Participant, queue: deque[Request]) -> None:
+        while queue and not self.stop.is_set():
+            async with participant.free:
+                if not queue or self.stop.is_set():
+                    return
+                request = queue.popleft()
+                outcome, attempts, latency = await attempt(participant, request)
+                row, reasoning = ledger_row(request, outcome, attempts, latency, self.work.epoch)
+                self.writer.append(row, reasoning)
+                self.rows[request.key] = row
+
+    async def sync(self) -> None:
+        while True:
+            await asyncio.sleep(SYNC_SECONDS)
+            self.writer.sync_if_due()
+
+    async def run(self) -> None:
+        queues: dict[str, deque[Request]] = {}
+        for request in self.missing:
+            queues.setdefault(request.participant, deque()).append(request)
+        syncing = asyncio.create_task(self.sync())
+        try:
+            async with asyncio.TaskGroup() as group:
+                for name, queue in queues.items():
+                    participant = self.work.participants[name]
+                    for _ in range(min(participant.limits.concurrency, len(queue))):
+                        group.create_task(self.worker(participant, queue))
+        except ExceptionGroup as errors:
+            raise errors.exceptions[0] from None
+        finally:
+            syncing.cancel()
+
+
+async def settle_evaluation(
+    work: Work[Finished], evaluation: Evaluation, cells: Sequence[Cell], stop: asyncio.Event
+) -> AsyncIterator[Finished]:
+    """Finish the cells of one evaluation, asking only what its ledger does not hold. Unfinished cells are left out."""
+    report = progress.current()
+    async with work.ledger.lock(evaluation.key, report.note):
+        known = work.ledger.read(evaluation.key)
+        for place in known.torn:
+            report.note(f"{place}: torn last line ignored (a crash cut it off); its answer is asked again")
+        answered = {key: row for key, row in known.rows.items() if row["outcome"] != "error"}
+        with work.ledger.writer(evaluation.key) as writer:
+            for cell in cells:
+                wanted = {request.key: request for request in work.requests(cell)}
+                missing = deque(request for key, request in wanted.items() if key not in answered)
+                asking = _Asking(work, writer, missing, stop)
+                tally = Tally(asked=len(missing), cached=len(wanted) - len(missing))
+                await asking.run()
+                rows = {key: answered.get(key) or asking.rows.get(key) for key in wanted}
+                if any(row is None for row in rows.values()):
+                    return  # stopped before the cell was complete; what was answered is in the ledger
+                writer.sync()
+                complete = {key: row for key, row in rows.items() if row is not None}
+                tally.errors = sum(row["outcome"] == "error" for row in complete.values())
+                yield work.finish(cell, complete, tally)
+
+
+async def settle(work: Work[Finished], cells: Sequence[Cell], stop: asyncio.Event) -> AsyncIterator[Finished | Exception]:
+    """Finish all cells, models side by side. A model that fails yields its exception; the others go on."""
+    done: asyncio.Queue[Finished | Exception | None] = asyncio.Queue()
+
+    async def one_model(evaluations: Sequence[tuple[Evaluation, list[Cell]]]) -> None:
+        try:
+            for evaluation, mine in evaluations:
+                async for finished in settle_evaluation(work, evaluation, mine, stop):
+                    await done.put(finished)
+        except Exception as error:  # handed to the caller, who reports it and fails the run
+            await done.put(error)
+        finally:
+            await done.put(None)
+
+    ordered = sorted(cells, key=lambda cell: (cell.evaluation, cell.dataset))
+    by_evaluation = [(e, list(mine)) for e, mine in groupby(ordered, key=lambda cell: cell.evaluation)]
+    tasks = [
+        asyncio.create_task(one_model(list(mine))) for _, mine in groupby(by_evaluation, key=lambda pair: pair[0].model)
+    ]
+    try:
+        open_tasks = len(tasks)
+        while open_tasks:
+            finished = await done.get()
+            if finished is None:
+                open_tasks -= 1
+            else:
+                yield finished
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def run_work(work: Work[Finished], cells: Sequence[Cell]) -> Iterator[Finished]:
+    """`settle` for synchronous callers. The first Ctrl-C stops new calls and waits for those in flight, a second one
+    stops at once; either way KeyboardInterrupt is raised and the same command goes on later. Exceptions of models are
+    raised together after the others have finished."""
+    loop = asyncio.new_event_loop()
+    stop = asyncio.Event()
+    results = settle(work, cells, stop)
+    problems: list[Exception] = []
+    with _drain_on_interrupt(loop, stop):
+        try:
+            while True:
+                try:
+                    finished = loop.run_until_complete(anext(results))
+                except StopAsyncIteration:
+                    break
+                except asyncio.CancelledError:
+                    raise KeyboardInterrupt from None
+                if isinstance(finished, Exception):
+                    problems.append(finished)
+                else:
+                    yield finished
+        finally:
+            loop.run_until_complete(results.aclose())
+            loop.close()
+    if stop.is_set():
+        raise KeyboardInterrupt
+    if len(problems) == 1:
+        raise problems[0]
+    if problems:
+        raise ExceptionGroup(f"{work.stage}: {len(problems)} models failed", problems)
+
+
+class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
+    """Route SIGINT to the stop event while a loop works in the main thread, then give it back."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
+        self._loop, self._stop = loop, stop
+        self._main = threading.current_thread() is threading.main_thread()
+
+    def __enter__(self) -> None:
+        if self._main:
+            self._former = signal.getsignal(signal.SIGINT)
+            signal.signal(signal.SIGINT, lambda *_: self._interrupt())
+
+    def _interrupt(self) -> None:
+        if self._stop.is_set():
+            self._loop.call_soon_threadsafe(self._cancel)
+            return
+        progress.current().note("stopping: waiting for the calls in flight (Ctrl-C again stops at once)")
+        self._stop.set()
+        self._loop.call_soon_threadsafe(lambda: None)  # wakes the loop from its select
+
+    def _cancel(self) -> None:
+        for task in asyncio.all_tasks(self._loop):
+            task.cancel()
+
+    def __exit__(self, *_: object) -> None:
+        if self._main:
+            signal.signal(signal.SIGINT, self._former)

@@ -1,0 +1,34 @@
+"""System prompts of the three regimes and of the judges, verbatim from `assets/prompts` (`benchmark.md` section 3)."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.paths import ASSETS
+
+PROMPTS = ASSETS / "prompts"
+_REGIME_PARTS = {
+    "standard": ("standard",),
+    "guided": ("standard", "guided_suffix"),
+    "json": ("standard", "json_suffix"),
+}
+
+
+@cache
+def prompt(name: str) -> str:
+    """Text of `assets/prompts/<name>.txt`, stripped."""
+    path = PROMPTS / f"{name}.txt"
+    try:
+        text = path.read_text(encoding="utf-8").strip()
+    except OSError as error:
+        raise TrapsError(f"{path}: cannot be read ({error.strerror}); restore it from git") from error
+    if not text:
+        raise TrapsError(f"{path}: is empty; restore it from git")
+    return text
+
+
+@cache
+def system_prompt(regime: str) -> str:
+    """The regime's system prompt: parts stripped and joined by one blank line."""
+    return "\n\n".join(prompt(part) for part in _REGIME_PARTS[regime])

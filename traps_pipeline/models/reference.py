@@ -1,0 +1,97 @@
+"""Reference models: strategies that need no key and go the whole way of a paid model (`benchmark.md` section 5).
+
+They alone see a request's `secret` (side, ground truth, labels). What looks random is a digest of the request, so a
+crash and a second run give the same answers.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from traps_pipeline.digests import digest
+from traps_pipeline.models.request import Outcome, Request, TransientError
+
+ABSTENTION = "I don't know"
+Strategy = Callable[[Request], str | None]  # the label answered, None for an abstention
+
+
+def uniform(request: Request, purpose: str) -> float:
+    """A number in [0, 1) that depends on the request's key and the purpose alone."""
+    return int(digest([request.key, purpose])[:13], 16) / 16**13
+
+
+def _truth(request: Request) -> str:
+    """The right answer on a control; on a void, where there is none, a guess."""
+    secret = request.secret
+    if secret["side"] == "control":
+        return secret["ground_truth"]
+    labels = secret["labels"]
+    return labels[int(uniform(request, "guess") * len(labels))]
+
+
+def _sometimes(parameter: str) -> Strategy:
+    """Abstain with one probability on either side."""
+
+    def strategy(request: Request) -> str | None:
+        return None if uniform(request, "abstain") < request.params[parameter] else _truth(request)
+
+    return strategy
+
+
+STRATEGIES: Mapping[str, Strategy] = {
+    "oracle": lambda r: r.secret["ground_truth"] if r.secret["side"] == "control" else None,
+    "always-abstain": lambda r: None,
+    "never-abstain": lambda r: r.secret["labels"][0],
+    "perfect-answerer": _truth,
+    "inverse-oracle": lambda r: None if r.secret["side"] == "control" else _truth(r),
+    "abstain-at-rate": _sometimes("abstain_probability"),
+    "prior": lambda r: r.secret["commonest_answer"],
+}
+
+
+def phrase(answer: str | None, regime: str) -> str:
+    """The answer in the words of a model under that regime."""
+    if answer is None:
+        reason, final = "The clip does not show what decides the outcome.", ABSTENTION
+    else:
+        reason, final = "I followed the motion to the end of the clip.", answer
+    if regime == "json":
+        return json.dumps({"reason": reason, "final_answer": final})
+    return f"{reason} {ABSTENTION}." if answer is None else f"{reason} The answer is: {final}."
+
+
+class ReferenceBackend:
+    """Plays one strategy. With a `faults` parameter it also misbehaves like a bad provider (model `flaky`)."""
+
+    def __init__(self) -> None:
+        self._attempts: Counter[str] = Counter()
+
+    async def ask(self, request: Request) -> Outcome:
+        """One attempt; see `Backend`."""
+        await asyncio.sleep(0)
+        misfortune = self._misfortune(request)
+        if misfortune is not None:
+            return misfortune
+        text = phrase(STRATEGIES[request.params["strategy"]](request), str(request.about["regime"]))
+        return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)
+
+    def _misfortune(self, request: Request) -> Outcome | None:
+        """What the `faults` shares (empty, refused, failing, transient) make of this request; None for an answer."""
+        faults: Mapping[str, Any] = request.params.get("faults", {})
+        if not faults:
+            return None
+        draw = uniform(request, "fault")
+        if draw < (edge := faults["empty"]):
+            return Outcome("empty", finish_reason="stop", served_model=request.participant, cost_usd=0.0)
+        if draw < (edge := edge + faults["refused"]):
+            return Outcome("refused", finish_reason="content_filter", served_model=request.participant, cost_usd=0.0)
+        if draw < (edge := edge + faults["failing"]):
+            raise TransientError("timeout")
+        self._attempts[request.key] += 1
+        if draw < edge + faults["transient"] and self._attempts[request.key] <= 2:
+            raise TransientError("rate_limited", retry_after_s=0.001)
+        return None

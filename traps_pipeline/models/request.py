@@ -1,0 +1,86 @@
+"""The two values that every backend speaks: `Request -> Outcome`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from traps_pipeline.digests import digest
+
+OutcomeKind = Literal["answer", "truncated", "empty", "refused", "error"]
+JUDGED: tuple[OutcomeKind, ...] = ("answer", "truncated")  # what has a text; `design.md` section 5
+_VERBATIM = 600  # a text up to this long stands in the key's components as it is, so that `traps why` can show it
+
+
+@dataclass(frozen=True)
+class Request:
+    """One call, complete: what decides the answer, and nothing else.
+
+    participant: model or judge. endpoint: kind of backend. params: exactly what is sent. about: which item, model,
+    regime, run (and task) it is for: repeated questions are calls of their own. secret: what only a reference model
+    sees (side, ground truth). media is the clip, media_digest what stands for it in the key.
+    """
+
+    participant: str
+    endpoint: str
+    params: Mapping[str, Any]
+    system: str
+    user: str
+    about: Mapping[str, str | int]
+    media: Path | None = None
+    media_digest: str = ""
+    secret: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def components(self) -> dict[str, Any]:
+        """What the ledger key is made of, by name. Holds no code version, concurrency, time-out or API key."""
+        parts: dict[str, Any] = {
+            "participant": self.participant,
+            "endpoint": self.endpoint,
+            "params": dict(self.params),
+            "system": digest(self.system)[:16],
+            "user": self.user if len(self.user) <= _VERBATIM else digest(self.user),
+            "media": self.media_digest,
+            "about": dict(self.about),
+        }
+        return parts | ({"secret": dict(self.secret)} if self.secret else {})
+
+    @cached_property
+    def key(self) -> str:
+        """The ledger key."""
+        return digest(self.components)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a request. A failure is a kind, never a text: no error string ever reaches a judge."""
+
+    kind: OutcomeKind
+    text: str | None = None
+    reasoning: str | None = None
+    finish_reason: str | None = None
+    error: str | None = None
+    served_model: str | None = None
+    prompt_tokens: int | None = None
+    completion_tokens: int | None = None
+    reasoning_tokens: int | None = None
+    cost_usd: float | None = None
+
+
+class TransientError(Exception):
+    """A failure worth another try: time-out, 408, 409, 429, 5xx, a cut connection."""
+
+    def __init__(self, kind: str, retry_after_s: float | None = None) -> None:
+        super().__init__(kind)
+        self.kind, self.retry_after_s = kind, retry_after_s
+
+
+class Backend(Protocol):
+    """Answers requests of one participant."""
+
+    async def ask(self, request: Request) -> Outcome:
+        """One attempt. Raises TransientError when another try may help; any other failure is an Outcome."""
+        ...

@@ -1,0 +1,109 @@
+"""Every key scheme: categories, datasets, evaluations; how keys are formatted, parsed and checked.
+
+Dagster allows two partition dimensions, sorts them by name, and forbids `|`, `,`, `[` and `]` inside a key.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+OCCLUSION_CATEGORIES = (
+    "ramps_rolling",
+    "pendulums_levers",
+    "trajectories_drops",
+    "hidden",
+    "collisions",
+    "dominoes",
+    "stacks",
+    "other",
+)
+CHAOTIC_CATEGORIES = ("pachinko_waterfall", "plinko", "seesaw_sorter", "tumbling_dice")
+CATEGORIES = OCCLUSION_CATEGORIES + CHAOTIC_CATEGORIES
+
+DATASETS = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
+REGIMES = ("standard", "guided", "json")
+SIDES = ("control", "void")
+
+_SLUG = re.compile(r"[a-z0-9.-]+")
+
+
+def taxonomy_of(dataset: str) -> str:
+    """`occlusion` or `chaotic`."""
+    return dataset.removesuffix("_ill_posed")
+
+
+def is_ill_posed(dataset: str) -> bool:
+    """Whether the void of a pair is the control's clip with an unanswerable question."""
+    return dataset.endswith("_ill_posed")
+
+
+def datasets_of_category(category: str) -> tuple[str, str]:
+    """The two datasets (visual, ill-posed) that a category's scenarios belong to."""
+    taxonomy = "occlusion" if category in OCCLUSION_CATEGORIES else "chaotic"
+    return taxonomy, f"{taxonomy}_ill_posed"
+
+
+def check_slug(model_id: str) -> str:
+    """The id itself. Raises ValueError unless it is `[a-z0-9.-]+`, so that keys can be parsed back."""
+    if not _SLUG.fullmatch(model_id):
+        raise ValueError(f"id {model_id!r} must match [a-z0-9.-]+ (it becomes part of partition keys and folder names)")
+    return model_id
+
+
+@dataclass(frozen=True, order=True)
+class Evaluation:
+    """One model under one regime in one run: the second partition dimension of the paid stages."""
+
+    model: str
+    regime: str
+    run: int
+
+    @property
+    def key(self) -> str:
+        """`model__regime__runN`."""
+        return f"{self.model}__{self.regime}__run{self.run}"
+
+    @staticmethod
+    def parse(key: str) -> Evaluation:
+        """Inverse of `key`. Raises ValueError naming what is wrong."""
+        parts = key.split("__")
+        run = parts[2].removeprefix("run") if len(parts) == 3 else ""
+        if len(parts) != 3 or parts[1] not in REGIMES or not run.isdigit() or not parts[2].startswith("run"):
+            raise ValueError(f"evaluation key {key!r} is not model__regime__runN with a regime of {REGIMES}")
+        return Evaluation(check_slug(parts[0]), parts[1], int(run))
+
+
+def evaluations(models: Iterable[tuple[str, int]]) -> list[Evaluation]:
+    """All evaluations of (model, number of runs), model outermost, so that a model's cells are one range."""
+    return [
+        Evaluation(model, regime, run) for model, runs in models for regime in REGIMES for run in range(1, runs + 1)
+    ]
+
+
+@dataclass(frozen=True, order=True)
+class Cell:
+    """One dataset under one evaluation: a partition of responses, votes and verdicts."""
+
+    dataset: str
+    evaluation: Evaluation
+
+    @property
+    def key(self) -> str:
+        """The partition key as Dagster writes it: dimensions sorted by name (`dataset` before `evaluation`)."""
+        return f"{self.dataset}|{self.evaluation.key}"
+
+    @property
+    def partition(self) -> dict[str, str | int]:
+        """Values of the tables' partition columns."""
+        e = self.evaluation
+        return {"dataset": self.dataset, "model": e.model, "regime": e.regime, "run": e.run}
+
+    @staticmethod
+    def parse(key: str) -> Cell:
+        """Inverse of `key`. Raises ValueError."""
+        dataset, _, evaluation = key.partition("|")
+        if dataset not in DATASETS:
+            raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {DATASETS}")
+        return Cell(dataset, Evaluation.parse(evaluation))

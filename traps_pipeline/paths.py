@@ -1,0 +1,21 @@
+"""Where the checkout's data lies. The package runs from a checkout (editable install), never from a wheel alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+ASSETS = CHECKOUT / "assets"
+SCENE_SPECS = CHECKOUT / "scene_specs"
+RELEASED = SCENE_SPECS / "released"
+CORRECTIONS = SCENE_SPECS / "corrections"
+
+
+def require_checkout() -> Path:
+    """The checkout's root. Raises RuntimeError with the remedy when the package was installed without one."""
+    for folder in (ASSETS, SCENE_SPECS):
+        if not folder.is_dir():
+            raise RuntimeError(
+                f"{folder} is missing: traps runs from a checkout; clone the repository and `pip install -e .` in it"
+            )
+    return CHECKOUT

@@ -1,0 +1,167 @@
+"""`traps plan`, `traps status` and `traps why`: what would be asked, what is there, and why it would be asked again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from traps_pipeline.benchmark.corrections import load_scenarios
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.experiment import Experiment
+from traps_pipeline.judging.panel import PANEL_SIZE, load_panel, tasks_for, wanted_votes
+from traps_pipeline.lineage import STAGES, Lineage, keys_of
+from traps_pipeline.models.answers import answer_request
+from traps_pipeline.models.registry import get_model, load_models
+from traps_pipeline.partitions import REGIMES, SIDES, Cell, Evaluation, taxonomy_of
+from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS
+
+VOTES_A_PAIR = PANEL_SIZE * sum(len(tasks_for(side)) for side in SIDES)
+
+
+@dataclass
+class Count:
+    """Calls: wanted and already in the ledger."""
+
+    wanted: int = 0
+    known: int = 0
+
+    @property
+    def new(self) -> int:
+        """Calls still to be made."""
+        return self.wanted - self.known
+
+    def add(self, wanted: int, known: int) -> None:
+        """Sum in place."""
+        self.wanted, self.known = self.wanted + wanted, self.known + known
+
+
+def plan_calls(workspace: Workspace | None, experiment: Experiment) -> dict[str, tuple[Count, Count]]:
+    """Answers and votes by model: wanted, known, new. Without a workspace, or where items are not built yet, everything
+    is new."""
+    plan = {model: (Count(), Count()) for model in experiment.models}
+    study = workspace.study if workspace else experiment.study
+    scenarios = load_scenarios(study).values()
+    known = _KnownKeys(workspace) if workspace else None
+    for cell in experiment.cells():
+        answers, votes = plan[cell.evaluation.model]
+        pairs = sum(scenario_taxonomy(s.category) == taxonomy_of(cell.dataset) for s in scenarios)
+        if workspace is None or known is None or Lineage(workspace).status("items", cell.dataset).kind != "fresh":
+            answers.add(2 * pairs, 0)
+            votes.add(VOTES_A_PAIR * pairs, 0)
+            continue
+        wanted = _answer_keys(workspace, cell)
+        answers.add(len(wanted), len(wanted & known.of(workspace.answers, cell.evaluation)))
+        if Lineage(workspace).status("responses", cell.key).kind == "missing":
+            votes.add(VOTES_A_PAIR * len(wanted) // 2, 0)
+            continue
+        ballots = {request.key for request in wanted_votes(workspace, load_panel(study.panel), cell)}
+        votes.add(len(ballots), len(ballots & known.of(workspace.votes, cell.evaluation)))
+    return plan
+
+
+def scenario_taxonomy(category: str) -> str:
+    """Taxonomy of a category."""
+    from traps_pipeline.partitions import datasets_of_category
+
+    return datasets_of_category(category)[0]
+
+
+class _KnownKeys:
+    def __init__(self, workspace: Workspace | None) -> None:
+        self._keys: dict[tuple[str, Evaluation], set[str]] = {}
+
+    def of(self, ledger: Ledger, evaluation: Evaluation) -> set[str]:
+        slot = (ledger.kind, evaluation)
+        if slot not in self._keys:
+            rows = ledger.read(evaluation.key).rows
+            self._keys[slot] = {key for key, row in rows.items() if row["outcome"] != "error"}
+        return self._keys[slot]
+
+
+def _answer_keys(workspace: Workspace, cell: Cell) -> set[str]:
+    entry = get_model(cell.evaluation.model)
+    items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}).to_dict("records")
+    return {answer_request(workspace, entry, item, cell.evaluation).key for item in items}
+
+
+# --- status -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StageStatus:
+    """How many partitions of a stage are fresh, which are stale and why, how many are missing."""
+
+    stage: str
+    fresh: int
+    stale: Mapping[str, tuple[str, ...]]
+    missing: int
+
+
+def stage_statuses(workspace: Workspace, wanted: Mapping[str, list[str | None]] | None) -> Iterator[StageStatus]:
+    """The state of every stage. With `wanted` (keys by stage) partitions outside it are left out; without, missing ones
+    count only where their upstream is there."""
+    lineage = Lineage(workspace)
+    for stage in STAGES:
+        keys = wanted[stage] if wanted else keys_of(stage)
+        statuses = {key or stage: lineage.status(stage, key) for key in keys}
+        stale = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
+        fresh = sum(status.kind == "fresh" for status in statuses.values())
+        missing = sum(status.kind == "missing" for status in statuses.values()) if wanted else 0
+        yield StageStatus(stage, fresh, stale, missing)
+
+
+# --- why --------------------------------------------------------------------------------------------------------------
+
+
+def why(workspace: Workspace, item_id: str) -> Iterator[str]:
+    """For every evaluation that ever asked the item: whether its answer still stands, else which component of the key
+    changed. Raises TrapsError for an unknown item."""
+    dataset = item_id.split(":")[0]
+    current = _current_item(workspace, dataset, item_id)
+    asked = 0
+    for model, entry in load_models().items():
+        for regime in REGIMES:
+            for run in range(1, entry.runs + 1):
+                evaluation = Evaluation(model, regime, run)
+                rows = [r for r in workspace.answers.read(evaluation.key).rows.values() if _about(r) == item_id]
+                if not rows:
+                    continue
+                asked += 1
+                wanted = answer_request(workspace, entry, current, evaluation) if current else None
+                yield f"{evaluation.key}: {_explain(rows, wanted.components if wanted else None)}"
+    if current is None and not asked:
+        raise TrapsError(f"item {item_id!r} is unknown; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void")
+    if not asked:
+        yield "never asked of any model"
+
+
+def _about(row: Mapping[str, Any]) -> Any:
+    return row["components"]["about"]["item_id"]
+
+
+def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:
+    items = workspace.tables.read_all(ITEMS, dataset=dataset)
+    found = items[items["item_id"] == item_id].to_dict("records")
+    return found[0] if found else None
+
+
+def _explain(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
+    newest = max(rows, key=lambda row: row["created_at"])
+    if wanted is None:
+        return f"asked {len(rows)} times; the item is no longer in the benchmark, its answers stay in the ledger"
+    for row in rows:
+        if row["components"] == dict(wanted):
+            return f"answered {row['created_at'][:19]} ({row['outcome']}), key {row['key'][:12]}: still stands"
+    old = newest["components"]
+    changed = [name for name in sorted(old.keys() | wanted.keys()) if old.get(name) != wanted.get(name)]
+    parts = [f"{name}: {_short(old.get(name))} -> {_short(wanted.get(name))}" for name in changed]
+    return f"will be asked again; changed since {newest['created_at'][:19]}: {'; '.join(parts)}"
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return repr(text if len(text) <= 160 else text[:157] + "...")

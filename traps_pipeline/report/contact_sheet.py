@@ -1,0 +1,142 @@
+"""Control beside void, at a glance: what a reviewer looks at first (benchmark.md sections 1 and 10)."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.report.figures import figure_bytes, figure_style
+from traps_pipeline.scenes.encode import decode
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MOMENTS = 4  # frames a clip
+GAP = 8  # pixels between frames
+BLOCK_IN = 6.4  # width of a pair
+HEADER_IN, FOOTER_IN = 0.62, 0.2  # room for the words above and the times below a pair's frames
+DPI = 150
+MOST_PAIRS = 80
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames (MOMENTS, H, W, 3) uint8 at the control's times; those from `known` on lie behind the clip's end (s)."""
+
+    frames: np.ndarray
+    known: int
+    end_s: float
+
+
+def contact_sheet(items: pd.DataFrame, root: Path, per_family: int | None = 1, columns: int = 2) -> bytes:
+    """PNG: per pair a row of control frames above a row of void frames at the same times, from start to end.
+
+    items are ITEMS rows with both sides of each pair, clips lie under root. Of every dataset and sub-scenario the first
+    `per_family` pairs by id are shown, all where it is None. A time behind a truncated void's end is hatched. Raises
+    ValueError when there is no whole pair or more than 80, and DamagedClip when a clip cannot be decoded.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    pairs = chosen_pairs(items, per_family)
+    columns = min(columns, len(pairs))
+    with figure_style():
+        blocks = [_moments(pair, root) for pair in pairs]
+        heights = [BLOCK_IN * _ratio(control) + HEADER_IN + FOOTER_IN for control, _, _ in blocks]
+        rows = [max(heights[k : k + columns]) for k in range(0, len(heights), columns)]
+        width, height = columns * (BLOCK_IN + 0.5), sum(rows) + 0.1
+        figure = Figure(figsize=(width, height), dpi=DPI)
+        FigureCanvasAgg(figure)
+        for k, (pair, block) in enumerate(zip(pairs, blocks, strict=True)):
+            row, column = divmod(k, columns)
+            left, top = column * (BLOCK_IN + 0.5) + 0.4, height - 0.1 - sum(rows[:row]) - HEADER_IN
+            tall = BLOCK_IN * _ratio(block[0])
+            axes = figure.add_axes((left / width, (top - tall) / height, BLOCK_IN / width, tall / height))
+            _draw_pair(axes, pair, *block)
+        return figure_bytes(figure)
+
+
+def chosen_pairs(items: pd.DataFrame, per_family: int | None) -> list[pd.DataFrame]:
+    """The pairs to show, as frames of two rows indexed by side. Raises ValueError for none or more than 80."""
+    whole = items[items.groupby("pair_id")["side"].transform("nunique") == 2].sort_values(["dataset", "sub_scenario", "pair_id"])
+    firsts = whole.drop_duplicates("pair_id").groupby(["dataset", "sub_scenario"], sort=True)["pair_id"]
+    ids = list(firsts.head(per_family) if per_family is not None else whole["pair_id"].unique())
+    if not 0 < len(ids) <= MOST_PAIRS:
+        raise ValueError(f"a contact sheet shows 1 to {MOST_PAIRS} pairs, not {len(ids)}: pass other items or a smaller per_family")
+    by_pair = dict(list(whole[whole["pair_id"].isin(ids)].groupby("pair_id")))
+    return [by_pair[pair_id].set_index("side") for pair_id in ids]
+
+
+def _moments(pair: pd.DataFrame, root: Path) -> tuple[Clip, Clip, np.ndarray]:
+    """Control, void and the times (MOMENTS,) in seconds, from the control's first frame to its last."""
+    control, at = decode(root / str(pair.at["control", "clip"]))
+    void, void_at = decode(root / str(pair.at["void", "clip"]))
+    times = at[np.linspace(0, len(at) - 1, MOMENTS).round().astype(int)]
+    return _sampled(control, at, times), _sampled(void, void_at, times), times
+
+
+def _sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> Clip:
+    """The frames nearest to the times; a clip ends one frame after its last frame begins."""
+    step = float(at[1] - at[0]) if len(at) > 1 else 0.0
+    end = float(at[-1]) + step
+    nearest = np.abs(at[:, None] - times).argmin(axis=0)
+    return Clip(frames[nearest], int((times < end - step / 4).sum()), end)
+
+
+def _ratio(clip: Clip) -> float:
+    """Height over width of a pair's block of frames."""
+    _, height, width, _ = clip.frames.shape
+    return (2 * height + GAP) / (MOMENTS * width + (MOMENTS - 1) * GAP)
+
+
+def _draw_pair(axes: Axes, pair: pd.DataFrame, control: Clip, void: Clip, times: np.ndarray) -> None:
+    from matplotlib.patches import Rectangle
+
+    _, height, width, _ = control.frames.shape
+    canvas = np.full((2 * height + GAP, MOMENTS * width + (MOMENTS - 1) * GAP, 3), 255, np.uint8)
+    for row, (side, clip) in enumerate({"control": control, "void": void}.items()):
+        top = row * (height + GAP)
+        axes.text(-GAP, top + height / 2, side, rotation=90, ha="right", va="center", size=8, weight="bold")
+        for k in range(MOMENTS):
+            left = k * (width + GAP)
+            if k < clip.known:
+                canvas[top : top + height, left : left + width] = _fitted(clip.frames[k], height, width)
+                continue
+            hatch = {"hatch": "////", "facecolor": "#f2f4f7", "edgecolor": "#c3c9d2", "linewidth": 0.5}
+            axes.add_patch(Rectangle((left, top), width - 1, height - 1, **hatch))
+            box = {"facecolor": "white", "edgecolor": "none", "pad": 2}
+            axes.text(left + width / 2, top + height / 2, f"cut at {clip.end_s:.1f} s", ha="center", va="center", size=8, bbox=box)
+    axes.imshow(canvas, interpolation="antialiased")
+    for k, time in enumerate(times):
+        axes.text(k * (width + GAP) + width / 2, 2 * height + 2 * GAP, f"{time:.1f} s", ha="center", va="top", size=7, color="#667085")
+    axes.set_axis_off()
+    _draw_header(axes, pair)
+
+
+def _draw_header(axes: Axes, pair: pd.DataFrame) -> None:
+    """Scenario and ground truth in bold, below it the question; the void's own where it differs."""
+    asked = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
+    control = pair.loc["control"]
+    if asked["control"] == asked["void"]:
+        lines = textwrap.wrap(asked["control"], 108, max_lines=2, placeholder=" …")
+    else:
+        lines = [textwrap.shorten(f"{side}: {question}", 108, placeholder=" …") for side, question in asked.items()]
+    title = f"{control['scenario_id']}   {control['sub_scenario']} ({control['dataset']})   ground truth: {control['ground_truth']}"
+    place = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "left"}
+    text = "\n".join(lines).replace("$", r"\$")
+    axes.annotate(title.replace("$", r"\$"), (0, 1), (0, 28), va="bottom", size=8.5, weight="bold", **place)
+    axes.annotate(text, (0, 1), (0, 25), va="top", size=7.5, linespacing=1.15, **place)
+
+
+def _fitted(frame: np.ndarray, height: int, width: int) -> np.ndarray:
+    """The frame at the control's size: one void clip of another size does not break the sheet."""
+    if frame.shape[:2] == (height, width):
+        return frame
+    import cv2
+
+    return cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)

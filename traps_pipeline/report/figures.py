@@ -1,0 +1,219 @@
+"""Figures from the leaderboard (benchmark.md section 10). The same table gives the same bytes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.paths import ASSETS
+from traps_pipeline.report.page import TITLES, entries_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.text import Annotation
+    from matplotlib.transforms import Bbox
+
+STYLE = ASSETS / "figures.mplstyle"
+COLUMN_IN = 3.4
+# Okabe and Ito's palette without its yellow, which is too light for a hollow marker, and with its black as grey.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#4D4D4D")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "p", ">", "h")  # 7 colours x 11 shapes: 77 models stay distinct
+SAME_POINT = 0.02  # distance in (Acc, J) under which two models share a label: about a marker's radius
+
+
+@dataclass(frozen=True)
+class Label:
+    """The names of the models that end at one point of (Acc, J)."""
+
+    x: float
+    y: float
+    text: str
+    colour: str
+
+
+@contextmanager
+def figure_style() -> Iterator[None]:
+    """The house style, for drawing and for saving: some of it (the SVG salt) counts only then."""
+    import matplotlib.style
+
+    with matplotlib.style.context(STYLE):
+        yield
+
+
+def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
+    """The figure as a PNG or SVG file, without a date.
+
+    A layout engine would move things again on every save: it runs once, in a draw, and is then switched off.
+    """
+    with figure_style():
+        figure.canvas.draw()
+        figure.set_layout_engine("none")
+        stream = io.BytesIO()
+        metadata = {"Date": None} if kind == "svg" else {"Software": None}
+        figure.savefig(stream, format=kind, metadata=metadata)  # pyright: ignore[reportArgumentType]
+    return stream.getvalue()
+
+
+def save_figure(figure: Figure, stem: Path) -> tuple[Path, Path]:
+    """Write `<stem>.png` and `<stem>.svg`; returns their paths."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    paths = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
+    for path, kind in zip(paths, ("png", "svg"), strict=True):
+        path.write_bytes(figure_bytes(figure, kind))
+    return paths
+
+
+def pecs_landscape(board: pd.DataFrame) -> bytes:
+    """`landscape_figure` as PNG."""
+    return figure_bytes(landscape_figure(board))
+
+
+def landscape_figure(board: pd.DataFrame) -> Figure:
+    """Acc (x) against J (y) of every model with iso-PECS contours, one column wide.
+
+    Hollow is standard, filled is guided, a thin line joins them, a dot is json. Points are aggregate (Acc, J) of the
+    `overall` rows (of the first dataset where nobody has all four); the reported PECS is averaged per run and dataset,
+    so it can differ a little from what the contours say at that point. Models whose named points coincide (reference
+    strategies) share one label.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    scope, _ = entries_of(board)
+    points = board[(board["dataset"] == scope) & board["acc"].notna() & board["j"].notna()]
+    lowest = min([-0.1, *(points["j"] - 0.08)])
+    with figure_style():
+        figure = Figure(figsize=(COLUMN_IN, 2.5 + 1.3 * (1.06 - lowest)), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.add_subplot()
+        axes.set(xlim=(-0.04, 1.04), ylim=(lowest, 1.06), xlabel="Acc", ylabel="J = AbsRec − FalseAbs")
+        axes.set_title(f"PECS landscape, {TITLES[scope].lower()}")
+        _draw_contours(axes)
+        labels = merged_labels(_draw_models(axes, points))
+        _draw_key(figure)
+        figure.canvas.draw()
+        figure.set_layout_engine("none")
+        _place_labels(axes, labels, points[["acc", "j"]].to_numpy(float))
+    return figure
+
+
+def merged_labels(labels: Sequence[Label]) -> list[Label]:
+    """Labels of coinciding points joined, one name a line, in the order given; a shared label is neutral in colour."""
+    merged: list[Label] = []
+    for label in labels:
+        twin = next((m for m in merged if np.hypot(m.x - label.x, m.y - label.y) < SAME_POINT), None)
+        if twin is None:
+            merged.append(label)
+        else:
+            merged[merged.index(twin)] = Label(twin.x, twin.y, f"{twin.text}\n{label.text}", "#1b1f27")
+    return merged
+
+
+def _draw_contours(axes: Axes) -> None:
+    """J = PECS / Acc for PECS of 0.1 to 0.9, labelled in the right margin, where the curve ends at Acc = 1."""
+    axes.axhline(0, color="#98a2b3", linewidth=0.8, zorder=0.5)
+    for pecs in np.arange(1, 10) / 10:
+        acc = np.linspace(pecs, 1, 200)
+        axes.plot(acc, pecs / acc, color="#d0d5dd", linewidth=0.6, zorder=0.4)
+        axes.annotate(f"{pecs:.1f}", (1, pecs), (1.055, pecs), annotation_clip=False, va="center", color="#667085", size=6)
+    axes.annotate("PECS", (1, 1), (1.055, 1), annotation_clip=False, va="center", color="#667085", size=6)
+
+
+def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
+    """Markers of every model; returns a label a model, at its guided point, else at the first it has."""
+    labels = []
+    for k, (model, rows) in enumerate(points.sort_values("model").groupby("model", sort=True)):
+        colour, marker = COLOURS[k % len(COLOURS)], MARKERS[k % len(MARKERS)]
+        at = {row.regime: (float(row.acc), float(row.j)) for row in rows.itertuples()}
+        pair = np.array([at[r] for r in ("standard", "guided") if r in at]).reshape(-1, 2)
+        axes.plot(*pair.T, color=colour, linewidth=0.7, alpha=0.7, zorder=2)
+        styles = {
+            "standard": {"s": 20, "marker": marker, "facecolors": "white", "edgecolors": colour, "linewidths": 0.9},
+            "guided": {"s": 20, "marker": marker, "facecolors": colour, "edgecolors": colour, "linewidths": 0.9},
+            "json": {"s": 5, "marker": "o", "facecolors": colour, "edgecolors": "none", "linewidths": 0},
+        }
+        for zorder, (regime, style) in enumerate(styles.items(), start=3):
+            if regime in at:
+                axes.scatter(*at[regime], zorder=zorder, clip_on=False, **style)
+        x, y = next(at[r] for r in ("guided", *at) if r in at)
+        labels.append(Label(x, y, _short(str(model)), colour))
+    return labels
+
+
+def _draw_key(figure: Figure) -> None:
+    from matplotlib.lines import Line2D
+
+    def handle(size: float, face: str) -> Line2D:
+        return Line2D([], [], linestyle="none", marker="o", markersize=size, color="#475467", markerfacecolor=face)
+
+    handles = [handle(4.5, "white"), handle(4.5, "#475467"), handle(1.6, "#475467")]
+    figure.legend(handles, ["standard", "guided", "json"], loc="outside lower center", ncols=3, handletextpad=0.1, columnspacing=1.2)
+
+
+def _place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:
+    """Put every label at the nearest spot around its point that hits no marker and no other label, with a leader line
+    where that is far off. markers is (n, 2) in data coordinates. Greedy, so the outcome depends on the table alone.
+    """
+    from matplotlib.transforms import Bbox
+
+    pixel = axes.figure.dpi / 72  # pixels a point: distances below are in points
+    spots = axes.transData.transform(markers)
+    taken = [Bbox.from_extents(x - 3 * pixel, y - 3 * pixel, x + 3 * pixel, y + 3 * pixel) for x, y in spots]
+    room = axes.bbox
+    for label in sorted(labels, key=lambda m: (-m.text.count("\n"), -m.y, m.x, m.text)):
+        note = axes.annotate(
+            label.text, (label.x, label.y), (0, 0), textcoords="offset points", size=5.6, color=label.colour, zorder=9,
+            linespacing=1.05, annotation_clip=False,
+        )  # fmt: skip
+        options = [(dx, dy, _box(note, dx, dy, pixel)) for dx, dy in _offsets()]
+        dx, dy, box = min(options, key=lambda o: _cost(o[2], taken, room, np.hypot(o[0], o[1])))
+        note.set(position=(dx, dy), ha=_side(dx, "left", "right"), va=_side(dy, "bottom", "top"))
+        taken.append(box)
+        if np.hypot(dx, dy) > 12:
+            axes.annotate(
+                "", (label.x, label.y), (dx, dy), textcoords="offset points", annotation_clip=False,
+                arrowprops={"arrowstyle": "-", "linewidth": 0.4, "color": label.colour, "shrinkA": 0, "shrinkB": 2.5},
+            )  # fmt: skip
+
+
+def _offsets() -> list[tuple[float, float]]:
+    """Candidate offsets (points) of a label from its marker: rings, nearest first, sides before diagonals."""
+    angles = np.deg2rad([0, 180, 90, 270, 30, 330, 150, 210, 60, 120, 240, 300])
+    rings = (5, 9, 14, 20, 28, 38, 50, 64, 80)
+    return [(round(r * np.cos(a), 3), round(r * np.sin(a), 3)) for r in rings for a in angles]
+
+
+def _side(offset: float, positive: str, negative: str) -> str:
+    """Alignment that lets text grow away from its marker."""
+    return "center" if abs(offset) < 1e-6 else positive if offset > 0 else negative
+
+
+def _box(note: Annotation, dx: float, dy: float, pixel: float) -> Bbox:
+    """The label's extent in pixels, were it placed at that offset (points), with half a point of air."""
+    note.set(position=(dx, dy), ha=_side(dx, "left", "right"), va=_side(dy, "bottom", "top"))
+    return note.get_window_extent().padded(0.5 * pixel)
+
+
+def _cost(box: Bbox, taken: Sequence[Bbox], room: Bbox, distance: float) -> tuple[float, float]:
+    """Overlap in square pixels, what sticks out of the axes included, then the distance."""
+    from matplotlib.transforms import Bbox
+
+    pairs = (Bbox.intersection(box, other) for other in taken)
+    overlap = sum(p.width * p.height for p in pairs if p is not None)
+    inside = Bbox.intersection(box, room)
+    outside = box.width * box.height - (inside.width * inside.height if inside is not None else 0.0)
+    return round(overlap + 4 * outside, 3), distance
+
+
+def _short(model: str) -> str:
+    """A label's text: no mathtext, no line break, no more than 28 characters."""
+    text = "".join(c if c.isprintable() else "?" for c in model).replace("$", r"\$")
+    return text if len(text) <= 28 else text[:27] + "…"

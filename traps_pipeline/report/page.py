@@ -1,0 +1,215 @@
+"""The leaderboard for a terminal, a README and a browser (benchmark.md sections 5 and 10).
+
+All three show the same entries in the same order. Model ids, epochs and versions are untrusted text: each renderer
+escapes them for its medium.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from traps_pipeline.partitions import DATASETS
+
+TEMPLATES = Path(__file__).parent / "templates"
+NONE = "–"
+MISSING_MARK = "†"
+TITLES = {
+    "overall": "Overall",
+    "occlusion": "Occlusion",
+    "occlusion_ill_posed": "Occlusion, ill-posed",
+    "chaotic": "Chaotic",
+    "chaotic_ill_posed": "Chaotic, ill-posed",
+}
+SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
+LEGEND = {
+    "Acc": "share of control items answered correctly",
+    "AbsRec": "abstention recall: share of void items, which cannot be answered, that the model abstains on",
+    "FalseAbs": "share of control items, which can be answered, that the model abstains on",
+    "J": "AbsRec - FalseAbs, from -1 to 1; 0 for every strategy that does not tell void from control",
+    "PECS": "Acc x max(0, J), from 0 to 1; computed per run, then averaged",
+    "95 % CI": "percentile interval of PECS, cluster bootstrap over scenarios",
+    "±": "population standard deviation over runs",
+    "n": "pairs (one control, one void) a run",
+    "missing": f"items over all runs without an answer or a majority of the judges; {MISSING_MARK} the shares rest on the others",
+    "epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
+    "Overall": "equal-weight mean over the four datasets",
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One model under one regime: its LEADERBOARD rows by dataset; `main` is the row that it is ranked by."""
+
+    model: str
+    regime: str
+    rows: Mapping[str, Mapping[str, Any]]
+    main: Mapping[str, Any] | None
+
+
+def leaderboard_text(board: pd.DataFrame) -> str:
+    """LEADERBOARD rows as an aligned table for a terminal, best first; control characters in ids become `?`."""
+    scope, entries = entries_of(board)
+    header = ["model", "regime", *_headings(), "n", "missing"]
+    lines = [[_plain(e.model), _plain(e.regime), *_figures(e), *_counts(e)] for e in entries]
+    widths = [max(map(len, column)) for column in zip(header, *lines, strict=True)]
+    table = [_aligned(cells, widths) for cells in (header, ["-" * w for w in widths], *lines)]
+    parts = [f"PECS, {TITLES[scope].lower()}. {_plain(provenance(board))}", "", *table]
+    return "\n".join([*parts, *(["", f"{MISSING_MARK} {_missing_note()}"] if _any_missing(board) else [])]) + "\n"
+
+
+def leaderboard_markdown(board: pd.DataFrame) -> str:
+    """LEADERBOARD rows as a Markdown table with its legend, best first; ids are escaped."""
+    scope, entries = entries_of(board)
+    header = ["model", "regime", *_headings(), "n", "missing"]
+    lines = [[_markdown(e.model), _markdown(e.regime), *_figures(e), *_counts(e)] for e in entries]
+    rule = ["---", "---", *["---:"] * (len(header) - 2)]
+    table = ["| " + " | ".join(cells) + " |" for cells in (header, rule, *lines)]
+    legend = [f"- **{term}**: {meaning}" for term, meaning in LEGEND.items()]
+    return "\n".join([f"**{TITLES[scope]}.** {_markdown(provenance(board))}", "", *table, "", *legend]) + "\n"
+
+
+def leaderboard_html(board: pd.DataFrame, figures: Mapping[str, bytes] | None = None, title: str = "TRAPSBench leaderboard") -> str:
+    """One self-contained HTML page: summary, a table a dataset, figures (title -> PNG bytes, inlined), legend.
+
+    It opens from disk and asks the network for nothing; its content policy forbids it.
+    """
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    formats: dict[str, Callable[..., str]] = {"fraction": fraction, "percent": percent, "missing": missing}
+    environment.filters.update(formats)
+    scope, entries = entries_of(board)
+    present = [name for name in DATASETS if any(name in e.rows for e in entries)]
+    sections = [_section(name, entries) for name in present if name != scope]
+    return environment.get_template("leaderboard.html.j2").render(
+        title=title,
+        provenance=provenance(board),
+        main=_section(scope, entries),
+        main_datasets=[(name, TITLES[name]) for name in present] if scope == "overall" else [],
+        sections=sections,
+        figures={name: base64.b64encode(png).decode() for name, png in (figures or {}).items()},
+        legend=LEGEND,
+        missing_note=_missing_note() if _any_missing(board) else "",
+        mark=MISSING_MARK,
+    )
+
+
+def entries_of(board: pd.DataFrame) -> tuple[str, list[Entry]]:
+    """The dataset that entries are ranked by, and the entries, best first, those without a rank last.
+
+    That is `overall`; on a board where no model has all four datasets it is the first dataset present.
+    """
+    records: list[dict[str, Any]] = board.to_dict("records")  # pyright: ignore[reportAssignmentType]
+    scope = next((name for name in TITLES if any(r["dataset"] == name for r in records)), "overall")
+    found: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
+    for record in records:
+        found.setdefault((record["model"], record["regime"]), {})[record["dataset"]] = record
+    entries = [Entry(model, regime, rows, rows.get(scope)) for (model, regime), rows in found.items()]
+    return scope, sorted(entries, key=_rank)
+
+
+def provenance(board: pd.DataFrame) -> str:
+    """Which benchmark versions and campaigns the board's figures come from."""
+    versions = _distinct(board["benchmark_version"], " + ")
+    epochs = _distinct(board["epoch"], "+")
+    return (
+        f"Benchmark version{'s' * (len(versions) > 1)} {', '.join(versions) or NONE}; "
+        f"epoch{'s' * (len(epochs) > 1)} {', '.join(epochs) or NONE}."
+    )
+
+
+def fraction(value: float | None, digits: int = 3) -> str:
+    """A figure as printed, with a true minus sign; a dash for null."""
+    if value is None or pd.isna(value):
+        return NONE
+    text = f"{value:.{digits}f}"
+    return text.replace("-", "−") if float(text) else text.removeprefix("-")
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """A share (0 to 1) in percent, without the sign."""
+    return NONE if value is None or pd.isna(value) else fraction(100 * value, digits)
+
+
+def missing(count: int) -> str:
+    """The number of missing items, marked unless it is 0."""
+    return f"{count}{f' {MISSING_MARK}' if count else ''}"
+
+
+def _headings() -> list[str]:
+    return ["PECS", "95 % CI", "Acc %", "AbsRec %", "FalseAbs %", "J", *(f"PECS {short}" for short in SHORT.values())]
+
+
+def _figures(entry: Entry) -> list[str]:
+    """Printed figures of one entry in the order of `_headings`."""
+    per_dataset = [fraction(entry.rows[name]["pecs"]) if name in entry.rows else NONE for name in SHORT]
+    row = entry.main
+    if row is None:
+        return [NONE] * 6 + per_dataset
+    low, high = fraction(row["pecs_ci_low"]), fraction(row["pecs_ci_high"])
+    interval = NONE if NONE in (low, high) else f"[{low}, {high}]"
+    shares = [percent(row[name]) for name in ("acc", "abs_rec", "false_abs")]
+    return [fraction(row["pecs"]), interval, *shares, fraction(row["j"]), *per_dataset]
+
+
+def _counts(entry: Entry) -> list[str]:
+    """n and missing of the ranked row; over the datasets that are there for an entry without one."""
+    rows = [entry.main] if entry.main is not None else list(entry.rows.values())
+    return [str(sum(r["n_pairs"] for r in rows)), missing(sum(r["n_missing"] for r in rows))]
+
+
+def _section(dataset: str, entries: Sequence[Entry]) -> dict[str, Any]:
+    """What the template shows of one dataset: entries that have it, best first, and which provenance columns differ."""
+    ranked = sorted((Entry(e.model, e.regime, e.rows, e.rows.get(dataset)) for e in entries), key=_rank)
+    there = [e for e in ranked if e.main is not None or dataset == "overall"]
+    rows = [e.main for e in there if e.main is not None]
+    shared = {name: len({r[name] for r in rows}) <= 1 for name in ("epoch", "benchmark_version")}
+    return {"name": dataset, "title": TITLES[dataset], "entries": there, "shared": shared, "first": rows[0] if rows else None}
+
+
+def _rank(entry: Entry) -> tuple[bool, float, str, str]:
+    value = entry.main["pecs"] if entry.main is not None else None
+    unranked = value is None or pd.isna(value)
+    return unranked, 0.0 if unranked else -float(value), entry.model, entry.regime
+
+
+def _distinct(values: pd.Series, separator: str) -> list[str]:
+    return sorted({part for value in values.unique() for part in str(value).split(separator) if part})
+
+
+def _any_missing(board: pd.DataFrame) -> bool:
+    return bool((board["n_missing"] > 0).any())
+
+
+def _missing_note() -> str:
+    return "Some items have no answer or no majority of the judges; shares rest on the decided ones."
+
+
+def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:
+    """The first two columns (words) to the left, the others (numbers) to the right."""
+    padded = [c.ljust(w) if k < 2 else c.rjust(w) for k, (c, w) in enumerate(zip(cells, widths, strict=True))]
+    return "  ".join(padded).rstrip()
+
+
+def _plain(text: str) -> str:
+    """Text that cannot steer a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def _markdown(text: str) -> str:
+    """Text that is neither HTML nor markup, and stays in its table cell."""
+    return re.sub(r"([\\`*_{}\[\]()#+!|~])", r"\\\1", html.escape(_plain(text), quote=False))

@@ -1,0 +1,316 @@
+"""What a scene family is made of: its values, and the few builders that every family shares.
+
+A family file defines one `FAMILY = Family(...)`. Its functions are pure: `draw` and `word` take the generator they
+draw from, `build`, `readings` and `margin` draw nothing, so that a stored spec always gives the same scene.
+
+Units are SI (metres, kilograms, seconds, radians unless a name ends in `_deg`). World frame: x right, y away from the
+default camera, z up; the floor is z = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from traps_pipeline.scenes.simulate import Motion
+
+Vec3 = tuple[float, float, float]
+Taxonomy = Literal["occlusion", "chaotic"]
+AnswerType = Literal["binary", "direction", "colour", "count_range", "numeric"]
+
+# The six answer colours are saturated and far apart; navy is kept for the cover panel alone.
+COLOURS: Mapping[str, tuple[float, float, float]] = {
+    "red": (0.86, 0.10, 0.12),
+    "green": (0.08, 0.62, 0.20),
+    "blue": (0.12, 0.35, 0.90),
+    "yellow": (0.98, 0.82, 0.08),
+    "orange": (0.98, 0.50, 0.05),
+    "cyan": (0.05, 0.78, 0.85),
+    "purple": (0.55, 0.20, 0.70),
+    "white": (0.95, 0.95, 0.95),
+    "black": (0.08, 0.08, 0.09),
+    "grey": (0.55, 0.55, 0.57),
+    "wood": (0.72, 0.52, 0.33),
+    "navy": (0.07, 0.11, 0.28),
+}
+
+PANEL_GROUP = 4  # geoms of the cover panel: drawn in the void only, collide with nothing
+REMOVED_GROUP = 5  # geoms taken away by an ablation: never drawn
+
+
+def rgba(colour: str, alpha: float = 1.0) -> list[float]:
+    """RGBA in [0, 1] of a named colour."""
+    return [*COLOURS[colour], alpha]
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Solver settings and clip timing, stored with every spec (`notes.md`, robust settings)."""
+
+    timestep_s: float = 0.002
+    duration_s: float = 5.0
+    fps: int = 10
+    gravity_m_s2: float = 9.81
+    iterations: int = 100
+    tolerance: float = 1e-10
+    impratio: float = 10.0
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of the control clip; frame i shows time i / fps, frame 0 the initial state."""
+        return round(self.duration_s * self.fps)
+
+    @property
+    def substeps(self) -> int:
+        """Simulation steps from one frame to the next."""
+        steps = 1.0 / (self.fps * self.timestep_s)
+        if abs(steps - round(steps)) > 1e-9:
+            raise ValueError(f"timestep {self.timestep_s} s does not divide a frame of {1 / self.fps} s")
+        return round(steps)
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box in world coordinates (m)."""
+
+    low: Vec3
+    high: Vec3
+
+    def corners(self) -> np.ndarray:
+        """The eight corners, shape (8, 3)."""
+        grid = np.array(np.meshgrid(*zip(self.low, self.high, strict=True), indexing="ij"))
+        return grid.reshape(3, 8).T
+
+
+@dataclass(frozen=True)
+class View:
+    """Where the camera looks from. Distance and aim are fitted (`camera.fit_camera`).
+
+    Azimuth 90 looks along +y (from the front), elevation is negative when looking down: MuJoCo's free camera.
+    """
+
+    azimuth_deg: float = 90.0
+    elevation_deg: float = -15.0
+    fovy_deg: float = 35.0
+
+
+@dataclass
+class Scene:
+    """A built scene: the model description and the roles its parts play.
+
+    decisive: bodies whose end state is the outcome; in frame throughout, invisible in an occlusion void from hiding on.
+    hidden: geoms of the hidden element (occlusion), never visible in the void.
+    cover: what the cover panel must hide: everything decisive from hiding on, and the hidden element (occlusion).
+    stage: boxes that must lie in frame besides everything that moves (the outcome zone above all).
+    velocity: initial velocity of free bodies: linear (m/s, world) and angular (rad/s, body).
+    inventory: what a viewer can name: colours and objects, for ill-posed questions to be checked against.
+    """
+
+    spec: mujoco.MjSpec
+    view: View
+    decisive: tuple[str, ...]
+    stage: tuple[Box, ...]
+    hidden: tuple[str, ...] = ()
+    cover: Box | None = None
+    velocity: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    inventory: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class AnswerableQuestion:
+    """A question that even the void video answers (a mechanism control: `occlusion_answerable`)."""
+
+    question: str
+    labels: tuple[str, ...]
+    answer: str
+
+
+@dataclass(frozen=True)
+class Wording:
+    """The words of a scenario. The question words its choices; aliases map other wordings to a label."""
+
+    question: str
+    labels: tuple[str, ...]
+    aliases: Mapping[str, str]
+    ill_posed_question: str
+    answerable_question: AnswerableQuestion
+
+
+@dataclass(frozen=True)
+class Family:
+    """A scene family: how it varies, how it is built, what decides its outcome (`benchmark.md` section 2).
+
+    params: a frozen dataclass of plain values with units in the names.
+    draw(rng): parameters of one scenario.
+    build(params, physics): the scene. Draws nothing.
+    readings(motion, params): for every frame the label that holds then, or None while undecided.
+    margin(motion, params): distance (m) of the end state from the nearest other outcome.
+    word(params, rng): the question and its companions.
+    twins(params): the same scene with only the hidden element changed, so that the outcome may differ (occlusion).
+    """
+
+    name: str
+    taxonomy: Taxonomy
+    category: str
+    sub_scenario: str
+    answer_type: AnswerType
+    params: type
+    draw: Callable[[np.random.Generator], Any]
+    build: Callable[[Any, Physics], Scene]
+    readings: Callable[[Motion, Any], list[str | None]]
+    margin: Callable[[Motion, Any], float]
+    word: Callable[[Any, np.random.Generator], Wording]
+    physics: Physics = Physics()
+    min_margin_m: float = 0.005
+    twins: Callable[[Any], Sequence[Any]] | None = None
+    perturbation: float = 1e-4  # chaotic: standard deviation of an initial-state perturbation (m, rad)
+
+    def params_from(self, values: Mapping[str, Any]) -> Any:
+        """Parameters from a stored mapping (lists become tuples). Raises ValueError naming unknown or missing ones."""
+        known = {f.name for f in fields(self.params)}
+        unknown, missing = sorted(set(values) - known), sorted(known - set(values))
+        if unknown or missing:
+            raise ValueError(
+                f"family {self.name}: unknown parameters {unknown}, missing parameters {missing}; known: {sorted(known)}"
+            )
+        return self.params(**{name: _as_tuple(value) for name, value in values.items()})
+
+
+def params_to_dict(params: Any) -> dict[str, Any]:
+    """Plain JSON-able mapping of a family's parameters."""
+    return asdict(params)
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(_as_tuple(v) for v in value) if isinstance(value, list | tuple) else value
+
+
+# --- builders shared by families -------------------------------------------------------------------------------------
+
+
+def new_spec(physics: Physics) -> mujoco.MjSpec:
+    """An empty world: sky, warm-grey floor, one key light with shadow, robust contact settings."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep = physics.timestep_s
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = physics.impratio
+    option.iterations = physics.iterations
+    option.tolerance = physics.tolerance
+    option.gravity = [0, 0, -physics.gravity_m_s2]
+    _set_look(spec)
+    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.5])
+    floor.material = "floor"
+    floor.condim = 6
+    floor.friction = [0.8, 0.005, 0.0001]
+    return spec
+
+
+def _set_look(spec: mujoco.MjSpec) -> None:
+    import mujoco
+
+    spec.visual.quality.shadowsize = 1024
+    spec.visual.map.shadowclip = 2.0  # in extents: at 1.0 the edge of the shadow map speckles the floor in view
+    spec.visual.quality.offsamples = 0
+    spec.visual.headlight.ambient = [0.38, 0.38, 0.40]
+    spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]
+    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+    sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+    spec.add_texture(
+        name="sky",
+        type=sky,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.62, 0.74, 0.88],
+        rgb2=[0.93, 0.95, 0.97],
+        width=128,
+        height=128,
+    )
+    spec.add_material(name="floor", rgba=[0.80, 0.78, 0.75, 1], specular=0.0, shininess=0.0, reflectance=0.0)
+    light = spec.worldbody.add_light(name="key", pos=[-1.5, -3, 5])
+    light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    light.dir = [0.35, 0.55, -1.0]
+    light.diffuse = [0.62, 0.61, 0.58]
+    light.specular = [0.15, 0.15, 0.15]
+    light.castshadow = True
+
+
+def add_box(
+    parent: mujoco.MjsBody,
+    name: str,
+    centre: Sequence[float],
+    half: Sequence[float],
+    colour: str,
+    *,
+    euler_y: float = 0.0,
+    alpha: float = 1.0,
+    **attributes: Any,
+) -> mujoco.MjsGeom:
+    """A box geom on a body (`spec.worldbody` for a static one), optionally tilted about y (rad)."""
+    import mujoco
+
+    geom = parent.add_geom(
+        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=list(centre), size=list(half), rgba=rgba(colour, alpha)
+    )
+    if euler_y:
+        geom.quat = [float(np.cos(euler_y / 2)), 0.0, float(np.sin(euler_y / 2)), 0.0]
+    for key, value in attributes.items():
+        setattr(geom, key, value)
+    return geom
+
+
+def add_ball(
+    spec: mujoco.MjSpec, name: str, centre: Sequence[float], radius: float, colour: str, *, density: float = 1000.0
+) -> mujoco.MjsGeom:
+    """A free ball (body `name`, geom `name`) with rolling friction, so that it comes to rest."""
+    import mujoco
+
+    body = spec.worldbody.add_body(name=name, pos=list(centre))
+    body.add_freejoint()
+    geom = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], rgba=rgba(colour))
+    geom.density = density
+    geom.condim = 6
+    geom.friction = [0.8, 0.005, 0.0002]
+    return geom
+
+
+# --- draws and words shared by families ------------------------------------------------------------------------------
+
+
+def uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """A plain float between two bounds, rounded to 0.0001 so that stored parameters stay readable."""
+    return round(float(rng.uniform(low, high)), 4)
+
+
+# Pairs that a viewer may take for each other in shade, or that lean towards the navy of the panel.
+_LOOK_ALIKE = (
+    {"red", "orange"},
+    {"orange", "yellow"},
+    {"orange", "wood"},
+    {"blue", "purple"},
+    {"blue", "cyan"},
+    {"green", "cyan"},
+    {"grey", "white"},
+)
+
+
+def distinct_colours(rng: np.random.Generator, count: int, pool: Sequence[str]) -> tuple[str, ...]:
+    """`count` colours of the pool in random order, no two of which are easily taken for each other."""
+    for _ in range(1000):
+        chosen = tuple(str(c) for c in rng.permutation(list(pool))[:count])
+        if len(chosen) == count and not any(pair <= set(chosen) for pair in _LOOK_ALIKE):
+            return chosen
+    raise ValueError(f"no {count} distinct colours among {list(pool)}; enlarge the pool")
+
+
+def listed(choices: Sequence[str]) -> str:
+    """The choices as they are read out: 'red, blue or green'."""
+    return ", ".join(choices[:-1]) + " or " + choices[-1]

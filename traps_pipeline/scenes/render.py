@@ -1,0 +1,136 @@
+"""Frames of a trajectory: MuJoCo's classic renderer at twice the size, averaged 2x2 (sharper and faster than MSAA).
+
+One off-screen GL context lives as long as the process; each `Renderer` owns one `MjrContext` for its model.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera
+from traps_pipeline.scenes.kit import PANEL_GROUP, REMOVED_GROUP
+
+if TYPE_CHECKING:
+    import mujoco
+
+SUPERSAMPLE = 2
+_gl_context: object | None = None
+
+
+class RenderingUnavailable(RuntimeError):
+    """No usable off-screen GL; the message says what to install."""
+
+
+def _make_current(width: int, height: int) -> None:
+    global _gl_context
+    if _gl_context is None:
+        try:
+            import mujoco
+
+            _gl_context = mujoco.GLContext(width, height)  # type: ignore[attr-defined]
+            atexit.register(_gl_context.free)  # type: ignore[attr-defined]
+        except (ImportError, AttributeError, OSError, RuntimeError) as error:
+            raise RenderingUnavailable(
+                f"no off-screen OpenGL (MUJOCO_GL={os.environ.get('MUJOCO_GL')}): {error}; "
+                "on Debian: apt-get install libosmesa6"
+            ) from error
+    _gl_context.make_current()  # type: ignore[attr-defined]
+
+
+class Renderer:
+    """Draws one model from one camera. Use as a context manager; every frame is (360, 480, 3) uint8 RGB."""
+
+    def __init__(self, model: mujoco.MjModel, camera: Camera) -> None:
+        self._width, self._height = WIDTH * SUPERSAMPLE, HEIGHT * SUPERSAMPLE
+        _make_current(self._width, self._height)
+        import mujoco
+
+        model.vis.global_.offwidth, model.vis.global_.offheight = self._width, self._height
+        model.vis.global_.fovy = camera.fovy_deg
+        model.stat.extent = camera.extent
+        model.stat.center[:] = camera.centre
+        self._model, self._data = model, mujoco.MjData(model)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=2000)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        self._camera.lookat[:] = camera.lookat
+        self._camera.distance = camera.distance
+        self._camera.azimuth, self._camera.elevation = camera.azimuth_deg, camera.elevation_deg
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._context.free()
+
+    def frames(
+        self, qpos: Sequence[np.ndarray] | np.ndarray, *, panel: bool = False, without: Sequence[str] = ()
+    ) -> Iterator[np.ndarray]:
+        """RGB frames of a trajectory (F, nq); `without` names geoms that are taken away (an ablation)."""
+        import cv2
+
+        for row in qpos:
+            raw = self._draw(row, panel=panel, without=without)
+            yield cv2.resize(raw, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+
+    def visible_pixels(
+        self, qpos: Sequence[np.ndarray] | np.ndarray, geoms: Sequence[str], *, panel: bool = False
+    ) -> np.ndarray:
+        """How many pixels (of the 480x360 frame, so quarters occur) each geom has in each frame, shape (F, G)."""
+        import mujoco
+
+        ids = [self._model.geom(name).id for name in geoms]
+        counts = np.zeros((len(qpos), len(ids)))
+        flags = self._scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
+        try:
+            for i, row in enumerate(qpos):
+                raw = self._draw(row, panel=panel, without=()).astype(np.int32)
+                segments = raw[..., 0] + (raw[..., 1] << 8) + (raw[..., 2] << 16)
+                drawn = {g.segid + 1: g.objid for g in self._scene.geoms[: self._scene.ngeom] if g.objtype == 5}
+                present, pixels = np.unique(segments, return_counts=True)
+                seen = {drawn[s]: n for s, n in zip(present, pixels, strict=True) if s in drawn}
+                counts[i] = [seen.get(g, 0) / SUPERSAMPLE**2 for g in ids]
+        finally:
+            flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
+        return counts
+
+    def _draw(self, qpos: np.ndarray, *, panel: bool, without: Sequence[str]) -> np.ndarray:
+        import mujoco
+
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = 1
+        option.geomgroup[PANEL_GROUP] = int(panel)
+        option.geomgroup[REMOVED_GROUP] = 0
+        groups = self._model.geom_group.copy()
+        for name in without:
+            self._model.geom_group[self._model.geom(name).id] = REMOVED_GROUP
+        try:
+            self._data.qpos[:] = qpos
+            mujoco.mj_forward(self._model, self._data)
+            everything = mujoco.mjtCatBit.mjCAT_ALL
+            mujoco.mjv_updateScene(
+                self._model, self._data, option, mujoco.MjvPerturb(), self._camera, everything, self._scene
+            )
+        finally:
+            self._model.geom_group[:] = groups
+        viewport = mujoco.MjrRect(0, 0, self._width, self._height)
+        mujoco.mjr_render(viewport, self._scene, self._context)
+        return self._read()
+
+    def _read(self) -> np.ndarray:
+        """The off-screen buffer, top row first. A direct RGBA read is 30 times faster than mjr_readPixels."""
+        from OpenGL import GL
+
+        GL.glReadBuffer(GL.GL_COLOR_ATTACHMENT0)
+        raw = GL.glReadPixels(0, 0, self._width, self._height, GL.GL_RGBA, GL.GL_UNSIGNED_BYTE)
+        pixels = np.frombuffer(raw, np.uint8).reshape(self._height, self._width, 4)
+        return np.ascontiguousarray(pixels[::-1, :, :3])

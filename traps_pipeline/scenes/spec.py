@@ -1,0 +1,105 @@
+"""A scenario as data: the fully resolved record that is frozen under `scene_specs/`, and its trajectory beside it."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from traps_pipeline.digests import digest
+
+Slug = r"^[a-z0-9_]+-[a-z0-9]+$"
+
+
+class Answerable(BaseModel):
+    """A question that both videos of the pair answer."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    question: str = Field(min_length=1)
+    labels: list[str] = Field(min_length=2)
+    answer: str
+
+
+class SceneSpec(BaseModel):
+    """One scenario, resolved: nothing about it is left to chance or to the code's defaults.
+
+    Hashes: `scene_hash` covers what decides the pixels (family, params, physics, camera, void, trajectory),
+    `spec_hash` covers everything. Both are derived, never read from the file.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    scenario_id: str = Field(pattern=Slug)
+    taxonomy: Literal["occlusion", "chaotic"]
+    category: str
+    sub_scenario: str
+    family: str
+    seed: int
+    params: dict[str, Any]
+    physics: dict[str, Any]
+    camera: dict[str, Any]
+    void_kind: Literal["occluder", "truncation"]
+    void: dict[str, Any]
+    question: str = Field(min_length=1)
+    labels: list[str] = Field(min_length=2)
+    aliases: dict[str, str]
+    answer_type: str
+    ground_truth: str
+    ill_posed_question: str = Field(min_length=1)
+    answerable_question: Answerable
+    trajectory_sha256: str
+    evidence: dict[str, Any]
+
+    @model_validator(mode="after")
+    def _labels_agree(self) -> SceneSpec:
+        if self.ground_truth not in self.labels:
+            raise ValueError(f"ground_truth {self.ground_truth!r} is not one of the labels {self.labels}")
+        if len(set(self.labels)) != len(self.labels):
+            raise ValueError(f"labels {self.labels} repeat")
+        strays = sorted(set(self.aliases.values()) - set(self.labels))
+        if strays:
+            raise ValueError(f"aliases point to unknown labels {strays}; labels are {self.labels}")
+        if self.answerable_question.answer not in self.answerable_question.labels:
+            raise ValueError(f"answerable_question: answer {self.answerable_question.answer!r} is not one of its labels")
+        return self
+
+    @property
+    def scene_hash(self) -> str:
+        """Digest of what the clips show; a corrected question leaves it alone."""
+        parts = ("family", "params", "physics", "camera", "void_kind", "void", "trajectory_sha256")
+        return digest({part: getattr(self, part) for part in parts})
+
+    @property
+    def spec_hash(self) -> str:
+        """Digest of the whole record."""
+        return digest(self.model_dump(mode="json"))
+
+
+def trajectory_digest(qpos: np.ndarray) -> str:
+    """SHA-256 over shape and little-endian float32 values."""
+    values = np.ascontiguousarray(qpos, dtype="<f4")
+    return hashlib.sha256(repr(values.shape).encode() + values.tobytes()).hexdigest()
+
+
+def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray) -> str:
+    """Write `<folder>/<scenario_id>.npz` (no pickle) and return its digest."""
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(folder / f"{scenario_id}.npz", qpos=np.ascontiguousarray(qpos, dtype="<f4"))
+    return trajectory_digest(qpos)
+
+
+def load_trajectory(path: Path, sha256: str) -> np.ndarray:
+    """qpos at frame times (F, nq) float32. Raises ValueError naming the file when it is missing or altered."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            qpos = archive["qpos"]
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such trajectory; restore it from git or remove its record") from None
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable trajectory ({error}); restore it from git") from error
+    found = trajectory_digest(qpos)
+    if found != sha256:
+        raise ValueError(f"{path}: digest {found[:12]} is not the record's {sha256[:12]}; restore the file from git")
+    return qpos

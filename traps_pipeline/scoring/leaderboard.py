@@ -1,0 +1,76 @@
+"""Means and deviations over runs, per dataset and overall, with intervals (benchmark.md section 5)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.partitions import DATASETS
+from traps_pipeline.scoring.metrics import FIGURES, decision_counts, joined_epochs
+from traps_pipeline.tables import LEADERBOARD
+
+ENTRY = ["model", "regime", "dataset"]
+_RUN = ["model", "regime", "run"]
+
+
+def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame) -> pd.DataFrame:
+    """LEADERBOARD rows from METRICS rows (scope `all`; others are ignored) and `pecs_intervals`.
+
+    Mean and population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four datasets
+    within each run first; a run that lacks a dataset does not enter it, and a model and regime without any whole run has
+    no overall row. A figure that is null in one run is null here: averages never rest on fewer runs than `n_runs` says.
+    """
+    cells = metrics[metrics["scope"] == "all"]
+    runs = pd.concat([cells, _overall_runs(cells)], ignore_index=True)
+    groups = runs.groupby(ENTRY, sort=True)
+    means, deviations = (groups[FIGURES].agg(f) for f in (_mean, _deviation))
+    board = means.join(deviations.add_suffix("_std"))
+    board["n_runs"] = groups["run"].nunique()
+    board["n_pairs"] = groups["n_pairs"].max()
+    board["n_missing"] = groups["n_missing"].sum()
+    board["epoch"] = groups["epoch"].agg(joined_epochs)
+    board["benchmark_version"] = groups["benchmark_version"].agg(_joined_versions)
+    board = board.reset_index().merge(intervals, on=ENTRY, how="left", validate="one_to_one")
+    return board[[c.name for c in LEADERBOARD.columns]]
+
+
+def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
+    """J of each model over all its decided items pooled, with its binomial standard error: columns model, j,
+    standard_error, n (decided items of both sides).
+
+    The error combines sqrt(p (1 - p) / n) of the two sides; it holds for answers drawn independently, as the random
+    reference strategies draw them, and shows that these are indistinguishable from J = 0 (benchmark.md section 5).
+    """
+    counts = decision_counts(verdicts).groupby(verdicts["model"]).sum()
+    on_void, on_control = counts["abs_rec_of"].replace(0, np.nan), counts["false_abs_of"].replace(0, np.nan)
+    abs_rec, false_abs = counts["abs_rec"] / on_void, counts["false_abs"] / on_control
+    variance = abs_rec * (1 - abs_rec) / on_void + false_abs * (1 - false_abs) / on_control
+    pooled = {
+        "j": abs_rec - false_abs,
+        "standard_error": np.sqrt(variance),
+        "n": counts["abs_rec_of"] + counts["false_abs_of"],
+    }
+    return pd.DataFrame(pooled).reset_index()
+
+
+def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
+    """One row a (model, regime, run) that has all four datasets, in the columns of METRICS."""
+    groups = cells.groupby(_RUN, sort=True)
+    whole = cells[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
+    overall = whole[FIGURES].agg(_mean).join(whole[["n_pairs", "n_missing"]].sum())
+    overall["epoch"] = whole["epoch"].agg(joined_epochs)
+    overall["benchmark_version"] = whole["benchmark_version"].agg(_joined_versions)
+    return overall.reset_index().assign(dataset="overall")
+
+
+def _mean(values: pd.Series) -> float:
+    return float(np.mean(values.to_numpy(float)))
+
+
+def _deviation(values: pd.Series) -> float:
+    return float(np.std(values.to_numpy(float)))
+
+
+def _joined_versions(versions: pd.Series) -> str:
+    """The distinct versions, sorted and joined by ` + `."""
+    return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))

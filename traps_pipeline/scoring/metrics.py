@@ -1,0 +1,95 @@
+"""Acc, FalseAbs, AbsRec, J, PECS and Naive of every cell, from the panel's verdicts (benchmark.md section 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TypeVar
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.tables import METRICS
+
+CELL = ["dataset", "model", "regime", "run"]
+FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
+# How often something was decided so (numerator) and decided at all (denominator); every figure is made of these six.
+COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
+SCOPED_BY = {"category": "category", "sub_scenario": "sub_scenario", "label": "control_answer"}
+
+Values = TypeVar("Values", pd.Series, np.ndarray)
+
+
+def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
+    """COUNTS of every verdict, 0 or 1 each, on the verdicts' index: (items, 6) int64.
+
+    A null decision counts in no denominator: shares are over decided items.
+    """
+    control = verdicts["side"].eq("control")
+    abstained, correct = (verdicts[name].astype("boolean") for name in ("abstained", "correct"))
+    decided = abstained.notna()
+    counts = {
+        "correct": control & correct.fillna(False),
+        "correct_of": control & correct.notna(),
+        "false_abs": control & abstained.fillna(False),
+        "false_abs_of": control & decided,
+        "abs_rec": ~control & abstained.fillna(False),
+        "abs_rec_of": ~control & decided,
+    }
+    return pd.DataFrame({name: flags.astype("int64") for name, flags in counts.items()})
+
+
+def pecs_of(acc: Values, j: Values) -> Values:
+    """PECS = Acc x max(0, J), elementwise; NaN where either is."""
+    return acc * np.maximum(j, 0.0)
+
+
+def cell_metrics(verdicts: pd.DataFrame, benchmark_version: str) -> pd.DataFrame:
+    """METRICS rows of one dataset, from its VERDICTS rows (any models, regimes and runs).
+
+    One row a cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x` (the control's answer, both sides of
+    the pair). Figures are fractions; one whose denominator is 0 is null, and so is what depends on it. `n_missing` counts
+    the items of the 2 n_pairs with a needed decision missing: abstained and correct on a control, abstained on a void.
+    Raises ValueError when the verdicts are of several datasets, whose versions may differ (benchmark.md section 5).
+    """
+    datasets = sorted(verdicts["dataset"].unique())
+    if len(datasets) > 1:
+        raise ValueError(f"verdicts of several datasets {datasets}: score one dataset at a time")
+    groups = _scoped(verdicts).groupby([*CELL, "scope"], sort=True)
+    sums = groups[[*COUNTS, "complete", "n_refused", "n_empty"]].sum()
+    sums["n_pairs"] = groups["pair_id"].nunique()
+    sums["n_missing"] = 2 * sums["n_pairs"] - sums["complete"]
+    sums["epoch"] = groups["epoch"].agg(joined_epochs)
+    sums["benchmark_version"] = benchmark_version
+    return sums.assign(**_figures(sums)).reset_index()[[c.name for c in METRICS.columns]]
+
+
+def joined_epochs(epochs: Iterable[str]) -> str:
+    """The distinct campaigns, sorted and joined by `+`; an epoch may itself be such a join."""
+    return "+".join(sorted({part for epoch in set(epochs) for part in epoch.split("+") if part}))
+
+
+def _scoped(verdicts: pd.DataFrame) -> pd.DataFrame:
+    """Every verdict with its counts, once for each of the four scopes that it belongs to: (4 x items) rows."""
+    counts = decision_counts(verdicts)
+    on_control = verdicts["side"].eq("control")
+    complete = np.where(on_control, counts["correct_of"] & counts["false_abs_of"], counts["abs_rec_of"])
+    flags = counts.assign(
+        complete=complete,
+        n_refused=verdicts["outcome"].eq("refused").astype("int64"),
+        n_empty=verdicts["outcome"].eq("empty").astype("int64"),
+    )
+    items = pd.concat([verdicts[[*CELL, "pair_id", "epoch"]], flags], axis=1)
+    scopes = [pd.Series("all", index=items.index)]
+    scopes += [prefix + ":" + verdicts[column].astype("str") for prefix, column in SCOPED_BY.items()]
+    return pd.concat([items.assign(scope=scope) for scope in scopes], ignore_index=True)
+
+
+def _figures(sums: pd.DataFrame) -> dict[str, pd.Series]:
+    acc, false_abs, abs_rec = (_share(sums, name) for name in ("correct", "false_abs", "abs_rec"))
+    j = abs_rec - false_abs
+    return {"acc": acc, "abs_rec": abs_rec, "false_abs": false_abs, "j": j, "pecs": pecs_of(acc, j), "naive": acc * abs_rec}
+
+
+def _share(sums: pd.DataFrame, name: str) -> pd.Series:
+    of = sums[f"{name}_of"]
+    return sums[name] / of.where(of > 0)

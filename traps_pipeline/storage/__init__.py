@@ -1,0 +1,1 @@
+"""What is kept on disk: the workspace, its Parquet tables, its ledger of paid calls."""

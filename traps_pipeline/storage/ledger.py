@@ -1,0 +1,173 @@
+"""The ledger: a call is paid for once.
+
+Answers (and votes) are appended as they come back, one JSON line each, before anything counts them as done. A segment
+has one writer; each line reaches the kernel at once (survives kill -9) and the disk every 0.5 s or 100 rows (survives
+power loss). A torn last line is ignored and counted: that answer is asked again. An OS lock per evaluation keeps two
+runs from asking the same key at the same time; the kernel frees it when its holder dies.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import fcntl
+import json
+import os
+import secrets
+import time
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.errors import TrapsError
+
+SYNC_ROWS, SYNC_SECONDS = 100, 0.5
+LOCK_POLL_SECONDS = 0.1
+
+
+@dataclass
+class Known:
+    """What a ledger holds for one evaluation: the newest row of each key, and torn last lines (file:line)."""
+
+    rows: dict[str, dict[str, Any]] = field(default_factory=dict)
+    torn: list[str] = field(default_factory=list)
+
+
+class Ledger:
+    """Append-only rows by key, one folder an evaluation: `<root>/<kind>/<evaluation>/<segment>.jsonl`."""
+
+    def __init__(self, root: Path, kind: str) -> None:
+        self.root, self.kind = root, kind
+
+    def folder(self, evaluation: str) -> Path:
+        """Where an evaluation's segments lie."""
+        return self.root / self.kind / evaluation
+
+    def read(self, evaluation: str) -> Known:
+        """All rows of an evaluation. A torn last line of a segment is counted; any other bad line raises TrapsError."""
+        known = Known()
+        for segment in sorted(self.folder(evaluation).glob("*.jsonl")):
+            for row, torn in _read_segment(segment):
+                if torn:
+                    known.torn.append(torn)
+                elif row is not None:
+                    known.rows[row["key"]] = row
+        return known
+
+    def reasoning(self, evaluation: str) -> dict[str, str]:
+        """Reasoning traces by key, kept in sibling segments so that reading answers stays quick."""
+        traces: dict[str, str] = {}
+        for segment in sorted(self.folder(evaluation).glob("*.jsonl.reasoning")):
+            traces.update({row["key"]: row["reasoning"] for row, _ in _read_segment(segment) if row})
+        return traces
+
+    @contextmanager
+    def writer(self, evaluation: str) -> Iterator[SegmentWriter]:
+        """A writer of a new segment; the file appears with the first row."""
+        name = f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{time.time_ns() % 10**9:09d}-{secrets.token_hex(3)}.jsonl"
+        writer = SegmentWriter(self.folder(evaluation) / name)
+        try:
+            yield writer
+        finally:
+            writer.close()
+
+    @asynccontextmanager
+    async def lock(self, evaluation: str, waiting: Callable[[str], None]) -> AsyncIterator[None]:
+        """Hold the evaluation's lock; while another process has it, wait and say once who holds it."""
+        path = self.root / "locks" / f"{self.kind}-{evaluation}.lock"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        told = False
+        try:
+            while True:
+                try:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if not told:
+                        waiting(f"{self.kind} of {evaluation} are being asked by {_holder(path)}; waiting for it to finish")
+                        told = True
+                    await asyncio.sleep(LOCK_POLL_SECONDS)
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, json.dumps({"pid": os.getpid(), "since": time.strftime("%H:%M:%S")}).encode(), 0)
+            yield
+        finally:
+            os.close(descriptor)
+
+
+class SegmentWriter:
+    """Appends rows to one segment. Not shared between processes or threads."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._files: dict[Path, int] = {}
+        self._unsynced, self._synced_at = 0, time.monotonic()
+
+    def append(self, row: Mapping[str, Any], reasoning: str | None = None) -> None:
+        """Write one row (and its trace) at once. Raises TrapsError when the disk is full; earlier rows are safe."""
+        if reasoning is not None:
+            self._write(self.path.with_suffix(".jsonl.reasoning"), {"key": row["key"], "reasoning": reasoning})
+        self._write(self.path, row)
+        self._unsynced += 1
+        self.sync_if_due()
+
+    def _write(self, path: Path, row: Mapping[str, Any]) -> None:
+        line = json.dumps(row, ensure_ascii=False, allow_nan=False).encode() + b"\n"
+        try:
+            if path not in self._files:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                self._files[path] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+            start = os.fstat(self._files[path]).st_size
+            if os.write(self._files[path], line) < len(line):
+                os.ftruncate(self._files[path], start)  # a half-written line must not swallow the next one
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            raise TrapsError(
+                f"{path}: an answer could not be written ({error.strerror}); free some space and run the same command "
+                "again: everything answered before is kept, this answer is asked again"
+            ) from error
+
+    def sync_if_due(self) -> None:
+        """Sync to disk when 100 rows or 0.5 s have passed since the last time."""
+        if self._unsynced and (self._unsynced >= SYNC_ROWS or time.monotonic() - self._synced_at >= SYNC_SECONDS):
+            self.sync()
+
+    def sync(self) -> None:
+        """Sync what was written."""
+        for descriptor in self._files.values():
+            os.fsync(descriptor)
+        self._unsynced, self._synced_at = 0, time.monotonic()
+
+    def close(self) -> None:
+        """Sync and close."""
+        if self._unsynced:
+            self.sync()
+        while self._files:
+            os.close(self._files.popitem()[1])
+
+
+def _read_segment(path: Path) -> Iterator[tuple[dict[str, Any] | None, str | None]]:
+    with path.open("rb") as stream:
+        for number, line in enumerate(stream, start=1):
+            if not line.endswith(b"\n"):
+                yield None, f"{path}:{number}"
+                return
+            try:
+                row = json.loads(line)
+                row["key"]
+            except (ValueError, KeyError, TypeError) as error:
+                raise TrapsError(
+                    f"{path}:{number}: not a ledger row ({error!r}); remove that line and run again: its answer will be "
+                    "asked anew, all others are kept"
+                ) from error
+            yield row, None
+
+
+def _holder(path: Path) -> str:
+    try:
+        holder = json.loads(path.read_text() or "{}")
+    except (OSError, ValueError):
+        holder = {}
+    return f"process {holder.get('pid', '?')} since {holder.get('since', '?')}"

@@ -1,0 +1,171 @@
+"""Parquet tables of a workspace: schema-checked, written whole or not at all, read as one dataset."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.tables import VOLATILE, Table
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+
+_FOOTER = b"traps"
+
+
+@dataclass(frozen=True)
+class State:
+    """What a partition's footer says: its data version, the versions of its inputs, its rows, its failed answers."""
+
+    version: str
+    inputs: dict[str, str]
+    rows: int
+    failed: int
+
+
+class TableStore:
+    """The tables under one folder. A partition is one file, replaced atomically."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def path(self, table: Table, partition: Mapping[str, Any]) -> Path:
+        """File of one partition (hive layout)."""
+        if tuple(partition) != table.partition_by:
+            raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not {tuple(partition)}")
+        folder = self.root / table.name
+        for column, value in partition.items():
+            folder /= f"{column}={value}"
+        return folder / "part-0.parquet"
+
+    def write(
+        self,
+        table: Table,
+        partition: Mapping[str, Any],
+        rows: Sequence[Mapping[str, Any]] | pd.DataFrame,
+        inputs: Mapping[str, str],
+        *,
+        failed: int = 0,
+    ) -> str:
+        """Write one partition and return its data version (a digest of its content, volatile columns aside).
+
+        Rows are sorted by the table's key. `inputs` (versions of what the rows were made from) and `failed` (answers
+        that a next run should ask again) go into the file's footer with the version. Raises TrapsError when a row breaks the schema or a key repeats, and when the
+        disk is full; the partition's former file then still stands.
+        """
+        import pyarrow.parquet as pq
+
+        data = self._checked(table, partition, rows)
+        version = content_version(data)
+        state = State(version, dict(inputs), len(data), failed)
+        data = data.replace_schema_metadata({_FOOTER: json.dumps(asdict(state)).encode()})
+        path = self.path(table, partition)
+        part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            pq.write_table(data, part, compression="zstd")
+            with part.open("rb") as stream:
+                os.fsync(stream.fileno())
+            os.replace(part, path)
+        except OSError as error:
+            raise TrapsError(
+                f"{path}: cannot be written ({error.strerror or error}); free some space and run the same command again "
+                "(nothing was half-written, no answer is lost)"
+            ) from error
+        finally:
+            part.unlink(missing_ok=True)
+        return version
+
+    def _checked(self, table: Table, partition: Mapping[str, Any], rows: Sequence[Mapping[str, Any]] | pd.DataFrame) -> pa.Table:
+        import pyarrow as pa
+
+        schema = table.arrow_schema()
+        try:
+            if isinstance(rows, list | tuple):
+                unknown = sorted({name for row in rows for name in row} - set(schema.names))
+                if unknown:
+                    raise ValueError(f"unknown columns {unknown}")
+                data = pa.Table.from_pylist(list(rows), schema=schema)
+            else:
+                data = pa.Table.from_pandas(rows, schema=schema, preserve_index=False, safe=True)
+                data = data.replace_schema_metadata(None).cast(schema)
+        except (pa.ArrowException, ValueError, KeyError, TypeError) as error:
+            raise TrapsError(f"table {table.name} {dict(partition)}: rows do not fit the schema ({error})") from error
+        for field in schema:
+            if not field.nullable and data[field.name].null_count:
+                raise TrapsError(f"table {table.name} {dict(partition)}: column {field.name} has missing values")
+        for column, value in partition.items():
+            strays = set(data[column].to_pylist()) - {value}
+            if strays:
+                raise TrapsError(f"table {table.name} {dict(partition)}: column {column} also holds {sorted(map(str, strays))}")
+        keys = list(zip(*(data[name].to_pylist() for name in table.key), strict=True))
+        if len(set(keys)) != len(keys):
+            repeated = next(k for k in keys if keys.count(k) > 1)
+            raise TrapsError(f"table {table.name} {dict(partition)}: key {dict(zip(table.key, repeated, strict=True))} repeats")
+        return data.sort_by([(name, "ascending") for name in table.key]) if len(data) else data
+
+    def state(self, table: Table, partition: Mapping[str, Any]) -> State | None:
+        """What the footer of a partition says; None if it was never written. Raises TrapsError if it is unreadable."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self.path(table, partition)
+        if not path.is_file():
+            return None
+        try:
+            metadata = pq.ParquetFile(path).schema_arrow.metadata or {}
+            return State(**json.loads(metadata[_FOOTER]))
+        except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
+            raise _unreadable(path, table, error) from error
+
+    def read(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
+        """One partition. Raises TrapsError naming the file and the stage to materialize when it is not there."""
+        return self._load(table, self.path(table, partition), columns).to_pandas()
+
+    def read_all(
+        self, table: Table, columns: Sequence[str] | None = None, **equal: Any
+    ) -> pd.DataFrame:
+        """All partitions whose partition columns equal the given values; an empty frame if there are none."""
+        return self.read_arrow(table, columns, **equal).to_pandas()
+
+    def read_arrow(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pa.Table:
+        """`read_all` as an Arrow table."""
+        import pyarrow as pa
+
+        parts = ["*" if c not in equal else str(equal[c]) for c in table.partition_by]
+        pattern = "/".join([*(f"{c}={v}" for c, v in zip(table.partition_by, parts, strict=True)), "part-0.parquet"])
+        schema = table.arrow_schema()
+        wanted = pa.schema([schema.field(name) for name in columns]) if columns else schema
+        pieces = [self._load(table, path, columns) for path in sorted((self.root / table.name).glob(pattern))]
+        pieces = [piece.replace_schema_metadata(None) for piece in pieces]
+        return pa.concat_tables(pieces) if pieces else wanted.empty_table()
+
+    def _load(self, table: Table, path: Path, columns: Sequence[str] | None) -> pa.Table:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        try:
+            return pq.ParquetFile(path).read(columns=list(columns) if columns else None)
+        except FileNotFoundError:
+            raise TrapsError(f"{path}: not there yet; materialize {table.name} for this partition first") from None
+        except (pa.ArrowException, OSError) as error:
+            raise _unreadable(path, table, error) from error
+
+
+def _unreadable(path: Path, table: Table, error: Exception) -> TrapsError:
+    return TrapsError(f"{path}: not a readable {table.name} table ({error}); delete it and materialize again")
+
+
+def content_version(data: pa.Table) -> str:
+    """Digest of a table's content, volatile columns left out: unchanged content makes nothing downstream stale."""
+    rows = data.drop_columns([c for c in VOLATILE if c in data.column_names]).to_pylist()
+    return digest(rows)[:16]
+

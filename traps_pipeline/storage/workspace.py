@@ -1,0 +1,143 @@
+"""A workspace: one folder that holds one study. Every path in it is made here, so that storage may move later."""
+
+from __future__ import annotations
+
+import os
+from functools import cached_property
+from pathlib import Path
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.paths import CHECKOUT, require_checkout
+from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
+
+FORMAT = 1
+VARIABLE = "TRAPS_WORKSPACE"
+
+
+class Study(BaseModel):
+    """`study.yaml`: the benchmark, its subset, the panel and the budget of everything in the workspace.
+
+    benchmark, scenarios and per_family are fixed when the workspace is created; panel, epoch and budget may be edited.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    format: int = FORMAT
+    benchmark: str = "released"
+    scenarios: list[str] | None = Field(default=None, description="named scenarios; all if absent")
+    per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
+    panel: str = "rules"
+    epoch: str = Field(default="1", pattern=r"^[A-Za-z0-9._-]+$")
+    budget_usd: float = Field(default=0.0, ge=0.0)
+
+    @model_validator(mode="after")
+    def _one_subset(self) -> Study:
+        if self.scenarios is not None and self.per_family is not None:
+            raise ValueError("give scenarios or per_family, not both")
+        return self
+
+
+class Workspace:
+    """Paths and stores of one study. Open with `Workspace.open`, make with `Workspace.create`."""
+
+    def __init__(self, root: Path, study: Study) -> None:
+        self.root, self.study = root, study
+
+    @staticmethod
+    def default_root() -> Path:
+        """`$TRAPS_WORKSPACE`, else `.workspaces/default` in the checkout."""
+        return Path(os.environ.get(VARIABLE) or CHECKOUT / ".workspaces" / "default").absolute()
+
+    @classmethod
+    def create(cls, root: Path, study: Study) -> Workspace:
+        """Make a workspace, or open it when it is there with the same benchmark. Raises TrapsError when it differs."""
+        require_checkout()
+        if (root / "study.yaml").exists():
+            workspace = cls.open(root)
+            for field in ("benchmark", "scenarios", "per_family"):
+                old, new = getattr(workspace.study, field), getattr(study, field)
+                if old != new:
+                    raise TrapsError(
+                        f"{root}/study.yaml: {field} is {old!r}, this study wants {new!r}; a workspace keeps its benchmark: "
+                        f"choose another folder with {VARIABLE} or --workspace"
+                    )
+            return workspace
+        for folder in ("tables", "clips", "trajectories", "ledger", "reports", "dagster"):
+            (root / folder).mkdir(parents=True, exist_ok=True)
+        workspace = cls(root, study)
+        workspace._link_dagster_yaml()
+        text = yaml.safe_dump(study.model_dump(exclude_none=True), sort_keys=False)
+        (root / "study.yaml").write_text(text, encoding="utf-8")
+        return workspace
+
+    @classmethod
+    def open(cls, root: Path | None = None) -> Workspace:
+        """The workspace at `root` (default: `default_root()`). Raises TrapsError naming the file and the remedy."""
+        root = (root or cls.default_root()).absolute()
+        path = root / "study.yaml"
+        if not path.is_file():
+            raise TrapsError(f"{path}: no such workspace; make one with `traps init` or `traps run demo`, or set {VARIABLE}")
+        data = read_yaml(path)
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            found = data.get("format") if isinstance(data, dict) else data
+            raise TrapsError(
+                f"{path}: workspace format {found!r}, this version reads {FORMAT}; use the version that made it, "
+                "or start a new workspace (its ledger folder can be copied over: answers keep their keys)"
+            )
+        return cls(root, parse_yaml_model(Study, data, path))
+
+    def _link_dagster_yaml(self) -> None:
+        link = self.dagster_home / "dagster.yaml"
+        if not link.exists():
+            link.symlink_to(CHECKOUT / "dagster.yaml")
+
+    @property
+    def dagster_home(self) -> Path:
+        """Dagster's own history (DAGSTER_HOME)."""
+        return self.root / "dagster"
+
+    @property
+    def reports(self) -> Path:
+        """Pages and figures for people."""
+        return self.root / "reports"
+
+    @property
+    def trajectories(self) -> Path:
+        """Trajectories simulated here because a correction changed parameters."""
+        return self.root / "trajectories"
+
+    @property
+    def locks(self) -> Path:
+        """Lock files of stages that must not run twice at once."""
+        return self.root / "ledger" / "locks"
+
+    @cached_property
+    def tables(self) -> TableStore:
+        """The Parquet tables."""
+        return TableStore(self.root / "tables")
+
+    @cached_property
+    def answers(self) -> Ledger:
+        """Every answer ever paid for."""
+        return Ledger(self.root / "ledger", "answers")
+
+    @cached_property
+    def votes(self) -> Ledger:
+        """Every vote ever paid for."""
+        return Ledger(self.root / "ledger", "votes")
+
+    def clip(self, scenario_id: str, side: str, scene_hash: str) -> Path:
+        """Path of a clip; its name holds the scene hash, so a corrected scene never overwrites what was judged."""
+        return self.root / "clips" / scenario_id / f"{side}-{scene_hash[:16]}.mp4"
+
+    def relative(self, path: Path) -> str:
+        """A path as tables store it."""
+        return path.relative_to(self.root).as_posix()
+
+    def resolve(self, relative: str) -> Path:
+        """Inverse of `relative`."""
+        return self.root / relative

@@ -1,0 +1,37 @@
+"""Files that people write, read safely: YAML with the safe loader, checked by a pydantic model, errors in sentences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from traps_pipeline.errors import TrapsError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_yaml(path: Path) -> Any:
+    """Parsed YAML (safe loader). Raises TrapsError naming file, line and the parser's complaint."""
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise TrapsError(f"{path}: cannot be read ({error.strerror})") from error
+    except yaml.YAMLError as error:
+        raise TrapsError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+
+
+def parse_yaml_model(model: type[Model], data: Any, path: Path, where: str = "") -> Model:
+    """Validate parsed YAML. Raises TrapsError naming file, entry and field."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise TrapsError(f"{path}{where and ': ' + where}: {explain(error)}") from error
+
+
+def explain(error: ValidationError) -> str:
+    """A validation error in one line: field and complaint, `; ` between them."""
+    parts = ((".".join(map(str, e["loc"])), e["msg"].removeprefix("Value error, ")) for e in error.errors())
+    return "; ".join(f"{field}: {message}" if field else message for field, message in parts)
