@@ -81,7 +81,7 @@ def _run_stage(
 ) -> None:
     lineage = Lineage(workspace)
     todo = [key for key in wanted_keys(workspace, experiment, stage) if lineage.status(stage, key).kind != "fresh"]
-    blocked = [key for key in todo if stage not in AGGREGATES and outcome.failed & set(upstream(stage, key))]
+    blocked = [key for key in todo if _blocked(lineage, stage, key, outcome.failed)]
     outcome.failed |= {(stage, key) for key in blocked}
     todo = [key for key in todo if key not in blocked]
     if not todo:
@@ -98,6 +98,13 @@ def _run_stage(
             outcome.problems.append(f"{name_of((stage, key))} is {status.kind}{': ' + '; '.join(lasting) if lasting else ''}")
         elif status.reasons:
             outcome.problems.append(f"{name_of((stage, key))}: {'; '.join(status.reasons)}")
+
+
+def _blocked(lineage: Lineage, stage: str, key: str | None, failed: set[Node]) -> bool:
+    """Whether a failure above leaves nothing sound to make a partition from."""
+    if stage in AGGREGATES:
+        return bool(failed) and not lineage.inputs(stage, key)
+    return bool(failed & set(upstream(stage, key)))
 
 
 def batches(stage: str, keys: Sequence[str | None]) -> Iterator[tuple[str | None, str | None]]:

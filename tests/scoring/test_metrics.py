@@ -47,7 +47,15 @@ def test_degenerate_strategies_score_zero(name, rows, strategy):
 
 def test_the_oracle_scores_one_on_every_scope(rows, strategy):
     metrics = cell_metrics(rows(strategy("oracle", 12), labels=("yes", "no", "no"), categories=("a", "b")), "v1")
-    assert set(metrics["scope"]) == {"all", "category:a", "category:b", "sub_scenario:a_sub", "sub_scenario:b_sub", "label:yes", "label:no"}
+    assert set(metrics["scope"]) == {
+        "all",
+        "category:a",
+        "category:b",
+        "sub_scenario:a_sub",
+        "sub_scenario:b_sub",
+        "label:yes",
+        "label:no",
+    }
     assert (metrics["pecs"] == 1.0).all()
 
 
@@ -56,7 +64,7 @@ def test_undecided_items_leave_their_denominators_and_count_as_missing(rows):
     pairs = [(True, False, True), (None, True, True), (True, None, False), (False, False, None), (None, None, None)]
     outcomes = ["answer"] * 8 + ["refused", "empty"]
     cell = one(cell_metrics(rows(pairs, outcomes=outcomes), "v1"), scope="all")
-    # Missing: control of 2, control of 3, void of 4, both of 5. Acc over pairs 1, 3, 4; FalseAbs 1, 2, 4; AbsRec 1, 2, 3.
+    # Missing: controls of 2, 3, 5, voids of 4, 5. Acc over pairs 1, 3, 4; FalseAbs 1, 2, 4; AbsRec 1, 2, 3.
     assert (cell.n_pairs, cell.n_missing, cell.n_refused, cell.n_empty) == (5, 5, 1, 1)
     assert [cell.acc, cell.false_abs, cell.abs_rec] == pytest.approx([2 / 3, 1 / 3, 2 / 3])
 

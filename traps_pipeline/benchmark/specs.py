@@ -89,9 +89,10 @@ def build_specs(workspace: Workspace, category: str) -> tuple[list[dict[str, Any
     version = version_of(map(spec_content, released), (spec_content(r.spec) for r in resolved))
     for item in resolved:
         try:
+            get_family(item.spec.family).params_from(item.spec.params)
             load_trajectory(item.trajectory, item.spec.trajectory_sha256)
         except ValueError as error:
-            raise TrapsError(str(error)) from error
+            raise TrapsError(f"{item.spec.scenario_id}: {error}") from error
     return [_row(workspace, item, version) for item in resolved], resolved
 
 

@@ -55,10 +55,10 @@ def _preview(png: bytes) -> dg.MarkdownMetadataValue:
 
 
 def _landscape(workspace: Workspace) -> Files:
-    from traps_pipeline.report.figures import pecs_landscape
+    from traps_pipeline.report.figures import figure_bytes, landscape_figure
 
-    board = workspace.tables.read(LEADERBOARD, {})
-    return {f"pecs_landscape.{kind}": pecs_landscape(board, kind) for kind in ("png", "svg")}
+    figure = landscape_figure(workspace.tables.read(LEADERBOARD, {}))
+    return {f"pecs_landscape.{kind}": figure_bytes(figure, kind) for kind in ("png", "svg")}
 
 
 def _sheet(workspace: Workspace) -> Files:

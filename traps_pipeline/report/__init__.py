@@ -1,1 +1,1 @@
-"""What people read: the leaderboard as text, Markdown and one HTML file, figures, contact sheets (benchmark.md section 10)."""
+"""What people read: the leaderboard as text, Markdown and one HTML file, figures, contact sheets."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 MOMENTS = 4  # frames a clip
 GAP = 8  # pixels between frames
 BLOCK_IN = 6.4  # width of a pair
-HEADER_IN, FOOTER_IN = 0.62, 0.2  # room for the words above and the times below a pair's frames
+HEADER_IN, FOOTER_IN = 0.95, 0.2  # room for the words above and the times below a pair's frames
 DPI = 150
 MOST_PAIRS = 80
 
@@ -63,11 +63,15 @@ def contact_sheet(items: pd.DataFrame, root: Path, per_family: int | None = 1, c
 
 def chosen_pairs(items: pd.DataFrame, per_family: int | None) -> list[pd.DataFrame]:
     """The pairs to show, as frames of two rows indexed by side. Raises ValueError for none or more than 80."""
-    whole = items[items.groupby("pair_id")["side"].transform("nunique") == 2].sort_values(["dataset", "sub_scenario", "pair_id"])
+    whole = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2].sort_values(
+        by=["dataset", "sub_scenario", "pair_id"]
+    )
     firsts = whole.drop_duplicates("pair_id").groupby(["dataset", "sub_scenario"], sort=True)["pair_id"]
     ids = list(firsts.head(per_family) if per_family is not None else whole["pair_id"].unique())
     if not 0 < len(ids) <= MOST_PAIRS:
-        raise ValueError(f"a contact sheet shows 1 to {MOST_PAIRS} pairs, not {len(ids)}: pass other items or a smaller per_family")
+        raise ValueError(
+            f"a contact sheet shows 1 to {MOST_PAIRS} pairs, not {len(ids)}: pass other items or a smaller per_family"
+        )
     by_pair = dict(list(whole[whole["pair_id"].isin(ids)].groupby("pair_id")))
     return [by_pair[pair_id].set_index("side") for pair_id in ids]
 
@@ -110,27 +114,47 @@ def _draw_pair(axes: Axes, pair: pd.DataFrame, control: Clip, void: Clip, times:
             hatch = {"hatch": "////", "facecolor": "#f2f4f7", "edgecolor": "#c3c9d2", "linewidth": 0.5}
             axes.add_patch(Rectangle((left, top), width - 1, height - 1, **hatch))
             box = {"facecolor": "white", "edgecolor": "none", "pad": 2}
-            axes.text(left + width / 2, top + height / 2, f"cut at {clip.end_s:.1f} s", ha="center", va="center", size=8, bbox=box)
+            axes.text(
+                left + width / 2,
+                top + height / 2,
+                f"cut at {clip.end_s:.1f} s",
+                ha="center",
+                va="center",
+                size=8,
+                bbox=box,
+            )
     axes.imshow(canvas, interpolation="antialiased")
     for k, time in enumerate(times):
-        axes.text(k * (width + GAP) + width / 2, 2 * height + 2 * GAP, f"{time:.1f} s", ha="center", va="top", size=7, color="#667085")
+        axes.text(
+            k * (width + GAP) + width / 2,
+            2 * height + 2 * GAP,
+            f"{time:.1f} s",
+            ha="center",
+            va="top",
+            size=7,
+            color="#667085",
+        )
     axes.set_axis_off()
     _draw_header(axes, pair)
 
 
 def _draw_header(axes: Axes, pair: pd.DataFrame) -> None:
-    """Scenario and ground truth in bold, below it the question; the void's own where it differs."""
+    """Scenario and ground truth in bold, below it the question; the void's own too where it differs."""
     asked = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
-    control = pair.loc["control"]
-    if asked["control"] == asked["void"]:
-        lines = textwrap.wrap(asked["control"], 108, max_lines=2, placeholder=" …")
-    else:
-        lines = [textwrap.shorten(f"{side}: {question}", 108, placeholder=" …") for side, question in asked.items()]
-    title = f"{control['scenario_id']}   {control['sub_scenario']} ({control['dataset']})   ground truth: {control['ground_truth']}"
-    place = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "left"}
-    text = "\n".join(lines).replace("$", r"\$")
-    axes.annotate(title.replace("$", r"\$"), (0, 1), (0, 28), va="bottom", size=8.5, weight="bold", **place)
-    axes.annotate(text, (0, 1), (0, 25), va="top", size=7.5, linespacing=1.15, **place)
+    same = asked["control"] == asked["void"]
+    questions = [asked["control"]] if same else [f"{side}: {question}" for side, question in asked.items()]
+    lines = [line for question in questions for line in textwrap.wrap(question, 108, max_lines=2, placeholder=" …")]
+    truth = pair.at["control", "ground_truth"]
+    scenario, sub_scenario, dataset = (pair.at["control", c] for c in ("scenario_id", "sub_scenario", "dataset"))
+    title = f"{scenario}   {sub_scenario} ({dataset})   ground truth: {truth}"
+    place: dict[str, Any] = {
+        "xycoords": "axes fraction",
+        "textcoords": "offset points",
+        "va": "bottom",
+        "parse_math": False,
+    }
+    axes.annotate("\n".join(lines), (0, 1), (0, 5), size=7.5, linespacing=1.15, **place)
+    axes.annotate(title, (0, 1), (0, 9 + 10 * len(lines)), size=8.5, weight="bold", **place)
 
 
 def _fitted(frame: np.ndarray, height: int, width: int) -> np.ndarray:

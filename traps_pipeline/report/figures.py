@@ -18,14 +18,13 @@ from traps_pipeline.report.page import TITLES, entries_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.text import Annotation
-    from matplotlib.transforms import Bbox
 
 STYLE = ASSETS / "figures.mplstyle"
 COLUMN_IN = 3.4
 # Okabe and Ito's palette without its yellow, which is too light for a hollow marker, and with its black as grey.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#4D4D4D")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "p", ">", "h")  # 7 colours x 11 shapes: 77 models stay distinct
+LINES = 2  # z-order of the lines from standard to guided
 SAME_POINT = 0.02  # distance in (Acc, J) under which two models share a label: about a marker's radius
 
 
@@ -88,20 +87,24 @@ def landscape_figure(board: pd.DataFrame) -> Figure:
     from matplotlib.figure import Figure
 
     scope, _ = entries_of(board)
-    points = board[(board["dataset"] == scope) & board["acc"].notna() & board["j"].notna()]
+    points = board.loc[(board["dataset"] == scope) & board["acc"].notna() & board["j"].notna()]
     lowest = min([-0.1, *(points["j"] - 0.08)])
     with figure_style():
-        figure = Figure(figsize=(COLUMN_IN, 2.5 + 1.3 * (1.06 - lowest)), layout="constrained")
+        figure = Figure(figsize=(COLUMN_IN, 2.4 + 1.15 * (1.06 - lowest)), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
-        axes.set(xlim=(-0.04, 1.04), ylim=(lowest, 1.06), xlabel="Acc", ylabel="J = AbsRec − FalseAbs")
-        axes.set_title(f"PECS landscape, {TITLES[scope].lower()}")
+        axes.set(
+            xlim=(-0.04, 1.04),
+            ylim=(lowest, 1.06),
+            xlabel=f"Acc, {TITLES[scope].lower()}",
+            ylabel="J = AbsRec − FalseAbs",
+        )
         _draw_contours(axes)
         labels = merged_labels(_draw_models(axes, points))
         _draw_key(figure)
         figure.canvas.draw()
         figure.set_layout_engine("none")
-        _place_labels(axes, labels, points[["acc", "j"]].to_numpy(float))
+        _place_labels(axes, labels, points.loc[:, ["acc", "j"]].to_numpy(float))
     return figure
 
 
@@ -123,7 +126,9 @@ def _draw_contours(axes: Axes) -> None:
     for pecs in np.arange(1, 10) / 10:
         acc = np.linspace(pecs, 1, 200)
         axes.plot(acc, pecs / acc, color="#d0d5dd", linewidth=0.6, zorder=0.4)
-        axes.annotate(f"{pecs:.1f}", (1, pecs), (1.055, pecs), annotation_clip=False, va="center", color="#667085", size=6)
+        axes.annotate(
+            f"{pecs:.1f}", (1, pecs), (1.055, pecs), annotation_clip=False, va="center", color="#667085", size=6
+        )
     axes.annotate("PECS", (1, 1), (1.055, 1), annotation_clip=False, va="center", color="#667085", size=6)
 
 
@@ -132,9 +137,12 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
     labels = []
     for k, (model, rows) in enumerate(points.sort_values("model").groupby("model", sort=True)):
         colour, marker = COLOURS[k % len(COLOURS)], MARKERS[k % len(MARKERS)]
-        at = {row.regime: (float(row.acc), float(row.j)) for row in rows.itertuples()}
+        at = {
+            regime: (float(acc), float(j))
+            for regime, acc, j in zip(*(rows[c] for c in ("regime", "acc", "j")), strict=True)
+        }
         pair = np.array([at[r] for r in ("standard", "guided") if r in at]).reshape(-1, 2)
-        axes.plot(*pair.T, color=colour, linewidth=0.7, alpha=0.7, zorder=2)
+        axes.plot(*pair.T, color=colour, linewidth=0.7, alpha=0.7, zorder=LINES)
         styles = {
             "standard": {"s": 20, "marker": marker, "facecolors": "white", "edgecolors": colour, "linewidths": 0.9},
             "guided": {"s": 20, "marker": marker, "facecolors": colour, "edgecolors": colour, "linewidths": 0.9},
@@ -155,65 +163,96 @@ def _draw_key(figure: Figure) -> None:
         return Line2D([], [], linestyle="none", marker="o", markersize=size, color="#475467", markerfacecolor=face)
 
     handles = [handle(4.5, "white"), handle(4.5, "#475467"), handle(1.6, "#475467")]
-    figure.legend(handles, ["standard", "guided", "json"], loc="outside lower center", ncols=3, handletextpad=0.1, columnspacing=1.2)
+    figure.legend(
+        handles,
+        ["standard", "guided", "json"],
+        loc="outside lower center",
+        ncols=3,
+        handletextpad=0.1,
+        columnspacing=1.2,
+    )
 
 
 def _place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:
-    """Put every label at the nearest spot around its point that hits no marker and no other label, with a leader line
-    where that is far off. markers is (n, 2) in data coordinates. Greedy, so the outcome depends on the table alone.
-    """
-    from matplotlib.transforms import Bbox
+    """Put every label near its point where it hits no marker, no other label and, if that is not far, no line.
 
-    pixel = axes.figure.dpi / 72  # pixels a point: distances below are in points
-    spots = axes.transData.transform(markers)
-    taken = [Bbox.from_extents(x - 3 * pixel, y - 3 * pixel, x + 3 * pixel, y + 3 * pixel) for x, y in spots]
-    room = axes.bbox
+    A leader line joins the two where they are apart. markers is (n, 2) in data coordinates. Greedy and without chance:
+    the outcome depends on the table alone.
+    """
+    from matplotlib.patheffects import withStroke
+
+    pixel = axes.figure.dpi / 72  # pixels a point: offsets are in points, boxes in pixels
+    room = np.array([axes.bbox.extents])
+    taken = _around(axes.transData.transform(markers), 3 * pixel)
+    lines = _around(_along_lines(axes, pixel), 0.5 * pixel)
+    offsets = _offsets()
+    distance = np.hypot(*offsets.T)
+    halo = [withStroke(linewidth=1.2, foreground="white")]
     for label in sorted(labels, key=lambda m: (-m.text.count("\n"), -m.y, m.x, m.text)):
         note = axes.annotate(
             label.text, (label.x, label.y), (0, 0), textcoords="offset points", size=5.6, color=label.colour, zorder=9,
-            linespacing=1.05, annotation_clip=False,
+            linespacing=1.05, annotation_clip=False, parse_math=False, path_effects=halo,
         )  # fmt: skip
-        options = [(dx, dy, _box(note, dx, dy, pixel)) for dx, dy in _offsets()]
-        dx, dy, box = min(options, key=lambda o: _cost(o[2], taken, room, np.hypot(o[0], o[1])))
+        extent = note.get_window_extent()
+        size = np.array([extent.width, extent.height])
+        boxes = _boxes(
+            axes.transData.transform((label.x, label.y)) + offsets * pixel, offsets, size + np.array([4, 1]) * pixel
+        )
+        outside = np.prod(boxes[0, 2:] - boxes[0, :2]) - _overlap(boxes, room)
+        area = 10 * (_overlap(boxes, taken) + outside) + 2 * _overlap(boxes, lines)
+        best = int(np.argmin(area / pixel**2 + distance))
+        dx, dy = offsets[best]
         note.set(position=(dx, dy), ha=_side(dx, "left", "right"), va=_side(dy, "bottom", "top"))
-        taken.append(box)
-        if np.hypot(dx, dy) > 12:
+        taken = np.vstack([taken, boxes[best]])
+        if distance[best] > 12:
             axes.annotate(
-                "", (label.x, label.y), (dx, dy), textcoords="offset points", annotation_clip=False,
+                "", (label.x, label.y), (dx, dy), textcoords="offset points", annotation_clip=False, zorder=1.9,
                 arrowprops={"arrowstyle": "-", "linewidth": 0.4, "color": label.colour, "shrinkA": 0, "shrinkB": 2.5},
             )  # fmt: skip
 
 
-def _offsets() -> list[tuple[float, float]]:
-    """Candidate offsets (points) of a label from its marker: rings, nearest first, sides before diagonals."""
+def _offsets() -> np.ndarray:
+    """Candidate offsets (n, 2) in points of a label from its marker: rings, nearest first, sides before diagonals."""
     angles = np.deg2rad([0, 180, 90, 270, 30, 330, 150, 210, 60, 120, 240, 300])
-    rings = (5, 9, 14, 20, 28, 38, 50, 64, 80)
-    return [(round(r * np.cos(a), 3), round(r * np.sin(a), 3)) for r in rings for a in angles]
+    rings = np.array([5, 9, 14, 20, 28, 38, 50, 64, 80])
+    return np.round(rings[:, None, None] * np.column_stack([np.cos(angles), np.sin(angles)]), 3).reshape(-1, 2)
 
 
 def _side(offset: float, positive: str, negative: str) -> str:
     """Alignment that lets text grow away from its marker."""
-    return "center" if abs(offset) < 1e-6 else positive if offset > 0 else negative
+    return "center" if offset == 0 else positive if offset > 0 else negative
 
 
-def _box(note: Annotation, dx: float, dy: float, pixel: float) -> Bbox:
-    """The label's extent in pixels, were it placed at that offset (points), with half a point of air."""
-    note.set(position=(dx, dy), ha=_side(dx, "left", "right"), va=_side(dy, "bottom", "top"))
-    return note.get_window_extent().padded(0.5 * pixel)
+def _boxes(anchors: np.ndarray, offsets: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Extents (n, 4) of a text of that size (2,), aligned by `_side` at each anchor; all in pixels."""
+    low = anchors - size * (1 - np.sign(offsets)) / 2
+    return np.hstack([low, low + size])
 
 
-def _cost(box: Bbox, taken: Sequence[Bbox], room: Bbox, distance: float) -> tuple[float, float]:
-    """Overlap in square pixels, what sticks out of the axes included, then the distance."""
-    from matplotlib.transforms import Bbox
+def _around(spots: np.ndarray, half: float) -> np.ndarray:
+    """Extents (n, 4) of squares around positions (n, 2)."""
+    return np.hstack([spots - half, spots + half])
 
-    pairs = (Bbox.intersection(box, other) for other in taken)
-    overlap = sum(p.width * p.height for p in pairs if p is not None)
-    inside = Bbox.intersection(box, room)
-    outside = box.width * box.height - (inside.width * inside.height if inside is not None else 0.0)
-    return round(overlap + 4 * outside, 3), distance
+
+def _along_lines(axes: Axes, step: float) -> np.ndarray:
+    """Pixel positions (n, 2) along the lines that join a model's points, `step` pixels apart."""
+    found = [np.empty((0, 2))]
+    for line in axes.lines:
+        ends = axes.transData.transform(line.get_xydata())
+        if line.get_zorder() == LINES and len(ends) == 2:
+            count = int(np.hypot(*(ends[1] - ends[0])) / step) + 1
+            found.append(np.linspace(ends[0], ends[1], count))
+    return np.concatenate(found)
+
+
+def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Area (n,) that each box (n, 4) shares with all others (m, 4) together."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    return np.clip(high - low, 0, None).prod(axis=2).sum(axis=1)
 
 
 def _short(model: str) -> str:
-    """A label's text: no mathtext, no line break, no more than 28 characters."""
-    text = "".join(c if c.isprintable() else "?" for c in model).replace("$", r"\$")
+    """A label's text: no line break, no more than 28 characters."""
+    text = "".join(c if c.isprintable() else "?" for c in model)
     return text if len(text) <= 28 else text[:27] + "…"

@@ -9,14 +9,14 @@ from __future__ import annotations
 import base64
 import html
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.partitions import DATASETS
+from traps_pipeline.partitions import DATASETS, REGIMES
 
 TEMPLATES = Path(__file__).parent / "templates"
 NONE = "–"
@@ -33,12 +33,13 @@ LEGEND = {
     "Acc": "share of control items answered correctly",
     "AbsRec": "abstention recall: share of void items, which cannot be answered, that the model abstains on",
     "FalseAbs": "share of control items, which can be answered, that the model abstains on",
-    "J": "AbsRec - FalseAbs, from -1 to 1; 0 for every strategy that does not tell void from control",
-    "PECS": "Acc x max(0, J), from 0 to 1; computed per run, then averaged",
+    "J": "AbsRec − FalseAbs, from −1 to 1; 0 for every strategy that does not tell void from control",
+    "PECS": "Acc × max(0, J), from 0 to 1; computed per run, then averaged. J is clipped at 0 here, so chance "
+    "alone lifts a random strategy slightly above 0: the J beside it, which is not clipped, tells",
     "95 % CI": "percentile interval of PECS, cluster bootstrap over scenarios",
     "±": "population standard deviation over runs",
     "n": "pairs (one control, one void) a run",
-    "missing": f"items over all runs without an answer or a majority of the judges; {MISSING_MARK} the shares rest on the others",
+    "missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares rest on the others",
     "epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
 }
@@ -76,7 +77,9 @@ def leaderboard_markdown(board: pd.DataFrame) -> str:
     return "\n".join([f"**{TITLES[scope]}.** {_markdown(provenance(board))}", "", *table, "", *legend]) + "\n"
 
 
-def leaderboard_html(board: pd.DataFrame, figures: Mapping[str, bytes] | None = None, title: str = "TRAPSBench leaderboard") -> str:
+def leaderboard_html(
+    board: pd.DataFrame, figures: Mapping[str, bytes] | None = None, title: str = "TRAPSBench leaderboard"
+) -> str:
     """One self-contained HTML page: summary, a table a dataset, figures (title -> PNG bytes, inlined), legend.
 
     It opens from disk and asks the network for nothing; its content policy forbids it.
@@ -124,8 +127,8 @@ def entries_of(board: pd.DataFrame) -> tuple[str, list[Entry]]:
 
 def provenance(board: pd.DataFrame) -> str:
     """Which benchmark versions and campaigns the board's figures come from."""
-    versions = _distinct(board["benchmark_version"], " + ")
-    epochs = _distinct(board["epoch"], "+")
+    versions = _distinct(board["benchmark_version"].unique(), " + ")
+    epochs = _distinct(board["epoch"].unique(), "+")
     return (
         f"Benchmark version{'s' * (len(versions) > 1)} {', '.join(versions) or NONE}; "
         f"epoch{'s' * (len(epochs) > 1)} {', '.join(epochs) or NONE}."
@@ -178,17 +181,24 @@ def _section(dataset: str, entries: Sequence[Entry]) -> dict[str, Any]:
     there = [e for e in ranked if e.main is not None or dataset == "overall"]
     rows = [e.main for e in there if e.main is not None]
     shared = {name: len({r[name] for r in rows}) <= 1 for name in ("epoch", "benchmark_version")}
-    return {"name": dataset, "title": TITLES[dataset], "entries": there, "shared": shared, "first": rows[0] if rows else None}
+    return {
+        "name": dataset,
+        "title": TITLES[dataset],
+        "entries": there,
+        "shared": shared,
+        "first": rows[0] if rows else None,
+    }
 
 
-def _rank(entry: Entry) -> tuple[bool, float, str, str]:
+def _rank(entry: Entry) -> tuple[bool, float, str, int]:
+    """Best PECS first, nulls last; ties by model, then in the regimes' own order."""
     value = entry.main["pecs"] if entry.main is not None else None
-    unranked = value is None or pd.isna(value)
-    return unranked, 0.0 if unranked else -float(value), entry.model, entry.regime
+    score = float("nan") if value is None else float(value)
+    return score != score, 0.0 if score != score else -score, entry.model, (*REGIMES, entry.regime).index(entry.regime)
 
 
-def _distinct(values: pd.Series, separator: str) -> list[str]:
-    return sorted({part for value in values.unique() for part in str(value).split(separator) if part})
+def _distinct(values: Iterable[Any], separator: str) -> list[str]:
+    return sorted({part for value in values for part in str(value).split(separator) if part})
 
 
 def _any_missing(board: pd.DataFrame) -> bool:

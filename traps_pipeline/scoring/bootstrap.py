@@ -1,7 +1,10 @@
-"""Percentile intervals of PECS by a cluster bootstrap over scenarios (benchmark.md section 5; spec notes, 'Statistics').
+"""Percentile intervals of PECS by a cluster bootstrap over scenarios (benchmark.md section 5).
 
 A scenario is one draw of the world: its pairs in both datasets of its taxonomy, in every run, model and regime, stay
 together. One weight matrix a taxonomy serves all cells, so two cells' resamples are paired.
+
+Because PECS clips J at 0, its interval for a strategy without discrimination (J = 0 but for chance) lies slightly above
+0 and need not contain it; whether J differs from 0 is a question for J (`leaderboard.pooled_j`).
 """
 
 from __future__ import annotations
@@ -24,17 +27,20 @@ def pecs_intervals(
 ) -> pd.DataFrame:
     """Intervals of the mean PECS over runs: one row a (model, regime) and dataset present, and one for `overall`.
 
-    PECS is computed per run, then averaged. `overall` is the equal-weight mean over the four datasets, over the runs that
-    have all four; null where there is no such run. A resample in which some denominator is 0 is dropped from that
+    PECS is computed per run, then averaged. `overall` is the equal-weight mean over the four datasets, over the runs
+    that have all four; null where there is no such run. A resample in which some denominator is 0 is dropped from that
     interval's percentiles. Memory: one float32 weight matrix (resamples, scenarios) a taxonomy, and one
     (resamples, 6 x cells) product of a single model and regime.
     """
-    items = pd.concat([verdicts[["model", "regime", "dataset", "run", "scenario_id"]], decision_counts(verdicts)], axis=1)
+    items = pd.concat(
+        [verdicts[["model", "regime", "dataset", "run", "scenario_id"]], decision_counts(verdicts)], axis=1
+    )
     items["taxonomy"] = items["dataset"].map(taxonomy_of)
     scenarios = {t: pd.Index(sorted(items.loc[items["taxonomy"] == t, "scenario_id"].unique())) for t in TAXONOMIES}
     weights = {t: scenario_weights(len(ids), resamples, [seed, k]) for k, (t, ids) in enumerate(scenarios.items())}
     rows = []
-    for (model, regime), group in items.groupby(["model", "regime"], sort=True):
+    for key, group in items.groupby(["model", "regime"], sort=True):
+        model, regime = cast(tuple[str, str], key)
         draws = _run_draws(group, scenarios, weights)
         for dataset, mean in _means_over_runs(draws).items():
             rows.append((model, regime, dataset, *_percentiles(mean, level)))
@@ -56,7 +62,9 @@ def resampled_pecs(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
     below 2^24, so float32 products are exact.
     """
     scenarios, cells, _ = counts.shape
-    sums = (weights @ counts.astype(np.float32).reshape(scenarios, -1)).reshape(-1, cells, len(COUNTS)).astype(np.float64)
+    sums = (
+        (weights @ counts.astype(np.float32).reshape(scenarios, -1)).reshape(-1, cells, len(COUNTS)).astype(np.float64)
+    )
     with np.errstate(invalid="ignore"):
         shares = sums[..., 0::2] / sums[..., 1::2]
     acc, false_abs, abs_rec = np.moveaxis(shares, -1, 0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pandas as pd
 
@@ -16,11 +18,12 @@ _RUN = ["model", "regime", "run"]
 def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame) -> pd.DataFrame:
     """LEADERBOARD rows from METRICS rows (scope `all`; others are ignored) and `pecs_intervals`.
 
-    Mean and population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four datasets
-    within each run first; a run that lacks a dataset does not enter it, and a model and regime without any whole run has
-    no overall row. A figure that is null in one run is null here: averages never rest on fewer runs than `n_runs` says.
+    Mean and population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four
+    datasets within each run first; a run that lacks a dataset does not enter it, and a model and regime without any
+    whole run has no overall row. A figure that is null in one run is null here: no average rests on fewer runs than
+    `n_runs` says.
     """
-    cells = metrics[metrics["scope"] == "all"]
+    cells = metrics.loc[metrics["scope"] == "all"]
     runs = pd.concat([cells, _overall_runs(cells)], ignore_index=True)
     groups = runs.groupby(ENTRY, sort=True)
     means, deviations = (groups[FIGURES].agg(f) for f in (_mean, _deviation))
@@ -31,7 +34,7 @@ def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame) -> pd.DataFrame:
     board["epoch"] = groups["epoch"].agg(joined_epochs)
     board["benchmark_version"] = groups["benchmark_version"].agg(_joined_versions)
     board = board.reset_index().merge(intervals, on=ENTRY, how="left", validate="one_to_one")
-    return board[[c.name for c in LEADERBOARD.columns]]
+    return board.loc[:, [c.name for c in LEADERBOARD.columns]]
 
 
 def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
@@ -41,7 +44,7 @@ def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
     The error combines sqrt(p (1 - p) / n) of the two sides; it holds for answers drawn independently, as the random
     reference strategies draw them, and shows that these are indistinguishable from J = 0 (benchmark.md section 5).
     """
-    counts = decision_counts(verdicts).groupby(verdicts["model"]).sum()
+    counts = cast(pd.DataFrame, decision_counts(verdicts).groupby(verdicts["model"]).sum())
     on_void, on_control = counts["abs_rec_of"].replace(0, np.nan), counts["false_abs_of"].replace(0, np.nan)
     abs_rec, false_abs = counts["abs_rec"] / on_void, counts["false_abs"] / on_control
     variance = abs_rec * (1 - abs_rec) / on_void + false_abs * (1 - false_abs) / on_control
@@ -57,7 +60,8 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     """One row a (model, regime, run) that has all four datasets, in the columns of METRICS."""
     groups = cells.groupby(_RUN, sort=True)
     whole = cells[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
-    overall = whole[FIGURES].agg(_mean).join(whole[["n_pairs", "n_missing"]].sum())
+    counts = cast(pd.DataFrame, whole[["n_pairs", "n_missing"]].sum())
+    overall = whole[FIGURES].agg(_mean).join(counts)
     overall["epoch"] = whole["epoch"].agg(joined_epochs)
     overall["benchmark_version"] = whole["benchmark_version"].agg(_joined_versions)
     return overall.reset_index().assign(dataset="overall")

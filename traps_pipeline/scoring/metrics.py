@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TypeVar
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -15,8 +15,6 @@ FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
 # How often something was decided so (numerator) and decided at all (denominator); every figure is made of these six.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
 SCOPED_BY = {"category": "category", "sub_scenario": "sub_scenario", "label": "control_answer"}
-
-Values = TypeVar("Values", pd.Series, np.ndarray)
 
 
 def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
@@ -38,7 +36,7 @@ def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame({name: flags.astype("int64") for name, flags in counts.items()})
 
 
-def pecs_of(acc: Values, j: Values) -> Values:
+def pecs_of(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
     """PECS = Acc x max(0, J), elementwise; NaN where either is."""
     return acc * np.maximum(j, 0.0)
 
@@ -47,20 +45,20 @@ def cell_metrics(verdicts: pd.DataFrame, benchmark_version: str) -> pd.DataFrame
     """METRICS rows of one dataset, from its VERDICTS rows (any models, regimes and runs).
 
     One row a cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x` (the control's answer, both sides of
-    the pair). Figures are fractions; one whose denominator is 0 is null, and so is what depends on it. `n_missing` counts
-    the items of the 2 n_pairs with a needed decision missing: abstained and correct on a control, abstained on a void.
+    the pair). Figures are fractions; one whose denominator is 0 is null, and so is what depends on it. `n_missing`
+    counts items, of 2 n_pairs, without a needed decision: abstained and correct on a control, abstained on a void.
     Raises ValueError when the verdicts are of several datasets, whose versions may differ (benchmark.md section 5).
     """
     datasets = sorted(verdicts["dataset"].unique())
     if len(datasets) > 1:
         raise ValueError(f"verdicts of several datasets {datasets}: score one dataset at a time")
     groups = _scoped(verdicts).groupby([*CELL, "scope"], sort=True)
-    sums = groups[[*COUNTS, "complete", "n_refused", "n_empty"]].sum()
+    sums = cast(pd.DataFrame, groups[[*COUNTS, "complete", "n_refused", "n_empty"]].sum())
     sums["n_pairs"] = groups["pair_id"].nunique()
     sums["n_missing"] = 2 * sums["n_pairs"] - sums["complete"]
     sums["epoch"] = groups["epoch"].agg(joined_epochs)
     sums["benchmark_version"] = benchmark_version
-    return sums.assign(**_figures(sums)).reset_index()[[c.name for c in METRICS.columns]]
+    return sums.assign(**_figures(sums)).reset_index().loc[:, [c.name for c in METRICS.columns]]
 
 
 def joined_epochs(epochs: Iterable[str]) -> str:
@@ -84,12 +82,21 @@ def _scoped(verdicts: pd.DataFrame) -> pd.DataFrame:
     return pd.concat([items.assign(scope=scope) for scope in scopes], ignore_index=True)
 
 
-def _figures(sums: pd.DataFrame) -> dict[str, pd.Series]:
+def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
+    """FIGURES of every cell, (cells,) each."""
     acc, false_abs, abs_rec = (_share(sums, name) for name in ("correct", "false_abs", "abs_rec"))
     j = abs_rec - false_abs
-    return {"acc": acc, "abs_rec": abs_rec, "false_abs": false_abs, "j": j, "pecs": pecs_of(acc, j), "naive": acc * abs_rec}
+    return {
+        "acc": acc,
+        "abs_rec": abs_rec,
+        "false_abs": false_abs,
+        "j": j,
+        "pecs": pecs_of(acc, j),
+        "naive": acc * abs_rec,
+    }
 
 
-def _share(sums: pd.DataFrame, name: str) -> pd.Series:
-    of = sums[f"{name}_of"]
-    return sums[name] / of.where(of > 0)
+def _share(sums: pd.DataFrame, name: str) -> np.ndarray:
+    """Numerator over denominator, (cells,); NaN where the denominator is 0."""
+    of = sums[f"{name}_of"].to_numpy(float)
+    return sums[name].to_numpy(float) / np.where(of > 0, of, np.nan)

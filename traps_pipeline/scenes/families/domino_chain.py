@@ -34,6 +34,12 @@ if TYPE_CHECKING:
 
     from traps_pipeline.scenes.simulate import Motion
 
+# In domino heights:
+PLANK = 0.07  # thickness of the plank that everything stands on
+BALL = 0.40  # radius of both balls
+BALL_AT = 0.55 + BALL  # centre of the kicked ball, from the front face of the last visible domino
+POSTS_AT = 1.75  # near face of the posts, from there as well: the stopped ball is past that domino's reach
+
 STILL_M = 0.002  # a domino that moves less than this any more is at rest
 DOMINO_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple", "white")
 
@@ -64,12 +70,6 @@ class Params:
     def hand_off(self) -> float:
         """Distance along the row from the last visible domino to the first concealed one."""
         return POSTS_AT + 0.09 + self.thickness
-
-
-PLANK = 0.07  # thickness of the plank that everything stands on, domino heights
-BALL = 0.40  # radius of both balls, domino heights
-BALL_AT = 0.55 + BALL  # centre of the kicked ball, from the front face of the last visible domino
-POSTS_AT = 1.75  # near face of the posts, from there as well: past the reach of that domino
 
 
 def draw(rng: np.random.Generator) -> Params:
@@ -121,7 +121,7 @@ def build(p: Params, physics: Physics) -> Scene:
         spec, "kicked", (p.direction * h * (face + BALL_AT), 0, ball_z), BALL * h, p.ball_colour, density=300
     )
     for ball in (starter, kicked):
-        ball.friction = [0.1, 0.005, 0.0004]  # the floor grips it, a domino slides over it and squeezes it out
+        ball.friction = [0.1, 0.005, 0.0004]  # the plank grips it, a domino slides over it and squeezes it out
     for i in range(p.visible):
         colour = p.first_colour if i == 0 else p.row_colour
         _add_domino(spec, p, f"domino_{i}", i * p.spacing, colour)
@@ -184,7 +184,7 @@ def _top_m(motion: Motion, p: Params) -> np.ndarray:
 
 
 def readings(motion: Motion, p: Params) -> list[str | None]:
-    """'yes' from when the top of the last domino is below half a domino's height; 'no' from when it has not fallen and no
+    """'yes' from when the top of the last domino is below half a domino's height; 'no' while it is not, from when no
     concealed domino moves any more."""
     fallen = _top_m(motion, p) < p.height_m / 2
     moves = [np.linalg.norm(motion.pos(b) - motion.pos(b)[-1], axis=1) > STILL_M for b in _concealed(p)]

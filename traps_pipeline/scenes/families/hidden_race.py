@@ -7,7 +7,6 @@ run-up says nothing about which lane is clear, so the ball that enters first is 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -30,19 +29,22 @@ from traps_pipeline.scenes.kit import (
 )
 
 if TYPE_CHECKING:
+    import mujoco
+
     from traps_pipeline.scenes.simulate import Motion
 
+Span = tuple[float, float]
 DECK_M = 0.045  # height of the lanes; the tray lies lower, so that no ball rolls back into the tunnel
 TRAY_M = 0.015
 ROUGH_BOARD_M = 0.10
-ARRIVING = 0.97  # share of its speed that a ball still has where the rough boards begin (contacts are soft)
+ARRIVING = 0.97  # share of its speed that a ball still has where the rough boards begin
 MIN_LEAD_S = 0.5  # a closer finish could fall between two sampled frames
 BALL_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
 
 @dataclass(frozen=True)
 class Params:
-    """direction: +1 rolls to the right. speeds_m_s, colours: one per lane, front lane first."""
+    """direction: +1 rolls to the right. colours, speeds, starts: one per lane, front lane first."""
 
     direction: int
     colours: tuple[str, ...]
@@ -92,7 +94,7 @@ def draw(rng: np.random.Generator) -> Params:
         deck_colour=str(deck),
         tunnel_colour=str(tunnel),
         tray_colour=str(tray),
-        azimuth_deg=90 - direction * uniform(rng, -26, 22),
+        azimuth_deg=90 - direction * uniform(rng, -16, 22),
         elevation_deg=uniform(rng, -38, -26),
     )
 
@@ -106,7 +108,7 @@ def build(p: Params, physics: Physics) -> Scene:
     rough_at = p.run_m + p.mouth_m + 2 * r + 0.04  # no ball feels it before it is wholly behind the panel
     end = p.exit_m + p.tray_m
 
-    def block(name: str, along: tuple[float, float], across: tuple[float, float], z: tuple[float, float], colour: str):
+    def block(name: str, along: Span, across: Span, z: Span, colour: str) -> mujoco.MjsGeom:
         mid = (p.direction * sum(along) / 2, sum(across) / 2, sum(z) / 2)
         half = ((along[1] - along[0]) / 2, (across[1] - across[0]) / 2, (z[1] - z[0]) / 2)
         return add_box(spec.worldbody, name, mid, half, colour)
@@ -142,10 +144,15 @@ def build(p: Params, physics: Physics) -> Scene:
         view=View(azimuth_deg=p.azimuth_deg, elevation_deg=p.elevation_deg),
         decisive=tuple(f"ball_{i}" for i in range(lanes)),
         hidden=tuple(f"board_{i}" for i in range(lanes)),
-        cover=Box((ends[0], -side - wall - 0.02, 0.0), (ends[1] + (shadow if p.direction > 0 else 0), high_y, roof + wall)),
+        cover=Box(
+            (ends[0], -side - wall - 0.02, 0.0), (ends[1] + (shadow if p.direction > 0 else 0), high_y, roof + wall)
+        ),
         stage=(Box((ends[0], -side - wall, 0.0), (ends[1], side + wall, roof + wall)),),
         velocity={f"ball_{i}": _rolling(p, v) for i, v in enumerate(p.speeds_m_s)},
-        inventory={"colours": (*p.colours, p.deck_colour, p.tunnel_colour), "objects": ("ball", "tunnel", "tray", "lane")},
+        inventory={
+            "colours": (*p.colours, p.deck_colour, p.tunnel_colour),
+            "objects": ("ball", "tunnel", "tray", "lane"),
+        },
     )
 
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from traps_pipeline.scenes.simulate import Motion
 
+Span = tuple[float, float]
 LIFT_M = 0.12  # height of the board's lower edge above the floor
 APRON_M = 0.175  # strip below the buckets that carries their numbers
 BUCKET_M = 0.16  # length of the walls between the buckets
@@ -102,7 +103,7 @@ class Params:
 
 def draw(rng: np.random.Generator) -> Params:
     """Staggered or skewed rows of round or square pegs; a second ball in two scenes of five."""
-    rows, peg_gap = int(rng.integers(5, 8)), uniform(rng, 0.116, 0.132)
+    rows, peg_gap = int(rng.integers(5, 8)), uniform(rng, 0.126, 0.140)
     skew = uniform(rng, -0.15, 0.15) if rng.random() < 0.5 else 0.0
     shifts = tuple(round(peg_gap * (i % 2 / 2 + i * skew + float(rng.normal(0, 0.04))), 4) for i in range(rows))
     board = str(rng.choice(list(SCHEMES)))
@@ -118,7 +119,7 @@ def draw(rng: np.random.Generator) -> Params:
         square_pegs=bool(rng.random() < 0.35),
         peg_radius_m=uniform(rng, 0.012, 0.016),
         tilt_deg=tilt,
-        ball_radius_m=uniform(rng, 0.031, 0.034),
+        ball_radius_m=uniform(rng, 0.0345, 0.037),
         ball_colours=tuple(str(c) for c in rng.permutation(SCHEMES[board])[:balls]),
         starts_m=tuple(round(float(sides[i] * rng.uniform(0.12, 0.40)), 4) for i in range(balls)),
         pushes_m_s=tuple(round(float(-sides[i] * rng.uniform(0.1, 0.6)), 4) for i in range(balls)),
@@ -137,11 +138,14 @@ def build(p: Params, physics: Physics) -> Scene:
     light = spec.light("key")  # almost from the front: long shadows of pegs would clutter the board
     light.dir = (-normal + [0.12, 0, 0]).tolist()
     light.castshadow = False
+    light.diffuse = [0.45, 0.45, 0.44]  # head-on, the usual key light would bleach the colours
     half_tilt = math.radians(p.tilt_deg) / 2
-    board = spec.worldbody.add_body(name="board", pos=[0, 0, LIFT_M], quat=[math.cos(half_tilt), math.sin(half_tilt), 0, 0])
+    board = spec.worldbody.add_body(
+        name="board", pos=[0, 0, LIFT_M], quat=[math.cos(half_tilt), math.sin(half_tilt), 0, 0]
+    )
     deep, side, top = 2 * p.ball_radius_m + GLASS_GAP_M, p.width_m / 2, p.height_m
 
-    def block(name: str, x: tuple[float, float], up: tuple[float, float], z: tuple[float, float], colour: str):
+    def block(name: str, x: Span, up: Span, z: Span, colour: str) -> mujoco.MjsGeom:
         centre = [sum(x) / 2, sum(up) / 2, sum(z) / 2]
         return add_box(board, name, centre, [(x[1] - x[0]) / 2, (up[1] - up[0]) / 2, (z[1] - z[0]) / 2], colour)
 
@@ -288,7 +292,18 @@ ABSENT_THING = (
     "Is the {thing} to the left or to the right of bucket 3?",
 )
 NO_SUCH_QUANTITY = ("What is the weight of the colour {colour}?", "How loud is the colour {colour}, in decibels?")
-THINGS = ("triangle", "spring", "trapdoor", "windmill", "pendulum", "domino", "dice cup", "hammer", "rubber duck", "ladder")
+THINGS = (
+    "triangle",
+    "spring",
+    "trapdoor",
+    "windmill",
+    "pendulum",
+    "domino",
+    "dice cup",
+    "hammer",
+    "rubber duck",
+    "ladder",
+)
 
 
 def _inventory(p: Params) -> dict[str, tuple[str, ...]]:
@@ -302,7 +317,14 @@ def word(p: Params, rng: np.random.Generator) -> Wording:
     labels = tuple(str(i + 1) for i in range(p.buckets))
     aliases = {}
     for label, number, ordinal in zip(labels, WORDS, ORDINALS, strict=False):
-        forms = (number, f"bucket {label}", f"bucket {number}", f"number {label}", f"{ordinal} bucket", f"bucket number {label}")
+        forms = (
+            number,
+            f"bucket {label}",
+            f"bucket {number}",
+            f"number {label}",
+            f"{ordinal} bucket",
+            f"bucket number {label}",
+        )
         aliases |= dict.fromkeys(forms, label)
     absent = [c for c in COLOURS if c not in _inventory(p)["colours"] and c not in ("navy", "wood", "grey", "white")]
     template = str(rng.choice(ABSENT_COLOUR + ABSENT_THING + NO_SUCH_QUANTITY))

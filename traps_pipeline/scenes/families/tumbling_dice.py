@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from traps_pipeline.scenes.kit import (
-    COLOURS,
     AnswerableQuestion,
     Box,
     Family,
@@ -32,11 +31,14 @@ if TYPE_CHECKING:
 
     from traps_pipeline.scenes.simulate import Motion
 
+Span = tuple[float, float]
 FACES = ("red", "green", "blue", "cyan", "orange", "yellow")
+EDGES = ("white", "black", "purple", "grey")
 NORMALS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))  # in the order of `faces`
 WALL_M = 0.02
 TRAY_M = 0.05  # height of the tray's floor
 FLAT_RAD = math.radians(8)  # a die that leans more lies on no face
+LEAD_S = 0.2  # a closer finish could fall between two sampled frames
 STILL = 0.1  # share of its size by which a lying die may move from one frame to the next
 
 
@@ -57,7 +59,7 @@ class Params:
     speeds_m_s: tuple[tuple[float, ...], ...]
     spins_rad_s: tuple[tuple[float, ...], ...]
     bounce: float  # damping of the contact: the lower, the livelier
-    edge_colour: str
+    edge_colours: tuple[str, ...]  # one per die, so that each can be followed
     step_colours: tuple[str, str]  # in turn, down the steps
     azimuth_deg: float
     elevation_deg: float
@@ -67,18 +69,24 @@ class Params:
         """Where the steps end and the tray begins."""
         return self.steps * self.step_m
 
+    @property
+    def tray_colour(self) -> str:
+        """A colour that no step has."""
+        return next(c for c in ("black", "white", "grey") if c not in self.step_colours)
+
     def floor_m(self, step: int) -> float:
         """Height of a step, the tray being one after the last."""
         return TRAY_M + (self.steps - step) * self.drop_m
 
 
 def draw(rng: np.random.Generator) -> Params:
-    """Two to four dice, thrown one behind the other."""
+    """Two to four dice, thrown up in a zigzag so that they do not touch before they land."""
     dice, direction = int(rng.choice([2, 3, 3, 4])), int(rng.choice([-1, 1]))
     half, steps = uniform(rng, 0.060, 0.068), int(rng.integers(4, 8))
     step = round(uniform(rng, 1.35, 1.65) / steps, 4)
-    width = round(max(0.50, (dice + 0.5) * 2.3 * half), 4)
-    lanes = [(i - (dice - 1) / 2) * width / dice for i in rng.permutation(dice)]
+    width = round(max(0.46, (2.5 * dice + 1.4) * half), 4)  # room for a turning die beside each wall
+    lanes = [(i - (dice - 1) / 2) * 2.5 * half for i in range(dice)]
+    ahead = int(rng.integers(2))
     turns = rng.normal(size=(dice, 4))
     light, dark = ("white", "wood"), ("grey", "black")
     return Params(
@@ -90,12 +98,17 @@ def draw(rng: np.random.Generator) -> Params:
         tray_m=uniform(rng, 0.60, 0.75),
         half_m=half,
         faces=tuple(tuple(str(c) for c in rng.permutation(FACES)) for _ in range(dice)),
-        starts_m=tuple((uniform(rng, 0.10, 0.22), round(float(y), 4), uniform(rng, 0.22, 0.34)) for y in lanes),
+        starts_m=tuple(
+            (uniform(rng, 0.13, 0.17) + 0.24 * ((i + ahead) % 2), round(y, 4), uniform(rng, 0.22, 0.34))
+            for i, y in enumerate(lanes)
+        ),
         turns=tuple(tuple(round(float(v), 5) for v in q / np.linalg.norm(q)) for q in turns),
-        speeds_m_s=tuple((uniform(rng, 0.5, 0.9), uniform(rng, -0.1, 0.1), uniform(rng, 1.1, 1.5)) for _ in range(dice)),
+        speeds_m_s=tuple(
+            (uniform(rng, 0.55, 0.85), uniform(rng, -0.06, 0.06), uniform(rng, 1.2, 1.6)) for _ in range(dice)
+        ),
         spins_rad_s=tuple(tuple(uniform(rng, -7, 7) for _ in range(3)) for _ in range(dice)),
-        bounce=uniform(rng, 12, 22),
-        edge_colour=str(rng.choice(["white", "black"])),
+        bounce=uniform(rng, 14, 26),
+        edge_colours=tuple(str(c) for c in rng.permutation(EDGES)[:dice]),
         step_colours=(str(rng.choice(light)), str(rng.choice(dark))) if rng.random() < 0.5 else ("grey", "wood"),
         azimuth_deg=90 + uniform(rng, -22, 22),
         elevation_deg=uniform(rng, -58, -46),
@@ -107,7 +120,7 @@ def build(p: Params, physics: Physics) -> Scene:
     spec = new_spec(physics)
     side, end, high = p.width_m / 2, p.run_m + p.tray_m, p.floor_m(0)
 
-    def block(name: str, along: tuple[float, float], across: tuple[float, float], z: tuple[float, float], colour: str):
+    def block(name: str, along: Span, across: Span, z: Span, colour: str) -> mujoco.MjsGeom:
         mid = (p.direction * sum(along) / 2, sum(across) / 2, sum(z) / 2)
         half = ((along[1] - along[0]) / 2, (across[1] - across[0]) / 2, (z[1] - z[0]) / 2)
         return add_box(spec.worldbody, name, mid, half, colour)
@@ -115,7 +128,7 @@ def build(p: Params, physics: Physics) -> Scene:
     for i in range(p.steps):
         along = (i * p.step_m, (i + 1) * p.step_m)
         block(f"step_{i}", along, (-side, side), (0, p.floor_m(i)), p.step_colours[i % 2])
-    block("tray", (p.run_m, end), (-side, side), (0, TRAY_M), "black" if "black" not in p.step_colours else "white")
+    block("tray", (p.run_m, end), (-side, side), (0, TRAY_M), p.tray_colour)
     low_rim, rim = TRAY_M + 1.6 * p.half_m, TRAY_M + 4 * p.half_m
     block("tray_end", (end, end + WALL_M), (-side, side), (0, rim), "wood")
     block("tray_front", (p.run_m, end + WALL_M), (-side - WALL_M, -side), (0, low_rim), "wood")
@@ -151,7 +164,7 @@ def _add_die(spec: mujoco.MjSpec, p: Params, i: int) -> None:
     )
     body.add_freejoint()
     h = p.half_m
-    cube = add_box(body, f"die_{i}", (0, 0, 0), (h, h, h), p.edge_colour, density=600.0, condim=4)
+    cube = add_box(body, f"die_{i}", (0, 0, 0), (h, h, h), p.edge_colours[i], density=600.0, condim=4)
     cube.friction, cube.solref, cube.priority = [0.5, 0.003, 0.0001], [-6000.0, -p.bounce], 1
     for colour, normal in zip(p.faces[i], NORMALS, strict=True):
         half = [0.0015 if n else 0.84 * h for n in normal]
@@ -163,18 +176,21 @@ def _throw(p: Params, i: int) -> tuple[float, ...]:
     return (p.direction * along, across, up, *p.spins_rad_s[i])
 
 
+def _short_of_tray(motion: Motion, p: Params) -> np.ndarray:
+    """How far (m) each die is from being past the last step and low enough to touch the tray, (F, dice)."""
+    places = np.stack([motion.pos(f"die_{i}") for i in range(len(p.faces))], axis=1)
+    return np.maximum(p.run_m - p.direction * places[..., 0], places[..., 2] - TRAY_M - 2.1 * p.half_m)
+
+
 def _first_die(motion: Motion, p: Params) -> tuple[int, int] | None:
-    """The first die whose centre is past the last step, and the frame; None if there is none or two arrive as one."""
-    past = _past(motion, p) > 0
-    if not past.any():
+    """The first die in the tray and the frame it is there; None if there is none or the next one comes too soon."""
+    inside = _short_of_tray(motion, p) <= 0
+    arrivals = np.where(inside.any(axis=0), motion.times[inside.argmax(axis=0)], math.inf)
+    first, second = np.sort(arrivals)[:2]
+    if math.isinf(first) or second - first < LEAD_S - 1e-9:
         return None
-    frame = int(past.any(axis=1).argmax())
-    return (int(past[frame].argmax()), frame) if past[frame].sum() == 1 else None
-
-
-def _past(motion: Motion, p: Params) -> np.ndarray:
-    """How far every die's centre is past the last step (m), shape (F, dice)."""
-    return np.stack([p.direction * motion.pos(f"die_{i}")[:, 0] - p.run_m for i in range(len(p.faces))], axis=1)
+    die = int(arrivals.argmin())
+    return die, int(inside[:, die].argmax())
 
 
 def _lean(motion: Motion, die: int) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +219,7 @@ def margin(motion: Motion, p: Params) -> float:
     if found is None:
         return 0.0
     die, arrival = found
-    lead = -np.max(np.delete(_past(motion, p)[arrival], die))
+    lead = np.min(np.delete(_short_of_tray(motion, p)[arrival], die))
     lean = _lean(motion, die)[1][-1]
     return float(min(lead, 2 * p.half_m * math.sin(max(0.0, math.pi / 4 - lean))))
 
@@ -228,11 +244,12 @@ NO_SUCH_QUANTITY = (
     "Which number is printed on the {face} face of the first die?",
     "How many pips does the {face} face show?",
 )
+ABSENT_COLOURS = ("pink", "magenta", "golden", "silver", "purple", "white", "black")  # less those of the scene
 THINGS = ("triangle", "spring", "pyramid", "windmill", "pendulum", "domino", "cup", "hammer", "ladder", "magnet")
 
 
 def _inventory(p: Params) -> dict[str, tuple[str, ...]]:
-    colours = sorted({*FACES, p.edge_colour, *p.step_colours, "wood", "black" if "black" not in p.step_colours else "white"})
+    colours = sorted({*FACES, *p.edge_colours, *p.step_colours, p.tray_colour, "wood"})
     return {"colours": tuple(colours), "objects": ("die", "step", "tray", "wall", "face")}
 
 
@@ -241,15 +258,13 @@ def word(p: Params, rng: np.random.Generator) -> Wording:
     choices = tuple(str(c) for c in rng.permutation(FACES))
     aliases = {form.format(c): c for c in FACES for form in ("{} face", "{} side", "{} on top", "{} face up")}
     aliases |= {"teal": "cyan", "turquoise": "cyan", "aqua": "cyan", "light blue": "cyan", "dark blue": "blue"}
-    absent = [c for c in COLOURS if c not in _inventory(p)["colours"] and c != "navy"]
+    absent = [c for c in ABSENT_COLOURS if c not in _inventory(p)["colours"]]
     template = str(rng.choice(ABSENT + NO_SUCH_QUANTITY))
     return Wording(
         question=str(rng.choice(QUESTIONS)).format(choices=listed(choices)),
         labels=choices,
         aliases=aliases,
-        ill_posed_question=template.format(
-            colour=rng.choice(absent), thing=rng.choice(THINGS), face=rng.choice(FACES)
-        ),
+        ill_posed_question=template.format(colour=rng.choice(absent), thing=rng.choice(THINGS), face=rng.choice(FACES)),
         answerable_question=_answerable(p, rng),
     )
 
@@ -261,8 +276,12 @@ def _answerable(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     if kind == 1:
         side = "left" if p.direction < 0 else "right"
         return AnswerableQuestion("Do the steps go down to the left or to the right?", ("left", "right"), side)
-    question = "What colour are the edges of the dice, white or black?"
-    return AnswerableQuestion(question, ("white", "black"), p.edge_colour)
+    edge = str(rng.choice(EDGES))
+    return AnswerableQuestion(
+        f"Does one of the dice have {edge} edges, yes or no?",
+        ("yes", "no"),
+        "yes" if edge in p.edge_colours else "no",
+    )
 
 
 FAMILY = Family(
@@ -277,7 +296,7 @@ FAMILY = Family(
     readings=readings,
     margin=margin,
     word=word,
-    physics=Physics(timestep_s=0.001, gravity_m_s2=4.0),
+    physics=Physics(timestep_s=0.001, gravity_m_s2=4.4),
     min_margin_m=0.03,
-    perturbation=1e-5,
+    perturbation=1e-6,
 )

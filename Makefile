@@ -1,0 +1,55 @@
+# Every target sets up what it needs. On a bare Debian machine: Python 3.11, make and apt are enough.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := $(CURDIR)/.workspaces/demo
+RENDER_PACKAGES := libosmesa6 python3-venv
+TEST_PACKAGES := $(RENDER_PACKAGES) chromium
+UI_WORKSPACE := $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO))
+
+.PHONY: demo test ui bench lint setup render-packages test-packages clean
+
+demo: setup ## leaderboard of eight reference models on 32 scenarios, no key needed
+	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
+
+test: test-packages setup lint ## lint, types and all tests, the slow ones too
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+ui: setup ## Dagster's web server and daemon on 127.0.0.1:3000
+	TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
+	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/dagster dev -h 127.0.0.1 -p 3000 -m traps_pipeline.definitions
+
+bench: setup ## ratios against what one would otherwise use
+	$(BIN)/python bench/calls.py
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --warnings
+
+setup: render-packages $(VENV)/.installed
+
+$(VENV)/.installed: requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or later is needed: make PYTHON=/path/to/python3.11")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	touch $@
+
+# apt only when something is missing; without root the one line to run is printed.
+render-packages:
+	@{ ldconfig -p | grep -q libOSMesa && $(PYTHON) -c 'import ensurepip'; } 2>/dev/null || $(call install,$(RENDER_PACKAGES))
+test-packages:
+	@{ ldconfig -p | grep -q libOSMesa && $(PYTHON) -c 'import ensurepip' && command -v chromium >/dev/null; } 2>/dev/null || $(call install,$(TEST_PACKAGES))
+
+define install
+if [ "$$(id -u)" = 0 ]; then \
+	apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(1) >/dev/null; \
+else \
+	echo "system packages are missing; run this once, then the same make command again:"; \
+	echo "  sudo apt-get install -y --no-install-recommends $(1)"; exit 1; \
+fi
+endef
+
+clean: ## remove the environment; studies under .workspaces stay
+	rm -rf $(VENV) .pytest_cache .ruff_cache

@@ -1,0 +1,145 @@
+"""Shared by all tests: one real demo study, and checkouts that a test may alter."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished `traps` command."""
+
+    code: int
+    out: str
+    err: str
+
+    def counts(self) -> dict[str, int]:
+        """Answers asked, votes asked, frames rendered, as the last lines say."""
+        found = re.search(r"(\d+) answers asked .*?(\d+) votes asked .*?(\d+) frames rendered", self.out, re.DOTALL)
+        assert found, f"no summary line in:\n{self.out}\n{self.err}"
+        return dict(zip(("answers", "votes", "frames"), map(int, found.groups()), strict=True))
+
+
+@dataclass(frozen=True)
+class Checkout:
+    """A copy of the checkout's code and data, with one workspace, driven by real commands."""
+
+    root: Path
+    workspace: Path
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What a shell in this checkout exports."""
+        own = {"TRAPS_WORKSPACE": self.workspace, "DAGSTER_HOME": self.workspace / "dagster", "PYTHONPATH": self.root}
+        return os.environ | {name: str(value) for name, value in own.items()}
+
+    def start(self, *command: str | Path) -> subprocess.Popen[str]:
+        """A command in the checkout, in a process group of its own."""
+        return subprocess.Popen(
+            list(map(str, command)),
+            cwd=self.root,
+            env=self.environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
+
+    def run(self, *command: str | Path) -> Finished:
+        """Run a command to its end."""
+        process = self.start(*command)
+        out, err = process.communicate(timeout=600)
+        return Finished(process.returncode, out, err)
+
+    def traps(self, *arguments: str | Path) -> Finished:
+        """Run a `traps` command."""
+        return self.run(sys.executable, "-m", "traps_pipeline.cli", *arguments)
+
+    def dagster(self, *arguments: str | Path) -> Finished:
+        """Run a `dagster` command."""
+        return self.run(sys.executable, "-m", "dagster", *arguments)
+
+    def correct(self, scenario_id: str, action: str = "correct", **changes: Any) -> None:
+        """Append a review decision."""
+        decision = {"scenario_id": scenario_id, "action": action, **changes, "who": "test", "when": "2026-11-21", "why": "test"}
+        folder = self.root / "scene_specs" / "corrections"
+        folder.mkdir(exist_ok=True)
+        with (folder / "review.jsonl").open("a") as stream:
+            stream.write(json.dumps(decision) + "\n")
+
+    def ledger_rows(self, kind: str) -> list[dict[str, Any]]:
+        """Every complete row of a ledger, repeated keys too."""
+        rows = []
+        for segment in sorted((self.workspace / "ledger" / kind).rglob("*.jsonl")):
+            rows += [json.loads(line) for line in segment.read_bytes().split(b"\n")[:-1]]
+        return rows
+
+
+def make_checkout(root: Path) -> Path:
+    """Copy what the package needs to run."""
+    for name in ("traps_pipeline", "assets", "scene_specs"):
+        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "dagster.yaml", root / "dagster.yaml")
+    return root
+
+
+def copy_workspace(source: Path, target: Path, checkout: Path) -> None:
+    """Copy a study; its Dagster history then links to the copied checkout's dagster.yaml."""
+    shutil.copytree(source, target, symlinks=True)
+    link = target / "dagster" / "dagster.yaml"
+    link.unlink()
+    link.symlink_to(checkout / "dagster.yaml")
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Checkout:
+    """The demo, run once for all tests by the command of `make demo`. Read only: copy it before changing anything."""
+    shared = tmp_path_factory.getbasetemp()
+    shared = shared.parent if os.environ.get("PYTEST_XDIST_WORKER") else shared
+    study = Checkout(ROOT, shared / "demo")
+    with (shared / "demo.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (shared / "demo.out").exists():
+            finished = study.traps("run", "demo")
+            assert finished.code == 0, finished.out + finished.err
+            (shared / "demo.out").write_text(finished.out)
+    return study
+
+
+@pytest.fixture(scope="session")
+def demo_output(demo: Checkout) -> str:
+    """What the demo printed."""
+    return (demo.workspace.parent / "demo.out").read_text()
+
+
+@pytest.fixture
+def study(demo: Checkout, tmp_path: Path) -> Checkout:
+    """A copy of the finished demo in a checkout of its own, to be altered at will."""
+    root = make_checkout(tmp_path / "checkout")
+    copy_workspace(demo.workspace, tmp_path / "study", root)
+    return Checkout(root, tmp_path / "study")
+
+
+@pytest.fixture
+def unasked(study: Checkout) -> Iterator[Checkout]:
+    """The demo's clips and items, with nothing asked yet."""
+    for table in ("responses", "votes", "verdicts", "metrics", "leaderboard"):
+        shutil.rmtree(study.workspace / "tables" / table)
+    shutil.rmtree(study.workspace / "ledger")
+    shutil.rmtree(study.workspace / "reports")
+    (study.workspace / "reports").mkdir()
+    yield study

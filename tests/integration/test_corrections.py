@@ -1,0 +1,185 @@
+"""What a correction touches is asked and rendered again, and only that; Dagster shows the same partitions stale."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS, METRICS, RESPONSES, SCENE_SPECS, TABLES, VIDEOS
+
+from tests.conftest import Checkout
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("corrections")]
+EVALUATIONS = 8 * 3 * 1  # models x regimes x runs of the demo
+
+# Dagster's own verdict on every partition, by the resolver behind its UI.
+STALE = """
+import json, sys
+import dagster as dg
+from dagster._core.definitions.data_version import CachingStaleStatusResolver
+from dagster._core.loader import LoadingContextForTest
+from traps_pipeline.definitions import defs
+from traps_pipeline.lineage import STAGES, keys_of
+graph = defs.get_repository_def().asset_graph
+with dg.DagsterInstance.get() as instance:
+    resolver = CachingStaleStatusResolver(instance, graph, LoadingContextForTest(instance))
+    stages = [stage for stage in STAGES if keys_of(stage) != [None]]
+    found = {f"{s}/{k}": resolver.get_status(dg.AssetKey(s), k).value for s in stages for k in keys_of(s)}
+print(json.dumps(sorted(name for name, status in found.items() if status == "STALE")))
+"""
+
+
+def stale_in_dagster(study: Checkout) -> list[str]:
+    finished = study.run(sys.executable, "-W", "ignore", "-c", STALE)
+    assert finished.code == 0, finished.err
+    return json.loads(finished.out.splitlines()[-1])
+
+
+def cells(*datasets: str) -> list[str]:
+    models = "always-abstain confidence-noise inverse-oracle never-abstain oracle perfect-answerer prior random-50".split()
+    return [f"{d}|{m}__{r}__run1" for d in datasets for m in models for r in ("standard", "guided", "json")]
+
+
+def materialize(study: Checkout, stage: str, *keys: str) -> None:
+    for key in keys:
+        finished = study.dagster(
+            *("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", stage, "--partition", key)
+        )
+        assert finished.code == 0, finished.err[-3000:]
+
+
+def test_a_corrected_question_asks_its_three_items_again(study: Checkout) -> None:
+    before = len(study.ledger_rows("answers")), len(study.ledger_rows("votes"))
+    study.correct("domino_chain-0001", question="Does the domino at the far end fall down, yes or no?")
+    run = study.traps("run", "demo")
+    assert run.code == 0, run.err
+    # Asked: control and void of `occlusion`, control of `occlusion_ill_posed`. Votes: three judges on abstention for
+    # each, and on correctness for the two controls.
+    assert run.counts() == {"answers": 3 * EVALUATIONS, "votes": (3 + 2) * 3 * EVALUATIONS, "frames": 0}
+    after = len(study.ledger_rows("answers")), len(study.ledger_rows("votes"))
+    assert (after[0] - before[0], after[1] - before[1]) == (3 * EVALUATIONS, 15 * EVALUATIONS)
+    touched = {row["components"]["about"]["item_id"] for row in study.ledger_rows("answers")[-0:] if "far end" in row["components"]["user"]}
+    assert touched == {
+        "occlusion:domino_chain-0001:control",
+        "occlusion:domino_chain-0001:void",
+        "occlusion_ill_posed:domino_chain-0001:control",
+    }
+    why = study.traps("why", "occlusion:domino_chain-0001:void").out
+    assert why.count("still stands") == EVALUATIONS
+
+
+def test_a_corrected_ill_posed_question_asks_one_item_again(study: Checkout) -> None:
+    study.correct("plinko-0002", ill_posed_question="What does the triangle at the bottom weigh?")
+    why = study.traps("why", "chaotic_ill_posed:plinko-0002:void").out
+    assert why.count("still stands") == EVALUATIONS  # nothing is made from the correction yet
+    run = study.traps("run", "demo")
+    assert run.code == 0, run.err
+    assert run.counts() == {"answers": EVALUATIONS, "votes": 3 * EVALUATIONS, "frames": 0}
+
+
+def test_versions_change_where_the_correction_reaches_and_nowhere_else(study: Checkout) -> None:
+    study.correct("plinko-0002", ill_posed_question="What does the triangle at the bottom weigh?")
+    assert study.traps("run", "demo").code == 0
+    tables = Workspace.open(study.workspace).tables
+    versions = tables.read_all(ITEMS).groupby("dataset")["benchmark_version"].unique()
+    corrected = versions.pop("chaotic_ill_posed")
+    assert len(corrected) == 1 and corrected[0].startswith("0.1.0+")
+    assert {version for found in versions for version in found} == {"0.1.0"}
+    specs = tables.read_all(SCENE_SPECS)
+    assert set(specs.query("category != 'plinko'")["benchmark_version"]) == {"0.1.0"}
+    assert set(tables.read_all(VIDEOS)["benchmark_version"]) == {"0.1.0"}  # a corrected question renders nothing
+
+
+def test_dagster_shows_exactly_the_touched_partitions_stale_stage_by_stage(study: Checkout) -> None:
+    assert stale_in_dagster(study) == []
+    study.correct("hidden_race-0003", question="Which of the balls leaves the tunnel before the other ones?")
+    status = study.traps("status").out
+    assert "hidden: corrections/hidden changed" in status
+    assert stale_in_dagster(study) == ["scene_specs/hidden"]
+    materialize(study, "scene_specs", "hidden")
+    assert stale_in_dagster(study) == ["items/occlusion", "items/occlusion_ill_posed", "videos/hidden"]
+    materialize(study, "videos", "hidden")
+    materialize(study, "items", "occlusion", "occlusion_ill_posed")
+    touched = cells("occlusion", "occlusion_ill_posed")
+    # Votes and verdicts are made from items as well as from responses.
+    stale = [f"{stage}/{cell}" for stage in ("responses", "verdicts", "votes") for cell in touched]
+    assert stale_in_dagster(study) == sorted(stale)
+    run = study.traps("run", "demo")
+    assert run.counts() == {"answers": 3 * EVALUATIONS, "votes": 15 * EVALUATIONS, "frames": 0}
+    assert stale_in_dagster(study) == []
+
+
+def test_a_rematerialization_that_changes_nothing_makes_nothing_stale(study: Checkout) -> None:
+    materialize(study, "scene_specs", "hidden")
+    materialize(study, "items", "occlusion")
+    materialize(study, "responses", "occlusion|oracle__standard__run1")
+    assert stale_in_dagster(study) == []
+    assert "stale" not in study.traps("status", "demo").out.replace("stale   missing", "").replace("stale means", "")
+
+
+def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> None:
+    clips = study.workspace / "clips"
+    before = {path: path.stat().st_mtime_ns for path in clips.rglob("*.mp4")}
+    azimuth = json.loads(_released(study, "domino_chain-0002"))["params"]["azimuth_deg"]
+    study.correct("domino_chain-0002", params={"azimuth_deg": azimuth + 2.0})
+    run = study.traps("run", "demo")
+    assert run.code == 0, run.err
+    assert run.counts() == {"answers": 4 * EVALUATIONS, "votes": 6 * 3 * EVALUATIONS, "frames": 100} or run.counts()["frames"] == 100
+    after = {path: path.stat().st_mtime_ns for path in clips.rglob("*.mp4")}
+    assert {path: time for path, time in after.items() if path in before} == before
+    new = set(after) - set(before)
+    assert {(path.parent.name, path.name.split("-")[0]) for path in new} == {
+        ("domino_chain-0002", "control"),
+        ("domino_chain-0002", "void"),
+    }
+    again = study.traps("run", "demo")
+    assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
+
+
+def test_a_discarded_scenario_leaves_every_table_and_keeps_its_answers(study: Checkout) -> None:
+    rows = len(study.ledger_rows("answers"))
+    study.correct("tumbling_dice-0004", action="discard")
+    run = study.traps("run", "demo")
+    assert run.code == 0, run.err
+    assert run.counts()["frames"] == 0
+    tables = Workspace.open(study.workspace).tables
+    for table in TABLES.values():
+        frame = tables.read_all(table)
+        for column in ("scenario_id", "item_id", "pair_id"):
+            if column in frame:
+                assert not frame[column].str.contains("tumbling_dice-0004").any(), (table.name, column)
+    cells = tables.read_all(METRICS, dataset="chaotic").query("scope == 'all'")
+    assert (cells["n_pairs"] == 15).all()
+    assert len(study.ledger_rows("answers")) >= rows
+    assert "stay in the ledger" in study.traps("why", "chaotic:tumbling_dice-0004:void").out
+
+
+def test_an_added_scenario_joins_a_study_of_the_whole_benchmark(study: Checkout, tmp_path: Path) -> None:
+    params = json.loads(_released(study, "hidden_race-0001"))["params"]
+    study.correct("hidden_race-9001", action="add", family="hidden_race", params=params)
+    experiment = tmp_path / "whole.yaml"
+    experiment.write_text("name: whole\nmodels: [oracle]\nregimes: [standard]\ndatasets: [occlusion]\n")
+    fresh = Checkout(study.root, tmp_path / "whole")
+    # The demo's clips serve: a clip's name is its content, so only the added pair is drawn.
+    shutil.copytree(study.workspace / "clips", fresh.workspace / "clips")
+    run = fresh.traps("run", experiment)
+    assert run.code == 0, run.err
+    assert run.counts()["frames"] == 100
+    assert len(Workspace.open(fresh.workspace).tables.read_all(RESPONSES)) == 2 * 17
+
+
+def _released(study: Checkout, scenario_id: str) -> str:
+    family = scenario_id.rsplit("-", 1)[0]
+    lines = (study.root / "scene_specs" / "released" / f"{family}.jsonl").read_text().splitlines()
+    return next(line for line in lines if json.loads(line)["scenario_id"] == scenario_id)
+
+
+def test_copies_of_the_package_are_what_runs(study: Checkout) -> None:
+    code = "import traps_pipeline.paths as p; print(p.CHECKOUT)"
+    out = subprocess.run([sys.executable, "-c", code], env=study.environment, capture_output=True, text=True, check=True)
+    assert Path(out.stdout.strip()) == study.root

@@ -1,0 +1,99 @@
+"""kill -9, two runs at once, Ctrl-C: a call is paid for once, and nothing that was answered is lost."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import TABLES, VOLATILE
+
+from tests.conftest import Checkout
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("crashes")]
+ANSWERS, VOTES = 3072, 13824
+
+
+def tables(root: Path) -> dict[str, pd.DataFrame]:
+    store = Workspace.open(root).tables
+    return {name: store.read_all(table).drop(columns=list(VOLATILE), errors="ignore") for name, table in TABLES.items()}
+
+
+def assert_same_tables(one: Path, other: Path) -> None:
+    for name, frame in tables(one).items():
+        pd.testing.assert_frame_equal(frame, tables(other)[name], obj=name)
+
+
+def rows_written(study: Checkout, kind: str) -> int:
+    return sum(path.read_bytes().count(b"\n") for path in (study.workspace / "ledger" / kind).rglob("*.jsonl"))
+
+
+def start(study: Checkout) -> subprocess.Popen[str]:
+    return study.start(sys.executable, "-m", "traps_pipeline.cli", "run", "demo")
+
+
+def wait_for_rows(study: Checkout, process: subprocess.Popen[str], kind: str, count: int) -> None:
+    while rows_written(study, kind) < count:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.002)
+
+
+def test_three_kills_while_answering_leave_the_same_tables_and_no_call_is_made_twice(unasked: Checkout, demo: Checkout) -> None:
+    moments = sorted(random.Random(20261121).sample(range(50, ANSWERS - 200), 3))
+    for moment in moments:
+        process = start(unasked)
+        wait_for_rows(unasked, process, "answers", moment)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        assert rows_written(unasked, "answers") < ANSWERS  # killed in the middle, not after the end
+    finished = unasked.traps("run", "demo")
+    assert finished.code == 0, finished.err
+    for kind, wanted in (("answers", ANSWERS), ("votes", VOTES)):
+        keys = [row["key"] for row in unasked.ledger_rows(kind)]
+        assert len(keys) == len(set(keys)) == wanted
+    assert_same_tables(unasked.workspace, demo.workspace)
+
+
+def test_a_kill_while_voting_leaves_the_same_tables(unasked: Checkout, demo: Checkout) -> None:
+    process = start(unasked)
+    wait_for_rows(unasked, process, "votes", 5000)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    finished = unasked.traps("run", "demo")
+    assert finished.code == 0, finished.err
+    assert len({row["key"] for row in unasked.ledger_rows("votes")}) == len(unasked.ledger_rows("votes")) == VOTES
+    assert_same_tables(unasked.workspace, demo.workspace)
+
+
+def test_two_runs_that_want_the_same_keys_ask_each_once(unasked: Checkout) -> None:
+    cell_range = ("chaotic|oracle__standard__run1", "occlusion_ill_posed|prior__json__run1")
+    command = (sys.executable, "-m", "dagster", "asset", "materialize", "-m", "traps_pipeline.definitions")
+    by_dagster = unasked.start(*command, "--select", "responses", "--partition-range", "occlusion|oracle__standard__run1...chaotic_ill_posed|random-50__json__run1")
+    by_traps = start(unasked)
+    for process in (by_dagster, by_traps):
+        _, err = process.communicate(timeout=300)
+        assert process.returncode == 0, err[-3000:]
+    keys = [row["key"] for row in unasked.ledger_rows("answers")]
+    assert len(keys) == len(set(keys))
+    assert len(keys) >= ANSWERS, cell_range
+
+
+def test_ctrl_c_drains_and_the_same_command_goes_on(unasked: Checkout, demo: Checkout) -> None:
+    process = start(unasked)
+    wait_for_rows(unasked, process, "answers", 300)
+    os.kill(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "interrupted" in err and "Traceback" not in err
+    assert 300 <= rows_written(unasked, "answers") < ANSWERS
+    finished = unasked.traps("run", "demo")
+    assert finished.code == 0, finished.err
+    assert len(unasked.ledger_rows("answers")) == ANSWERS
+    assert_same_tables(unasked.workspace, demo.workspace)

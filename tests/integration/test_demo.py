@@ -1,0 +1,89 @@
+"""`make demo` as a user sees it: the numbers that must come out, the second run, what is written."""
+
+from __future__ import annotations
+
+import pytest
+from traps_pipeline.scoring.leaderboard import pooled_j
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS, LEADERBOARD, METRICS, TABLES, VERDICTS, VIDEOS
+
+from tests.conftest import Checkout
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("demo")]
+DEGENERATE = ("always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle")
+
+
+@pytest.fixture(scope="module")
+def workspace(demo: Checkout) -> Workspace:
+    return Workspace.open(demo.workspace)
+
+
+def test_the_oracle_scores_one_in_every_dataset_and_regime(workspace: Workspace) -> None:
+    board = workspace.tables.read(LEADERBOARD, {}).query("model == 'oracle'")
+    assert len(board) == 3 * 5  # regimes x (four datasets and overall)
+    assert (board[["acc", "abs_rec", "pecs", "pecs_ci_low", "pecs_ci_high"]] == 1.0).all().all()
+    assert (board["false_abs"] == 0.0).all()
+
+
+@pytest.mark.parametrize("model", DEGENERATE)
+def test_a_degenerate_strategy_scores_zero_everywhere(workspace: Workspace, model: str) -> None:
+    cells = workspace.tables.read_all(METRICS).query("model == @model and scope == 'all'")
+    assert len(cells) == 4 * 3
+    assert (cells["pecs"] == 0.0).all()
+
+
+@pytest.mark.parametrize("model", ["random-50", "confidence-noise"])
+def test_a_random_strategy_does_not_discriminate(workspace: Workspace, model: str) -> None:
+    pooled = pooled_j(workspace.tables.read_all(VERDICTS)).set_index("model").loc[model]
+    assert abs(pooled["j"]) < 3 * pooled["standard_error"]
+
+
+def test_nothing_is_missing_or_undecided(workspace: Workspace) -> None:
+    assert (workspace.tables.read_all(METRICS)["n_missing"] == 0).all()
+
+
+def test_every_dataset_has_sixteen_pairs_of_two_items(workspace: Workspace) -> None:
+    items = workspace.tables.read_all(ITEMS)
+    assert items.groupby(["dataset", "side"]).size().to_dict() == {
+        (dataset, side): 16
+        for dataset in ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
+        for side in ("control", "void")
+    }
+
+
+def test_clips_are_five_second_masters_and_chaotic_voids_are_prefixes(workspace: Workspace) -> None:
+    clips = workspace.tables.read_all(VIDEOS)
+    assert len(clips) == 64
+    assert set(zip(clips["width"], clips["height"], clips["fps"], strict=True)) == {(480, 360, 10)}
+    assert (clips.query("side == 'control'")["n_frames"] == 50).all()
+    chaotic = clips[clips["category"].isin(["plinko", "tumbling_dice"])].query("side == 'void'")
+    assert chaotic["n_frames"].between(10, 49).all()
+
+
+def test_every_table_knows_its_benchmark_version(workspace: Workspace) -> None:
+    for table in TABLES.values():
+        assert set(workspace.tables.read_all(table)["benchmark_version"]) == {"0.1.0"}, table.name
+
+
+def test_the_demo_ends_with_the_leaderboard_and_paths_that_exist(demo: Checkout, demo_output: str) -> None:
+    assert "3072 answers asked (0 from the ledger), 13824 votes asked (0 from the ledger), 2400 frames rendered" in demo_output
+    lines = demo_output.splitlines()
+    for name in ("leaderboard.html", "leaderboard.md", "pecs_landscape.png", "contact_sheet.png"):
+        path = demo.workspace / "reports" / name
+        assert str(path) in lines
+        assert path.stat().st_size > 1000
+
+
+def test_a_second_run_asks_and_renders_nothing(study: Checkout) -> None:
+    again = study.traps("run", "demo")
+    assert again.code == 0, again.err
+    assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
+    assert "to do" not in again.out  # no partition was materialized
+
+
+def test_status_calls_everything_fresh_and_plan_has_nothing_new(study: Checkout) -> None:
+    status = study.traps("status", "demo").out
+    for stage, partitions in (("scene_specs", 4), ("items", 4), ("responses", 96), ("verdicts", 96), ("leaderboard", 1)):
+        assert f"{stage:<18} {partitions:>6}      0        0" in status
+    plan = study.traps("plan", "demo").out.splitlines()[-1].split()
+    assert plan == ["all", "3,072", "3,072", "0", "13,824", "13,824", "0"]

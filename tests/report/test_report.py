@@ -1,0 +1,251 @@
+"""What people read says what the table says, escaped, and the same on every build."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet
+from traps_pipeline.report.figures import Label, landscape_figure, merged_labels, pecs_landscape, save_figure
+from traps_pipeline.report.page import (
+    entries_of,
+    fraction,
+    leaderboard_html,
+    leaderboard_markdown,
+    leaderboard_text,
+    percent,
+)
+from traps_pipeline.scenes.encode import encode
+from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.tables import LEADERBOARD
+
+HOSTILE = "<script>alert(1)</script>|[x](http://evil.example)\x1b[2J"
+REFERENCES = {  # Acc, FalseAbs, AbsRec
+    "oracle": (1, 0, 1),
+    "always-abstain": (0, 1, 1),
+    "never-abstain": (0.4, 0, 0),
+    "random-50": (0.5, 0.5, 0.5),
+    "perfect-answerer": (1, 0, 0),
+    "inverse-oracle": (0, 1, 0),
+    "confidence-noise": (0.7, 0.3, 0.3),
+    "prior": (0.41, 0, 0),
+}
+
+
+def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6), **other):
+    """One LEADERBOARD row with these Acc, FalseAbs and AbsRec."""
+    acc, false_abs, abs_rec = shares
+    j = abs_rec - false_abs
+    pecs = acc * max(0.0, j)
+    figures = {"acc": acc, "abs_rec": abs_rec, "false_abs": false_abs, "j": j, "pecs": pecs}
+    row = {
+        **{"model": model, "regime": regime, "dataset": dataset, "n_runs": 3, "n_pairs": 1404, "n_missing": 0},
+        **{name: float(value) for name, value in figures.items()},
+        **{f"{name}_std": 0.01 for name in figures},
+        **{"pecs_ci_low": pecs, "pecs_ci_high": pecs, "naive": acc * abs_rec, "epoch": "e1", "benchmark_version": "v1"},
+    }
+    return {**row, **other}
+
+
+def board_of(*rows):
+    return pd.DataFrame(list(rows))[[c.name for c in LEADERBOARD.columns]]
+
+
+@pytest.fixture(scope="module")
+def board():
+    """The reference strategies and a model of hostile name, under all regimes on all datasets and overall."""
+    models = {**REFERENCES, HOSTILE: (0.6, 0.1, 0.5)}
+    return board_of(
+        *(board_row(m, r, d, shares) for m, shares in models.items() for r in REGIMES for d in (*DATASETS, "overall"))
+    )
+
+
+@pytest.fixture(scope="module")
+def png(board):
+    return pecs_landscape(board)
+
+
+def test_the_boards_of_these_tests_fit_the_schema(board, tmp_path):
+    TableStore(tmp_path).write(LEADERBOARD, {}, board, {})
+
+
+def test_text_lists_models_by_overall_pecs_with_their_interval(board):
+    shown = board[board["model"] != HOSTILE]
+    shown = pd.concat([shown, board_of(board_row("mid", pecs_ci_low=0.2, pecs_ci_high=0.3))])
+    lines = leaderboard_text(shown).splitlines()
+    assert lines[0] == "PECS, overall. Benchmark version v1; epoch e1."
+    assert lines[4].split()[:6] == ["oracle", "standard", "1.000", "[1.000,", "1.000]", "100.0"]
+    # Acc 0.5, J 0.6 - 0.1 = 0.5, PECS 0.25; no dataset of its own is on the board.
+    assert next(x for x in lines if x.startswith("mid")).split() == [
+        "mid", "standard", "0.250", "[0.200,", "0.300]", "50.0", "60.0", "10.0", "0.500", *"––––", "1404", "0",
+    ]  # fmt: skip
+    assert [x.split()[0] for x in lines[4:8]] == ["oracle"] * 3 + ["mid"]
+    assert len({len(x) for x in lines[2:]}) == 1
+
+
+def test_ties_keep_the_regimes_order(board):
+    _, entries = entries_of(board)
+    assert [e.regime for e in entries[:3]] == list(REGIMES)
+
+
+def test_missing_items_are_marked_wherever_the_model_stands():
+    board = board_of(
+        board_row("whole"), board_row("gaps", n_missing=7), board_row("gaps", dataset="occlusion", n_missing=7)
+    )
+    for text in (leaderboard_text(board), leaderboard_markdown(board), leaderboard_html(board)):
+        assert "7 †" in text
+        assert "0 †" not in text
+    assert "†" not in leaderboard_text(board_of(board_row("whole")))
+
+
+def test_a_model_without_an_overall_row_is_listed_last_with_what_it_has():
+    board = board_of(
+        board_row("partial", dataset="chaotic", shares=(1, 0, 1), n_pairs=500, n_missing=3), board_row("weak")
+    )
+    last = leaderboard_text(board).splitlines()[5]
+    assert last.split() == ["partial", "standard", *["–"] * 8, "1.000", "–", "500", "3", "†"]
+    assert "not all four datasets evaluated" in leaderboard_html(board)
+
+
+def test_a_board_of_one_dataset_is_ranked_by_that_dataset():
+    board = board_of(board_row("a", dataset="chaotic"), board_row("b", dataset="chaotic", shares=(1, 0, 1)))
+    lines = leaderboard_text(board).splitlines()
+    assert lines[0].startswith("PECS, chaotic.")
+    assert [x.split()[0] for x in lines[4:6]] == ["b", "a"]
+
+
+def test_null_figures_are_dashes_and_negative_ones_have_a_true_minus():
+    assert (fraction(None), fraction(float("nan")), fraction(-0.5), fraction(-0.0001)) == ("–", "–", "−0.500", "0.000")
+    assert (percent(0.1234), percent(np.nan)) == ("12.3", "–")
+    null = dict.fromkeys(("acc", "j", "pecs", "pecs_std", "pecs_ci_low", "pecs_ci_high"), np.nan)
+    board = board_of(board_row("m", **null))
+    assert "nan" not in leaderboard_text(board) + leaderboard_markdown(board) + leaderboard_html(board)
+
+
+def test_html_escapes_a_hostile_model_id(board):
+    page = leaderboard_html(board)
+    assert "<script" not in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+
+
+def test_markdown_keeps_a_hostile_model_id_in_its_cell(board):
+    text = leaderboard_markdown(board)
+    assert "<script" not in text
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in rows} == {15}
+    assert r"\|\[x\]\(http://evil.example\)?\[2J" in text
+
+
+def test_text_lets_no_model_id_steer_the_terminal(board):
+    assert "\x1b" not in leaderboard_text(board)
+
+
+def test_html_asks_the_network_for_nothing(board, png):
+    page = leaderboard_html(board, {"PECS landscape": png})
+    targets = re.findall(r"""(?:src|href|action|data|poster|srcset)\s*=\s*["']?([^"'\s>]*)""", page)
+    assert len(targets) == 1
+    assert targets[0].startswith("data:image/png;base64,")
+    assert not re.search(r"url\(|@import|<link|<script|<iframe", page)
+    assert "default-src 'none'" in page
+
+
+def test_html_shows_every_dataset_version_epoch_n_and_the_legend(board):
+    page = leaderboard_html(board)
+    for title in ("Overall", "Occlusion", "Occlusion, ill-posed", "Chaotic", "Chaotic, ill-posed"):
+        assert f"<h2>{title}</h2>" in page
+    for term in ("Acc", "AbsRec", "FalseAbs", "J", "PECS", "n", "missing", "epoch"):
+        assert f"<dt>{term}</dt>" in page
+    assert page.count("Benchmark version v1.") == page.count("Epoch e1.") == 5
+
+
+def test_html_names_the_epoch_in_each_row_where_rows_differ():
+    page = leaderboard_html(board_of(board_row("a"), board_row("b", epoch="e2")))
+    assert '<th class="word">Epoch</th>' in page
+    assert '<td class="word">e2</td>' in page
+
+
+def test_an_empty_board_still_gives_a_page_a_table_and_a_figure():
+    board = pd.DataFrame(columns=pd.Index([c.name for c in LEADERBOARD.columns]))
+    assert "Overall" in leaderboard_html(board)
+    assert leaderboard_text(board).startswith("PECS, overall.")
+    assert pecs_landscape(board).startswith(b"\x89PNG")
+
+
+def test_figures_are_byte_identical_on_a_second_build(board, png, tmp_path):
+    assert pecs_landscape(board) == png
+    first, second = (save_figure(landscape_figure(board), tmp_path / name / "landscape") for name in ("a", "b"))
+    assert [p.name for p in first] == ["landscape.png", "landscape.svg"]
+    assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
+    assert first[0].read_bytes() == png
+    assert b"<dc:date>" not in first[1].read_bytes()
+
+
+def test_no_two_labels_of_the_landscape_overlap(board):
+    figure = landscape_figure(board)
+    axes = figure.axes[0]
+    figure.canvas.draw()
+    boxes = [t.get_window_extent() for t in axes.texts if t.get_text()]
+    assert not [(a, b) for k, a in enumerate(boxes) for b in boxes[:k] if a.overlaps(b)]
+    edge = figure.bbox
+    assert all(b.x0 >= 0 and b.y0 >= 0 and b.x1 <= edge.x1 and b.y1 <= edge.y1 for b in boxes)
+
+
+def test_the_landscape_reaches_down_to_the_inverse_oracle(board):
+    assert landscape_figure(board).axes[0].get_ylim()[0] < -1
+    only_good = board[board["j"] >= 0]
+    assert landscape_figure(only_good).axes[0].get_ylim()[0] == pytest.approx(-0.1)
+
+
+def test_coinciding_models_share_one_label():
+    labels = [Label(0.4, 0.0, "a", "red"), Label(0.41, 0.0, "b", "blue"), Label(0.9, 0.0, "c", "green")]
+    assert [label.text for label in merged_labels(labels)] == ["a\nb", "c"]
+
+
+def pair_rows(scenario, root, frames=12, kept=12, dataset="chaotic", size=(48, 64)):
+    """ITEMS columns of one pair whose void keeps the control's first frames, with its clips written under root."""
+    clip = [np.full((*size, 3), 15 * k, np.uint8) for k in range(frames)]
+    for side, count in (("control", frames), ("void", kept)):
+        encode(clip[:count], root / f"{scenario}-{side}.mp4", 10)
+    return [
+        {
+            **{"pair_id": f"{dataset}:{scenario}", "dataset": dataset, "scenario_id": scenario, "side": side},
+            **{
+                "sub_scenario": scenario.split("-")[0],
+                "question": "Where?",
+                "ground_truth": "left" if side == "control" else None,
+            },
+            "clip": f"{scenario}-{side}.mp4",
+        }
+        for side in ("control", "void")
+    ]
+
+
+def test_a_contact_sheet_is_a_png_and_hatches_what_the_void_does_not_show(tmp_path):
+    import matplotlib.image
+
+    sheets = []
+    for kept in (12, 5):
+        items = pd.DataFrame(pair_rows("plinko-0", tmp_path, kept=kept))
+        sheets.append(matplotlib.image.imread(io.BytesIO(contact_sheet(items, tmp_path))))
+    full, hatched = sheets
+    differs = np.abs(full - hatched).sum(axis=2) > 0.05
+    down, right = np.nonzero(differs)
+    # Frames 0, 4, 7, 11 are shown: the void of 5 frames has the first two, so only the lower right quarter changes.
+    assert full.shape == hatched.shape
+    assert down.min() > 0.5 * full.shape[0]
+    assert right.min() > 0.5 * full.shape[1]
+
+
+def test_a_contact_sheet_takes_the_first_pairs_of_each_sub_scenario(tmp_path):
+    rows = [r for s in ("plinko-1", "plinko-0", "dice-0") for r in pair_rows(s, tmp_path, frames=2, kept=2)]
+    rows += pair_rows("dice-1", tmp_path, frames=2, kept=2)[:1]  # no void: not a pair
+    items = pd.DataFrame(rows)
+    assert [p.at["void", "scenario_id"] for p in chosen_pairs(items, 1)] == ["dice-0", "plinko-0"]
+    assert [p.at["void", "scenario_id"] for p in chosen_pairs(items, None)] == ["dice-0", "plinko-0", "plinko-1"]
+    with pytest.raises(ValueError, match="1 to 80 pairs, not 0"):
+        chosen_pairs(items[items["side"] == "control"], 1)

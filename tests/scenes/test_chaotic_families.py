@@ -1,0 +1,190 @@
+"""The chaotic families on released records: outcomes, cuts and their evidence; and the rule that chooses a cut."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from traps_pipeline.scenes.camera import Camera
+from traps_pipeline.scenes.ensemble import (
+    MIN_ACCEPTED,
+    MIN_ENTROPY_BITS,
+    TOP_SHARE,
+    Cut,
+    Rollout,
+    choose_cut,
+    earliest_cut,
+    entropy_bits,
+    latest_open_cut,
+)
+from traps_pipeline.scenes.kit import Family, Physics
+from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.resolve import Outcome, compile_scene, read_outcome
+from traps_pipeline.scenes.simulate import Motion, replay, simulate
+from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+
+RELEASED = Path(__file__).parents[2] / "scene_specs" / "released"
+FAMILIES = ("plinko", "tumbling_dice")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A released record with everything rebuilt from it."""
+
+    spec: SceneSpec
+    family: Family
+    params: Any
+    physics: Physics
+    camera: Camera
+    qpos: np.ndarray
+    motion: Motion
+    outcome: Outcome
+
+    def cut(self, family: Family | None = None) -> Cut | None:
+        """The cut chosen anew."""
+        commit, seed = self.outcome.commit_frame, self.spec.seed
+        return choose_cut(family or self.family, self.params, self.physics, self.camera, self.qpos, commit, seed)
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def stored(request: pytest.FixtureRequest) -> Stored:
+    return load(request.param)
+
+
+def load(name: str) -> Stored:
+    with (RELEASED / f"{name}.jsonl").open(encoding="utf-8") as lines:
+        spec = SceneSpec.model_validate(json.loads(next(lines)))
+    family, physics = get_family(name), Physics(**spec.physics)
+    params = family.params_from(spec.params)
+    camera = Camera(**{key: tuple(value) if isinstance(value, list) else value for key, value in spec.camera.items()})
+    qpos = load_trajectory(RELEASED / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
+    motion = replay(compile_scene(family, params, physics)[0], qpos, physics)
+    return Stored(spec, family, params, physics, camera, qpos, motion, read_outcome(family, motion, params))
+
+
+def test_the_stored_trajectory_ends_in_the_ground_truth(stored: Stored):
+    assert stored.outcome.label == stored.spec.ground_truth
+    assert round(stored.outcome.commit_frame / stored.physics.fps, 3) == stored.spec.evidence["commit_s"]
+
+
+def test_the_cut_comes_after_one_second_and_before_the_outcome_is_committed(stored: Stored):
+    last_shown = stored.spec.void["cut_frame"] - 1
+    assert last_shown / stored.physics.fps >= 1.0
+    assert last_shown < stored.outcome.commit_frame
+
+
+def test_the_last_frames_of_the_void_carry_no_reading_of_the_outcome(stored: Stored):
+    assert stored.family.readings(stored.motion, stored.params)[stored.spec.void["cut_frame"] - 1] is None
+
+
+def test_the_evidence_meets_the_bounds_on_entropy_top_share_and_rollouts(stored: Stored):
+    evidence = stored.spec.evidence
+    assert evidence["entropy_bits"] >= MIN_ENTROPY_BITS == 1.0
+    assert evidence["top_share"] <= TOP_SHARE == 0.65
+    assert MIN_ACCEPTED == 64 <= evidence["accepted"]
+    assert evidence["accepted"] + evidence["unresolved"] <= evidence["tried"]
+
+
+@pytest.mark.parametrize("name", ["plinko", pytest.param("tumbling_dice", marks=pytest.mark.slow)])
+def test_choosing_the_cut_of_a_stored_record_again_gives_the_same_cut(name: str):
+    stored = load(name)
+    cut = stored.cut()
+    assert cut is not None
+    assert cut.frame == stored.spec.void["cut_frame"]
+    assert cut.evidence().items() <= stored.spec.evidence.items()
+
+
+def test_identical_starts_leave_no_outcome_open_and_yield_no_cut(stored: Stored):
+    assert stored.cut(replace(stored.family, perturbation=0.0)) is None
+
+
+def test_a_board_without_pegs_has_one_certain_outcome_and_yields_no_cut():
+    plinko = load("plinko")
+    # The board keeps its size: the rows still count, but all their pegs lie beyond the walls and are left out.
+    bare = replace(plinko.params, row_shifts_m=(99.0,) * plinko.params.rows)
+    model, scene = compile_scene(plinko.family, bare, plinko.physics)
+    qpos = simulate(model, scene, plinko.physics)
+    labels = plinko.family.readings(replay(model, qpos, plinko.physics), bare)
+    commit = labels.index(labels[-1])
+    assert not [i for i in range(model.ngeom) if model.geom(i).name.startswith("peg")]
+    assert labels[-1] is not None
+    assert commit >= earliest_cut(plinko.physics)
+    assert choose_cut(plinko.family, bare, plinko.physics, plinko.camera, qpos, commit, plinko.spec.seed) is None
+
+
+def test_a_perturbation_that_shows_before_one_second_yields_no_cut(stored: Stored):
+    assert stored.cut(replace(stored.family, perturbation=0.05)) is None
+
+
+def test_an_outcome_committed_before_one_second_yields_no_cut(stored: Stored):
+    early = replace(stored, outcome=replace(stored.outcome, commit_frame=10))
+    assert early.cut() is None
+
+
+@pytest.mark.parametrize(
+    ("counts", "bits"),
+    [
+        ({"a": 32, "b": 32}, 1.0),
+        ({"a": 48, "b": 16}, 0.811278),  # 3/4 log2(4/3) + 1/4 log2 4
+        ({"a": 16, "b": 16, "c": 16, "d": 16}, 2.0),
+        ({"a": 64}, 0.0),
+        ({"a": 64, "b": 0}, 0.0),
+        ({}, 0.0),
+    ],
+)
+def test_the_entropy_of_outcome_counts_is_shannons_in_bits(counts: dict[str, int], bits: float):
+    assert math.isclose(entropy_bits(counts), bits, abs_tol=1e-6)
+
+
+def test_the_last_frame_of_the_earliest_cut_is_at_one_second():
+    assert earliest_cut(Physics(fps=10)) == 11
+    assert earliest_cut(Physics(fps=20)) == 21
+
+
+def rollouts(parted: int, **counts: int) -> list[Rollout]:
+    """Rollouts by label; `unresolved` ones have none."""
+    return [Rollout(parted, None if key == "unresolved" else key) for key, n in counts.items() for _ in range(n)]
+
+
+def test_of_all_open_frames_the_latest_is_the_cut():
+    futures = rollouts(20, left=32, right=32) + rollouts(15, left=40)
+    cut = latest_open_cut(futures, range(11, 31), 1.0, 1e-5)
+    assert cut == Cut(20, entropy_bits=1.0, top_share=0.5, accepted=64, tried=104, unresolved=0, perturbation=1e-5)
+
+
+def test_an_unresolved_rollout_is_counted_but_is_no_outcome():
+    futures = rollouts(20, left=40, right=40, unresolved=48)
+    cut = latest_open_cut(futures, range(11, 31), 1.0, 1e-5)
+    assert cut is not None
+    assert (cut.entropy_bits, cut.accepted, cut.unresolved) == (1.0, 80, 48)
+    assert latest_open_cut(rollouts(20, left=64, unresolved=64), range(11, 31), 1.0, 1e-5) is None
+
+
+def test_fewer_than_64_accepted_rollouts_make_no_cut():
+    assert latest_open_cut(rollouts(20, left=32, right=31), range(11, 31), 0.9, 1e-5) is None
+
+
+def test_an_outcome_above_65_percent_makes_no_cut_however_high_the_entropy():
+    futures = rollouts(20, a=66, b=8, c=8, d=9, e=9)  # 1.51 bits, but 66 %
+    assert latest_open_cut(futures, range(11, 31), 1.0, 1e-5) is None
+    assert latest_open_cut([*futures[1:], Rollout(20, "b")], range(11, 31), 1.0, 1e-5) is not None
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_questions_of_200_draws_repeat_no_ill_posed_text_more_than_ten_times(name: str):
+    family, texts = get_family(name), []
+    for draw in range(200):
+        rng = np.random.default_rng([5, draw])
+        wording = family.word(family.draw(rng), rng)
+        texts.append(wording.ill_posed_question)
+        assert set(wording.aliases.values()) <= set(wording.labels)
+        assert all(label in wording.question for label in wording.labels)
+        assert wording.answerable_question.answer in wording.answerable_question.labels
+    assert max(texts.count(text) for text in set(texts)) <= 10
+    assert len(set(texts)) >= 40
