@@ -143,3 +143,19 @@ def unasked(study: Checkout) -> Iterator[Checkout]:
     shutil.rmtree(study.workspace / "reports")
     (study.workspace / "reports").mkdir()
     yield study
+
+
+@pytest.fixture
+def tiny_disk(tmp_path: Path) -> Iterator[Path]:
+    """A folder on a disk of 64 KiB: a full disk without filling anybody's."""
+    folder = tmp_path / "tiny-disk"
+    folder.mkdir()
+    if os.geteuid() != 0:
+        pytest.skip("mounting a tmpfs needs root")
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", str(folder)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
+        pytest.skip("mounting a tmpfs is not permitted here")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)

@@ -7,10 +7,11 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline import progress
 from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import Experiment
 from traps_pipeline.lineage import PARTITIONED_BY, STAGES, Lineage, Node, name_of, upstream
 from traps_pipeline.models.registry import all_evaluations
@@ -21,7 +22,9 @@ from traps_pipeline.tables import SCENE_SPECS
 if TYPE_CHECKING:
     import dagster as dg
 
+SHOWN = 4  # unfinished partitions named in a problem
 AGGREGATES = ("metrics", "leaderboard")  # made from whatever verdicts are there
+_INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
 _QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
 
 
@@ -79,8 +82,15 @@ def run_experiment(workspace: Workspace, experiment: Experiment) -> Outcome:
 def _run_stage(
     instance: dg.DagsterInstance, workspace: Workspace, experiment: Experiment, stage: str, outcome: Outcome
 ) -> None:
-    lineage = Lineage(workspace)
-    todo = [key for key in wanted_keys(workspace, experiment, stage) if lineage.status(stage, key).kind != "fresh"]
+    from traps_pipeline.defs.common import recorded_versions
+
+    lineage, recorded = Lineage(workspace), recorded_versions(instance, stage)
+    # A crash between a table and its event leaves a table that Dagster does not know; it is materialized once more.
+    todo = [
+        key
+        for key in wanted_keys(workspace, experiment, stage)
+        if lineage.status(stage, key).kind != "fresh" or recorded.get(key) != lineage.version(stage, key)
+    ]
     blocked = [key for key in todo if _blocked(lineage, stage, key, outcome.failed)]
     outcome.failed |= {(stage, key) for key in blocked}
     todo = [key for key in todo if key not in blocked]
@@ -90,14 +100,13 @@ def _run_stage(
     for batch in batches(stage, todo):
         outcome.problems += _materialize(instance, stage, batch)
     after = Lineage(workspace)
-    for key in todo:
-        status = after.status(stage, key)
-        lasting = [reason for reason in status.reasons if "calls failed" not in reason]
-        if status.kind == "missing" or lasting:
-            outcome.failed.add((stage, key))
-            outcome.problems.append(f"{name_of((stage, key))} is {status.kind}{': ' + '; '.join(lasting) if lasting else ''}")
-        elif status.reasons:
-            outcome.problems.append(f"{name_of((stage, key))}: {'; '.join(status.reasons)}")
+    statuses = {(stage, key): after.status(stage, key) for key in todo}
+    unfinished = [node for node, status in statuses.items() if status.kind == "missing" or status.outdated]
+    outcome.failed.update(unfinished)
+    if unfinished:
+        shown = ", ".join(name_of(node) for node in unfinished[:SHOWN]) + (", ..." if len(unfinished) > SHOWN else "")
+        outcome.problems.append(f"{len(unfinished)} of {len(todo)} partitions of {stage} are not done: {shown}")
+    outcome.problems += [f"{name_of(node)}: {status.failed} calls failed" for node, status in statuses.items() if status.failed]
 
 
 def _blocked(lineage: Lineage, stage: str, key: str | None, failed: set[Node]) -> bool:
@@ -146,16 +155,22 @@ def _materialize(instance: dg.DagsterInstance, stage: str, batch: tuple[str | No
     first, last = batch
     ranged = PARTITIONED_BY.get(stage) == "cell"
     tags = {"dagster/asset_partition_range_start": str(first), "dagster/asset_partition_range_end": str(last)}
-    result = dg.materialize(
-        [*SOURCES, *ASSETS, *inputs_current],
-        selection=dg.AssetSelection.assets(stage),
-        instance=instance,
-        partition_key=None if ranged else first,
-        tags=tags if ranged else None,
-        raise_on_error=False,
-        run_config=_QUIET,
-    )
-    problems = [_reason(event) for event in result.all_events if event.is_step_failure]
+    try:
+        result = dg.materialize(
+            [*SOURCES, *ASSETS, *inputs_current],
+            selection=dg.AssetSelection.assets(stage),
+            instance=instance,
+            partition_key=None if ranged else first,
+            tags=tags if ranged else None,
+            raise_on_error=False,
+            run_config=_QUIET,
+        )
+    except dg.DagsterExecutionInterruptedError:
+        raise KeyboardInterrupt from None
+    failures = [event for event in result.all_events if event.is_step_failure]
+    if any(error.cls_name in _INTERRUPTS for event in failures for error in _chain(event)):
+        raise KeyboardInterrupt
+    problems = [_reason(event) for event in failures]
     for evaluation in result.get_asset_check_evaluations():
         if not evaluation.passed:
             details = {name: value.value for name, value in evaluation.metadata.items()}
@@ -165,9 +180,19 @@ def _materialize(instance: dg.DagsterInstance, stage: str, batch: tuple[str | No
     return problems
 
 
-def _reason(event: dg.DagsterEvent) -> str:
-    """The innermost error of a failed step."""
-    error = event.step_failure_data.error
-    while error is not None and error.cause is not None:
+def _chain(event: dg.DagsterEvent) -> list[Any]:
+    """The error of a failed step and its causes, outermost first."""
+    chain, error = [], event.step_failure_data.error
+    while error is not None:
+        chain.append(error)
         error = error.cause
-    return "the step failed" if error is None else error.message.strip().removeprefix("traps_pipeline.errors.TrapsError: ")
+    return chain
+
+
+def _reason(event: dg.DagsterEvent) -> str:
+    """The error of a failed step: our own sentence where there is one, else the innermost exception."""
+    chain = _chain(event)
+    told = [error for error in chain if error.cls_name == TrapsError.__name__]
+    if not told:
+        return chain[-1].message.strip() if chain else "the step failed"
+    return told[0].message.strip().removeprefix(f"{TrapsError.__module__}.{TrapsError.__name__}: ")

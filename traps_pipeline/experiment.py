@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.registry import get_model
@@ -24,14 +25,14 @@ class Experiment(BaseModel):
     description: str = ""
     benchmark: str = "released"
     scenarios: list[str] | None = None
-    per_family: int | None = None
+    per_family: int | None = Field(default=None, ge=1)
     datasets: list[str] = list(DATASETS)
     models: list[str] = Field(min_length=1)
     regimes: list[str] = list(REGIMES)
-    runs: list[int] = [1]
+    runs: list[Annotated[int, Field(ge=1)]] = [1]
     panel: str = "rules"
     epoch: str = "1"
-    budget_usd: float = 0.0
+    budget_usd: float = Field(default=0.0, ge=0.0)
 
     @field_validator("datasets")
     @classmethod
@@ -42,6 +43,18 @@ class Experiment(BaseModel):
     @classmethod
     def _regimes(cls, values: list[str]) -> list[str]:
         return _known(values, REGIMES)
+
+    @field_validator("models", "datasets", "regimes", "runs")
+    @classmethod
+    def _once(cls, values: list[Any]) -> list[Any]:
+        if len(set(values)) != len(values):
+            raise ValueError(f"{values} names something twice")
+        return values
+
+    @model_validator(mode="after")
+    def _study_holds_together(self) -> Experiment:
+        _ = self.study  # its own rules (one subset, an epoch's characters) are this file's errors
+        return self
 
     @property
     def study(self) -> Study:
@@ -73,7 +86,9 @@ def load_experiment(name: str) -> Experiment:
     path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / f"{name}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in EXPERIMENTS.glob("*.yaml")))
-        raise TrapsError(f"no experiment {name!r}: {path} is not there; known: {known}, or give the path of a YAML file")
+        raise TrapsError(
+            f"no experiment {name!r}: {path} is not there; known: {known}, or give the path of a YAML file"
+        )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
     for model in experiment.models:
         get_model(model)

@@ -47,10 +47,16 @@ Node = tuple[str, str | None]  # stage or source, and its partition key
 
 @dataclass(frozen=True)
 class Status:
-    """fresh, stale (with what changed) or missing."""
+    """fresh, stale (with what changed, and how many calls failed) or missing."""
 
     kind: Literal["fresh", "stale", "missing"]
-    reasons: tuple[str, ...] = ()
+    outdated: tuple[str, ...] = ()
+    failed: int = 0
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is stale, in words."""
+        return (*self.outdated, f"{self.failed} calls failed and can be asked again") if self.failed else self.outdated
 
 
 def name_of(node: Node) -> str:
@@ -130,11 +136,9 @@ class Lineage:
         if state is None:
             return Status("missing")
         reasons = [*_differences(state.inputs, self.inputs(stage, key))]
-        if state.failed:
-            reasons.append(f"{state.failed} calls failed and can be asked again")
         if stage == "videos":
             reasons += [f"clip {path} is gone or damaged" for path in missing_clips(self._workspace, str(key))]
-        return Status("stale", tuple(reasons)) if reasons else Status("fresh")
+        return Status("stale", tuple(reasons), state.failed) if reasons or state.failed else Status("fresh")
 
     def _state(self, stage: str, key: str | None) -> State | None:
         if stage in TABLES:

@@ -27,6 +27,7 @@ REGIMES = ("standard", "guided", "json")
 SIDES = ("control", "void")
 
 _SLUG = re.compile(r"[a-z0-9.-]+")
+_EVALUATION = re.compile(r"(?P<model>.+?)__(?P<regime>[a-z]+)__run(?P<run>[1-9][0-9]*)")
 
 
 def taxonomy_of(dataset: str) -> str:
@@ -68,11 +69,10 @@ class Evaluation:
     @staticmethod
     def parse(key: str) -> Evaluation:
         """Inverse of `key`. Raises ValueError naming what is wrong."""
-        parts = key.split("__")
-        run = parts[2].removeprefix("run") if len(parts) == 3 else ""
-        if len(parts) != 3 or parts[1] not in REGIMES or not run.isdigit() or not parts[2].startswith("run"):
+        found = _EVALUATION.fullmatch(key)
+        if found is None or found["regime"] not in REGIMES:
             raise ValueError(f"evaluation key {key!r} is not model__regime__runN with a regime of {REGIMES}")
-        return Evaluation(check_slug(parts[0]), parts[1], int(run))
+        return Evaluation(check_slug(found["model"]), found["regime"], int(found["run"]))
 
 
 def evaluations(models: Iterable[tuple[str, int]]) -> list[Evaluation]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from traps_pipeline.errors import TrapsError
+
 CHECKOUT = Path(__file__).resolve().parents[1]
 ASSETS = CHECKOUT / "assets"
 SCENE_SPECS = CHECKOUT / "scene_specs"
@@ -12,10 +14,10 @@ CORRECTIONS = SCENE_SPECS / "corrections"
 
 
 def require_checkout() -> Path:
-    """The checkout's root. Raises RuntimeError with the remedy when the package was installed without one."""
+    """The checkout's root. Raises TrapsError with the remedy when the package was installed without one."""
     for folder in (ASSETS, SCENE_SPECS):
         if not folder.is_dir():
-            raise RuntimeError(
+            raise TrapsError(
                 f"{folder} is missing: traps runs from a checkout; clone the repository and `pip install -e .` in it"
             )
     return CHECKOUT

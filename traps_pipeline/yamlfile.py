@@ -1,7 +1,8 @@
-"""Files that people write, read safely: YAML with the safe loader, checked by a pydantic model, errors in sentences."""
+"""Files that people write, read safely: YAML and JSON Lines, checked by pydantic models, errors in sentences."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,8 +20,19 @@ def read_yaml(path: Path) -> Any:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise TrapsError(f"{path}: cannot be read ({error.strerror})") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise TrapsError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+
+
+def read_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """The lines of a JSON Lines file that hold anything, with their numbers from 1. Raises TrapsError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrapsError(f"{path}: cannot be read ({error}); restore it from git") from error
+    for number, line in enumerate(text.split("\n"), start=1):  # not splitlines: JSON may hold U+2028 as it is
+        if line.strip():
+            yield number, line
 
 
 def parse_yaml_model(model: type[Model], data: Any, path: Path, where: str = "") -> Model:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -55,7 +54,8 @@ def materialize(study: Checkout, stage: str, *keys: str) -> None:
 
 def test_a_corrected_question_asks_its_three_items_again(study: Checkout) -> None:
     before = len(study.ledger_rows("answers")), len(study.ledger_rows("votes"))
-    study.correct("domino_chain-0001", question="Does the domino at the far end fall down, yes or no?")
+    question = "Is the hindmost domino lying down when the clip ends, yes or no?"
+    study.correct("domino_chain-0001", question=question)
     run = study.traps("run", "demo")
     assert run.code == 0, run.err
     # Asked: control and void of `occlusion`, control of `occlusion_ill_posed`. Votes: three judges on abstention for
@@ -63,8 +63,8 @@ def test_a_corrected_question_asks_its_three_items_again(study: Checkout) -> Non
     assert run.counts() == {"answers": 3 * EVALUATIONS, "votes": (3 + 2) * 3 * EVALUATIONS, "frames": 0}
     after = len(study.ledger_rows("answers")), len(study.ledger_rows("votes"))
     assert (after[0] - before[0], after[1] - before[1]) == (3 * EVALUATIONS, 15 * EVALUATIONS)
-    touched = {row["components"]["about"]["item_id"] for row in study.ledger_rows("answers")[-0:] if "far end" in row["components"]["user"]}
-    assert touched == {
+    asked = [row["components"] for row in study.ledger_rows("answers") if row["components"]["user"] == question]
+    assert {components["about"]["item_id"] for components in asked} == {
         "occlusion:domino_chain-0001:control",
         "occlusion:domino_chain-0001:void",
         "occlusion_ill_posed:domino_chain-0001:control",
@@ -119,7 +119,7 @@ def test_a_rematerialization_that_changes_nothing_makes_nothing_stale(study: Che
     materialize(study, "items", "occlusion")
     materialize(study, "responses", "occlusion|oracle__standard__run1")
     assert stale_in_dagster(study) == []
-    assert "stale" not in study.traps("status", "demo").out.replace("stale   missing", "").replace("stale means", "")
+    assert " changed" not in study.traps("status", "demo").out
 
 
 def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> None:
@@ -129,7 +129,11 @@ def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> N
     study.correct("domino_chain-0002", params={"azimuth_deg": azimuth + 2.0})
     run = study.traps("run", "demo")
     assert run.code == 0, run.err
-    assert run.counts() == {"answers": 4 * EVALUATIONS, "votes": 6 * 3 * EVALUATIONS, "frames": 100} or run.counts()["frames"] == 100
+    # Both items of `occlusion` and both of `occlusion_ill_posed` show new clips. Judges see no clip: a vote is asked
+    # again only where the new answer reads otherwise, which is so for the two random strategies at most.
+    counts = run.counts()
+    assert counts["votes"] <= 2 * 3 * (6 + 3) * 2
+    assert (counts["answers"], counts["frames"]) == (4 * EVALUATIONS, 100)
     after = {path: path.stat().st_mtime_ns for path in clips.rglob("*.mp4")}
     assert {path: time for path, time in after.items() if path in before} == before
     new = set(after) - set(before)
@@ -161,6 +165,7 @@ def test_a_discarded_scenario_leaves_every_table_and_keeps_its_answers(study: Ch
 
 def test_an_added_scenario_joins_a_study_of_the_whole_benchmark(study: Checkout, tmp_path: Path) -> None:
     params = json.loads(_released(study, "hidden_race-0001"))["params"]
+    params["azimuth_deg"] += 3.0  # an exact copy would be caught: no two clips may show the same frames
     study.correct("hidden_race-9001", action="add", family="hidden_race", params=params)
     experiment = tmp_path / "whole.yaml"
     experiment.write_text("name: whole\nmodels: [oracle]\nregimes: [standard]\ndatasets: [occlusion]\n")
@@ -180,6 +185,5 @@ def _released(study: Checkout, scenario_id: str) -> str:
 
 
 def test_copies_of_the_package_are_what_runs(study: Checkout) -> None:
-    code = "import traps_pipeline.paths as p; print(p.CHECKOUT)"
-    out = subprocess.run([sys.executable, "-c", code], env=study.environment, capture_output=True, text=True, check=True)
-    assert Path(out.stdout.strip()) == study.root
+    finished = study.run(sys.executable, "-c", "import traps_pipeline.paths as p; print(p.CHECKOUT)")
+    assert Path(finished.out.strip()) == study.root

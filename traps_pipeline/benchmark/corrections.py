@@ -2,7 +2,8 @@
 
 `scene_specs/corrections/*.jsonl` is append-only, one decision a line, read in the order of file names and lines:
 
-    {"scenario_id": "plinko-0003", "action": "correct", "question": "...", "who": "jd", "when": "2026-11-21", "why": "..."}
+    {"scenario_id": "plinko-0003", "action": "correct", "question": "...",
+     "who": "jd", "when": "2026-11-21", "why": "..."}     (on one line)
 
 keep: reviewed, nothing changes. correct: any of question, labels, aliases, answer, ill_posed_question,
 answerable_question, params. discard: the pair leaves the benchmark (its answers stay in the ledger). add: a new
@@ -29,7 +30,7 @@ from traps_pipeline.paths import CORRECTIONS
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.spec import Answerable, SceneSpec, Slug
 from traps_pipeline.storage.workspace import Study
-from traps_pipeline.yamlfile import explain
+from traps_pipeline.yamlfile import explain, read_lines
 
 WORDS = ("question", "labels", "aliases", "ill_posed_question", "answerable_question")
 
@@ -104,9 +105,7 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
     """All decisions with `file:line`. Raises TrapsError naming the line."""
     found = []
     for path in sorted(folder.glob("*.jsonl")):
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-            if not line.strip():
-                continue
+        for number, line in read_lines(path):
             where = f"{path}:{number}"
             try:
                 found.append((where, Correction.model_validate(json.loads(line))))
@@ -126,18 +125,23 @@ def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Cor
         known = scenarios.get(correction.scenario_id)
         if correction.action == "add":
             if known is not None or correction.scenario_id in released:
-                raise TrapsError(f"{where}: cannot add {correction.scenario_id!r}: the id is taken; choose a free number")
+                raise TrapsError(
+                    f"{where}: cannot add {correction.scenario_id!r}: the id is taken; choose a free number"
+                )
             scenarios[correction.scenario_id] = _added(where, correction)
             continue
         if known is None:
             gone = "was discarded" if correction.scenario_id in released else "is unknown"
             raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {gone}; name a scenario of the benchmark")
+        if correction.action in ("keep", "discard") and correction.changes():
+            raise TrapsError(
+                f"{where}: `{correction.action}` changes nothing, yet gives {sorted(correction.changes())}; "
+                "use `correct`"
+            )
         if correction.action == "discard":
             del scenarios[correction.scenario_id]
         elif correction.action == "correct":
             scenarios[correction.scenario_id] = _corrected(where, known, correction)
-        elif correction.changes():
-            raise TrapsError(f"{where}: `keep` changes nothing, yet gives {sorted(correction.changes())}; use `correct`")
     return dict(sorted(scenarios.items()))
 
 
@@ -163,7 +167,8 @@ def _added(where: str, correction: Correction) -> Scenario:
     changes = correction.changes()
     if correction.family not in family_names() or "params" not in changes:
         raise TrapsError(
-            f"{where}: `add` needs params and a known family, not {correction.family!r}; known: {', '.join(family_names())}"
+            f"{where}: `add` needs params and a known family, not {correction.family!r}; "
+            f"known: {', '.join(family_names())}"
         )
     family = get_family(str(correction.family))
     try:

@@ -54,7 +54,9 @@ def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:
     return {name: min(count, key=lambda answer: (-count[answer], answer)) for name, count in counts.items()}
 
 
-def _check_clips(workspace: Workspace, dataset: str, specs: Sequence[Record], clips: Mapping[tuple[str, str], Record]) -> None:
+def _check_clips(
+    workspace: Workspace, dataset: str, specs: Sequence[Record], clips: Mapping[tuple[str, str], Record]
+) -> None:
     for spec in specs:
         for side in SIDES:
             clip = clips.get((spec["scenario_id"], side))

@@ -13,7 +13,7 @@ from traps_pipeline.partitions import CATEGORIES
 from traps_pipeline.paths import RELEASED, SCENE_SPECS
 from traps_pipeline.scenes.registry import family_names
 from traps_pipeline.scenes.spec import SceneSpec
-from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
+from traps_pipeline.yamlfile import explain, parse_yaml_model, read_lines, read_yaml
 
 
 class Release(BaseModel):
@@ -36,12 +36,12 @@ def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
     """All released records by scenario id. Raises TrapsError naming file, line and what to do."""
     records: dict[str, SceneSpec] = {}
     for path in sorted(folder.glob("*.jsonl")):
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-            if not line.strip():
-                continue
+        for number, line in read_lines(path):
             spec = parse_record(line, f"{path}:{number}")
             if spec.scenario_id in records:
-                raise TrapsError(f"{path}:{number}: scenario {spec.scenario_id!r} occurs twice; remove one of the lines")
+                raise TrapsError(
+                    f"{path}:{number}: scenario {spec.scenario_id!r} occurs twice; remove one of the lines"
+                )
             records[spec.scenario_id] = spec
     if not records:
         raise TrapsError(f"{folder}: holds no released records; restore it from git or draw some with `traps sample`")
@@ -57,7 +57,11 @@ def parse_record(line: str, where: str) -> SceneSpec:
     except ValueError as error:
         raise TrapsError(f"{where}: not JSON ({error}); restore the line from git") from error
     if spec.family not in family_names():
-        raise TrapsError(f"{where}: {spec.scenario_id}: unknown family {spec.family!r}; known: {', '.join(family_names())}")
+        raise TrapsError(
+            f"{where}: {spec.scenario_id}: unknown family {spec.family!r}; known: {', '.join(family_names())}"
+        )
     if spec.category not in CATEGORIES:
-        raise TrapsError(f"{where}: {spec.scenario_id}: unknown category {spec.category!r}; known: {', '.join(CATEGORIES)}")
+        raise TrapsError(
+            f"{where}: {spec.scenario_id}: unknown category {spec.category!r}; known: {', '.join(CATEGORIES)}"
+        )
     return spec

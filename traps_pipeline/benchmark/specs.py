@@ -42,10 +42,15 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> Resolved:
             record = (folder / f"{name}.json").read_text(encoding="utf-8")
             return Resolved(parse_record(record, str(folder / f"{name}.json")), folder / f"{name}.npz")
     spec, qpos = _simulate(scenario)
-    save_trajectory(workspace.trajectories, name, qpos)
     part = workspace.trajectories / f".{name}.{os.getpid()}.part"
-    part.write_text(json.dumps(spec.model_dump(mode="json")), encoding="utf-8")
-    os.replace(part, workspace.trajectories / f"{name}.json")
+    try:
+        save_trajectory(workspace.trajectories, name, qpos)
+        part.write_text(json.dumps(spec.model_dump(mode="json")), encoding="utf-8")
+        part.replace(workspace.trajectories / f"{name}.json")  # last, so that it vouches for the trajectory
+    except OSError as error:
+        raise TrapsError(f"{part.parent / name}.json: cannot be written ({error.strerror}); free some space") from error
+    finally:
+        part.unlink(missing_ok=True)
     progress.current().note(
         f"{scenario.scenario_id}: simulated here after {scenario.where}; to freeze it for other machines copy "
         f"trajectories/{name}.* of the workspace to {CORRECTIONS.relative_to(CHECKOUT)}/trajectories/"
@@ -67,7 +72,8 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray]:
         spec, qpos = resolve(family, params, wording, scenario_id=scenario.scenario_id, seed=seed, physics=physics)
     except (Rejected, ValueError, TypeError) as error:
         raise TrapsError(
-            f"{scenario.where}: {scenario.scenario_id}: these parameters make no valid pair ({error}); change them or discard it"
+            f"{scenario.where}: {scenario.scenario_id}: these parameters make no valid pair ({error}); "
+            "change them or discard it"
         ) from error
     words = dict(scenario.words)
     if released is not None and released.labels == spec.labels:  # where they still fit, the released words stand
@@ -75,8 +81,8 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray]:
     answer = words.pop("answer", spec.ground_truth)
     if answer != spec.ground_truth:
         raise TrapsError(
-            f"{scenario.where}: {scenario.scenario_id}: the correction says {answer!r}, the simulation {spec.ground_truth!r}; "
-            "leave the answer out or change the parameters"
+            f"{scenario.where}: {scenario.scenario_id}: the correction says {answer!r}, "
+            f"the simulation {spec.ground_truth!r}; leave the answer out or change the parameters"
         )
     return apply_words(spec, words, scenario.where), qpos
 

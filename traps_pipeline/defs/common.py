@@ -8,7 +8,7 @@ section 3). Sources are observed on the way, so provenance never points at nothi
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import dagster as dg
@@ -69,8 +69,7 @@ def provenance(context: dg.AssetExecutionContext, workspace: Workspace) -> dict[
     tags = {_CODE_TAG: context.run_id}
     for parent in sorted(context.assets_def.asset_deps[context.asset_key]):
         name = parent.to_user_string()
-        fetch = context.instance.fetch_observations if name in SOURCES else context.instance.fetch_materializations
-        newest = fetch(dg.AssetRecordsFilter(asset_key=parent), limit=1).records
+        newest = _fetch(context.instance, name)(dg.AssetRecordsFilter(asset_key=parent), limit=1).records
         version = _recorded_version(newest[0]) if newest else None
         tags[f"{_INPUT_VERSION}/{name}"] = version or "none"
         tags[f"{_INPUT_POINTER}/{name}"] = str(newest[0].storage_id) if newest else "NULL"
@@ -81,7 +80,7 @@ def observe_sources(instance: dg.DagsterInstance, workspace: Workspace) -> list[
     """Tell Dagster the versions of all sources that it does not know yet; returns those that changed."""
     lineage, changed = Lineage(workspace), list[Node]()
     for source in SOURCES:
-        recorded = _recorded_versions(instance, source)
+        recorded = recorded_versions(instance, source)
         for key in keys_of(source):
             version = str(lineage.version(source, key))
             if recorded.get(key) != version:
@@ -91,19 +90,23 @@ def observe_sources(instance: dg.DagsterInstance, workspace: Workspace) -> list[
     return changed
 
 
-def _recorded_versions(instance: dg.DagsterInstance, source: str) -> dict[str | None, str | None]:
-    """The newest observed version of each partition of a source."""
+def recorded_versions(instance: dg.DagsterInstance, name: str) -> dict[str | None, str | None]:
+    """The data version that Dagster knows of each partition of a stage or source."""
     versions: dict[str | None, str | None] = {}
     cursor = None
     while True:
-        page = instance.fetch_observations(dg.AssetRecordsFilter(asset_key=dg.AssetKey(source)), limit=1000, cursor=cursor)
+        page = _fetch(instance, name)(dg.AssetRecordsFilter(asset_key=dg.AssetKey(name)), limit=1000, cursor=cursor)
         for record in page.records:  # newest first
-            observation = record.asset_observation
-            if observation is not None:
-                versions.setdefault(observation.partition, _recorded_version(record))
-        if not page.has_more or len(versions) >= len(keys_of(source)):
+            event = record.asset_materialization or record.asset_observation
+            if event is not None:
+                versions.setdefault(event.partition, _recorded_version(record))
+        if not page.has_more or len(versions) >= len(keys_of(name)):
             return versions
         cursor = page.cursor
+
+
+def _fetch(instance: dg.DagsterInstance, name: str) -> Callable[..., dg.EventRecordsResult]:
+    return instance.fetch_observations if name in SOURCES else instance.fetch_materializations
 
 
 def _recorded_version(record: dg.EventLogRecord) -> str | None:

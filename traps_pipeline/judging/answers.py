@@ -6,10 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 
 NUMERIC_TOLERANCE = 0.5
-NUMBER_WORDS = {
-    word: str(n)
-    for n, word in enumerate("zero one two three four five six seven eight nine ten eleven twelve".split())
-}
+_WORDS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+NUMBER_WORDS = {word: str(n) for n, word in enumerate(_WORDS)}
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 
 
@@ -19,6 +17,14 @@ def normalise(text: str) -> str:
     text = re.sub(r"(?<=\d)\s*(?:-|to)\s*(?=\d)", "-", text)
     text = re.sub(r"(?<!\d)[.\-]|[.\-](?!\d)|[^\w\s.\-]", " ", text)
     return " ".join(word for word in text.split() if word not in ("a", "an", "the"))
+
+
+def strip_fence(text: str) -> str:
+    """JSON out of a ```json fence, which some models and judges add against the instruction."""
+    text = text.strip()
+    if text.startswith("```") and text.endswith("```"):
+        text = text[3:-3].removeprefix("json").strip()
+    return text
 
 
 def to_number(text: str) -> float | None:
@@ -38,7 +44,7 @@ def to_label(text: str, labels: Sequence[str], aliases: Mapping[str, str]) -> st
 def is_correct(
     extracted: str | None, ground_truth: str, answer_type: str, labels: Sequence[str], aliases: Mapping[str, str]
 ) -> bool:
-    """Numeric: within 0.5 of the ground truth. Others: the label named is the ground truth; an unmapped value is wrong."""
+    """Numeric: within 0.5 of the ground truth. Others: the label named is the truth; an unmapped value is wrong."""
     if extracted is None:
         return False
     if answer_type == "numeric":

@@ -6,16 +6,18 @@ from __future__ import annotations
 import json
 import re
 
-from traps_pipeline.judging.answers import NUMBER_WORDS, normalise
+from traps_pipeline.judging.answers import NUMBER_WORDS, normalise, strip_fence
 from traps_pipeline.models.request import Outcome, Request
 
 COLOURS = (
-    "red green blue yellow orange cyan purple white black grey gray brown pink magenta teal turquoise violet navy".split()
+    *("red", "green", "blue", "yellow", "orange", "cyan", "purple", "white", "black", "grey", "gray", "brown", "pink"),
+    *("magenta", "teal", "turquoise", "violet", "navy"),
 )
 SIDES = ("left", "right", "elsewhere", "somewhere else", "balanced", "level")
 ABSTENTIONS = (
     r"i (?:do not|don'?t|cannot|can'?t) (?:really )?(?:know|tell|say|determine|answer|see)",
-    r"(?:cannot|can'?t|can not|could not|couldn'?t) be (?:\w+ )?(?:determined|answered|known|inferred|established|seen)",
+    r"(?:cannot|can'?t|can not|could not|couldn'?t) be (?:\w+ )?"
+    r"(?:determined|answered|known|inferred|established|seen)",
     r"(?:impossible|not possible|unable) to (?:tell|determine|know|say|answer|conclude|see)",
     r"\b(?:unanswerable|undeterminable|indeterminate|undetermined|unknowable|unknown)\b",
     r"(?:insufficient|not enough|no sufficient|lack of) (?:\w+ )?(?:information|evidence|data)",
@@ -25,7 +27,13 @@ ABSTENTIONS = (
     r"\bno way to (?:tell|know|determine)\b",
 )
 _ABSTENTION = re.compile("|".join(ABSTENTIONS))
-_FINAL = re.compile(r"(?:final answer|answer is|answer)\s*(?:is)?\s*[:=]?\s*", re.IGNORECASE)
+_FINAL = re.compile(r"\banswer\W*?(?:\bis\b\s*:?|[:=])\s*", re.IGNORECASE)
+# "I can't tell exactly, but it seems to go left" commits: a hedge, then a turn, then words that settle on something.
+_TURN = re.compile(r"\b(?:but|however|nevertheless|nonetheless|still|yet)\b")
+_COMMITMENT = re.compile(
+    r"\b(?:appears?|seems?|looks?|likely|probably|i(?:'d| would) (?:say|guess|go with|pick|choose)"
+    r"|(?:my )?(?:best )?guess|i (?:think|believe))\b"
+)
 _RESPONSE = re.compile(r"^(RESPONSE-[0-9a-f]{12})\n(.*)\n\1\Z", re.DOTALL | re.MULTILINE)
 _TRUTH = re.compile(r"^Ground truth: (.*)$", re.MULTILINE)
 
@@ -48,13 +56,13 @@ class RuleJudge:
 
 
 def final_statement(answer: str) -> str:
-    """The part of an answer that commits: the JSON's `final_answer`, else what follows the last 'answer is', else all."""
+    """What an answer commits to: the JSON's `final_answer`, else what follows the last 'answer is', else all."""
     try:
-        parsed = json.loads(answer)
+        parsed = json.loads(strip_fence(answer))
     except ValueError:
         parsed = None
-    if isinstance(parsed, dict) and parsed.get("final_answer") is not None:
-        return str(parsed["final_answer"])
+    if isinstance(parsed, dict) and "final_answer" in parsed:
+        return "" if parsed["final_answer"] is None else str(parsed["final_answer"])
     pieces = _FINAL.split(answer)
     return pieces[-1] if len(pieces) > 1 and pieces[-1].strip() else answer
 
@@ -62,7 +70,8 @@ def final_statement(answer: str) -> str:
 def judge_abstention(answer: str) -> dict[str, object]:
     """Abstained if the committing part declines; a hedge before a committed answer is an answer."""
     final = final_statement(answer).lower().replace("’", "'")
-    found = _ABSTENTION.search(final)
+    last = _TURN.split(final)[-1]
+    found = None if _COMMITMENT.search(last) and not _ABSTENTION.search(last) else _ABSTENTION.search(final)
     abstained = found is not None or not normalise(final)
     reason = f"The response says '{found.group()}'." if found else "The response commits to an answer."
     return {"abstained": abstained, "confidence": "high" if found else "medium", "reasoning": reason}
@@ -79,7 +88,7 @@ def judge_correctness(answer: str, ground_truth: str) -> dict[str, object]:
 
 
 def extract(text: str, like: str) -> str | None:
-    """The last word of the same kind as `like` (range, number, yes/no, side or colour) in a text; else the whole text."""
+    """The last word of the kind of `like` (range, number, yes/no, side or colour) in a text; else the whole text."""
     words = normalise(text)
     kind = normalise(like)
     if re.fullmatch(r"\d+-\d+", kind):

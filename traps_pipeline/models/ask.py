@@ -13,12 +13,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from itertools import groupby
 from typing import Any, Generic, TypeVar
 
 from traps_pipeline import progress
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.registry import Limits
 from traps_pipeline.models.request import Backend, Outcome, Request, TransientError
@@ -56,7 +58,7 @@ class Participants:
 
 @dataclass(frozen=True)
 class Work(Generic[Finished]):
-    """What a stage asks. requests(cell): all calls it wants. finish(cell, rows by key, tally): writes the cell's table."""
+    """What a stage asks. requests(cell): all calls it wants. finish(cell, rows by key, tally): writes its table."""
 
     stage: str
     ledger: Ledger
@@ -66,8 +68,20 @@ class Work(Generic[Finished]):
     finish: Callable[[Cell, Mapping[str, Row], Tally], Finished]
 
 
-async def attempt(participant: Participant, request: Request) -> tuple[Outcome, int, float]:
-    """An outcome, the calls it took, the seconds of the last one. The one retry layer: exponential with full jitter."""
+@dataclass(frozen=True)
+class Settled:
+    """A cell all of whose calls are answered: the ledger's row of each key, and what it took."""
+
+    cell: Cell
+    rows: Mapping[str, Row]
+    tally: Tally
+
+
+async def attempt(participant: Participant, request: Request, stop: asyncio.Event) -> tuple[Outcome, int, float] | None:
+    """An outcome, the calls it took, the seconds of the last one; None when stopped while waiting for another try.
+
+    The one retry layer: exponential with full jitter, and never sooner than the provider asks.
+    """
     for number in range(1, participant.limits.retries + 2):
         began = time.monotonic()
         try:
@@ -76,17 +90,32 @@ async def attempt(participant: Participant, request: Request) -> tuple[Outcome, 
             outcome = Outcome("error", error=error.kind)
             if number <= participant.limits.retries:
                 longest = min(participant.limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
-                await asyncio.sleep(max(error.retry_after_s or 0.0, random.uniform(0, longest)))
+                if await _stopped_within(stop, max(error.retry_after_s or 0.0, random.uniform(0, longest))):
+                    return None
                 continue
         return outcome, number, time.monotonic() - began
     raise AssertionError("unreachable: the last attempt returns")
 
 
-def ledger_row(request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str) -> tuple[Row, str | None]:
+async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
+    with suppress(TimeoutError):
+        await asyncio.wait_for(stop.wait(), seconds)
+    return stop.is_set()
+
+
+def ledger_row(
+    request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str
+) -> tuple[Row, str | None]:
     """The row that stands for an answer, and its reasoning trace."""
     fields = asdict(outcome)
     reasoning = fields.pop("reasoning")
-    row = {"key": request.key, "outcome": fields.pop("kind"), **fields, "attempts": attempts, "latency_s": round(latency_s, 6)}
+    row = {
+        "key": request.key,
+        "outcome": fields.pop("kind"),
+        **fields,
+        "attempts": attempts,
+        "latency_s": round(latency_s, 6),
+    }
     row |= {"epoch": epoch, "created_at": datetime.now(UTC).isoformat(), "components": request.components}
     return row, reasoning
 
@@ -97,20 +126,33 @@ class _Asking:
 
     work: Work[Any]
     writer: SegmentWriter
-    missing: deque[Request]
+    missing: Sequence[Request]
     stop: asyncio.Event
+    what: str
     rows: dict[str, Row] = field(default_factory=dict)
+    problems: list[Exception] = field(default_factory=list)
 
     async def worker(self, participant: Participant, queue: deque[Request]) -> None:
-        while queue and not self.stop.is_set():
-            async with participant.free:
-                if not queue or self.stop.is_set():
-                    return
-                request = queue.popleft()
-                outcome, attempts, latency = await attempt(participant, request)
-                row, reasoning = ledger_row(request, outcome, attempts, latency, self.work.epoch)
-                self.writer.append(row, reasoning)
-                self.rows[request.key] = row
+        try:
+            while await self.one(participant, queue):
+                pass
+        except Exception as error:  # noqa: BLE001 - raised by `run`, once the calls in flight are in the ledger
+            self.problems.append(error)
+
+    async def one(self, participant: Participant, queue: deque[Request]) -> bool:
+        """Ask and record one request of the queue; False when there is nothing more to do."""
+        async with participant.free:
+            if not queue or self.stop.is_set() or self.problems:
+                return False
+            request = queue.popleft()
+            attempted = await attempt(participant, request, self.stop)
+            if attempted is None:
+                return False
+            row, reasoning = ledger_row(request, *attempted, self.work.epoch)
+            self.writer.append(row, reasoning)
+            self.rows[request.key] = row
+            progress.current().tick(self.work.stage, self.what, len(self.rows), len(self.missing))
+            return True
 
     async def sync(self) -> None:
         while True:
@@ -118,26 +160,27 @@ class _Asking:
             self.writer.sync_if_due()
 
     async def run(self) -> None:
+        """Ask all that is missing. An exception stops new calls; it is raised when those in flight are recorded."""
         queues: dict[str, deque[Request]] = {}
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
+        asked = [(self.work.participants[name], queue) for name, queue in queues.items()]
         syncing = asyncio.create_task(self.sync())
         try:
             async with asyncio.TaskGroup() as group:
-                for name, queue in queues.items():
-                    participant = self.work.participants[name]
+                for participant, queue in asked:
                     for _ in range(min(participant.limits.concurrency, len(queue))):
                         group.create_task(self.worker(participant, queue))
-        except ExceptionGroup as errors:
-            raise errors.exceptions[0] from None
         finally:
             syncing.cancel()
+        if self.problems:
+            raise self.problems[0]
 
 
 async def settle_evaluation(
-    work: Work[Finished], evaluation: Evaluation, cells: Sequence[Cell], stop: asyncio.Event
-) -> AsyncIterator[Finished]:
-    """Finish the cells of one evaluation, asking only what its ledger does not hold. Unfinished cells are left out."""
+    work: Work[Any], evaluation: Evaluation, cells: Sequence[Cell], stop: asyncio.Event
+) -> AsyncIterator[Settled]:
+    """Settle the cells of one evaluation, asking only what its ledger does not hold. Unfinished cells are left out."""
     report = progress.current()
     async with work.ledger.lock(evaluation.key, report.note):
         known = work.ledger.read(evaluation.key)
@@ -147,29 +190,29 @@ async def settle_evaluation(
         with work.ledger.writer(evaluation.key) as writer:
             for cell in cells:
                 wanted = {request.key: request for request in work.requests(cell)}
-                missing = deque(request for key, request in wanted.items() if key not in answered)
-                asking = _Asking(work, writer, missing, stop)
+                missing = [request for key, request in wanted.items() if key not in answered]
+                asking = _Asking(work, writer, missing, stop, cell.key)
                 tally = Tally(asked=len(missing), cached=len(wanted) - len(missing))
                 await asking.run()
                 rows = {key: answered.get(key) or asking.rows.get(key) for key in wanted}
-                if any(row is None for row in rows.values()):
-                    return  # stopped before the cell was complete; what was answered is in the ledger
+                if stop.is_set() or any(row is None for row in rows.values()):
+                    return  # what was answered is in the ledger
                 writer.sync()
                 complete = {key: row for key, row in rows.items() if row is not None}
                 tally.errors = sum(row["outcome"] == "error" for row in complete.values())
-                yield work.finish(cell, complete, tally)
+                yield Settled(cell, complete, tally)
 
 
-async def settle(work: Work[Finished], cells: Sequence[Cell], stop: asyncio.Event) -> AsyncIterator[Finished | Exception]:
-    """Finish all cells, models side by side. A model that fails yields its exception; the others go on."""
-    done: asyncio.Queue[Finished | Exception | None] = asyncio.Queue()
+async def settle(work: Work[Any], cells: Sequence[Cell], stop: asyncio.Event) -> AsyncIterator[Settled | Exception]:
+    """Settle all cells, models side by side. A model that fails yields its exception; the others go on."""
+    done: asyncio.Queue[Settled | Exception | None] = asyncio.Queue()
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[Cell]]]) -> None:
         try:
             for evaluation, mine in evaluations:
-                async for finished in settle_evaluation(work, evaluation, mine, stop):
-                    await done.put(finished)
-        except Exception as error:  # handed to the caller, who reports it and fails the run
+                async for settled in settle_evaluation(work, evaluation, mine, stop):
+                    await done.put(settled)
+        except Exception as error:  # noqa: BLE001 - handed to the caller, who reports it and fails the run
             await done.put(error)
         finally:
             await done.put(None)
@@ -182,11 +225,11 @@ async def settle(work: Work[Finished], cells: Sequence[Cell], stop: asyncio.Even
     try:
         open_tasks = len(tasks)
         while open_tasks:
-            finished = await done.get()
-            if finished is None:
+            settled = await done.get()
+            if settled is None:
                 open_tasks -= 1
             else:
-                yield finished
+                yield settled
     finally:
         for task in tasks:
             task.cancel()
@@ -194,35 +237,60 @@ async def settle(work: Work[Finished], cells: Sequence[Cell], stop: asyncio.Even
 
 
 def run_work(work: Work[Finished], cells: Sequence[Cell]) -> Iterator[Finished]:
-    """`settle` for synchronous callers. The first Ctrl-C stops new calls and waits for those in flight, a second one
-    stops at once; either way KeyboardInterrupt is raised and the same command goes on later. Exceptions of models are
-    raised together after the others have finished."""
+    """Settle cells and finish each (write its table) just before it is handed on. For synchronous callers.
+
+    The first Ctrl-C stops new calls and waits for those in flight, a second one stops at once; either way
+    KeyboardInterrupt is raised and the same command goes on later. A caller that closes the iterator early stops it in
+    the same way. Exceptions of models are raised together after the others have finished.
+    """
     loop = asyncio.new_event_loop()
     stop = asyncio.Event()
     results = settle(work, cells, stop)
     problems: list[Exception] = []
-    with _drain_on_interrupt(loop, stop):
+    try:
+        while True:
+            try:
+                # Dagster sets a handler of its own around each step of this generator, so ours is set for each too.
+                with _drain_on_interrupt(loop, stop):
+                    settled = loop.run_until_complete(anext(results))
+            except StopAsyncIteration:
+                break
+            except asyncio.CancelledError:
+                raise KeyboardInterrupt from None
+            if stop.is_set():
+                continue  # drain: calls in flight are paid for and go to the ledger, no more tables are made
+            if isinstance(settled, Exception):
+                problems.append(settled)
+            else:
+                yield work.finish(settled.cell, settled.rows, settled.tally)
+    finally:
+        interrupted = stop.is_set()
+        stop.set()
         try:
-            while True:
-                try:
-                    finished = loop.run_until_complete(anext(results))
-                except StopAsyncIteration:
-                    break
-                except asyncio.CancelledError:
-                    raise KeyboardInterrupt from None
-                if isinstance(finished, Exception):
-                    problems.append(finished)
-                else:
-                    yield finished
+            with _drain_on_interrupt(loop, stop):
+                loop.run_until_complete(_exhaust(results))
+        except asyncio.CancelledError:
+            raise KeyboardInterrupt from None
         finally:
-            loop.run_until_complete(results.aclose())
             loop.close()
-    if stop.is_set():
+    if interrupted:
         raise KeyboardInterrupt
+    _raise_together(work.stage, problems)
+
+
+async def _exhaust(results: AsyncIterator[Any]) -> None:
+    async for _ in results:
+        pass
+
+
+def _raise_together(stage: str, problems: Sequence[Exception]) -> None:
+    """One exception for all models that failed; sentences stay sentences."""
+    if problems and all(isinstance(problem, TrapsError) for problem in problems):
+        raise TrapsError("\n".join(sorted({str(problem) for problem in problems})))
     if len(problems) == 1:
         raise problems[0]
     if problems:
-        raise ExceptionGroup(f"{work.stage}: {len(problems)} models failed", problems)
+        raise ExceptionGroup(f"{stage}: {len(problems)} models failed", problems)
 
 
 class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used

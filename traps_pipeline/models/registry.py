@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import Evaluation, check_slug, evaluations
@@ -50,6 +50,15 @@ class ModelEntry(BaseModel):
     @classmethod
     def _slug(cls, value: str) -> str:
         return check_slug(value)
+
+    @model_validator(mode="after")
+    def _known_strategy(self) -> ModelEntry:
+        from traps_pipeline.models.reference import STRATEGIES
+
+        if self.backend == "reference" and self.params.get("strategy") not in STRATEGIES:
+            known = ", ".join(STRATEGIES)
+            raise ValueError(f"params.strategy is {self.params.get('strategy')!r}; known strategies: {known}")
+        return self
 
 
 @cache

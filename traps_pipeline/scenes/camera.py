@@ -92,7 +92,7 @@ def fit_camera(view: View, points: np.ndarray) -> Camera:
 
 
 def fit_panel(camera: Camera, cover: Box) -> Panel:
-    """The smallest upright panel just in front of `cover` that hides all of it from the camera, standing on the floor."""
+    """The smallest upright panel on the floor, just in front of `cover`, that hides all of it from the camera."""
     eye = camera.position()
     azimuth = np.radians(camera.azimuth_deg)
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])

@@ -14,10 +14,12 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from traps_pipeline.digests import file_digest
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.camera import Camera, Panel
 from traps_pipeline.scenes.encode import DamagedClip, encode, frames_digest
 from traps_pipeline.scenes.kit import Physics
@@ -133,11 +135,18 @@ def _save(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: flo
     encode(frames, path, fps)
     clip = Clip(file_digest(path), frames_digest(frames), len(frames), fps, path.stat().st_size, leaked_pixels)
     part = note_of(path).with_suffix(f".{os.getpid()}.part")
-    part.write_text(json.dumps(asdict(clip)), encoding="utf-8")
-    os.replace(part, note_of(path))
+    try:
+        part.write_text(json.dumps(asdict(clip)), encoding="utf-8")
+        part.replace(note_of(path))
+    except OSError as error:
+        raise TrapsError(
+            f"{note_of(path)}: cannot be written ({error.strerror}); free some space and run again"
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)
 
 
-def _tuples(values: dict[str, object]) -> dict[str, object]:
+def _tuples(values: dict[str, Any]) -> dict[str, Any]:
     return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
 
 
@@ -155,7 +164,11 @@ def render_pairs(jobs: Sequence[Job], workers: int | None = None) -> Iterator[tu
         return
     workers = min(workers or len(os.sched_getaffinity(0)), len(todo))
     pool = ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=_exit_with_parent, initargs=(os.getpid(),), max_tasks_per_child=100
+        workers,
+        mp_context=get_context("spawn"),
+        initializer=_exit_with_parent,
+        initargs=(os.getpid(),),
+        max_tasks_per_child=100,
     )
     try:
         futures = {pool.submit(render_pair, job): job for job in todo}
@@ -167,10 +180,10 @@ def render_pairs(jobs: Sequence[Job], workers: int | None = None) -> Iterator[tu
 
 def _exit_with_parent(parent: int) -> None:
     """A worker whose parent was killed must not live on."""
+
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(1.0)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from traps_pipeline.errors import TrapsError
+
 ENCODER = {"crf": "16", "g": "10", "preset": "medium", "threads": "1"}
 
 
@@ -25,8 +27,12 @@ def frames_digest(frames: Sequence[np.ndarray]) -> str:
 
 
 def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
-    """Write RGB frames (F, H, W, 3) as an mp4 (H.264, yuv420p, faststart); the file appears whole or not at all."""
+    """Write RGB frames (F, H, W, 3) as an mp4 (H.264, yuv420p, faststart); the file appears whole or not at all.
+
+    Raises TrapsError when it cannot be written (a full disk); a former file then still stands.
+    """
     import av
+    from av.error import FFmpegError
 
     part = path.with_suffix(f".{os.getpid()}.part")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -39,7 +45,12 @@ def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
             for frame in frames:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
             container.mux(stream.encode(None))
-        os.replace(part, path)
+        part.replace(path)
+    except (FFmpegError, OSError) as error:
+        raise TrapsError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space and run the same command again "
+            "(clips that are there are not rendered again)"
+        ) from error
     finally:
         part.unlink(missing_ok=True)
 
@@ -47,12 +58,18 @@ def encode(frames: Sequence[np.ndarray], path: Path, fps: int) -> None:
 def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """All frames (F, H, W, 3) uint8 RGB and their times (F,) in seconds. Raises DamagedClip."""
     import av
+    from av.error import FFmpegError
 
     try:
         with av.open(str(path)) as container:
+            promised = container.streams.video[0].frames
             pairs = [(f.to_ndarray(format="rgb24"), float(f.time or 0.0)) for f in container.decode(video=0)]
-    except (av.FFmpegError, OSError) as error:
-        raise DamagedClip(f"{path}: cannot be decoded ({error}); delete the file and materialize videos again") from error
-    if not pairs:
-        raise DamagedClip(f"{path}: holds no frame; delete the file and materialize videos again")
+    except (FFmpegError, OSError, IndexError) as error:  # IndexError: no video stream
+        raise DamagedClip(
+            f"{path}: cannot be decoded ({error}); delete the file and materialize videos again"
+        ) from error
+    if not pairs or len(pairs) != promised:
+        raise DamagedClip(
+            f"{path}: holds {len(pairs)} of {promised} frames; delete the file and materialize videos again"
+        )
     return np.stack([p[0] for p in pairs]), np.array([p[1] for p in pairs])

@@ -177,7 +177,8 @@ class Family:
         unknown, missing = sorted(set(values) - known), sorted(known - set(values))
         if unknown or missing:
             raise ValueError(
-                f"family {self.name}: unknown parameters {unknown}, missing parameters {missing}; known: {sorted(known)}"
+                f"family {self.name}: unknown parameters {unknown}, missing parameters {missing}; "
+                f"known: {sorted(known)}"
             )
         return self.params(**{name: _as_tuple(value) for name, value in values.items()})
 

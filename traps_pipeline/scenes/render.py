@@ -8,7 +8,7 @@ from __future__ import annotations
 import atexit
 import os
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -132,5 +132,5 @@ class Renderer:
 
         GL.glReadBuffer(GL.GL_COLOR_ATTACHMENT0)
         raw = GL.glReadPixels(0, 0, self._width, self._height, GL.GL_RGBA, GL.GL_UNSIGNED_BYTE)
-        pixels = np.frombuffer(raw, np.uint8).reshape(self._height, self._width, 4)
+        pixels = np.frombuffer(cast(bytes, raw), np.uint8).reshape(self._height, self._width, 4)
         return np.ascontiguousarray(pixels[::-1, :, :3])

@@ -60,7 +60,9 @@ def sample_family(
         report(f"{scenario_id}: {spec.ground_truth} after {draw + 1} draws {json.dumps(spec.evidence)}")
     if len(sample.scenarios) < count:
         tally = ", ".join(f"{n} x {reason}" for reason, n in sample.rejections.most_common())
-        raise RuntimeError(f"{family.name}: {len(sample.scenarios)} of {count} after {max_draws} draws; rejected: {tally}")
+        raise RuntimeError(
+            f"{family.name}: {len(sample.scenarios)} of {count} after {max_draws} draws; rejected: {tally}"
+        )
     return sample
 
 

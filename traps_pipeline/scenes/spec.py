@@ -62,7 +62,9 @@ class SceneSpec(BaseModel):
         if strays:
             raise ValueError(f"aliases point to unknown labels {strays}; labels are {self.labels}")
         if self.answerable_question.answer not in self.answerable_question.labels:
-            raise ValueError(f"answerable_question: answer {self.answerable_question.answer!r} is not one of its labels")
+            raise ValueError(
+                f"answerable_question: answer {self.answerable_question.answer!r} is not one of its labels"
+            )
         return self
 
     @property

@@ -66,7 +66,8 @@ class Ledger:
     @contextmanager
     def writer(self, evaluation: str) -> Iterator[SegmentWriter]:
         """A writer of a new segment; the file appears with the first row."""
-        name = f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{time.time_ns() % 10**9:09d}-{secrets.token_hex(3)}.jsonl"
+        second, rest = divmod(time.time_ns(), 10**9)  # one reading, so that names sort as segments were begun
+        name = f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime(second))}-{rest:09d}-{secrets.token_hex(3)}.jsonl"
         writer = SegmentWriter(self.folder(evaluation) / name)
         try:
             yield writer
@@ -77,8 +78,9 @@ class Ledger:
     async def lock(self, evaluation: str, waiting: Callable[[str], None]) -> AsyncIterator[None]:
         """Hold the evaluation's lock; while another process has it, wait and say once who holds it."""
         path = self.root / "locks" / f"{self.kind}-{evaluation}.lock"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        with _writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         told = False
         try:
             while True:
@@ -87,11 +89,14 @@ class Ledger:
                     break
                 except BlockingIOError:
                     if not told:
-                        waiting(f"{self.kind} of {evaluation} are being asked by {_holder(path)}; waiting for it to finish")
+                        waiting(
+                            f"{self.kind} of {evaluation} are being asked by {_holder(path)}; waiting for it to finish"
+                        )
                         told = True
                     await asyncio.sleep(LOCK_POLL_SECONDS)
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, json.dumps({"pid": os.getpid(), "since": time.strftime("%H:%M:%S")}).encode(), 0)
+            with _writing(path):
+                os.ftruncate(descriptor, 0)
+                os.pwrite(descriptor, json.dumps({"pid": os.getpid(), "since": time.strftime("%H:%M:%S")}).encode(), 0)
             yield
         finally:
             os.close(descriptor)
@@ -115,7 +120,7 @@ class SegmentWriter:
 
     def _write(self, path: Path, row: Mapping[str, Any]) -> None:
         line = json.dumps(row, ensure_ascii=False, allow_nan=False).encode() + b"\n"
-        try:
+        with _writing(path):
             if path not in self._files:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 self._files[path] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
@@ -123,11 +128,6 @@ class SegmentWriter:
             if os.write(self._files[path], line) < len(line):
                 os.ftruncate(self._files[path], start)  # a half-written line must not swallow the next one
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError as error:
-            raise TrapsError(
-                f"{path}: an answer could not be written ({error.strerror}); free some space and run the same command "
-                "again: everything answered before is kept, this answer is asked again"
-            ) from error
 
     def sync_if_due(self) -> None:
         """Sync to disk when 100 rows or 0.5 s have passed since the last time."""
@@ -136,8 +136,9 @@ class SegmentWriter:
 
     def sync(self) -> None:
         """Sync what was written."""
-        for descriptor in self._files.values():
-            os.fsync(descriptor)
+        for path, descriptor in self._files.items():
+            with _writing(path):
+                os.fsync(descriptor)
         self._unsynced, self._synced_at = 0, time.monotonic()
 
     def close(self) -> None:
@@ -146,6 +147,18 @@ class SegmentWriter:
             self.sync()
         while self._files:
             os.close(self._files.popitem()[1])
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn a full or broken disk into a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise TrapsError(
+            f"{path}: could not be written ({error.strerror}); free some space and run the same command again: "
+            "everything answered before is kept, only what was in flight is asked again"
+        ) from error
 
 
 def _read_segment(path: Path) -> Iterator[tuple[dict[str, Any] | None, str | None]]:
@@ -159,8 +172,8 @@ def _read_segment(path: Path) -> Iterator[tuple[dict[str, Any] | None, str | Non
                 row["key"]
             except (ValueError, KeyError, TypeError) as error:
                 raise TrapsError(
-                    f"{path}:{number}: not a ledger row ({error!r}); remove that line and run again: its answer will be "
-                    "asked anew, all others are kept"
+                    f"{path}:{number}: not a ledger row ({error!r}); remove that line and run again: its answer "
+                    "will be asked anew, all others are kept"
                 ) from error
             yield row, None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -58,8 +59,8 @@ class TableStore:
         """Write one partition and return its data version (a digest of its content, volatile columns aside).
 
         Rows are sorted by the table's key. `inputs` (versions of what the rows were made from) and `failed` (answers
-        that a next run should ask again) go into the file's footer with the version. Raises TrapsError when a row breaks the schema or a key repeats, and when the
-        disk is full; the partition's former file then still stands.
+        that a next run should ask again) go into the file's footer with the version. Raises TrapsError when a row
+        breaks the schema or a key repeats, and when the disk is full; the partition's former file then still stands.
         """
         import pyarrow.parquet as pq
 
@@ -74,26 +75,29 @@ class TableStore:
             pq.write_table(data, part, compression="zstd")
             with part.open("rb") as stream:
                 os.fsync(stream.fileno())
-            os.replace(part, path)
+            part.replace(path)
         except OSError as error:
             raise TrapsError(
-                f"{path}: cannot be written ({error.strerror or error}); free some space and run the same command again "
-                "(nothing was half-written, no answer is lost)"
+                f"{path}: cannot be written ({error.strerror or error}); free some space and run the same command "
+                "again (nothing was half-written, no answer is lost)"
             ) from error
         finally:
             part.unlink(missing_ok=True)
         return version
 
-    def _checked(self, table: Table, partition: Mapping[str, Any], rows: Sequence[Mapping[str, Any]] | pd.DataFrame) -> pa.Table:
+    def _checked(
+        self, table: Table, partition: Mapping[str, Any], rows: Sequence[Mapping[str, Any]] | pd.DataFrame
+    ) -> pa.Table:
         import pyarrow as pa
 
         schema = table.arrow_schema()
+        listed = [_without_nan(row) for row in rows] if isinstance(rows, Sequence) else None
+        names = {str(name) for name in (rows if listed is None else (name for row in listed for name in row))}
         try:
-            if isinstance(rows, list | tuple):
-                unknown = sorted({name for row in rows for name in row} - set(schema.names))
-                if unknown:
-                    raise ValueError(f"unknown columns {unknown}")
-                data = pa.Table.from_pylist(list(rows), schema=schema)
+            if names - set(schema.names):
+                raise ValueError(f"unknown columns {sorted(names - set(schema.names))}")
+            if listed is not None:
+                data = pa.Table.from_pylist(listed, schema=schema)
             else:
                 data = pa.Table.from_pandas(rows, schema=schema, preserve_index=False, safe=True)
                 data = data.replace_schema_metadata(None).cast(schema)
@@ -105,11 +109,15 @@ class TableStore:
         for column, value in partition.items():
             strays = set(data[column].to_pylist()) - {value}
             if strays:
-                raise TrapsError(f"table {table.name} {dict(partition)}: column {column} also holds {sorted(map(str, strays))}")
+                raise TrapsError(
+                    f"table {table.name} {dict(partition)}: column {column} also holds {sorted(map(str, strays))}"
+                )
         keys = list(zip(*(data[name].to_pylist() for name in table.key), strict=True))
         if len(set(keys)) != len(keys):
             repeated = next(k for k in keys if keys.count(k) > 1)
-            raise TrapsError(f"table {table.name} {dict(partition)}: key {dict(zip(table.key, repeated, strict=True))} repeats")
+            raise TrapsError(
+                f"table {table.name} {dict(partition)}: key {dict(zip(table.key, repeated, strict=True))} repeats"
+            )
         return data.sort_by([(name, "ascending") for name in table.key]) if len(data) else data
 
     def state(self, table: Table, partition: Mapping[str, Any]) -> State | None:
@@ -130,9 +138,7 @@ class TableStore:
         """One partition. Raises TrapsError naming the file and the stage to materialize when it is not there."""
         return self._load(table, self.path(table, partition), columns).to_pandas()
 
-    def read_all(
-        self, table: Table, columns: Sequence[str] | None = None, **equal: Any
-    ) -> pd.DataFrame:
+    def read_all(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pd.DataFrame:
         """All partitions whose partition columns equal the given values; an empty frame if there are none."""
         return self.read_arrow(table, columns, **equal).to_pandas()
 
@@ -140,24 +146,42 @@ class TableStore:
         """`read_all` as an Arrow table."""
         import pyarrow as pa
 
+        strangers = sorted(set(equal) - set(table.partition_by))
+        if strangers:
+            raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not by {strangers}")
         parts = ["*" if c not in equal else str(equal[c]) for c in table.partition_by]
         pattern = "/".join([*(f"{c}={v}" for c, v in zip(table.partition_by, parts, strict=True)), "part-0.parquet"])
-        schema = table.arrow_schema()
-        wanted = pa.schema([schema.field(name) for name in columns]) if columns else schema
         pieces = [self._load(table, path, columns) for path in sorted((self.root / table.name).glob(pattern))]
         pieces = [piece.replace_schema_metadata(None) for piece in pieces]
-        return pa.concat_tables(pieces) if pieces else wanted.empty_table()
+        return pa.concat_tables(pieces) if pieces else _wanted(table, columns).empty_table()
 
     def _load(self, table: Table, path: Path, columns: Sequence[str] | None) -> pa.Table:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
         try:
-            return pq.ParquetFile(path).read(columns=list(columns) if columns else None)
+            wanted = _wanted(table, columns)
+            data = pq.ParquetFile(path).read(columns=wanted.names)
+            if not data.schema.equals(wanted):
+                raise pa.ArrowInvalid("its columns are not those of this version")
+            return data
         except FileNotFoundError:
             raise TrapsError(f"{path}: not there yet; materialize {table.name} for this partition first") from None
         except (pa.ArrowException, OSError) as error:
             raise _unreadable(path, table, error) from error
+
+
+def _without_nan(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The row with NaN as a missing value, which is what it is in a data frame."""
+    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
+
+
+def _wanted(table: Table, columns: Sequence[str] | None) -> pa.Schema:
+    """The table's schema, or some columns of it in the schema's order."""
+    import pyarrow as pa
+
+    schema = table.arrow_schema()
+    return pa.schema([field for field in schema if columns is None or field.name in columns])
 
 
 def _unreadable(path: Path, table: Table, error: Exception) -> TrapsError:
@@ -168,4 +192,3 @@ def content_version(data: pa.Table) -> str:
     """Digest of a table's content, volatile columns left out: unchanged content makes nothing downstream stale."""
     rows = data.drop_columns([c for c in VOLATILE if c in data.column_names]).to_pylist()
     return digest(rows)[:16]
-

@@ -56,14 +56,15 @@ class Workspace:
     def create(cls, root: Path, study: Study) -> Workspace:
         """Make a workspace, or open it when it is there with the same benchmark. Raises TrapsError when it differs."""
         require_checkout()
+        root = root.absolute()
         if (root / "study.yaml").exists():
             workspace = cls.open(root)
             for field in ("benchmark", "scenarios", "per_family"):
                 old, new = getattr(workspace.study, field), getattr(study, field)
                 if old != new:
                     raise TrapsError(
-                        f"{root}/study.yaml: {field} is {old!r}, this study wants {new!r}; a workspace keeps its benchmark: "
-                        f"choose another folder with {VARIABLE} or --workspace"
+                        f"{root}/study.yaml: {field} is {old!r}, this study wants {new!r}; a workspace keeps its "
+                        f"benchmark: choose another folder with {VARIABLE} or --workspace"
                     )
             return workspace
         for folder in ("tables", "clips", "trajectories", "ledger", "reports", "dagster"):
@@ -71,7 +72,9 @@ class Workspace:
         workspace = cls(root, study)
         workspace._link_dagster_yaml()
         text = yaml.safe_dump(study.model_dump(exclude_none=True), sort_keys=False)
-        (root / "study.yaml").write_text(text, encoding="utf-8")
+        part = root / f".study.yaml.{os.getpid()}.part"
+        part.write_text(text, encoding="utf-8")
+        part.replace(root / "study.yaml")
         return workspace
 
     @classmethod
@@ -80,7 +83,9 @@ class Workspace:
         root = (root or cls.default_root()).absolute()
         path = root / "study.yaml"
         if not path.is_file():
-            raise TrapsError(f"{path}: no such workspace; make one with `traps init` or `traps run demo`, or set {VARIABLE}")
+            raise TrapsError(
+                f"{path}: no such workspace; make one with `traps init` or `traps run demo`, or set {VARIABLE}"
+            )
         data = read_yaml(path)
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             found = data.get("format") if isinstance(data, dict) else data

@@ -1,0 +1,91 @@
+"""Every stage on its own through Dagster's own command, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+
+import pytest
+from traps_pipeline.lineage import PARTITIONED_BY, STAGES, Lineage
+from traps_pipeline.storage.workspace import Workspace
+
+from tests.conftest import Checkout, Finished
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("stages")]
+CELL = "occlusion|oracle__standard__run1"
+ONE_KEY = {"category": "dominoes", "dataset": "occlusion", "cell": CELL}
+RANGE = "occlusion|oracle__standard__run1...occlusion_ill_posed|always-abstain__json__run1"
+
+
+def materialize(study: Checkout, stage: str, *partition: str) -> Finished:
+    return study.dagster("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", stage, *partition)
+
+
+def test_every_stage_is_rematerialized_alone_from_the_tables_that_are_there(study: Checkout) -> None:
+    before = {stage: Lineage(Workspace.open(study.workspace)).version(stage, _key(stage)) for stage in STAGES}
+    for stage in STAGES:
+        key = _key(stage)
+        finished = materialize(study, stage, *(("--partition", key) if key else ()))
+        assert finished.code == 0, (stage, finished.err[-3000:])
+    after = {stage: Lineage(Workspace.open(study.workspace)).version(stage, _key(stage)) for stage in STAGES}
+    assert after == before  # rebuilt from the same inputs: the same content
+
+
+def _key(stage: str) -> str | None:
+    return ONE_KEY.get(PARTITIONED_BY.get(stage, ""))
+
+
+def test_a_range_of_cells_is_one_run_and_makes_exactly_its_cells(unasked: Checkout) -> None:
+    for stage in ("responses", "votes", "verdicts"):
+        finished = materialize(unasked, stage, "--partition-range", RANGE)
+        assert finished.code == 0, (stage, finished.err[-3000:])
+        made = sorted((unasked.workspace / "tables" / stage).rglob("*.parquet"))
+        assert len(made) == 2 * 2 * 3  # datasets x models x regimes
+    assert len(unasked.ledger_rows("answers")) == 2 * 2 * 3 * 32
+
+
+def test_an_unknown_partition_exits_with_one(study: Checkout) -> None:
+    finished = materialize(study, "responses", "--partition", "occlusion|nobody__standard__run1")
+    assert finished.code == 1
+    assert "nobody__standard__run1" in finished.out + finished.err
+
+
+def test_a_missing_upstream_exits_with_one_and_names_it(unasked: Checkout) -> None:
+    finished = materialize(unasked, "votes", "--partition", CELL)
+    assert finished.code == 1
+    assert "materialize responses for this partition first" in finished.out + finished.err
+
+
+def test_a_failing_step_exits_with_one_and_names_the_file(study: Checkout) -> None:
+    path = study.root / "scene_specs" / "released" / "domino_chain.jsonl"
+    lines = path.read_text().splitlines()
+    record = json.loads(lines[3])
+    record["ground_truth"] = "perhaps"
+    path.write_text("\n".join([*lines[:3], json.dumps(record), *lines[4:]]) + "\n")
+    finished = materialize(study, "scene_specs", "--partition", "dominoes")
+    assert finished.code == 1
+    assert f"{path}:4" in finished.out + finished.err
+
+
+def test_a_table_that_was_deleted_is_made_again_from_the_ledger(study: Checkout) -> None:
+    shutil.rmtree(study.workspace / "tables" / "responses")
+    shutil.rmtree(study.workspace / "tables" / "verdicts")
+    run = study.traps("run", "demo")
+    assert run.code == 0, run.err
+    assert run.counts() == {"answers": 0, "votes": 0, "frames": 0}
+
+
+def test_the_code_location_validates_and_imports_nothing_heavy(study: Checkout) -> None:
+    heavy = ("torch", "transformers", "litellm", "mujoco", "matplotlib", "cv2", "sklearn", "av")
+    code = f"import traps_pipeline.definitions, sys; print([m for m in {heavy} if m in sys.modules])"
+    finished = study.run(sys.executable, "-c", code)
+    assert finished.out.strip() == "[]", finished.err
+    valid = study.dagster("definitions", "validate", "-m", "traps_pipeline.definitions")
+    assert valid.code == 0, valid.err
+    assert "BetaWarning" not in valid.err
+
+
+def test_help_loads_neither_dagster_nor_pandas(study: Checkout) -> None:
+    code = "import sys; from traps_pipeline.cli import build_parser; build_parser().format_help(); print(sorted({'dagster', 'pandas', 'pydantic', 'numpy'} & set(sys.modules)))"
+    assert study.run(sys.executable, "-c", code).out.strip() == "[]"

@@ -1,0 +1,172 @@
+"""What judges are shown, which votes count, and when three votes decide."""
+
+from __future__ import annotations
+
+import json
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.panel import Vote, load_panel, majority, parse_vote, render, tasks_for, vote_request
+from traps_pipeline.models.prompts import prompt
+from traps_pipeline.partitions import Cell, Evaluation
+
+ITEM: dict[str, Any] = {
+    "item_id": "chaotic:seesaw_sorter-0001:control",
+    "question": "Which bin?",
+    "ground_truth": "left",
+    "answer_type": "direction",
+    "labels": ["left", "right"],
+    "aliases": json.dumps({"red bin": "left"}),
+}
+CELL = Cell("chaotic", Evaluation("some-model", "guided", 2))
+
+
+@pytest.mark.parametrize("cast", list(product(("yes", "no", "invalid"), repeat=3)))
+def test_a_majority_is_two_valid_votes_that_agree(cast: tuple[str, str, str]) -> None:
+    votes = [Vote(False) if word == "invalid" else Vote(True, word == "yes") for word in cast]
+    expected = True if cast.count("yes") >= 2 else False if cast.count("no") >= 2 else None
+    assert majority(votes) is expected
+
+
+def test_an_invalid_vote_never_counts_whatever_it_says() -> None:
+    assert majority([Vote(True, True), Vote(False, True), Vote(True, False)]) is None
+    assert majority([Vote(False, True)] * 3) is None
+
+
+def test_controls_are_judged_on_both_tasks_and_voids_on_abstention_alone() -> None:
+    assert set(tasks_for("control")) == {"abstention", "correctness"}
+    assert tasks_for("void") == ("abstention",)
+
+
+def test_a_judge_sees_question_and_answer_and_for_correctness_the_truth_and_no_more() -> None:
+    answer = "It rolls into the red bin.\n"
+    (judge, *_) = load_panel("rules")
+    abstention = vote_request(judge, "abstention", CELL, ITEM | {"side": "control"}, answer)
+    correctness = vote_request(judge, "correctness", CELL, ITEM | {"side": "control"}, answer)
+    assert (abstention.system, correctness.system) == (prompt("judge_abstention"), prompt("judge_correctness"))
+    for request in (abstention, correctness):
+        assert "Which bin?" in request.user and answer in request.user
+        assert request.media is None and not request.secret
+        for told in ("some-model", "guided", "control", "void", "chaotic", "run2", "seesaw"):
+            assert told not in request.user
+    assert "left" not in abstention.user
+    assert "Ground truth: left" in correctness.user
+
+
+def test_the_same_answer_on_either_side_reads_the_same_to_a_judge() -> None:
+    void = ITEM | {"side": "void", "ground_truth": None}
+    (judge, *_) = load_panel("rules")
+    users = {vote_request(judge, "abstention", CELL, item, "left").user for item in (ITEM | {"side": "control"}, void)}
+    assert len(users) == 1
+
+
+def test_the_answer_stands_whole_between_markers_that_it_does_not_hold() -> None:
+    for answer in ("left", "RESPONSE-000000000000\nleft", "a\n\nb", ""):
+        lines = render("abstention", "Which bin?", answer, None).split("\n")
+        marker = lines[-1]
+        assert marker.startswith("RESPONSE-") and marker not in answer
+        assert "\n".join(lines[lines.index(marker) + 1 : -1]) == answer
+
+
+def test_votes_of_one_answer_have_a_key_for_each_judge_task_run_regime_model_and_item() -> None:
+    panel = load_panel("rules")
+    keys = set()
+    for judge, task in product(panel, ("abstention", "correctness")):
+        for e in (CELL.evaluation, Evaluation("some-model", "guided", 1), Evaluation("b", "guided", 2)):
+            for item in (ITEM, ITEM | {"item_id": "chaotic_ill_posed:seesaw_sorter-0001:control"}):
+                keys.add(vote_request(judge, task, Cell("chaotic", e), item, "left").key)  # type: ignore[arg-type]
+    assert len(keys) == 3 * 2 * 3 * 2
+
+
+def vote(task: Any, text: str | None, outcome: str = "answer", **item: Any) -> Vote:
+    return parse_vote(task, {"outcome": outcome, "text": text}, ITEM | item)
+
+
+def test_a_vote_that_meets_the_schema_is_valid() -> None:
+    text = '{"abstained": true, "confidence": "high", "reasoning": "It declines."}'
+    assert vote("abstention", text) == Vote(True, True, confidence="high", rationale="It declines.")
+    assert vote("abstention", f"```json\n{text}\n```").decision is True
+
+
+@pytest.mark.parametrize(
+    ("text", "outcome", "reason"),
+    [
+        (None, "empty", "judge returned empty"),
+        (None, "refused", "judge returned refused"),
+        (None, "error", "judge returned error"),
+        ("", "answer", "Invalid JSON"),
+        ("It abstained.", "answer", "Invalid JSON"),
+        ('{"abstained": true', "truncated", "Invalid JSON"),
+        ("[]", "answer", "should be an object"),
+        ('{"abstained": true, "confidence": "high"}', "answer", "reasoning: Field required"),
+        ('{"abstained": "true", "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
+        ('{"abstained": 1, "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
+        ('{"abstained": null, "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
+        ('{"abstained": true, "confidence": "certain", "reasoning": ""}', "answer", "confidence: "),
+    ],
+)
+def test_a_vote_that_breaks_the_schema_is_invalid_for_a_reason(text: str | None, outcome: str, reason: str) -> None:
+    invalid = vote("abstention", text, outcome)
+    assert (invalid.valid, invalid.decision) == (False, None)
+    assert invalid.invalid_reason is not None and reason in invalid.invalid_reason
+
+
+@pytest.mark.parametrize(
+    ("value", "claim", "right"),
+    [
+        ('"left"', "true", True),
+        ('"the Red bin"', "true", True),
+        ('"left"', "false", True),  # the judge's own claim is recorded and not used
+        ('"right"', "true", False),
+        ('"somewhere"', "true", False),
+        ("null", "true", False),
+        ("3", "true", False),
+    ],
+)
+def test_correctness_is_decided_from_the_extracted_value(value: str, claim: str, right: bool) -> None:
+    cast = vote("correctness", f'{{"correct": {claim}, "extracted_value": {value}, "reasoning": "r"}}')
+    assert (cast.valid, cast.decision, cast.judge_correct) == (True, right, claim == "true")
+
+
+@pytest.mark.parametrize(
+    ("value", "right"), [("3", True), ("2.5", True), ('"three"', True), ("4", False), ("true", False)]
+)
+def test_numbers_are_extracted_as_numbers_or_words(value: str, right: bool) -> None:
+    text = f'{{"correct": true, "extracted_value": {value}, "reasoning": "r"}}'
+    assert vote("correctness", text, ground_truth="3", answer_type="numeric", labels=["1", "3"]).decision is right
+
+
+def panels(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "judges.yaml"
+    path.write_text(text)
+    return path
+
+
+JUDGES = "judges: [{id: a, backend: rule}, {id: b, backend: rule}, {id: c, backend: rule}]\n"
+
+
+def test_a_panel_seats_its_judges_in_order(tmp_path: Path) -> None:
+    path = panels(tmp_path, JUDGES + "panels: {p: [c, a, b]}")
+    assert [judge.id for judge in load_panel("p", path)] == ["c", "a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (JUDGES + "panels: {q: [a, b, c]}", "no panel 'p'; it has q"),
+        (JUDGES + "panels: {p: [a, b]}", "must seat 3 different known judges"),
+        (JUDGES + "panels: {p: [a, b, b]}", "must seat 3 different known judges"),
+        (JUDGES + "panels: {p: [a, b, c, c]}", "must seat 3 different known judges"),
+        (JUDGES + "panels: {p: [a, b, d]}", "must seat 3 different known judges"),
+        (JUDGES.replace("id: b", "id: a") + "panels: {p: [a, b, c]}", "a judge's id occurs twice"),
+        (JUDGES.replace("rule}]", "rule, mood: bad}]") + "panels: {p: [a, b, c]}", r"judges\.2\.mood: Extra inputs"),
+        (JUDGES.replace("id: b", "id: B") + "panels: {p: [a, b, c]}", r"judges\.1\.id: .*must match"),
+    ],
+)
+def test_a_wrong_panel_is_named(tmp_path: Path, text: str, complaint: str) -> None:
+    with pytest.raises(TrapsError, match=rf"judges\.yaml: .*{complaint}"):
+        load_panel("p", panels(tmp_path, text))

@@ -1,0 +1,432 @@
+"""Asking: wanted minus known, and nothing twice, whatever the provider, the disk or the user does meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models import ask
+from traps_pipeline.models.answers import answer_request
+from traps_pipeline.models.ask import Participant, Row, Work, run_work, settle
+from traps_pipeline.models.registry import Limits, get_model
+from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.progress import Tally
+from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.workspace import Study, Workspace
+
+CELL = Cell("occlusion", Evaluation("m", "standard", 1))
+QUICK = Limits(concurrency=4, retries=2, backoff_s=0.001)
+LEFT = Outcome("answer", "left", reasoning="it leans left")
+
+
+class Answering:
+    """A backend that counts calls, per item and at once, and does what the test says."""
+
+    def __init__(self, answer: Callable[[Request, int], Awaitable[Outcome]] | None = None) -> None:
+        self.calls: list[str] = []
+        self.at_once, self.most_at_once = 0, 0
+        self._answer = answer
+
+    async def ask(self, request: Request) -> Outcome:
+        item = str(request.about["item_id"])
+        self.calls.append(item)
+        self.at_once += 1
+        self.most_at_once = max(self.most_at_once, self.at_once)
+        try:
+            await asyncio.sleep(0)
+            return await self._answer(request, self.calls.count(item)) if self._answer else LEFT
+        finally:
+            self.at_once -= 1
+
+
+def request(item: int | str, model: str = "m", **changes: Any) -> Request:
+    about = {"item_id": f"item-{item}", "model": model, "regime": "standard", "run": 1}
+    return replace(Request(model, "test", {}, "system", "user", about), **changes)
+
+
+def work(
+    root: Path, backends: Mapping[str, Answering], wanted: Callable[[Cell], Sequence[Request]], limits: Limits = QUICK
+) -> Work[dict[str, Any]]:
+    """Work whose finish returns what it was given, as {cell, rows, tally}."""
+
+    def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> dict[str, Any]:
+        return {"cell": cell, "rows": list(rows.values()), "tally": tally}
+
+    free = {name: asyncio.Semaphore(limits.concurrency) for name in backends}
+    participants: Any = {name: Participant(backend, limits, free[name]) for name, backend in backends.items()}
+    return Work("responses", Ledger(root, "answers"), participants, "1", wanted, finish)
+
+
+def ten(_: Cell) -> list[Request]:
+    return [request(n) for n in range(10)]
+
+
+def outcomes(finished: dict[str, Any]) -> list[str]:
+    return [row["outcome"] for row in finished["rows"]]
+
+
+def test_what_was_answered_is_not_asked_again(tmp_path: Path) -> None:
+    backend = Answering()
+    (first,) = run_work(work(tmp_path, {"m": backend}, ten), [CELL])
+    assert (first["tally"].asked, first["tally"].cached, len(backend.calls)) == (10, 0, 10)
+    (second,) = run_work(work(tmp_path, {"m": backend}, ten), [CELL])
+    assert (second["tally"].asked, second["tally"].cached, len(backend.calls)) == (0, 10, 10)
+    assert second["rows"] == first["rows"]
+    assert len(Ledger(tmp_path, "answers").reasoning("m__standard__run1")) == 10
+
+
+def test_only_the_difference_is_asked(tmp_path: Path) -> None:
+    backend = Answering()
+    list(run_work(work(tmp_path, {"m": backend}, lambda _: ten(CELL)[:7]), [CELL]))
+    backend.calls.clear()
+    (finished,) = run_work(work(tmp_path, {"m": backend}, ten), [CELL])
+    assert backend.calls == ["item-7", "item-8", "item-9"]
+    assert [row["components"]["about"]["item_id"] for row in finished["rows"]] == [f"item-{n}" for n in range(10)]
+
+
+def test_a_torn_line_costs_one_call(tmp_path: Path) -> None:
+    backend = Answering()
+    list(run_work(work(tmp_path, {"m": backend}, ten), [CELL]))
+    (segment,) = (tmp_path / "answers" / CELL.evaluation.key).glob("*.jsonl")
+    segment.write_bytes(segment.read_bytes()[:-5])
+    backend.calls.clear()
+    (finished,) = run_work(work(tmp_path, {"m": backend}, ten), [CELL])
+    assert len(backend.calls) == finished["tally"].asked == 1
+
+
+def test_a_passing_failure_is_tried_again_and_leaves_no_trace_but_the_count(tmp_path: Path) -> None:
+    async def twice_busy(_: Request, call: int) -> Outcome:
+        if call <= 2:
+            raise TransientError("rate_limited")
+        return LEFT
+
+    (finished,) = run_work(work(tmp_path, {"m": Answering(twice_busy)}, lambda _: [request(1)]), [CELL])
+    (row,) = finished["rows"]
+    assert (row["outcome"], row["text"], row["error"], row["attempts"]) == ("answer", "left", None, 3)
+
+
+def test_a_lasting_failure_is_an_outcome_without_text_and_is_asked_again_next_time(tmp_path: Path) -> None:
+    async def always_busy(_: Request, call: int) -> Outcome:
+        raise TransientError("timeout")
+
+    backend = Answering(always_busy)
+    (finished,) = run_work(work(tmp_path, {"m": backend}, lambda _: [request(1)]), [CELL])
+    (row,) = finished["rows"]
+    assert (row["outcome"], row["text"], row["error"], row["attempts"]) == ("error", None, "timeout", 3)
+    assert finished["tally"].errors == 1
+    assert len(backend.calls) == 1 + QUICK.retries
+    (again,) = run_work(work(tmp_path, {"m": Answering()}, lambda _: [request(1)]), [CELL])
+    assert (outcomes(again), again["tally"].asked, again["tally"].errors) == (["answer"], 1, 0)
+    (settled,) = run_work(work(tmp_path, {"m": Answering()}, lambda _: [request(1)]), [CELL])
+    assert (outcomes(settled), settled["tally"].asked) == (["answer"], 0)
+
+
+@pytest.mark.parametrize("kind", ["empty", "refused", "truncated"])
+def test_what_a_model_would_not_say_is_an_answer_of_its_own_and_not_asked_again(tmp_path: Path, kind: Any) -> None:
+    async def silent(_: Request, call: int) -> Outcome:
+        return Outcome(kind)
+
+    backend = Answering(silent)
+    for _ in range(2):
+        (finished,) = run_work(work(tmp_path, {"m": backend}, lambda _: [request(1)]), [CELL])
+    assert outcomes(finished) == [kind]
+    assert len(backend.calls) == 1
+
+
+def test_a_provider_that_asks_to_wait_is_not_called_sooner(tmp_path: Path) -> None:
+    moments: list[float] = []
+
+    async def wait_please(_: Request, call: int) -> Outcome:
+        moments.append(time.monotonic())
+        if call == 1:
+            raise TransientError("rate_limited", retry_after_s=0.2)
+        return LEFT
+
+    list(run_work(work(tmp_path, {"m": Answering(wait_please)}, lambda _: [request(1)]), [CELL]))
+    assert moments[1] - moments[0] >= 0.2
+
+
+def test_waits_grow_with_each_retry_and_are_drawn_below_their_bound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bounds: list[float] = []
+    monkeypatch.setattr(ask.random, "uniform", lambda low, high: bounds.append(high) or 0.0)
+
+    async def always_busy(_: Request, call: int) -> Outcome:
+        raise TransientError("timeout")
+
+    limits = Limits(concurrency=1, retries=8, backoff_s=1.0)
+    list(run_work(work(tmp_path, {"m": Answering(always_busy)}, lambda _: [request(1)], limits), [CELL]))
+    assert bounds == [1, 2, 4, 8, 16, 32, 60, 60]
+
+
+def test_never_more_calls_at_once_than_the_model_allows(tmp_path: Path) -> None:
+    async def slow(_: Request, call: int) -> Outcome:
+        await asyncio.sleep(0.002)
+        return LEFT
+
+    backend = Answering(slow)
+    evaluations = [Evaluation("m", "standard", run) for run in (1, 2)]
+    cells = [Cell(dataset, e) for e in evaluations for dataset in ("occlusion", "chaotic")]
+    done = list(run_work(work(tmp_path, {"m": backend}, ten, Limits(concurrency=3)), cells))
+    assert len(done) == 4
+    assert backend.most_at_once == 3
+
+
+def test_a_model_that_fails_does_not_stop_another(tmp_path: Path) -> None:
+    async def broken(_: Request, call: int) -> Outcome:
+        raise ValueError("no such parameter: temprature")
+
+    other = Cell("occlusion", Evaluation("n", "standard", 1))
+    job = work(
+        tmp_path, {"m": Answering(broken), "n": Answering()}, lambda cell: [request(1, model=cell.evaluation.model)]
+    )
+    done = []
+    with pytest.raises(ValueError, match="temprature"):
+        for finished in run_work(job, [CELL, other]):
+            done.append(finished["cell"])
+    assert done == [other]
+
+
+def test_several_models_that_fail_are_named_together(tmp_path: Path) -> None:
+    async def broken(r: Request, call: int) -> Outcome:
+        raise TrapsError(f"{r.participant}: no key; set one")
+
+    names = ("m", "n", "o")
+    cells = [Cell("occlusion", Evaluation(name, "standard", 1)) for name in names]
+    backends = {"m": Answering(broken), "n": Answering(broken), "o": Answering()}
+    job = work(tmp_path, backends, lambda cell: [request(1, model=cell.evaluation.model)])
+    with pytest.raises(TrapsError, match=r"m: no key; set one\nn: no key; set one"):
+        list(run_work(job, cells))
+    assert backends["o"].calls == ["item-1"]
+
+
+def test_closing_the_work_early_records_the_calls_in_flight(tmp_path: Path) -> None:
+    async def slow(_: Request, call: int) -> Outcome:
+        await asyncio.sleep(0.3)
+        return LEFT
+
+    quick, other = Answering(), Cell("occlusion", Evaluation("n", "standard", 1))
+    backends = {"m": quick, "n": Answering(slow)}
+    job = work(tmp_path, backends, lambda cell: [request(n, model=cell.evaluation.model) for n in range(10)])
+    running = run_work(job, [CELL, other])
+    assert next(running)["cell"] == CELL
+    running.close()  # type: ignore[attr-defined]
+    assert len(backends["n"].calls) == 4
+    assert len(Ledger(tmp_path, "answers").read(other.evaluation.key).rows) == 4
+
+
+def test_calls_in_flight_are_recorded_when_another_call_of_the_cell_fails(tmp_path: Path) -> None:
+    async def one_broken(r: Request, call: int) -> Outcome:
+        if r.about["item_id"] == "item-1":
+            raise ValueError("cannot be sent")
+        await asyncio.sleep(0.05)
+        return LEFT
+
+    backend = Answering(one_broken)
+    with pytest.raises(ValueError, match="cannot be sent"):
+        list(run_work(work(tmp_path, {"m": backend}, ten), [CELL]))
+    assert backend.calls == ["item-0", "item-1", "item-2", "item-3"]  # four at once, none begun afterwards
+    assert len(Ledger(tmp_path, "answers").read(CELL.evaluation.key).rows) == 3
+
+
+def test_a_full_disk_ends_the_cell_and_keeps_what_was_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from traps_pipeline.storage import ledger
+
+    write = ledger.os.write
+    monkeypatch.setattr(ledger.os, "write", lambda fd, line: write(fd, line) if b"item-5" not in line else 0)
+    with pytest.raises(TrapsError, match=r"could not be written .*free some space"):
+        list(run_work(work(tmp_path, {"m": Answering()}, ten), [CELL]))
+    kept = len(Ledger(tmp_path, "answers").read(CELL.evaluation.key).rows)
+    monkeypatch.undo()
+    (finished,) = run_work(work(tmp_path, {"m": Answering()}, ten), [CELL])
+    assert kept >= 5
+    assert (finished["tally"].cached, finished["tally"].asked) == (kept, 10 - kept)
+
+
+def test_stopping_records_the_calls_in_flight_and_starts_no_new_one(tmp_path: Path) -> None:
+    stop = asyncio.Event()
+
+    async def stopping(r: Request, call: int) -> Outcome:
+        if r.about["item_id"] == "item-5":
+            stop.set()
+        await asyncio.sleep(0.02)
+        return LEFT
+
+    async def drain() -> list[Any]:
+        return [finished async for finished in settle(work(tmp_path, {"m": backend}, ten), [CELL], stop)]
+
+    backend = Answering(stopping)
+    assert asyncio.run(drain()) == []
+    assert sorted(set(backend.calls)) == sorted(backend.calls)
+    rows = Ledger(tmp_path, "answers").read(CELL.evaluation.key).rows
+    assert {row["components"]["about"]["item_id"] for row in rows.values()} == set(backend.calls)
+    assert 6 <= len(backend.calls) <= 8
+
+
+def test_stopping_does_not_wait_for_a_provider_that_asked_for_an_hour(tmp_path: Path) -> None:
+    stop = asyncio.Event()
+
+    async def in_an_hour(_: Request, call: int) -> Outcome:
+        asyncio.get_running_loop().call_later(0.05, stop.set)
+        raise TransientError("rate_limited", retry_after_s=3600.0)
+
+    async def drain() -> list[Any]:
+        return [finished async for finished in settle(work(tmp_path, {"m": backend}, ten), [CELL], stop)]
+
+    backend = Answering(in_an_hour)
+    assert asyncio.run(asyncio.wait_for(drain(), 5)) == []
+    assert len(backend.calls) == 4
+
+
+INTERRUPTED = """
+import asyncio, sys
+from pathlib import Path
+from traps_pipeline.models.ask import Participant, Work, run_work
+from traps_pipeline.models.registry import Limits
+from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.storage.ledger import Ledger
+class Slow:
+    asked = 0
+    async def ask(self, request):
+        Slow.asked += 1
+        if Slow.asked == 6:
+            print("six calls", flush=True)
+        await asyncio.sleep(0.3)
+        return Outcome("answer", "left")
+requests = [Request("m", "test", {}, "s", "u", {"item_id": str(n)}) for n in range(40)]
+participants = {"m": Participant(Slow(), Limits(concurrency=4), asyncio.Semaphore(4))}
+work = Work("responses", Ledger(Path(sys.argv[1]), "answers"), participants, "1", lambda _: requests, lambda *_: 1)
+try:
+    list(run_work(work, [Cell("occlusion", Evaluation("m", "standard", 1))]))
+except KeyboardInterrupt:
+    print(Slow.asked, "asked", flush=True)
+    sys.exit(130)
+"""
+
+
+def test_ctrl_c_waits_for_the_calls_in_flight_and_goes_on_later(tmp_path: Path) -> None:
+    run = subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert run.stdout is not None and run.stdout.readline() == "six calls\n"
+    run.send_signal(signal.SIGINT)
+    out, err = run.communicate(timeout=10)
+    assert run.returncode == 130
+    assert "waiting for the calls in flight" in err
+    assert "Traceback" not in err
+    rows = Ledger(tmp_path, "answers").read(CELL.evaluation.key).rows
+    assert 6 <= len(rows) <= 8  # four at once: the second four, or two of them, were in flight
+    assert out == f"{len(rows)} asked\n"
+
+
+def test_a_second_ctrl_c_stops_at_once(tmp_path: Path) -> None:
+    script = INTERRUPTED.replace("asyncio.sleep(0.3)", "asyncio.sleep(0.3 if Slow.asked < 5 else 60)")
+    run = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert run.stdout is not None and run.stdout.readline() == "six calls\n"
+    run.send_signal(signal.SIGINT)
+    time.sleep(0.3)
+    assert run.poll() is None
+    run.send_signal(signal.SIGINT)
+    _, err = run.communicate(timeout=10)
+    assert run.returncode == 130, err
+    assert "Traceback" not in err
+    assert len(Ledger(tmp_path, "answers").read(CELL.evaluation.key).rows) == 4
+
+
+def test_two_runs_that_want_the_same_keys_at_once_ask_each_once(tmp_path: Path) -> None:
+    script = INTERRUPTED.replace("asyncio.sleep(0.3)", "asyncio.sleep(0.02)").replace(
+        "except KeyboardInterrupt", "finally"
+    )
+    script = script.replace("    sys.exit(130)\n", "")
+    runs = [
+        subprocess.Popen(
+            [sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
+    said = [run.communicate(timeout=20)[0].splitlines()[-1] for run in runs]
+    assert [run.returncode for run in runs] == [0, 0]
+    assert sorted(said) == ["0 asked", "40 asked"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"participant": "n"},
+        {"endpoint": "other"},
+        {"params": {"temperature": 0.8}},
+        {"system": "another system prompt"},
+        {"user": "another question?"},
+        {"media_digest": "abc"},
+        {"about": {"item_id": "item-2", "model": "m", "regime": "standard", "run": 1}},
+        {"secret": {"side": "void"}},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_the_key_changes_with_each_thing_that_decides_the_answer(change: dict[str, Any]) -> None:
+    assert replace(request(1), **change).key != request(1).key
+
+
+def test_the_key_does_not_change_with_where_the_clip_lies_or_in_what_order_parameters_stand() -> None:
+    one = request(1, params={"a": 1, "b": 2}, media=Path("/here/clip.mp4"), media_digest="abc")
+    two = request(1, params={"b": 2, "a": 1}, media=Path("/there/clip.mp4"), media_digest="abc")
+    assert one.key == two.key
+
+
+def test_a_long_text_decides_the_key_as_a_short_one_does() -> None:
+    keys = {request(1, user=text).key for text in ("x" * 600, "x" * 601, "x" * 600 + "y")}
+    assert len(keys) == 3
+
+
+FIRST = Evaluation("random-50", "standard", 1)
+ITEM = {
+    "item_id": "occlusion:s-1:control",
+    "side": "control",
+    "question": "Left or right?",
+    "labels": ["left", "right"],
+    "ground_truth": "left",
+    "commonest_answer": "right",
+    "clip": "clips/s-1/control.mp4",
+    "media_digest": "abc",
+}
+
+
+def test_the_key_holds_no_limits_but_run_regime_item_and_ground_truth(tmp_path: Path) -> None:
+    workspace, entry = Workspace.create(tmp_path, Study()), get_model("random-50")
+
+    def key(evaluation: Evaluation = FIRST, **changes: Any) -> str:
+        return answer_request(workspace, entry, ITEM | changes, evaluation).key
+
+    limited = entry.model_copy(update={"limits": Limits(concurrency=1, retries=0, backoff_s=9.0)})
+    assert answer_request(workspace, limited, ITEM, FIRST).key == key()
+    assert key(clip="clips/elsewhere.mp4") == key()
+    evaluations = [
+        Evaluation("random-50", regime, run) for regime in ("standard", "guided", "json") for run in (1, 2, 3)
+    ]
+    assert len({key(evaluation) for evaluation in evaluations}) == 9
+    assert key(item_id="occlusion_ill_posed:s-1:control") != key()  # the same control in two datasets is two calls
+    assert key(ground_truth="right") != key()
+    assert key(commonest_answer="left") == key()  # only `prior` reads it
+
+
+def test_the_ground_truth_of_a_pair_is_no_part_of_its_voids_key(tmp_path: Path) -> None:
+    workspace, entry = Workspace.create(tmp_path, Study()), get_model("oracle")
+    void = ITEM | {"side": "void", "ground_truth": None}
+    request = answer_request(workspace, entry, void | {"control_answer": "left"}, Evaluation("oracle", "standard", 1))
+    assert request.secret == {"side": "void", "labels": ["left", "right"]}
+    assert "left" not in request.system and request.user == "Left or right?"

@@ -1,0 +1,31 @@
+"""Prompts are what the files say, byte for byte."""
+
+from __future__ import annotations
+
+import pytest
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.prompts import PROMPTS, prompt, system_prompt
+
+
+def raw(name: str) -> str:
+    return (PROMPTS / f"{name}.txt").read_bytes().decode("utf-8").strip()
+
+
+def test_each_regime_is_its_parts_joined_by_one_blank_line() -> None:
+    assert system_prompt("standard") == raw("standard")
+    assert system_prompt("guided") == raw("standard") + "\n\n" + raw("guided_suffix")
+    assert system_prompt("json") == raw("standard") + "\n\n" + raw("json_suffix")
+
+
+def test_the_files_say_what_the_paper_says() -> None:
+    assert system_prompt("standard").startswith("You are a physical reasoning module deployed in a robotic system.")
+    assert system_prompt("standard").endswith("- State your analysis briefly, then provide your final answer.")
+    assert system_prompt("guided").endswith("""don't provide a guess and respond "I don't know".""")
+    assert '{"reason": "<your step-by-step analysis>", "final_answer": "<your answer>"}' in system_prompt("json")
+    assert "\r" not in system_prompt("json")
+
+
+def test_a_missing_prompt_is_named_with_the_remedy() -> None:
+    with pytest.raises(TrapsError, match=r"prompts/no_such\.txt: cannot be read .*restore it from git"):
+        prompt("no_such")

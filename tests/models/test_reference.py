@@ -1,0 +1,98 @@
+"""Reference strategies play by their rules on either side, and the same way every time."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Any
+
+import pytest
+
+from traps_pipeline.models.reference import ABSTENTION, STRATEGIES, ReferenceBackend, uniform
+from traps_pipeline.models.registry import get_model
+from traps_pipeline.models.request import Outcome, Request, TransientError
+
+LABELS = ["left", "right", "elsewhere"]
+
+
+def request(side: str, item: int = 0, regime: str = "standard", **params: Any) -> Request:
+    secret: dict[str, Any] = {"side": side, "labels": LABELS, "commonest_answer": "elsewhere"}
+    if side == "control":
+        secret["ground_truth"] = "right"
+    about = {"item_id": f"{side}-{item}", "model": "m", "regime": regime, "run": 1}
+    return Request("m", "reference", params, "system", "question", about, secret=secret)
+
+
+def abstains(outcome: Outcome) -> bool:
+    return ABSTENTION in str(outcome.text)
+
+
+def answers(strategy: str, side: str, **params: Any) -> str | None:
+    return STRATEGIES[strategy](request(side, strategy=strategy, **params))
+
+
+@pytest.mark.parametrize(
+    ("strategy", "control", "void"),
+    [
+        ("oracle", {"right"}, {None}),
+        ("always-abstain", {None}, {None}),
+        ("never-abstain", {"left"}, {"left"}),
+        ("perfect-answerer", {"right"}, set(LABELS)),
+        ("inverse-oracle", {None}, set(LABELS)),
+        ("prior", {"elsewhere"}, {"elsewhere"}),
+    ],
+)
+def test_a_strategy_says_what_its_name_says(strategy: str, control: set[str | None], void: set[str | None]) -> None:
+    for side, said in (("control", control), ("void", void)):
+        assert {STRATEGIES[strategy](request(side, n)) for n in range(50)} == said
+
+
+@pytest.mark.parametrize(("model", "rate"), [("random-50", 0.5), ("confidence-noise", 0.2)])
+def test_an_abstention_rate_holds_on_both_sides_within_three_sigma(model: str, rate: float) -> None:
+    n, params = 2000, get_model(model).params
+    for side in ("control", "void"):
+        count = sum(STRATEGIES["abstain-at-rate"](request(side, k, **params)) is None for k in range(n))
+        assert abs(count - n * rate) <= 3 * (n * rate * (1 - rate)) ** 0.5  # 67 of 1,000; 54 of 400
+
+
+def test_what_looks_random_is_the_same_every_time_and_differs_between_seeds() -> None:
+    def drawn(seed: int) -> list[str | None]:
+        strategy = STRATEGIES["abstain-at-rate"]
+        return [strategy(request("void", k, abstain_probability=0.5, seed=seed)) for k in range(100)]
+
+    assert drawn(1) == drawn(1)
+    assert drawn(1) != drawn(2)
+    draws = [uniform(request("void", k), "x") for k in range(2000)]
+    assert min(draws) >= 0 and max(draws) < 1
+    assert abs(sum(draws) / 2000 - 0.5) < 3 * (1 / 12 / 2000) ** 0.5
+
+
+def test_the_json_regime_is_answered_in_json_and_the_others_in_words() -> None:
+    backend = ReferenceBackend()
+    spoken = asyncio.run(backend.ask(request("control", strategy="oracle")))
+    assert str(spoken.text).endswith("The answer is: right.")
+    written = asyncio.run(backend.ask(request("control", regime="json", strategy="oracle")))
+    assert json.loads(str(written.text))["final_answer"] == "right"
+    silent = asyncio.run(backend.ask(request("void", regime="json", strategy="oracle")))
+    assert json.loads(str(silent.text))["final_answer"] == ABSTENTION
+
+
+def test_the_flaky_provider_fails_in_the_shares_that_its_entry_says() -> None:
+    backend, params = ReferenceBackend(), get_model("flaky").params
+    seen: dict[str, int] = {}
+
+    async def call(r: Request) -> str:
+        for _ in range(3):
+            try:
+                return (await backend.ask(r)).kind
+            except TransientError as error:
+                kind = error.kind
+        return kind
+
+    for k in range(1000):
+        kind = asyncio.run(call(request("control", k, **params)))
+        seen[kind] = seen.get(kind, 0) + 1
+    expected = {"empty": 0.1, "refused": 0.1, "timeout": 0.05, "answer": 0.75}  # 429s pass at the third try
+    assert seen.keys() == expected.keys()
+    for kind, share in expected.items():
+        assert abs(seen[kind] - 1000 * share) <= 3 * (1000 * share * (1 - share)) ** 0.5

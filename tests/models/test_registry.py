@@ -1,0 +1,78 @@
+"""A model is one entry of a YAML file; a wrong one is named with its field."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.registry import all_evaluations, get_model, load_models
+from traps_pipeline.partitions import REGIMES, Evaluation
+
+GROUPS = "groups: {family: f, access: none, input: none, group: g}"
+
+
+def registry(tmp_path: Path, *entries: str) -> Path:
+    path = tmp_path / "models.yaml"
+    path.write_text("models:\n" + "".join(f"  - {{{entry}}}\n" for entry in entries))
+    return path
+
+
+def entry(model_id: str, more: str = "") -> str:
+    return f"id: {model_id}, backend: reference, params: {{strategy: oracle}}, {GROUPS}{more}"
+
+
+def test_entries_keep_their_order_and_defaults(tmp_path: Path) -> None:
+    models = load_models(registry(tmp_path, entry("z-2.5"), entry("a", ", runs: 1, limits: {retries: 0}")))
+    assert list(models) == ["z-2.5", "a"]
+    assert (models["z-2.5"].runs, models["a"].runs) == (3, 1)
+    assert (models["z-2.5"].limits.concurrency, models["z-2.5"].limits.retries) == (24, 5)  # benchmark.md section 3
+    assert models["a"].limits.retries == 0
+
+
+@pytest.mark.parametrize(
+    ("entries", "complaint"),
+    [
+        ([entry("ok"), entry("Bad_Id")], r"model 2 \(Bad_Id\): id: id 'Bad_Id' must match"),
+        ([entry("a__b")], r"model 1 \(a__b\): id: .*must match"),
+        ([entry("a|b")], r"model 1 .*: id: .*must match"),
+        ([entry("a", ", colour: red")], r"model 1 \(a\): colour: Extra inputs"),
+        ([entry("a", ", limits: {retrys: 3}")], r"model 1 \(a\): limits\.retrys: Extra inputs"),
+        ([entry("a", ", runs: 0")], r"model 1 \(a\): runs: "),
+        ([f"id: a, backend: telepathy, {GROUPS}"], r"model 1 \(a\): backend: .*'reference'"),
+        (
+            [f"id: a, backend: reference, params: {{strategy: psychic}}, {GROUPS}"],
+            r"model 1 \(a\): .*'psychic'.*oracle",
+        ),
+        ([f"id: a, backend: reference, {GROUPS}"], r"model 1 \(a\): .*strategy"),
+        ([f"backend: reference, {GROUPS}"], r"model 1 \(\?\): id: Field required"),
+        ([entry("a"), entry("b"), entry("a")], r"model 3: id 'a' occurs twice"),
+    ],
+)
+def test_a_wrong_entry_is_named_with_its_field(tmp_path: Path, entries: list[str], complaint: str) -> None:
+    with pytest.raises(TrapsError, match=rf"models\.yaml: {complaint}"):
+        load_models(registry(tmp_path, *entries))
+
+
+def test_a_file_without_models_says_what_it_must_hold(tmp_path: Path) -> None:
+    path = tmp_path / "models.yaml"
+    for text in ("", "[]", "judges: []", "models: 3"):
+        path.write_text(text)
+        load_models.cache_clear()
+        with pytest.raises(TrapsError, match=r"models\.yaml: must hold a list `models:`"):
+            load_models(path)
+
+
+def test_an_unknown_model_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(TrapsError, match=r"unknown model 'gpt-6'; .*models\.yaml has oracle, always-abstain"):
+        get_model("gpt-6")
+
+
+def test_every_model_regime_and_run_is_one_evaluation_model_outermost() -> None:
+    expected = [
+        (m.id, regime, run) for m in load_models().values() for regime in REGIMES for run in range(1, m.runs + 1)
+    ]
+    assert [(e.model, e.regime, e.run) for e in all_evaluations()] == expected
+    assert Evaluation("oracle", "json", 2) not in all_evaluations()  # one run: no run2 key
+    assert Evaluation("random-50", "json", 3) in all_evaluations()

@@ -1,0 +1,127 @@
+"""Clips: the same frames give the same bytes, a frame is a tenth of a second, and damage is named."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from traps_pipeline.digests import file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.scenes.clips import check_clip
+from traps_pipeline.scenes.encode import DamagedClip, decode, encode, frames_digest
+
+
+def frames(count: int = 20, height: int = 120, width: int = 160) -> list[np.ndarray]:
+    """A bright square that moves over a gradient; no two frames alike."""
+    ramp = np.linspace(0, 200, width).astype(np.uint8)
+    drawn = []
+    for i in range(count):
+        frame = np.repeat(np.tile(ramp, (height, 1))[..., None], 3, axis=2)
+        frame[40:80, 5 * i : 5 * i + 40] = (230, 40, 30)
+        drawn.append(frame)
+    return drawn
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    path = tmp_path / "clip.mp4"
+    encode(frames(), path, 10)
+    return path
+
+
+def test_the_same_frames_give_the_same_bytes_and_others_others(tmp_path: Path) -> None:
+    for name, drawn in (("a", frames()), ("b", frames()), ("c", frames()[:-1])):
+        encode(drawn, tmp_path / f"{name}.mp4", 10)
+    digests = [file_digest(tmp_path / f"{name}.mp4") for name in "abc"]
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_frame_i_shows_time_i_tenths_exactly(clip: Path) -> None:
+    decoded, times = decode(clip)
+    assert decoded.shape == (20, 120, 160, 3) and decoded.dtype == np.uint8
+    assert times.tolist() == [i / 10 for i in range(20)]
+
+
+def test_what_is_decoded_looks_like_what_was_drawn(clip: Path) -> None:
+    decoded, _ = decode(clip)
+    error = np.abs(decoded.astype(int) - np.stack(frames()).astype(int))
+    assert error.mean() < 3  # of 255
+    for i, frame in enumerate(decoded):
+        red = (frame[60, :, 0] > 180) & (frame[60, :, 1] < 100)
+        assert abs(np.flatnonzero(red).min() - 5 * i) <= 2
+
+
+def test_a_clip_may_have_one_frame(tmp_path: Path) -> None:
+    encode(frames(1), tmp_path / "one.mp4", 10)
+    assert decode(tmp_path / "one.mp4")[1].tolist() == [0.0]
+
+
+def test_a_clip_cut_off_anywhere_is_named_with_the_remedy(clip: Path) -> None:
+    whole = clip.read_bytes()
+    for kept in [*range(0, len(whole), len(whole) // 40), len(whole) - 1]:
+        clip.write_bytes(whole[:kept])
+        with pytest.raises(DamagedClip, match=r"clip\.mp4: .*delete the file and materialize videos again"):
+            decode(clip)
+
+
+def test_what_is_no_clip_or_is_not_there_is_named(tmp_path: Path) -> None:
+    (tmp_path / "words.mp4").write_text("no clip")
+    for name in ("words.mp4", "nothing.mp4"):
+        with pytest.raises(DamagedClip, match=rf"{name}: "):
+            decode(tmp_path / name)
+
+
+def test_a_clip_is_checked_by_size_and_digest(clip: Path) -> None:
+    digest, size = file_digest(clip), clip.stat().st_size
+    check_clip(clip, digest, size)
+    whole = clip.read_bytes()
+    for damaged in (whole[:-1], whole[:-1] + bytes([whole[-1] ^ 1]), b""):
+        clip.write_bytes(damaged)
+        with pytest.raises(DamagedClip, match=rf"clip\.mp4: .*{len(damaged)} of {size} bytes.*delete it and run again"):
+            check_clip(clip, digest, size)
+    clip.unlink()
+    with pytest.raises(DamagedClip, match=r"clip\.mp4: .*0 of"):
+        check_clip(clip, digest, size)
+
+
+def test_the_frames_digest_is_over_the_pixels_of_all_frames() -> None:
+    drawn = frames(3)
+    expected = hashlib.sha256(b"".join(frame.tobytes() for frame in drawn)).hexdigest()
+    assert frames_digest(drawn) == expected
+    assert frames_digest([np.asfortranarray(frame) for frame in drawn]) == expected
+    assert frames_digest(drawn[::-1]) != expected
+
+
+def test_a_failure_while_encoding_leaves_the_former_clip_and_no_part(clip: Path) -> None:
+    before = clip.read_bytes()
+    with pytest.raises(Exception, match="ndim"):
+        encode([*frames(5), np.zeros((7, 7), np.uint8)], clip, 10)
+    assert clip.read_bytes() == before
+    assert [path.name for path in clip.parent.iterdir()] == ["clip.mp4"]
+
+
+def test_a_full_disk_is_named_with_the_remedy_and_leaves_no_part(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = clip.read_bytes()
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(TrapsError, match=r"clip\.mp4: cannot be written .*No space left.*free some space"):
+        encode(frames(3), clip, 10)
+    assert clip.read_bytes() == before
+    assert [path.name for path in clip.parent.iterdir()] == ["clip.mp4"]
+
+
+def test_a_disk_that_is_really_full_is_named_too(tiny_disk: Path) -> None:
+    noise: Sequence[np.ndarray] = np.random.default_rng(0).integers(0, 255, size=(20, 120, 160, 3), dtype=np.uint8)
+    with pytest.raises(TrapsError, match=r"clip\.mp4: cannot be written .*free some space"):
+        encode(noise, tiny_disk / "clip.mp4", 10)
+    assert list(tiny_disk.iterdir()) == []

@@ -1,0 +1,212 @@
+"""A call is paid for once: what the ledger has taken, no crash, full disk or second run loses."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.ledger import Ledger
+
+HOLD = """
+import asyncio, sys, time
+from pathlib import Path
+from traps_pipeline.storage.ledger import Ledger
+async def hold():
+    async with Ledger(Path(sys.argv[1]), "answers").lock("m", print):
+        print("held", flush=True)
+        time.sleep(60)
+asyncio.run(hold())
+"""
+FILL = """
+import resource, sys
+from pathlib import Path
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.ledger import Ledger
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+try:
+    with Ledger(Path(sys.argv[1]), "answers").writer("m") as writer:
+        for n in range(100):
+            writer.append({"key": f"k{n}", "text": "x" * 100})
+except TrapsError as error:
+    print(error)
+"""
+
+
+@pytest.fixture
+def ledger(tmp_path: Path) -> Ledger:
+    return Ledger(tmp_path, "answers")
+
+
+def segments(ledger: Ledger) -> list[Path]:
+    return sorted(ledger.folder("m").glob("*.jsonl"))
+
+
+def write(ledger: Ledger, *rows: dict[str, object]) -> None:
+    with ledger.writer("m") as writer:
+        for row in rows:
+            writer.append(row)
+
+
+def test_rows_come_back_by_key_and_evaluation(ledger: Ledger) -> None:
+    write(ledger, {"key": "a", "text": "left – 左"}, {"key": "b", "text": None})
+    assert ledger.read("m").rows == {"a": {"key": "a", "text": "left – 左"}, "b": {"key": "b", "text": None}}
+    assert ledger.read("m").torn == []
+    assert ledger.read("another").rows == {}
+
+
+def test_a_writer_that_writes_nothing_leaves_no_file(ledger: Ledger) -> None:
+    with ledger.writer("m"):
+        pass
+    assert segments(ledger) == []
+
+
+def test_the_newest_row_of_a_key_wins_within_and_across_segments(ledger: Ledger) -> None:
+    write(ledger, {"key": "a", "text": "1"}, {"key": "a", "text": "2"}, {"key": "b", "text": "3"})
+    assert ledger.read("m").rows["a"]["text"] == "2"
+    write(ledger, {"key": "a", "text": "4"})
+    assert len(segments(ledger)) == 2
+    assert {key: row["text"] for key, row in ledger.read("m").rows.items()} == {"a": "4", "b": "3"}
+
+
+def test_segments_of_one_second_are_read_in_the_order_they_were_begun(ledger: Ledger) -> None:
+    for n in range(20):
+        write(ledger, {"key": "a", "n": n})
+    assert ledger.read("m").rows["a"]["n"] == 19
+
+
+def test_a_torn_last_line_is_ignored_and_counted_with_its_place(ledger: Ledger) -> None:
+    write(ledger, {"key": "a"}, {"key": "b"})
+    segment = segments(ledger)[0]
+    segment.write_bytes(segment.read_bytes()[:-1])
+    known = ledger.read("m")
+    assert list(known.rows) == ["a"]
+    assert known.torn == [f"{segment}:2"]
+
+
+@pytest.mark.parametrize("line", ["{not json", '"text"', '{"no": "key"}', ""])
+def test_a_bad_line_in_the_middle_is_named_with_the_remedy(ledger: Ledger, line: str) -> None:
+    write(ledger, {"key": "a"}, {"key": "b"}, {"key": "c"})
+    segment = segments(ledger)[0]
+    first, _, last = segment.read_text().splitlines()
+    segment.write_text(f"{first}\n{line}\n{last}\n")
+    with pytest.raises(TrapsError, match=rf"{segment.name}:2: not a ledger row .*remove that line and run again"):
+        ledger.read("m")
+
+
+def test_reasoning_lies_in_a_sibling_file_and_comes_back_by_key(ledger: Ledger) -> None:
+    with ledger.writer("m") as writer:
+        writer.append({"key": "a", "text": "left"}, reasoning="It rolls left.")
+        writer.append({"key": "b", "text": "right"})
+    assert ledger.reasoning("m") == {"a": "It rolls left."}
+    assert "rolls" not in segments(ledger)[0].read_text()
+    assert [path.name for path in ledger.folder("m").glob("*.reasoning")] == [segments(ledger)[0].name + ".reasoning"]
+
+
+def test_a_row_is_in_the_file_before_append_returns(ledger: Ledger) -> None:
+    with ledger.writer("m") as writer:
+        writer.append({"key": "a"})
+        seen = subprocess.run(["cat", str(segments(ledger)[0])], capture_output=True, check=True, text=True)
+        assert seen.stdout == '{"key": "a"}\n'
+
+
+def test_a_full_disk_loses_no_earlier_row_and_leaves_no_half_line(ledger: Ledger, tmp_path: Path) -> None:
+    ran = subprocess.run([sys.executable, "-c", FILL, str(tmp_path)], capture_output=True, check=True, text=True)
+    assert "could not be written" in ran.stdout and "free some space and run the same command again" in ran.stdout
+    known = ledger.read("m")
+    line = len('{"key": "k10", "text": ""}\n') + 100
+    assert len(known.rows) == 15  # 10 lines of 126 bytes and 5 of 127 are 1,895; a sixth would pass 2,000
+    assert line == 127
+    assert known.torn == []
+    write(ledger, {"key": "later"})
+    assert len(ledger.read("m").rows) == 16
+
+
+def test_a_disk_that_is_really_full_loses_no_earlier_row(tiny_disk: Path) -> None:
+    ledger, written = Ledger(tiny_disk, "answers"), 0
+    with (
+        pytest.raises(TrapsError, match=r"\.jsonl: .*No space left on device.*free some space"),
+        ledger.writer("m") as w,
+    ):
+        for n in range(1000):
+            w.append({"key": f"k{n}", "text": "x" * 300})
+            written += 1
+    assert written > 50
+    known = ledger.read("m")
+    assert list(known.rows) == [f"k{n}" for n in range(written)]
+    assert known.torn == []
+
+
+@pytest.fixture
+def fsyncs(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    counted: list[int] = []
+    real = os.fsync
+
+    def fsync(descriptor: int) -> None:
+        counted.append(descriptor)
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    yield counted
+
+
+def test_rows_reach_the_disk_every_hundred_rows_or_half_second(
+    ledger: Ledger, fsyncs: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    with ledger.writer("m") as writer:
+        for n in range(99):
+            writer.append({"key": str(n)})
+        assert len(fsyncs) == 0
+        writer.append({"key": "99"})
+        assert len(fsyncs) == 1
+        writer.append({"key": "100"})
+        clock[0] += 0.49
+        writer.sync_if_due()
+        assert len(fsyncs) == 1
+        clock[0] += 0.01
+        writer.sync_if_due()
+        assert len(fsyncs) == 2
+        writer.sync_if_due()
+        assert len(fsyncs) == 2  # nothing new to sync
+        writer.append({"key": "101"})
+    assert len(fsyncs) == 3  # closing syncs
+
+
+def test_a_second_run_waits_and_says_who_holds_the_lock_until_that_one_is_killed(
+    ledger: Ledger, tmp_path: Path
+) -> None:
+    said: list[str] = []
+
+    async def take() -> float:
+        began = time.monotonic()
+        async with ledger.lock("m", said.append):
+            return time.monotonic() - began
+
+    async def scenario() -> tuple[float, float]:
+        async with ledger.lock("another", said.append):  # evaluations do not block each other
+            pass
+        taking = asyncio.create_task(take())
+        await asyncio.sleep(0.5)
+        assert not taking.done()
+        os.kill(holder.pid, signal.SIGKILL)
+        return await asyncio.wait_for(taking, 5), await take()
+
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+        waited, again = asyncio.run(scenario())
+    finally:
+        holder.kill()
+        holder.wait()
+    assert again < 0.4 <= waited
+    assert len(said) == 1 and f"answers of m are being asked by process {holder.pid} since" in said[0]

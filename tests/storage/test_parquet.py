@@ -1,0 +1,188 @@
+"""Tables are written whole or not at all, and only as their schema says."""
+
+from __future__ import annotations
+
+import errno
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.parquet import State, TableStore
+from traps_pipeline.tables import RESPONSES, VIDEOS
+
+PARTITION = {"category": "plinko"}
+CELL = {"dataset": "chaotic", "model": "m", "regime": "standard", "run": 1}
+
+
+def clip(scenario: str, side: str = "control", **changes: Any) -> dict[str, Any]:
+    """A row of the videos table."""
+    texts = {name: f"{name} of {scenario}" for name in ("path", "file_sha256", "frames_sha256", "scene_hash")}
+    numbers = {"n_frames": 50, "fps": 10, "width": 480, "height": 360, "duration_s": 5.0, "size_bytes": 1000}
+    row = {"scenario_id": scenario, "category": "plinko", "side": side, "benchmark_version": "0.1.0"}
+    return row | texts | numbers | changes
+
+
+def answer(item: str, **changes: Any) -> dict[str, Any]:
+    """A row of the responses table."""
+    row = {"item_id": item, "pair_id": item, "side": "void", "outcome": "answer", "text": "left", "latency_s": 1.0}
+    row |= {"attempts": 1, "request_key": "k", "epoch": "1", "created_at": datetime(2026, 1, 1, tzinfo=UTC)}
+    return row | CELL | {"benchmark_version": "0.1.0"} | changes
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> TableStore:
+    return TableStore(tmp_path / "tables")
+
+
+def leftovers(folder: Path) -> list[str]:
+    return [path.name for path in folder.rglob("*") if path.is_file() and path.name != "part-0.parquet"]
+
+
+@pytest.mark.parametrize("as_frame", [False, True])
+def test_an_unknown_column_is_refused_by_name(store: TableStore, as_frame: bool) -> None:
+    rows = [clip("plinko-0001", colour="red")]
+    with pytest.raises(TrapsError, match=r"table videos .*colour"):
+        store.write(VIDEOS, PARTITION, pd.DataFrame(rows) if as_frame else rows, {})
+    assert store.state(VIDEOS, PARTITION) is None
+
+
+@pytest.mark.parametrize("as_frame", [False, True])
+def test_a_missing_value_is_refused_in_a_column_that_must_hold_one(store: TableStore, as_frame: bool) -> None:
+    rows = [clip("plinko-0001"), clip("plinko-0002", path=None)]
+    with pytest.raises(TrapsError, match=r"table videos .*path: string not null|column path has missing values"):
+        store.write(VIDEOS, PARTITION, pd.DataFrame(rows) if as_frame else rows, {})
+
+
+def test_a_missing_column_is_refused_by_name(store: TableStore) -> None:
+    row = clip("plinko-0001")
+    del row["fps"]
+    for rows in ([row], pd.DataFrame([row])):
+        with pytest.raises(TrapsError, match=r"table videos .*fps"):
+            store.write(VIDEOS, PARTITION, rows, {})
+
+
+def test_a_value_of_another_type_is_refused(store: TableStore) -> None:
+    with pytest.raises(TrapsError, match=r"table videos .*do not fit the schema"):
+        store.write(VIDEOS, PARTITION, [clip("plinko-0001", fps="ten")], {})
+
+
+def test_a_repeated_key_is_refused_and_shown(store: TableStore) -> None:
+    rows = [clip("plinko-0001"), clip("plinko-0002"), clip("plinko-0001", path="elsewhere")]
+    with pytest.raises(TrapsError, match=r"table videos .*'plinko-0001', 'side': 'control'.* repeats"):
+        store.write(VIDEOS, PARTITION, rows, {})
+
+
+def test_a_row_of_another_partition_is_refused(store: TableStore) -> None:
+    rows = [clip("plinko-0001"), clip("hidden_race-0001", category="hidden")]
+    with pytest.raises(TrapsError, match=r"table videos .*column category also holds \['hidden'\]"):
+        store.write(VIDEOS, PARTITION, rows, {})
+
+
+def test_a_table_is_sorted_by_its_key_and_comes_back_as_it_was_written(store: TableStore) -> None:
+    rows = [clip("plinko-0002"), clip("plinko-0001", "void"), clip("plinko-0001")]
+    store.write(VIDEOS, PARTITION, rows, {})
+    read = store.read(VIDEOS, PARTITION)
+    assert read.to_dict("records") == [rows[2], rows[1], rows[0]]
+
+
+def test_the_footer_says_version_inputs_rows_and_failures(store: TableStore) -> None:
+    version = store.write(VIDEOS, PARTITION, [clip("plinko-0001")], {"scene_specs/plinko": "abc"}, failed=3)
+    assert store.state(VIDEOS, PARTITION) == State(version, {"scene_specs/plinko": "abc"}, rows=1, failed=3)
+
+
+def test_the_version_does_not_depend_on_times_attempts_or_row_order(store: TableStore) -> None:
+    first = store.write(RESPONSES, CELL, [answer("a"), answer("b")], {})
+    later = {"created_at": datetime(2027, 1, 1, tzinfo=UTC), "latency_s": 9.0, "attempts": 4}
+    assert store.write(RESPONSES, CELL, [answer("b", **later), answer("a")], {"x": "another input"}) == first
+
+
+@pytest.mark.parametrize("change", [{"text": "right"}, {"text": None}, {"cost_usd": 0.1}, {"epoch": "2"}])
+def test_the_version_changes_with_any_other_content(store: TableStore, change: dict[str, Any]) -> None:
+    first = store.write(RESPONSES, CELL, [answer("a"), answer("b")], {})
+    assert store.write(RESPONSES, CELL, [answer("a"), answer("b", **change)], {}) != first
+
+
+def test_a_table_of_no_rows_is_a_table(store: TableStore) -> None:
+    store.write(VIDEOS, PARTITION, [], {})
+    assert len(store.read(VIDEOS, PARTITION)) == 0
+    assert list(store.read(VIDEOS, PARTITION).columns) == [column.name for column in VIDEOS.columns]
+
+
+def test_a_full_disk_leaves_the_former_file_and_nothing_half_written(
+    store: TableStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    version = store.write(VIDEOS, PARTITION, [clip("plinko-0001")], {})
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    for module, name in ((pq, "write_table"), (os, "fsync"), (os, "replace")):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, full)
+            with pytest.raises(TrapsError, match=r"part-0\.parquet: .*No space left on device.*free some space"):
+                store.write(VIDEOS, PARTITION, [clip("plinko-0002")], {})
+        assert leftovers(store.root) == []
+        assert list(store.read(VIDEOS, PARTITION)["scenario_id"]) == ["plinko-0001"]
+        state = store.state(VIDEOS, PARTITION)
+        assert state is not None and state.version == version
+
+
+def test_a_disk_that_is_really_full_leaves_the_former_file(tiny_disk: Path) -> None:
+    store = TableStore(tiny_disk)
+    store.write(VIDEOS, PARTITION, [clip("plinko-0001")], {})
+    noise = [clip(f"plinko-{n:04d}", path=os.urandom(500).hex()) for n in range(200)]
+    with pytest.raises(TrapsError, match=r"part-0\.parquet: .*free some space"):
+        store.write(VIDEOS, PARTITION, noise, {})
+    assert leftovers(tiny_disk) == []
+    assert list(store.read(VIDEOS, PARTITION)["scenario_id"]) == ["plinko-0001"]
+
+
+@pytest.mark.parametrize("damage", [b"", b"PAR1 no table", None])
+def test_an_unreadable_file_is_named_with_the_remedy(store: TableStore, damage: bytes | None) -> None:
+    store.write(VIDEOS, PARTITION, [clip("plinko-0001")], {})
+    path = store.path(VIDEOS, PARTITION)
+    path.write_bytes(path.read_bytes()[:-20] if damage is None else damage)
+    remedy = r"category=plinko/part-0\.parquet: not a readable videos table.*materialize again"
+    for look in (store.read, store.state):
+        with pytest.raises(TrapsError, match=remedy):
+            look(VIDEOS, PARTITION)
+    with pytest.raises(TrapsError, match=remedy):
+        store.read_all(VIDEOS)
+
+
+def test_a_missing_partition_names_its_file_and_the_stage_to_materialize(store: TableStore) -> None:
+    assert store.state(VIDEOS, PARTITION) is None
+    with pytest.raises(TrapsError, match=r"videos/category=plinko/part-0\.parquet: .*materialize videos"):
+        store.read(VIDEOS, PARTITION)
+
+
+def test_partitions_are_read_together_and_by_column(store: TableStore) -> None:
+    assert len(store.read_all(RESPONSES)) == 0
+    for dataset in ("chaotic", "occlusion"):
+        for run in (1, 2):
+            cell = CELL | {"dataset": dataset, "run": run}
+            store.write(RESPONSES, cell, [answer(f"{dataset}:{n}", **cell) for n in range(run)], {})
+    assert len(store.read_all(RESPONSES)) == 6
+    assert len(store.read_all(RESPONSES, dataset="chaotic", run=2)) == 2
+    assert list(store.read_all(RESPONSES, ["item_id"], run=1)["item_id"]) == ["chaotic:0", "occlusion:0"]
+
+
+def test_a_misspelt_partition_column_is_refused(store: TableStore) -> None:
+    store.write(VIDEOS, PARTITION, [clip("plinko-0001")], {})
+    with pytest.raises(ValueError, match=r"videos .*catgory"):
+        store.read_all(VIDEOS, catgory="hidden")
+
+
+def test_a_partition_written_by_another_version_of_the_schema_is_named(store: TableStore) -> None:
+    store.write(VIDEOS, PARTITION, [clip("plinko-0001")], {})
+    store.write(VIDEOS, {"category": "hidden"}, [clip("hidden_race-0001", category="hidden")], {})
+    path = store.path(VIDEOS, PARTITION)
+    pq.write_table(pq.read_table(path, partitioning=None).drop_columns(["fps"]), path)
+    with pytest.raises(TrapsError, match=r"category=plinko/part-0\.parquet: .*materialize again"):
+        store.read_all(VIDEOS)

@@ -1,0 +1,100 @@
+"""One folder holds one study, and says so when it holds another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.workspace import FORMAT, Study, Workspace
+
+
+def edit(root: Path, **changes: Any) -> None:
+    path = root / "study.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | changes))
+
+
+def test_a_created_workspace_opens_with_its_study(tmp_path: Path) -> None:
+    study = Study(per_family=2, epoch="2026-11", budget_usd=12.5)
+    Workspace.create(tmp_path / "w", study)
+    assert Workspace.open(tmp_path / "w").study == study
+    assert yaml.safe_load((tmp_path / "w" / "study.yaml").read_text()) == {
+        "format": FORMAT,
+        "benchmark": "released",
+        "per_family": 2,
+        "panel": "rules",
+        "epoch": "2026-11",
+        "budget_usd": 12.5,
+    }
+    assert [path.name for path in (tmp_path / "w").glob(".*")] == []
+
+
+def test_creating_it_again_opens_it_and_keeps_what_was_edited(tmp_path: Path) -> None:
+    Workspace.create(tmp_path, Study(scenarios=["plinko-0001"]))
+    edit(tmp_path, epoch="2", budget_usd=5.0)
+    again = Workspace.create(tmp_path, Study(scenarios=["plinko-0001"]))
+    assert (again.study.epoch, again.study.budget_usd) == ("2", 5.0)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "field"),
+    [(Study(per_family=3), "per_family"), (Study(benchmark="sampled-1"), "benchmark"), (Study(), "per_family")],
+)
+def test_another_benchmark_or_subset_is_refused_with_the_remedy(tmp_path: Path, wanted: Study, field: str) -> None:
+    Workspace.create(tmp_path, Study(per_family=2))
+    with pytest.raises(TrapsError, match=rf"study\.yaml: {field} is .*choose another folder with TRAPS_WORKSPACE"):
+        Workspace.create(tmp_path, wanted)
+
+
+@pytest.mark.parametrize("other", [FORMAT + 1, 0, None])
+def test_a_workspace_of_another_format_is_refused_with_the_remedy(tmp_path: Path, other: int | None) -> None:
+    Workspace.create(tmp_path, Study())
+    edit(tmp_path, format=other)
+    with pytest.raises(TrapsError, match=rf"study\.yaml: workspace format {other}, .*reads {FORMAT}; .*start a new"):
+        Workspace.open(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (b"format: [1", "not valid YAML"),
+        (b"\xff\xfe\x00", "not valid YAML"),
+        (b"just words", "workspace format"),
+        (b"format: 1\nbudget: 3", "budget: Extra inputs"),
+        (b"format: 1\nbudget_usd: -3", "budget_usd: Input should be greater"),
+        (b"format: 1\nper_family: 2\nscenarios: [a-1]", "give scenarios or per_family, not both"),
+    ],
+)
+def test_a_malformed_study_names_its_file_and_the_field(tmp_path: Path, text: bytes, complaint: str) -> None:
+    (tmp_path / "study.yaml").write_bytes(text)
+    with pytest.raises(TrapsError, match=rf"study\.yaml: .*{complaint}"):
+        Workspace.open(tmp_path)
+
+
+def test_a_folder_without_a_study_says_how_to_make_one(tmp_path: Path) -> None:
+    with pytest.raises(TrapsError, match=r"study\.yaml: no such workspace; make one with `traps init`"):
+        Workspace.open(tmp_path)
+
+
+def test_the_workspace_is_found_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path))
+    assert Workspace.default_root() == tmp_path
+    monkeypatch.delenv("TRAPS_WORKSPACE")
+    assert Workspace.default_root().parts[-2:] == (".workspaces", "default")
+
+
+def test_paths_are_absolute_however_the_workspace_was_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert Workspace.create(Path("w"), Study()).root == tmp_path / "w"
+    assert Workspace.open(Path("w")).root == tmp_path / "w"
+
+
+def test_a_clip_of_another_scene_has_another_path_and_tables_store_it_relative(tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path, Study())
+    one, two = (workspace.clip("plinko-0001", "void", digit * 64) for digit in "ab")
+    assert one != two
+    assert workspace.relative(one) == f"clips/plinko-0001/void-{'a' * 16}.mp4"
+    assert workspace.resolve(workspace.relative(one)) == one

@@ -1,0 +1,70 @@
+"""An experiment names what is asked of whom; a wrong one is named by file and field."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.experiment import load_experiment
+from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.storage.workspace import Study
+
+
+def experiment(tmp_path: Path, text: str) -> str:
+    (tmp_path / "my.yaml").write_text("name: my\nmodels: [oracle, random-50]\n" + text)
+    return str(tmp_path / "my.yaml")
+
+
+def test_the_demo_is_eight_reference_models_by_three_regimes_on_32_named_scenarios() -> None:
+    demo = load_experiment("demo")
+    assert len(demo.models) == 8 and demo.regimes == list(REGIMES) and demo.runs == [1]
+    assert demo.scenarios is not None and len(set(demo.scenarios)) == 32
+    assert len(demo.cells()) == 8 * 3 * 1 * 4
+
+
+def test_all_datasets_and_regimes_are_asked_where_none_is_named_and_a_model_has_no_more_runs_than_it_has(
+    tmp_path: Path,
+) -> None:
+    cells = load_experiment(experiment(tmp_path, "runs: [1, 2, 3]\n")).cells()
+    by_model = [sum(c.evaluation.model == model for c in cells) for model in ("oracle", "random-50")]
+    assert by_model == [len(DATASETS) * 3 * 1, len(DATASETS) * 3 * 3]
+    assert len(set(cells)) == len(cells)
+    some = load_experiment(experiment(tmp_path, "datasets: [chaotic]\nregimes: [json]\n")).cells()
+    assert [cell.key for cell in some] == ["chaotic|oracle__json__run1", "chaotic|random-50__json__run1"]
+
+
+def test_the_study_of_an_experiment_is_its_benchmark_subset_panel_and_budget(tmp_path: Path) -> None:
+    text = "per_family: 2\nepoch: '7'\nbudget_usd: 3\n"
+    assert load_experiment(experiment(tmp_path, text)).study == Study(per_family=2, epoch="7", budget_usd=3)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("datasets: [chaos]\n", r"datasets: .*'chaos'.* choose from occlusion"),
+        ("regimes: []\n", "regimes: nothing given; choose from standard"),
+        ("regimes: [json, json]\n", "regimes: .*twice"),
+        ("runs: [0]\n", r"runs\.0: "),
+        ("runs: [1, 1]\n", "runs: .*twice"),
+        ("model: oracle\n", "model: Extra inputs"),
+        ("per_family: 0\n", "per_family: "),
+        ("budget_usd: -1\n", "budget_usd: "),
+        ("per_family: 1\nscenarios: [plinko-0001]\n", "give scenarios or per_family, not both"),
+        ("epoch: 'a b'\n", "epoch"),
+        ("datasets: [\n", "not valid YAML"),
+    ],
+)
+def test_a_wrong_experiment_names_its_file_and_field(tmp_path: Path, text: str, complaint: str) -> None:
+    with pytest.raises(TrapsError, match=rf"my\.yaml: .*{complaint}"):
+        load_experiment(experiment(tmp_path, text))
+
+
+def test_an_unknown_model_or_experiment_is_answered_with_the_known_ones(tmp_path: Path) -> None:
+    path = tmp_path / "other.yaml"
+    path.write_text("name: other\nmodels: [oracle, gpt-6]\n")
+    with pytest.raises(TrapsError, match=r"unknown model 'gpt-6'; .* has oracle"):
+        load_experiment(str(path))
+    with pytest.raises(TrapsError, match=r"no experiment 'demmo': .*known: .*demo"):
+        load_experiment("demmo")

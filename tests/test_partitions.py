@@ -1,0 +1,84 @@
+"""Keys are formatted and parsed back, and hold nothing that Dagster forbids."""
+
+from __future__ import annotations
+
+import pytest
+
+from traps_pipeline.models.registry import all_evaluations
+from traps_pipeline.partitions import (
+    CATEGORIES,
+    CHAOTIC_CATEGORIES,
+    DATASETS,
+    OCCLUSION_CATEGORIES,
+    Cell,
+    Evaluation,
+    check_slug,
+    datasets_of_category,
+    evaluations,
+    is_ill_posed,
+    taxonomy_of,
+)
+
+
+def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None:
+    cells = [Cell(dataset, e) for dataset in DATASETS for e in all_evaluations()]
+    assert all(Cell.parse(cell.key) == cell for cell in cells)
+    assert all(Evaluation.parse(e.key) == e for e in all_evaluations())
+    assert not any(set(key) & set("|,[]") for key in (*CATEGORIES, *DATASETS, *(e.key for e in all_evaluations())))
+    assert len({cell.key for cell in cells}) == len(cells)
+
+
+def test_a_cell_reads_as_the_design_says() -> None:
+    cell = Cell("occlusion", Evaluation("gemini-2.5-pro", "guided", 1))
+    assert cell.key == "occlusion|gemini-2.5-pro__guided__run1"
+    assert cell.partition == {"dataset": "occlusion", "model": "gemini-2.5-pro", "regime": "guided", "run": 1}
+    assert list(cell.partition) == ["dataset", "model", "regime", "run"]
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        *("m__guided", "m__guided__1", "m__guided__runx", "m__guided__run", "m__guided__run0", "m__guided__run01"),
+        *("m__guided__run²", "m__warm__run1", "M__guided__run1", "a b__guided__run1", "a__b__guided__run1"),
+        *("__guided__run1", "m__guided__run1__x", "m__guided__run-1", "", "m__guided__run1\n"),
+    ],
+)
+def test_a_wrong_evaluation_key_is_refused(key: str) -> None:
+    with pytest.raises(ValueError, match=r"evaluation key|must match"):
+        Evaluation.parse(key)
+
+
+@pytest.mark.parametrize("key", ["pachinko|m__guided__run1", "m__guided__run1", "occlusion", "|m__guided__run1", ""])
+def test_a_wrong_cell_key_is_refused(key: str) -> None:
+    with pytest.raises(ValueError, match=r"cell key|evaluation key"):
+        Cell.parse(key)
+
+
+@pytest.mark.parametrize("slug", ["", "a_b", "a__b", "A", "a|b", "a/b", "a b", "a,b", "a\n"])
+def test_an_id_that_would_break_keys_is_refused(slug: str) -> None:
+    with pytest.raises(ValueError, match="must match"):
+        check_slug(slug)
+    assert check_slug("qwen3-vl-8b.2") == "qwen3-vl-8b.2"
+
+
+def test_evaluations_go_model_by_model_so_that_a_model_is_one_range() -> None:
+    keys = [e.key for e in evaluations([("a", 2), ("b", 1)])]
+    assert keys == [
+        *(
+            "a__standard__run1",
+            "a__standard__run2",
+            "a__guided__run1",
+            "a__guided__run2",
+            "a__json__run1",
+            "a__json__run2",
+        ),
+        *("b__standard__run1", "b__guided__run1", "b__json__run1"),
+    ]
+
+
+def test_a_category_belongs_to_its_taxonomys_two_datasets() -> None:
+    assert (len(OCCLUSION_CATEGORIES), len(CHAOTIC_CATEGORIES), len(set(CATEGORIES))) == (8, 4, 12)
+    assert datasets_of_category("hidden") == ("occlusion", "occlusion_ill_posed")
+    assert datasets_of_category("plinko") == ("chaotic", "chaotic_ill_posed")
+    assert [taxonomy_of(d) for d in DATASETS] == ["occlusion", "occlusion", "chaotic", "chaotic"]
+    assert [is_ill_posed(d) for d in DATASETS] == [False, True, False, True]

@@ -1,0 +1,59 @@
+"""Progress: one line a partition, with calls, cache hits and the time left."""
+
+from __future__ import annotations
+
+import io
+import time
+
+import pytest
+
+from traps_pipeline import progress
+from traps_pipeline.progress import LIVE_SECONDS, Progress, Tally, TerminalProgress, clock, reporting
+
+
+def test_each_partition_is_a_line_with_its_counts_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    out = io.StringIO()
+    live = TerminalProgress(out)
+    live.stage("responses", 4)
+    now[0] = 30.0
+    live.partition("responses", "chaotic|oracle__json__run1", Tally(asked=10, cached=6))
+    now[0] = 60.0
+    live.partition("responses", "chaotic|prior__json__run1", Tally(cached=16))
+    live.partition("leaderboard", "", Tally())
+    first, second, third, fourth = out.getvalue().splitlines()
+    assert first == "responses: 4 partitions to do"
+    said = [" ".join(line.split()) for line in (second, third, fourth)]
+    assert said == [
+        "responses chaotic|oracle__json__run1 10 asked, 6 cached [1/4] 1:30 left",
+        "responses chaotic|prior__json__run1 16 cached [2/4] 1:00 left",
+        "leaderboard - done [3/4] 0:20 left",
+    ]
+    assert live.totals == {"responses": Tally(asked=10, cached=22), "leaderboard": Tally()}
+
+
+def test_a_long_partition_speaks_every_half_minute_and_no_oftener(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    out = io.StringIO()
+    live = TerminalProgress(out)
+    for second in range(100):
+        now[0] = float(second)
+        live.tick("responses", "a cell", second, 100)
+    lines = out.getvalue().splitlines()
+    assert [line.split(": ")[1] for line in lines] == ["30 of 100", "60 of 100", "90 of 100"]
+    assert LIVE_SECONDS == 30
+
+
+def test_a_progress_holds_for_its_block_even_when_it_fails() -> None:
+    before, mine = progress.current(), Progress()
+    with pytest.raises(ValueError, match="x"), reporting(mine):
+        assert progress.current() is mine
+        raise ValueError("x")
+    assert progress.current() is before
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0, "0:00"), (59.4, "0:59"), (59.6, "1:00"), (3600, "60:00")])
+def test_time_reads_as_minutes_and_seconds(seconds: float, text: str) -> None:
+    assert clock(seconds) == text
