@@ -20,7 +20,8 @@ ui: setup ## Dagster's web server and daemon on 127.0.0.1:3000
 	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/dagster dev -h 127.0.0.1 -p 3000 -m traps_pipeline.definitions
 
 bench: setup ## ratios against what one would otherwise use
-	$(BIN)/python bench/calls.py
+	$(BIN)/python bench/render.py
+	$(BIN)/python bench/ledger.py
 
 lint: setup
 	$(BIN)/ruff check .

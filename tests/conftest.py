@@ -75,7 +75,14 @@ class Checkout:
 
     def correct(self, scenario_id: str, action: str = "correct", **changes: Any) -> None:
         """Append a review decision."""
-        decision = {"scenario_id": scenario_id, "action": action, **changes, "who": "test", "when": "2026-11-21", "why": "test"}
+        decision = {
+            "scenario_id": scenario_id,
+            "action": action,
+            **changes,
+            "who": "test",
+            "when": "2026-11-21",
+            "why": "test",
+        }
         folder = self.root / "scene_specs" / "corrections"
         folder.mkdir(exist_ok=True)
         with (folder / "review.jsonl").open("a") as stream:

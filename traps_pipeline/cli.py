@@ -27,7 +27,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"traps: {error}", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:
-        print("\ntraps: interrupted; everything answered or rendered is kept. Run the same command to go on.", file=sys.stderr)
+        print(
+            "\ntraps: interrupted; everything answered or rendered is kept. Run the same command to go on.",
+            file=sys.stderr,
+        )
         return INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()
@@ -41,20 +44,32 @@ def build_parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
-    def add(name: str, command: Callable[[argparse.Namespace], int], text: str, *, workspace: bool = True) -> argparse.ArgumentParser:
+    def add(
+        name: str, command: Callable[[argparse.Namespace], int], text: str, *, workspace: bool = True
+    ) -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=text, description=text)
         sub.set_defaults(command=command)
         if workspace:
-            sub.add_argument("--workspace", type=Path, help="study folder (default: $TRAPS_WORKSPACE, else .workspaces/default)")
+            sub.add_argument(
+                "--workspace", type=Path, help="study folder (default: $TRAPS_WORKSPACE, else .workspaces/default)"
+            )
         return sub
 
     add("doctor", doctor, "render one frame, encode it, and name what is missing")
-    add("init", init, "make a workspace for an experiment without running it").add_argument("experiment", nargs="?", default="demo")
-    add("plan", plan, "count the calls of an experiment: wanted, known, new; nothing is sent").add_argument("experiment")
+    add("init", init, "make a workspace for an experiment without running it").add_argument(
+        "experiment", nargs="?", default="demo"
+    )
+    add("plan", plan, "count the calls of an experiment: wanted, known, new; nothing is sent").add_argument(
+        "experiment"
+    )
     add("run", run, "materialize whatever of an experiment is missing or stale").add_argument("experiment")
     add("status", status, "what is there, missing and stale, and why").add_argument("experiment", nargs="?")
-    add("why", why, "why an item's answers stand or will be asked again").add_argument("item", help="dataset:scenario:side")
-    sample = add("sample", sample_scenarios, "draw scenarios of a family and write them as released records", workspace=False)
+    add("why", why, "why an item's answers stand or will be asked again").add_argument(
+        "item", help="dataset:scenario:side"
+    )
+    sample = add(
+        "sample", sample_scenarios, "draw scenarios of a family and write them as released records", workspace=False
+    )
     sample.add_argument("family")
     sample.add_argument("--count", type=int, default=8)
     sample.add_argument("--seed", type=int, default=1)
@@ -81,7 +96,7 @@ def init(arguments: argparse.Namespace) -> int:
     """See `traps init --help`."""
     workspace = _create(arguments, _experiment(arguments))
     print(f"workspace {workspace.root} (study.yaml names its benchmark, panel and budget)")
-    print(f"next: export TRAPS_WORKSPACE={workspace.root} DAGSTER_HOME={workspace.dagster_home}; traps run {arguments.experiment}")
+    print(f"next: export TRAPS_WORKSPACE={workspace.root} DAGSTER_HOME={workspace.dagster_home}")
     return OK
 
 
@@ -107,7 +122,9 @@ def plan(arguments: argparse.Namespace) -> int:
 
 def _plan_line(name: str, counts: tuple) -> str:
     answers, votes = ((count.wanted, count.known, count.new) for count in counts)
-    return f"{name:<24} {answers[0]:>9,} {answers[1]:>9,} {answers[2]:>9,}   {votes[0]:>9,} {votes[1]:>9,} {votes[2]:>9,}"
+    return (
+        f"{name:<24} {answers[0]:>9,} {answers[1]:>9,} {answers[2]:>9,}   {votes[0]:>9,} {votes[1]:>9,} {votes[2]:>9,}"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -123,13 +140,16 @@ def run(arguments: argparse.Namespace) -> int:
     total = progress.totals
     asked, voted, drawn = (total.get(stage, Tally()) for stage in ("responses", "votes", "videos"))
     print(
-        f"\n{asked.asked} answers asked ({asked.cached} from the ledger), {voted.asked} votes asked ({voted.cached} from the "
-        f"ledger), {drawn.frames} frames rendered, {clock(outcome.seconds)} min"
+        f"\n{asked.asked} answers asked ({asked.cached} from the ledger), {voted.asked} votes asked "
+        f"({voted.cached} from the ledger), {drawn.frames} frames rendered, {clock(outcome.seconds)} min"
     )
     if outcome.problems:
         for problem in outcome.problems:
             print(f"traps: {problem}", file=sys.stderr)
-        print(f"traps: {len(outcome.problems)} problem(s); what is done is kept: run the same command to go on", file=sys.stderr)
+        print(
+            f"traps: {len(outcome.problems)} problem(s); what is done is kept: run the same command to go on",
+            file=sys.stderr,
+        )
         return FAILED
     _print_results(workspace)
     return OK

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dagster as dg
 
 from traps_pipeline.defs import benchmark, evaluation, report, scoring
+from traps_pipeline.defs.common import watch_sources
 from traps_pipeline.paths import require_checkout
 
 require_checkout()
@@ -24,9 +25,13 @@ ASSETS = [
     report.leaderboard_page,
 ]
 JOBS = [
-    dg.define_asset_job("render", dg.AssetSelection.assets("scene_specs", "videos"), description="Specs and clips of a category."),
     dg.define_asset_job(
-        "evaluate", dg.AssetSelection.assets("responses", "votes", "verdicts"), description="Answers, votes and verdicts of cells."
+        "render", dg.AssetSelection.assets("scene_specs", "videos"), description="Specs and clips of a category."
+    ),
+    dg.define_asset_job(
+        "evaluate",
+        dg.AssetSelection.assets("responses", "votes", "verdicts"),
+        description="Answers, votes and verdicts of cells.",
     ),
     dg.define_asset_job(
         "publish",
@@ -37,5 +42,9 @@ JOBS = [
 
 # In process: a run costs 2 s instead of 5, and rendering and asking bring their own processes and connections.
 defs = dg.Definitions(
-    assets=[*SOURCES, *ASSETS], asset_checks=report.inputs_current, jobs=JOBS, executor=dg.in_process_executor
+    assets=[*SOURCES, *ASSETS],
+    sensors=[watch_sources],
+    asset_checks=report.inputs_current,
+    jobs=JOBS,
+    executor=dg.in_process_executor,
 )

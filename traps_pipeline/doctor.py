@@ -37,13 +37,11 @@ def examine(workspace_root: Path) -> Iterator[Finding]:
 def _finding(what: str, look: Callable[[], str]) -> Finding:
     try:
         return Finding(True, what, look())
-    except Exception as error:  # a doctor reports whatever it meets
+    except Exception as error:  # noqa: BLE001 - a doctor reports whatever it meets
         return Finding(False, what, f"{error}")
 
 
 def _python() -> str:
-    if sys.version_info < (3, 11):
-        raise RuntimeError(f"Python {sys.version.split()[0]} is too old; install 3.11 or later")
     return sys.version.split()[0]
 
 
@@ -96,7 +94,9 @@ def _disk(root: Path) -> str:
     existing = next(path for path in (root, *root.parents) if path.exists())
     free = shutil.disk_usage(existing).free / 1e9
     if free < MIN_FREE_GB:
-        raise RuntimeError(f"{free:.1f} GB free at {existing}; free at least {MIN_FREE_GB} GB or choose another workspace")
+        raise RuntimeError(
+            f"{free:.1f} GB free at {existing}; free at least {MIN_FREE_GB} GB or choose another workspace"
+        )
     return f"{free:.1f} GB free at {existing}"
 
 

@@ -1,4 +1,4 @@
-"""`traps run`: walk the stages of an experiment through Dagster, materializing what is missing or stale, and no more."""
+"""`traps run`: walk the stages of an experiment through Dagster, making what is missing or stale, and no more."""
 
 from __future__ import annotations
 
@@ -75,8 +75,20 @@ def run_experiment(workspace: Workspace, experiment: Experiment) -> Outcome:
         observe_sources(instance, workspace)
         for stage in STAGES:
             _run_stage(instance, workspace, experiment, stage, outcome)
+    outcome.problems += failed_checks(workspace, experiment)
     outcome.seconds = time.monotonic() - began
     return outcome
+
+
+def failed_checks(workspace: Workspace, experiment: Experiment) -> list[str]:
+    """Checks of the experiment's partitions that do not pass, whichever run made them."""
+    problems = []
+    for stage in STAGES:
+        for key in wanted_keys(workspace, experiment, stage):
+            for check in workspace.failed_checks(stage, key):
+                details = workspace.failed_check(stage, check, key).read_text(encoding="utf-8")
+                problems.append(f"check {check} of {name_of((stage, key))} does not pass: {details}")
+    return problems
 
 
 def _run_stage(
@@ -106,7 +118,9 @@ def _run_stage(
     if unfinished:
         shown = ", ".join(name_of(node) for node in unfinished[:SHOWN]) + (", ..." if len(unfinished) > SHOWN else "")
         outcome.problems.append(f"{len(unfinished)} of {len(todo)} partitions of {stage} are not done: {shown}")
-    outcome.problems += [f"{name_of(node)}: {status.failed} calls failed" for node, status in statuses.items() if status.failed]
+    outcome.problems += [
+        f"{name_of(node)}: {status.failed} calls failed" for node, status in statuses.items() if status.failed
+    ]
 
 
 def _blocked(lineage: Lineage, stage: str, key: str | None, failed: set[Node]) -> bool:
@@ -171,10 +185,6 @@ def _materialize(instance: dg.DagsterInstance, stage: str, batch: tuple[str | No
     if any(error.cls_name in _INTERRUPTS for event in failures for error in _chain(event)):
         raise KeyboardInterrupt
     problems = [_reason(event) for event in failures]
-    for evaluation in result.get_asset_check_evaluations():
-        if not evaluation.passed:
-            details = {name: value.value for name, value in evaluation.metadata.items()}
-            problems.append(f"check {evaluation.check_name} of {stage} {first or ''} did not pass: {details}")
     if not result.success and not problems:
         problems.append(f"{stage} {first or ''}: the run failed; see its log in Dagster")
     return problems

@@ -13,11 +13,13 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from typing import Literal
 
-from traps_pipeline.benchmark.corrections import load_scenarios
+from traps_pipeline.benchmark.corrections import folded, load_scenarios
 from traps_pipeline.benchmark.items import categories_of_dataset
+from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.specs import released_in_study
 from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import load_panel
 from traps_pipeline.models.prompts import prompt, system_prompt
 from traps_pipeline.models.registry import all_evaluations, get_model
@@ -169,6 +171,15 @@ class Lineage:
         raise KeyError(f"unknown source {name!r}; known: {', '.join(SOURCES)}")
 
 
+def reread_sources() -> None:
+    """Forget what was read of specs, corrections, prompts and judges: a server that lives long sees edits then.
+
+    The models stay: partition keys are made from them when the code location is loaded.
+    """
+    for cached in (load_released, folded, prompt, system_prompt, load_panel):
+        cached.cache_clear()
+
+
 def _differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterable[str]:
     for name in sorted(then.keys() | now.keys()):
         if name not in now:
@@ -188,4 +199,9 @@ def write_report_state(workspace: Workspace, name: str, version: str, inputs: Ma
 def read_report_state(workspace: Workspace, name: str) -> State | None:
     """The state that `write_report_state` wrote; None if the report was never made."""
     path = workspace.reports / f"{name}.state.json"
-    return State(**json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else None
+    if not path.is_file():
+        return None
+    try:
+        return State(**json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise TrapsError(f"{path}: is not what was written ({error}); delete it and run again") from error

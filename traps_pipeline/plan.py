@@ -10,11 +10,11 @@ from typing import Any
 from traps_pipeline.benchmark.corrections import load_scenarios
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import Experiment
-from traps_pipeline.judging.panel import PANEL_SIZE, load_panel, tasks_for, wanted_votes
+from traps_pipeline.judging.panel import PANEL_SIZE, load_panel, tasks_for, wanted_ballots
 from traps_pipeline.lineage import STAGES, Lineage, keys_of
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.registry import get_model, load_models
-from traps_pipeline.partitions import REGIMES, SIDES, Cell, Evaluation, taxonomy_of
+from traps_pipeline.partitions import REGIMES, SIDES, Cell, Evaluation, datasets_of_category
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS
@@ -45,11 +45,11 @@ def plan_calls(workspace: Workspace | None, experiment: Experiment) -> dict[str,
     plan = {model: (Count(), Count()) for model in experiment.models}
     study = workspace.study if workspace else experiment.study
     scenarios = load_scenarios(study).values()
-    known = _KnownKeys(workspace) if workspace else None
+    known = _KnownKeys()
     for cell in experiment.cells():
         answers, votes = plan[cell.evaluation.model]
-        pairs = sum(scenario_taxonomy(s.category) == taxonomy_of(cell.dataset) for s in scenarios)
-        if workspace is None or known is None or Lineage(workspace).status("items", cell.dataset).kind != "fresh":
+        pairs = sum(cell.dataset in datasets_of_category(s.category) for s in scenarios)
+        if workspace is None or Lineage(workspace).status("items", cell.dataset).kind != "fresh":
             answers.add(2 * pairs, 0)
             votes.add(VOTES_A_PAIR * pairs, 0)
             continue
@@ -58,20 +58,15 @@ def plan_calls(workspace: Workspace | None, experiment: Experiment) -> dict[str,
         if Lineage(workspace).status("responses", cell.key).kind == "missing":
             votes.add(VOTES_A_PAIR * len(wanted) // 2, 0)
             continue
-        ballots = {request.key for request in wanted_votes(workspace, load_panel(study.panel), cell)}
+        ballots = {ballot.request.key for ballot in wanted_ballots(workspace, load_panel(study.panel), cell)}
         votes.add(len(ballots), len(ballots & known.of(workspace.votes, cell.evaluation)))
     return plan
 
 
-def scenario_taxonomy(category: str) -> str:
-    """Taxonomy of a category."""
-    from traps_pipeline.partitions import datasets_of_category
-
-    return datasets_of_category(category)[0]
-
-
 class _KnownKeys:
-    def __init__(self, workspace: Workspace | None) -> None:
+    """Keys that the ledgers answer, read once an evaluation."""
+
+    def __init__(self) -> None:
         self._keys: dict[tuple[str, Evaluation], set[str]] = {}
 
     def of(self, ledger: Ledger, evaluation: Evaluation) -> set[str]:
@@ -134,7 +129,9 @@ def why(workspace: Workspace, item_id: str) -> Iterator[str]:
                 wanted = answer_request(workspace, entry, current, evaluation) if current else None
                 yield f"{evaluation.key}: {_explain(rows, wanted.components if wanted else None)}"
     if current is None and not asked:
-        raise TrapsError(f"item {item_id!r} is unknown; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void")
+        raise TrapsError(
+            f"item {item_id!r} is unknown; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void"
+        )
     if not asked:
         yield "never asked of any model"
 
@@ -145,8 +142,7 @@ def _about(row: Mapping[str, Any]) -> Any:
 
 def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:
     items = workspace.tables.read_all(ITEMS, dataset=dataset)
-    found = items[items["item_id"] == item_id].to_dict("records")
-    return found[0] if found else None
+    return next((item for item in items.to_dict("records") if item["item_id"] == item_id), None)
 
 
 def _explain(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:

@@ -1,4 +1,4 @@
-"""How long work tells where it stands. Library code reports to `current()`; the command line and the DAG install theirs."""
+"""How long work tells where it stands. Library code reports to `current()`; the command line installs its own."""
 
 from __future__ import annotations
 
@@ -69,7 +69,8 @@ class TerminalProgress(Progress):
         self._done += 1
         counts = [f"{n} {word}" for word, n in vars(tally).items() if n]
         left = (time.monotonic() - self._began) / self._done * max(self._total - self._done, 0)
-        self._say(f"  {stage:<12} {key or '-':<52} {', '.join(counts) or 'done':<34} [{self._done}/{self._total}] {clock(left)} left")
+        what = f"{stage:<12} {key or '-':<52} {', '.join(counts) or 'done':<34}"
+        self._say(f"  {what} [{self._done}/{self._total}] {clock(left)} left")
 
     def tick(self, stage: str, what: str, done: int, total: int) -> None:
         """See `Progress`."""

@@ -53,7 +53,10 @@ class Table:
             "strs": pa.list_(pa.string()),
         }
         return pa.schema(
-            [pa.field(c.name, types[c.type.rstrip("?")], nullable=c.nullable, metadata={"doc": c.doc}) for c in self.columns]
+            [
+                pa.field(c.name, types[c.type.rstrip("?")], nullable=c.nullable, metadata={"doc": c.doc})
+                for c in self.columns
+            ]
         )
 
 
@@ -69,7 +72,9 @@ _CELL = """
     regime str standard, guided or json
     run int independent repetition, from 1
 """
-_VERSION = "    benchmark_version str version of the benchmark part this row comes from: release, or release+digest once corrected\n"
+_VERSION = """
+    benchmark_version str of the part of the benchmark that this row is from: release, or release+digest once corrected
+"""
 
 SCENE_SPECS = Table(
     "scene_specs",

@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, METRICS, RESPONSES, SCENE_SPECS, TABLES, VIDEOS
 
 from tests.conftest import Checkout
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS, METRICS, RESPONSES, SCENE_SPECS, TABLES, VIDEOS
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("corrections")]
 EVALUATIONS = 8 * 3 * 1  # models x regimes x runs of the demo
@@ -40,7 +40,16 @@ def stale_in_dagster(study: Checkout) -> list[str]:
 
 
 def cells(*datasets: str) -> list[str]:
-    models = "always-abstain confidence-noise inverse-oracle never-abstain oracle perfect-answerer prior random-50".split()
+    models = [
+        "always-abstain",
+        "confidence-noise",
+        "inverse-oracle",
+        "never-abstain",
+        "oracle",
+        "perfect-answerer",
+        "prior",
+        "random-50",
+    ]
     return [f"{d}|{m}__{r}__run1" for d in datasets for m in models for r in ("standard", "guided", "json")]
 
 

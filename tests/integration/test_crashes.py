@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import TABLES, VOLATILE
 
 from tests.conftest import Checkout
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import TABLES, VOLATILE
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("crashes")]
 ANSWERS, VOTES = 3072, 13824
@@ -45,7 +45,9 @@ def wait_for_rows(study: Checkout, process: subprocess.Popen[str], kind: str, co
         time.sleep(0.002)
 
 
-def test_three_kills_while_answering_leave_the_same_tables_and_no_call_is_made_twice(unasked: Checkout, demo: Checkout) -> None:
+def test_three_kills_while_answering_leave_the_same_tables_and_no_call_is_made_twice(
+    unasked: Checkout, demo: Checkout
+) -> None:
     moments = sorted(random.Random(20261121).sample(range(50, ANSWERS - 200), 3))
     for moment in moments:
         process = start(unasked)
@@ -75,7 +77,13 @@ def test_a_kill_while_voting_leaves_the_same_tables(unasked: Checkout, demo: Che
 def test_two_runs_that_want_the_same_keys_ask_each_once(unasked: Checkout) -> None:
     cell_range = ("chaotic|oracle__standard__run1", "occlusion_ill_posed|prior__json__run1")
     command = (sys.executable, "-m", "dagster", "asset", "materialize", "-m", "traps_pipeline.definitions")
-    by_dagster = unasked.start(*command, "--select", "responses", "--partition-range", "occlusion|oracle__standard__run1...chaotic_ill_posed|random-50__json__run1")
+    by_dagster = unasked.start(
+        *command,
+        "--select",
+        "responses",
+        "--partition-range",
+        "occlusion|oracle__standard__run1...chaotic_ill_posed|random-50__json__run1",
+    )
     by_traps = start(unasked)
     for process in (by_dagster, by_traps):
         _, err = process.communicate(timeout=300)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
+
+from tests.conftest import Checkout
 from traps_pipeline.scoring.leaderboard import pooled_j
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, LEADERBOARD, METRICS, TABLES, VERDICTS, VIDEOS
-
-from tests.conftest import Checkout
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("demo")]
 DEGENERATE = ("always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle")
@@ -66,7 +66,10 @@ def test_every_table_knows_its_benchmark_version(workspace: Workspace) -> None:
 
 
 def test_the_demo_ends_with_the_leaderboard_and_paths_that_exist(demo: Checkout, demo_output: str) -> None:
-    assert "3072 answers asked (0 from the ledger), 13824 votes asked (0 from the ledger), 2400 frames rendered" in demo_output
+    assert (
+        "3072 answers asked (0 from the ledger), 13824 votes asked (0 from the ledger), 2400 frames rendered"
+        in demo_output
+    )
     lines = demo_output.splitlines()
     for name in ("leaderboard.html", "leaderboard.md", "pecs_landscape.png", "contact_sheet.png"):
         path = demo.workspace / "reports" / name
@@ -83,7 +86,13 @@ def test_a_second_run_asks_and_renders_nothing(study: Checkout) -> None:
 
 def test_status_calls_everything_fresh_and_plan_has_nothing_new(study: Checkout) -> None:
     status = study.traps("status", "demo").out
-    for stage, partitions in (("scene_specs", 4), ("items", 4), ("responses", 96), ("verdicts", 96), ("leaderboard", 1)):
+    for stage, partitions in (
+        ("scene_specs", 4),
+        ("items", 4),
+        ("responses", 96),
+        ("verdicts", 96),
+        ("leaderboard", 1),
+    ):
         assert f"{stage:<18} {partitions:>6}      0        0" in status
     plan = study.traps("plan", "demo").out.splitlines()[-1].split()
     assert plan == ["all", "3,072", "3,072", "0", "13,824", "13,824", "0"]

@@ -40,7 +40,9 @@ def test_a_malformed_spec_names_file_and_line(study: Checkout) -> None:
 
 def test_an_unknown_family_is_answered_with_the_known_ones(study: Checkout) -> None:
     path = edit_record(study, "plinko", 1, family="plonko")
-    assert_refused(study.traps("run", "demo"), f"{path}:1", "unknown family 'plonko'", "domino_chain, hidden_race, plinko")
+    assert_refused(
+        study.traps("run", "demo"), f"{path}:1", "unknown family 'plonko'", "domino_chain, hidden_race, plinko"
+    )
 
 
 def test_a_duplicate_scenario_names_the_second_line(study: Checkout) -> None:
@@ -129,14 +131,19 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 6 MB: room for the Dagster history, not for all tables and clips."""
     folder = tmp_path / "small"
     folder.mkdir()
-    mounted = os.geteuid() == 0 and subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", folder], check=False).returncode == 0
+    mounted = (
+        os.geteuid() == 0
+        and subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", folder], check=False).returncode == 0
+    )
     if not mounted:
         pytest.skip("mounting a tmpfs needs root; tests/storage covers a full disk with a writer that raises ENOSPC")
     yield folder
     subprocess.run(["umount", "-l", folder], check=True)
 
 
-def test_a_full_disk_ends_in_a_sentence_and_the_same_command_goes_on(unasked: Checkout, small_disk: Path, demo: Checkout) -> None:
+def test_a_full_disk_ends_in_a_sentence_and_the_same_command_goes_on(
+    unasked: Checkout, small_disk: Path, demo: Checkout
+) -> None:
     ledger = unasked.workspace / "ledger"
     ledger.symlink_to(small_disk, target_is_directory=True)
     filler = small_disk / "filler"

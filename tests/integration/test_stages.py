@@ -7,10 +7,10 @@ import shutil
 import sys
 
 import pytest
-from traps_pipeline.lineage import PARTITIONED_BY, STAGES, Lineage
-from traps_pipeline.storage.workspace import Workspace
 
 from tests.conftest import Checkout, Finished
+from traps_pipeline.lineage import PARTITIONED_BY, STAGES, Lineage
+from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("stages")]
 CELL = "occlusion|oracle__standard__run1"
@@ -87,5 +87,8 @@ def test_the_code_location_validates_and_imports_nothing_heavy(study: Checkout) 
 
 
 def test_help_loads_neither_dagster_nor_pandas(study: Checkout) -> None:
-    code = "import sys; from traps_pipeline.cli import build_parser; build_parser().format_help(); print(sorted({'dagster', 'pandas', 'pydantic', 'numpy'} & set(sys.modules)))"
+    code = (
+        "import sys; from traps_pipeline.cli import build_parser; build_parser().format_help();"
+        "print(sorted({'dagster', 'pandas', 'pydantic', 'numpy'} & set(sys.modules)))"
+    )
     assert study.run(sys.executable, "-c", code).out.strip() == "[]"

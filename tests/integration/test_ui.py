@@ -15,16 +15,19 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Page, expect, sync_playwright
+
+from tests.conftest import Checkout
 from traps_pipeline.definitions import ASSETS, SOURCES
 from traps_pipeline.lineage import partition_of
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import TABLES
 
-from tests.conftest import Checkout
-
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("ui")]
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
-QUIET = "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking --disable-sync --disable-component-update"
+QUIET = (
+    "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking --disable-sync "
+    "--disable-component-update"
+)
 RUN_SECONDS = 90
 
 
@@ -41,7 +44,18 @@ def server(study: Checkout) -> Iterator[str]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = (sys.executable, "-m", "dagster", "dev", "-h", "127.0.0.1", "-p", str(port), "-m", "traps_pipeline.definitions")
+    command = (
+        sys.executable,
+        "-m",
+        "dagster",
+        "dev",
+        "-h",
+        "127.0.0.1",
+        "-p",
+        str(port),
+        "-m",
+        "traps_pipeline.definitions",
+    )
     process = study.start(*command)
     url = f"http://127.0.0.1:{port}"
     try:
@@ -83,7 +97,7 @@ def materialize(page: Page, server: str, asset: str, *choices: str) -> None:
     for choice in choices:
         page.get_by_text("Select a partition or create one").first.click()
         page.get_by_placeholder("Filter partitions").fill(choice)
-        page.get_by_text(choice, exact=True).last.click()
+        page.get_by_text(choice, exact=True).locator("visible=true").last.click()
         page.keyboard.press("Escape")
     page.get_by_role("button", name="Launch").last.click()
     expect(page.get_by_role("button", name="Launch")).to_have_count(0)
@@ -100,7 +114,9 @@ def materialize_and_wait(study: Checkout, page: Page, server: str, stage: str, k
     wait_until(lambda: file.stat().st_mtime_ns > before, RUN_SECONDS, f"{stage} {key} is made from the UI")
 
 
-def test_a_correction_is_driven_from_the_ui_and_nothing_leaves_the_machine(study: Checkout, server: str, page: Page, tmp_path: Path) -> None:
+def test_a_correction_is_driven_from_the_ui_and_nothing_leaves_the_machine(
+    study: Checkout, server: str, page: Page, tmp_path: Path
+) -> None:
     hosts = set[str]()
     page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
     page.goto(f"{server}/asset-groups")

@@ -62,7 +62,7 @@ def load(name: str) -> Stored:
         spec = SceneSpec.model_validate(json.loads(next(lines)))
     family, physics = get_family(name), Physics(**spec.physics)
     params = family.params_from(spec.params)
-    camera = Camera(**{key: tuple(value) if isinstance(value, list) else value for key, value in spec.camera.items()})
+    camera = Camera.from_record(spec.camera)
     qpos = load_trajectory(RELEASED / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
     motion = replay(compile_scene(family, params, physics)[0], qpos, physics)
     return Stored(spec, family, params, physics, camera, qpos, motion, read_outcome(family, motion, params))

@@ -181,11 +181,12 @@ def _added(where: str, correction: Correction) -> Scenario:
 
 def load_scenarios(study: Study) -> dict[str, Scenario]:
     """The scenarios of a study: folded, then the study's subset. Raises TrapsError for an unknown named scenario."""
-    return subset(_folded(), study)
+    return subset(folded(), study)
 
 
 @cache
-def _folded() -> dict[str, Scenario]:
+def folded() -> dict[str, Scenario]:
+    """The released records after all corrections."""
     return fold(load_released(), read_corrections())
 
 

@@ -1,1 +1,1 @@
-"""The DAG: one file a stage group. Assets read tables, call one library function, write a table; they know no science."""
+"""The DAG: one file a stage group. Assets read tables, call a library function, write a table."""

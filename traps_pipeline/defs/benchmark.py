@@ -31,7 +31,11 @@ category_to_datasets = dg.StaticPartitionMapping({c: list(datasets_of_category(c
     output_required=False,
     check_specs=[
         check("unique_scenarios", "scene_specs", "No scenario occurs twice."),
-        check("outcome_settled", "scene_specs", "Replayed from the frozen trajectory, every outcome is the ground truth, settled 0.6 s before the end."),
+        check(
+            "outcome_settled",
+            "scene_specs",
+            "Replayed from the frozen trajectory, every outcome is the ground truth, settled 0.6 s before the end.",
+        ),
     ],
 )
 def scene_specs(context: dg.AssetExecutionContext) -> Events:
@@ -46,9 +50,14 @@ def scene_specs(context: dg.AssetExecutionContext) -> Events:
     progress.current().partition("scene_specs", category, Tally())
     yield common.materialized(context, category, version, provenance, **{"dagster/partition_row_count": len(rows)})
     ids = [row["scenario_id"] for row in rows]
-    yield verdict_of("unique_scenarios", context, len(set(ids)) == len(ids), scenarios=len(ids))
+    repeated = sorted({id_ for id_ in ids if ids.count(id_) > 1})
+    yield verdict_of(
+        "unique_scenarios", context, workspace, {category: repeated} if repeated else {}, scenarios=len(ids)
+    )
     problems = unsettled(resolved)
-    yield verdict_of("outcome_settled", context, not problems, problems=problems)
+    yield verdict_of(
+        "outcome_settled", context, workspace, {category: problems} if problems else {}, scenarios=len(ids)
+    )
 
 
 @dg.asset(
@@ -60,7 +69,11 @@ def scene_specs(context: dg.AssetExecutionContext) -> Events:
     metadata=table_metadata("videos"),
     output_required=False,
     check_specs=[
-        check("panel_hides", "videos", "Nothing decisive has a pixel, shadow included, in any checked frame of an occluded void."),
+        check(
+            "panel_hides",
+            "videos",
+            "Nothing decisive has a pixel, shadow included, in any checked frame of an occluded void.",
+        ),
         check("clips_distinct", "videos", "No two clips of a category show the same frames."),
     ],
 )
@@ -78,9 +91,10 @@ def videos(context: dg.AssetExecutionContext) -> Events:
     metadata = {"dagster/partition_row_count": len(rows), "frames rendered": drawn, "megabytes": round(size, 2)}
     yield common.materialized(context, category, version, provenance, **metadata)
     leaking = {id_: pixels for id_, pixels in leaks.items() if pixels}
-    yield verdict_of("panel_hides", context, not leaking, voids=len(leaks), leaking=leaking)
-    digests = [(row["side"], row["frames_sha256"]) for row in rows]
-    yield verdict_of("clips_distinct", context, len(set(digests)) == len(digests), clips=len(rows))
+    yield verdict_of("panel_hides", context, workspace, {category: leaking} if leaking else {}, voids=len(leaks))
+    shown = [(row["side"], row["frames_sha256"]) for row in rows]
+    alike = [row["path"] for row, frames in zip(rows, shown, strict=True) if shown.count(frames) > 1]
+    yield verdict_of("clips_distinct", context, workspace, {category: alike} if alike else {}, clips=len(rows))
 
 
 @dg.asset(
@@ -96,8 +110,11 @@ def videos(context: dg.AssetExecutionContext) -> Events:
     output_required=False,
     check_specs=[
         check("two_items_a_pair", "items", "Every pair has one control and one void item."),
-        check("unique_items", "items", "No item id occurs twice."),
-        check("clips_present", "items", "Every clip is there with its digest (checked while building; a damaged one fails the step)."),
+        check(
+            "clips_present",
+            "items",
+            "Every clip is there with its digest (checked while building; a damaged one fails the step).",
+        ),
     ],
 )
 def items(context: dg.AssetExecutionContext) -> Events:
@@ -112,10 +129,10 @@ def items(context: dg.AssetExecutionContext) -> Events:
     progress.current().partition("items", dataset, Tally())
     metadata = {"dagster/partition_row_count": len(rows), "benchmark version": rows[0]["benchmark_version"]}
     yield common.materialized(context, dataset, version, provenance, **metadata)
-    sides = [(row["pair_id"], row["side"]) for row in rows]
-    pairs = {pair for pair, _ in sides}
-    complete = set(sides) == {(pair, side) for pair in pairs for side in ("control", "void")}
-    yield verdict_of("two_items_a_pair", context, complete and len(rows) == 2 * len(pairs), pairs=len(pairs))
-    yield verdict_of("unique_items", context, len({row["item_id"] for row in rows}) == len(rows), items=len(rows))
-    clips = {row["clip"] for row in rows}
-    yield verdict_of("clips_present", context, all(workspace.resolve(clip).is_file() for clip in clips), clips=len(clips))
+    sides: dict[str, list[str]] = {}
+    for row in rows:
+        sides.setdefault(row["pair_id"], []).append(row["side"])
+    odd = {pair: found for pair, found in sides.items() if sorted(found) != ["control", "void"]}
+    yield verdict_of("two_items_a_pair", context, workspace, {dataset: odd} if odd else {}, pairs=len(sides))
+    absent = sorted({row["clip"] for row in rows if not workspace.resolve(row["clip"]).is_file()})
+    yield verdict_of("clips_present", context, workspace, {dataset: absent} if absent else {}, items=len(rows))

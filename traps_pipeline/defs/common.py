@@ -7,13 +7,14 @@ section 3). Sources are observed on the way, so provenance never points at nothi
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import dagster as dg
 
-from traps_pipeline.lineage import PARTITIONED_BY, SOURCES, Lineage, Node, keys_of
+from traps_pipeline.lineage import PARTITIONED_BY, SOURCES, Lineage, Node, keys_of, reread_sources
 from traps_pipeline.models.registry import all_evaluations
 from traps_pipeline.partitions import CATEGORIES, DATASETS
 from traps_pipeline.storage.workspace import Workspace
@@ -29,7 +30,11 @@ CELL = dg.MultiPartitionsDefinition({"dataset": DATASET, "evaluation": EVALUATIO
 SINGLE_RUN = dg.BackfillPolicy.single_run()
 OWNERS = ["team:benchmark"]
 
-_VERSION_TAG, _USER_TAG, _CODE_TAG = "dagster/data_version", "dagster/data_version_is_user_provided", "dagster/code_version"
+_VERSION_TAG, _USER_TAG, _CODE_TAG = (
+    "dagster/data_version",
+    "dagster/data_version_is_user_provided",
+    "dagster/code_version",
+)
 _INPUT_VERSION, _INPUT_POINTER = "dagster/input_data_version", "dagster/input_event_pointer"
 
 by_dataset = dg.MultiToSingleDimensionPartitionMapping("dataset")
@@ -116,19 +121,32 @@ def _recorded_version(record: dg.EventLogRecord) -> str | None:
 
 def source_asset(name: str, group: str, description: str, kinds: Sequence[str]) -> dg.SourceAsset | dg.AssetsDefinition:
     """An observable source asset whose data version, by partition where it has any, is made from its content."""
-    partitions = {"category": CATEGORY, "evaluation": EVALUATION}.get(PARTITIONED_BY.get(name, ""))
+    kind = PARTITIONED_BY.get(name)
+    partitions = CATEGORY if kind == "category" else EVALUATION if kind == "evaluation" else None
     tags = {f"dagster/kind/{kind}": "" for kind in kinds}
 
-    @dg.observable_source_asset(
-        name=name, partitions_def=partitions, group_name=group, description=description, tags=tags, auto_observe_interval_minutes=1
-    )
     def observe() -> dg.DataVersion | dg.DataVersionsByPartition:
         lineage = Lineage(Workspace.open())
         if partitions is None:
             return dg.DataVersion(str(lineage.version(name, None)))
         return dg.DataVersionsByPartition({str(key): str(lineage.version(name, key)) for key in keys_of(name)})
 
-    return observe
+    decorate = dg.observable_source_asset(
+        name=name, partitions_def=partitions, group_name=group, description=description, tags=tags
+    )
+    return decorate(observe)
+
+
+@dg.sensor(
+    minimum_interval_seconds=30,
+    default_status=dg.DefaultSensorStatus.RUNNING,
+    description="Looks at specs, corrections, prompts and registries, so that what an edit touched shows as stale.",
+)
+def watch_sources(context: dg.SensorEvaluationContext) -> dg.SkipReason:
+    """Observes the sources every 30 s while the daemon runs; launches nothing."""
+    reread_sources()
+    changed = observe_sources(context.instance, Workspace.open())
+    return dg.SkipReason(f"{len(changed)} source partitions changed" if changed else "no source changed")
 
 
 def check(name: str, asset: str, description: str) -> dg.AssetCheckSpec:
@@ -136,9 +154,27 @@ def check(name: str, asset: str, description: str) -> dg.AssetCheckSpec:
     return dg.AssetCheckSpec(name, asset=asset, description=description)
 
 
-def verdict_of(name: str, context: dg.AssetExecutionContext, passed: bool, **metadata: Any) -> dg.AssetCheckResult:
-    """The result of such a check."""
-    return dg.AssetCheckResult(check_name=name, asset_key=context.asset_key, passed=bool(passed), metadata=metadata)
+def verdict_of(
+    name: str,
+    context: dg.AssetExecutionContext,
+    workspace: Workspace,
+    failing: Mapping[str | None, Any],
+    **metadata: Any,
+) -> dg.AssetCheckResult:
+    """The result of such a check over this run's partitions; `failing` has details by partition key.
+
+    A failure is also kept in the workspace until the partition passes, so that every later run and `traps status` tell.
+    """
+    stage = context.asset_key.to_user_string()
+    for key in keys(context) if context.has_partition_key or context.has_partition_key_range else [None]:
+        file = workspace.failed_check(stage, name, key)
+        if key in failing:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(failing[key], default=str), encoding="utf-8")
+        else:
+            file.unlink(missing_ok=True)
+    metadata["failing"] = {str(key): details for key, details in failing.items()}
+    return dg.AssetCheckResult(check_name=name, asset_key=context.asset_key, passed=not failing, metadata=metadata)
 
 
 Events = Iterator[dg.AssetMaterialization | dg.AssetCheckResult]

@@ -7,7 +7,17 @@ import dagster as dg
 from traps_pipeline import progress
 from traps_pipeline.defs import common
 from traps_pipeline.defs.benchmark import items
-from traps_pipeline.defs.common import CELL, OWNERS, SINGLE_RUN, Events, by_dataset, by_evaluation, check, table_metadata, verdict_of
+from traps_pipeline.defs.common import (
+    CELL,
+    OWNERS,
+    SINGLE_RUN,
+    Events,
+    by_dataset,
+    by_evaluation,
+    check,
+    table_metadata,
+    verdict_of,
+)
 from traps_pipeline.lineage import Lineage
 from traps_pipeline.models.answers import FinishedCell, collect_answers
 from traps_pipeline.partitions import Cell
@@ -17,14 +27,20 @@ from traps_pipeline.tables import RESPONSES, VERDICTS, VOTES
 
 GROUP = "evaluation"
 MAX_INVALID_SHARE = 0.05
-models = common.source_asset("models", GROUP, "assets/models.yaml: what decides a model's answers, by evaluation.", ["yaml"])
+models = common.source_asset(
+    "models", GROUP, "assets/models.yaml: what decides a model's answers, by evaluation.", ["yaml"]
+)
 prompts = common.source_asset("prompts", GROUP, "assets/prompts: the regime's system prompt, by evaluation.", ["text"])
-judges = common.source_asset("judges", GROUP, "assets/judges.yaml and the judges' prompts: the study's panel.", ["yaml"])
+judges = common.source_asset(
+    "judges", GROUP, "assets/judges.yaml and the judges' prompts: the study's panel.", ["yaml"]
+)
 
 Collect = Callable[[Workspace, Sequence[Cell], Mapping[str, Mapping[str, str]]], Iterator[FinishedCell]]
 
 
-def _collect(context: dg.AssetExecutionContext, stage: str, collect: Collect) -> Iterator[tuple[FinishedCell, dg.AssetMaterialization]]:
+def _collect(
+    context: dg.AssetExecutionContext, stage: str, collect: Collect
+) -> Iterator[tuple[FinishedCell, dg.AssetMaterialization]]:
     """Run a paid stage over this run's cells; each is materialized as it is finished."""
     workspace = Workspace.open()
     cells = [Cell.parse(key) for key in common.keys(context)]
@@ -58,13 +74,14 @@ def _collect(context: dg.AssetExecutionContext, stage: str, collect: Collect) ->
 )
 def responses(context: dg.AssetExecutionContext) -> Events:
     """Answers of a model under a regime in a run, one row an item; only what the ledger does not hold is asked."""
-    workspace, wrong = Workspace.open(), list[str]()
+    workspace, wrong, n_rows = Workspace.open(), dict[str | None, str](), 0
     for done, event in _collect(context, "responses", collect_answers):
         state = Lineage(workspace).state("items", done.cell.dataset)
         if state is None or state.rows != done.rows:
-            wrong.append(done.cell.key)
+            wrong[done.cell.key] = f"{done.rows} rows for {state.rows if state else 0} items"
+        n_rows += done.rows
         yield event
-    yield verdict_of("one_answer_an_item", context, not wrong, cells=wrong)
+    yield verdict_of("one_answer_an_item", context, workspace, wrong, rows=n_rows)
 
 
 @dg.asset(
@@ -76,19 +93,25 @@ def responses(context: dg.AssetExecutionContext) -> Events:
     owners=OWNERS,
     metadata=table_metadata("votes"),
     output_required=False,
-    check_specs=[check("few_invalid_votes", "votes", f"At most {MAX_INVALID_SHARE:.0%} of the votes break the judges' schema.")],
+    check_specs=[
+        check(
+            "few_invalid_votes", "votes", f"At most {MAX_INVALID_SHARE:.0%} of a cell's votes break the judges' schema."
+        )
+    ],
 )
 def votes(context: dg.AssetExecutionContext) -> Events:
     """Votes of the study's panel on the answers of a cell, one row a judge and task."""
     from traps_pipeline.judging.panel import collect_votes
 
-    workspace, n_votes, n_invalid = Workspace.open(), 0, 0
+    workspace, many, n_votes = Workspace.open(), dict[str | None, str](), 0
     for done, event in _collect(context, "votes", collect_votes):
-        valid = workspace.tables.read(VOTES, done.cell.partition, ["valid"])["valid"]
-        n_votes, n_invalid = n_votes + len(valid), n_invalid + int((~valid).sum())
+        valid = workspace.tables.read(VOTES, done.cell.partition, ["valid"])["valid"].to_numpy(bool)
+        invalid = len(valid) - int(valid.sum())
+        if invalid > MAX_INVALID_SHARE * done.rows:
+            many[done.cell.key] = f"{invalid} of {done.rows} votes are invalid"
+        n_votes += done.rows
         yield event
-    share = n_invalid / n_votes if n_votes else 0.0
-    yield verdict_of("few_invalid_votes", context, share <= MAX_INVALID_SHARE, votes=n_votes, invalid=n_invalid, share=share)
+    yield verdict_of("few_invalid_votes", context, workspace, many, votes=n_votes)
 
 
 @dg.asset(
@@ -107,7 +130,7 @@ def verdicts(context: dg.AssetExecutionContext) -> Events:
     from traps_pipeline.judging.panel import decide_cell
 
     workspace = Workspace.open()
-    lineage, provenance, wrong = Lineage(workspace), common.provenance(context, workspace), list[str]()
+    lineage, provenance, wrong = Lineage(workspace), common.provenance(context, workspace), dict[str | None, str]()
     for key in common.keys(context):
         cell = Cell.parse(key)
         rows = decide_cell(workspace, cell)
@@ -115,8 +138,8 @@ def verdicts(context: dg.AssetExecutionContext) -> Events:
         progress.current().partition("verdicts", key, Tally())
         answered = workspace.tables.state(RESPONSES, cell.partition)
         if answered is None or answered.rows != len(rows):
-            wrong.append(key)
+            wrong[key] = f"{len(rows)} verdicts for {answered.rows if answered else 0} answers"
         undecided = sum(row["undecided"] for row in rows)
         metadata = {"dagster/partition_row_count": len(rows), "undecided": undecided}
         yield common.materialized(context, key, version, provenance, **metadata)
-    yield verdict_of("one_verdict_an_item", context, not wrong, cells=wrong)
+    yield verdict_of("one_verdict_an_item", context, workspace, wrong)

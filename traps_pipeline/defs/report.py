@@ -23,10 +23,20 @@ GROUP = "report"
 Files = dict[str, bytes]
 
 
-def _report(name: str, doc: str, deps: Sequence[dg.AssetsDefinition], make: Callable[[Workspace], Files]) -> dg.AssetsDefinition:
+def _report(
+    name: str, doc: str, deps: Sequence[dg.AssetsDefinition], make: Callable[[Workspace], Files]
+) -> dg.AssetsDefinition:
     """An unpartitioned asset that writes files for people into the workspace's `reports` folder."""
 
-    @dg.asset(name=name, description=doc, deps=deps, group_name=GROUP, kinds={"png" if "page" not in name else "html"}, owners=OWNERS, output_required=False)
+    @dg.asset(
+        name=name,
+        description=doc,
+        deps=deps,
+        group_name=GROUP,
+        kinds={"png" if "page" not in name else "html"},
+        owners=OWNERS,
+        output_required=False,
+    )
     def report(context: dg.AssetExecutionContext) -> Events:
         workspace = Workspace.open()
         provenance = common.provenance(context, workspace)
@@ -47,7 +57,7 @@ def _report(name: str, doc: str, deps: Sequence[dg.AssetsDefinition], make: Call
 def _write(path: Path, content: bytes) -> None:
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     part.write_bytes(content)
-    os.replace(part, path)
+    part.replace(path)
 
 
 def _preview(png: bytes) -> dg.MarkdownMetadataValue:
@@ -88,20 +98,32 @@ pecs_landscape = _report(
     "pecs_landscape", "Acc against J with iso-PECS contours, one marker a model and regime.", [leaderboard], _landscape
 )
 contact_sheet = _report(
-    "contact_sheet", "Control and void frames of one pair of each sub-scenario, with question and ground truth.", [items], _sheet
+    "contact_sheet",
+    "Control and void frames of one pair of each sub-scenario, with question and ground truth.",
+    [items],
+    _sheet,
 )
 leaderboard_page = _report(
-    "leaderboard_page", "The leaderboard as a page that opens from disk (HTML) and as Markdown.", [leaderboard, pecs_landscape, contact_sheet], _page
+    "leaderboard_page",
+    "The leaderboard as a page that opens from disk (HTML) and as Markdown.",
+    [leaderboard, pecs_landscape, contact_sheet],
+    _page,
 )
 
 
 def _inputs_current(asset: dg.AssetsDefinition) -> dg.AssetChecksDefinition:
     name = asset.key.to_user_string()
 
-    @dg.asset_check(asset=asset, name="inputs_current", description="Made from what is there now; Dagster itself never calls an unpartitioned asset stale.")
+    @dg.asset_check(
+        asset=asset,
+        name="inputs_current",
+        description="Made from what is there now; Dagster itself never calls an unpartitioned asset stale.",
+    )
     def current() -> dg.AssetCheckResult:
         status = Lineage(Workspace.open()).status(name, None)
-        return dg.AssetCheckResult(passed=status.kind == "fresh", metadata={"status": status.kind, "changed": list(status.reasons)})
+        return dg.AssetCheckResult(
+            passed=status.kind == "fresh", metadata={"status": status.kind, "changed": list(status.reasons)}
+        )
 
     return current
 

@@ -1,5 +1,7 @@
 """The scoring group: metrics of cells, the leaderboard."""
 
+from typing import Any
+
 import dagster as dg
 
 from traps_pipeline import progress
@@ -23,11 +25,13 @@ GROUP = "scoring"
     owners=OWNERS,
     metadata=table_metadata("metrics"),
     output_required=False,
-    check_specs=[check("shares_are_shares", "metrics", "Acc, AbsRec and FalseAbs lie in [0, 1], PECS is Acc x max(0, J).")],
+    check_specs=[
+        check("shares_are_shares", "metrics", "Acc, AbsRec and FalseAbs lie in [0, 1], PECS is Acc x max(0, J).")
+    ],
 )
 def metrics(context: dg.AssetExecutionContext) -> Events:
     """Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset, by scope (`benchmark.md` section 5)."""
-    from traps_pipeline.scoring.metrics import cell_metrics
+    from traps_pipeline.scoring.metrics import cell_metrics, wrong_figures
 
     workspace, dataset = Workspace.open(), context.partition_key
     provenance = common.provenance(context, workspace)
@@ -35,15 +39,16 @@ def metrics(context: dg.AssetExecutionContext) -> Events:
     judged = workspace.tables.read_all(VERDICTS, dataset=dataset)
     if judged.empty:
         raise TrapsError(f"metrics {dataset}: no verdicts yet; materialize verdicts for a cell of this dataset first")
-    benchmark_version = workspace.tables.read(ITEMS, {"dataset": dataset}, ["benchmark_version"])["benchmark_version"].iloc[0]
+    benchmark_version = workspace.tables.read(ITEMS, {"dataset": dataset}, ["benchmark_version"])[
+        "benchmark_version"
+    ].iloc[0]
     frame = cell_metrics(judged, benchmark_version)
     version = workspace.tables.write(METRICS, {"dataset": dataset}, frame, inputs)
     progress.current().partition("metrics", dataset, Tally())
     yield common.materialized(context, dataset, version, provenance, **{"dagster/partition_row_count": len(frame)})
-    shares = frame[["acc", "abs_rec", "false_abs"]].stack()
-    product = frame["acc"] * (frame["abs_rec"] - frame["false_abs"]).clip(lower=0)
-    wrong = int((~shares.between(0, 1)).sum()) + int(((frame["pecs"] - product).abs() > 1e-12).sum())
-    yield verdict_of("shares_are_shares", context, wrong == 0, cells=len(frame), wrong=wrong)
+    wrong = wrong_figures(frame)
+    failing: dict[str | None, str] = {dataset: f"{wrong} figures are wrong"} if wrong else {}
+    yield verdict_of("shares_are_shares", context, workspace, failing, cells=len(frame))
 
 
 @dg.asset(
@@ -60,6 +65,7 @@ def leaderboard(context: dg.AssetExecutionContext) -> Events:
     from traps_pipeline.report.page import leaderboard_markdown
     from traps_pipeline.scoring.bootstrap import pecs_intervals
     from traps_pipeline.scoring.leaderboard import leaderboard as rank
+    from traps_pipeline.scoring.leaderboard import wrong_intervals
 
     workspace = Workspace.open()
     provenance = common.provenance(context, workspace)
@@ -70,13 +76,14 @@ def leaderboard(context: dg.AssetExecutionContext) -> Events:
     board = rank(cells, pecs_intervals(workspace.tables.read_all(VERDICTS)))
     version = workspace.tables.write(LEADERBOARD, {}, board, inputs)
     progress.current().partition("leaderboard", "", Tally())
-    overall = board[board["dataset"] == "overall"]
-    metadata = {
+    metadata: dict[str, Any] = {
         "dagster/row_count": len(board),
         "leaderboard": dg.MetadataValue.md(leaderboard_markdown(board)),
-        "best overall PECS": float(overall["pecs"].max()) if len(overall) else 0.0,
     }
+    overall = board.loc[board["dataset"] == "overall", "pecs"].to_numpy(float)
+    if len(overall):
+        metadata["best overall PECS"] = float(overall.max())
     yield common.materialized(context, None, version, provenance, **metadata)
-    known = board.dropna(subset=["pecs_ci_low", "pecs_ci_high"])
-    ordered = (known["pecs_ci_low"] >= 0) & (known["pecs_ci_low"] <= known["pecs_ci_high"]) & (known["pecs_ci_high"] <= 1)
-    yield verdict_of("intervals_ordered", context, ordered.all(), rows=len(known), wrong=int((~ordered).sum()))
+    wrong = wrong_intervals(board)
+    failing: dict[str | None, str] = {None: f"{wrong} intervals are wrong"} if wrong else {}
+    yield verdict_of("intervals_ordered", context, workspace, failing, rows=len(board))

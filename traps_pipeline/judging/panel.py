@@ -176,12 +176,14 @@ def collect_votes(
     """Ask the study's panel what is missing and write the votes table of each cell."""
     panel = load_panel(workspace.study.panel)
 
+    ballots: dict[Cell, list[Ballot]] = {}
+
     def requests(cell: Cell) -> list[Request]:
-        return wanted_votes(workspace, panel, cell)
+        ballots[cell] = wanted_ballots(workspace, panel, cell)
+        return [ballot.request for ballot in ballots[cell]]
 
     def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> FinishedCell:
-        ballots = _ballots(workspace, panel, cell)
-        table = [_vote_row(cell, item, task, request, rows[request.key]) for item, task, request in ballots]
+        table = [_vote_row(cell, ballot, rows[ballot.request.key]) for ballot in ballots.pop(cell)]
         version = workspace.tables.write(VOTES, cell.partition, table, inputs[cell.key], failed=tally.errors)
         return FinishedCell(cell, version, len(table), tally)
 
@@ -190,23 +192,26 @@ def collect_votes(
     yield from run_work(work, cells)
 
 
-def wanted_votes(workspace: Workspace, panel: Sequence[JudgeEntry], cell: Cell) -> list[Request]:
-    """The calls of every vote that a cell wants."""
-    return [request for _, _, request in _ballots(workspace, panel, cell)]
+@dataclass(frozen=True)
+class Ballot:
+    """One vote that is wanted: the item and task, and the call that asks for it."""
+
+    item: Mapping[str, Any]
+    task: Task
+    request: Request
 
 
-def _ballots(
-    workspace: Workspace, panel: Sequence[JudgeEntry], cell: Cell
-) -> Iterator[tuple[dict[str, Any], Task, Request]]:
-    """Item, task and call of every vote that a cell wants."""
+def wanted_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: Cell) -> list[Ballot]:
+    """Every vote that the answers of a cell want."""
     items = _items_by_id(workspace, cell.dataset)
+    ballots = []
     for response in workspace.tables.read(RESPONSES, cell.partition).to_dict("records"):
         if response["outcome"] not in JUDGED:
             continue
         item = _item_of(items, response, cell)
         for task in tasks_for(item["side"]):
-            for judge in panel:
-                yield item, task, vote_request(judge, task, cell, item, response["text"])
+            ballots += [Ballot(item, task, vote_request(judge, task, cell, item, response["text"])) for judge in panel]
+    return ballots
 
 
 def _items_by_id(workspace: Workspace, dataset: str) -> dict[str, dict[str, Any]]:
@@ -223,7 +228,8 @@ def _item_of(items: Mapping[str, dict[str, Any]], response: Mapping[str, Any], c
     return items[response["item_id"]]
 
 
-def _vote_row(cell: Cell, item: Mapping[str, Any], task: Task, request: Request, row: Row) -> dict[str, Any]:
+def _vote_row(cell: Cell, ballot: Ballot, row: Row) -> dict[str, Any]:
+    item, task, request = ballot.item, ballot.task, ballot.request
     vote = parse_vote(task, row, item)
     return {
         **{name: item[name] for name in ("item_id", "side", "benchmark_version")},

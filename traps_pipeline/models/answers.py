@@ -44,7 +44,8 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
-    """What a reference strategy reads, and no more, so that a correction re-asks only those it concerns."""
+    """What reference strategies may read: side, labels, on a control its ground truth; the sub-scenario's commonest
+    answer goes to `prior` alone, so that a corrected answer which changes it re-asks no other model."""
     secret: dict[str, Any] = {"side": item["side"], "labels": list(item["labels"])}
     if item["side"] == "control":
         secret["ground_truth"] = item["ground_truth"]

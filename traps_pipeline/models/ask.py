@@ -157,7 +157,11 @@ class _Asking:
     async def sync(self) -> None:
         while True:
             await asyncio.sleep(SYNC_SECONDS)
-            self.writer.sync_if_due()
+            try:
+                self.writer.sync_if_due()
+            except TrapsError as error:  # a disk that cannot be synced stops new calls, as one that cannot be written
+                self.problems.append(error)
+                return
 
     async def run(self) -> None:
         """Ask all that is missing. An exception stops new calls; it is raised when those in flight are recorded."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +29,11 @@ class Camera:
     extent: float
     centre: Vec3
 
+    @staticmethod
+    def from_record(record: Mapping[str, Any]) -> Camera:
+        """The camera of a stored spec."""
+        return Camera(**_tuples(record))
+
     def axes(self) -> np.ndarray:
         """Rows: right, up, forward unit vectors in the world, shape (3, 3)."""
         return _axes(self.azimuth_deg, self.elevation_deg)
@@ -50,11 +57,20 @@ class Panel:
     half: Vec3
     yaw_deg: float
 
+    @staticmethod
+    def from_record(record: Mapping[str, Any]) -> Panel:
+        """The panel of a stored spec."""
+        return Panel(**_tuples(record))
+
     def corners(self) -> np.ndarray:
         """The eight corners in the world, shape (8, 3)."""
         local = Box(tuple(-h for h in self.half), self.half).corners()  # type: ignore[arg-type]
         c, s = np.cos(np.radians(self.yaw_deg)), np.sin(np.radians(self.yaw_deg))
         return local @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + np.array(self.centre)
+
+
+def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
 
 
 def _axes(azimuth_deg: float, elevation_deg: float) -> np.ndarray:

@@ -14,17 +14,18 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import Camera, Panel
 from traps_pipeline.scenes.encode import DamagedClip, encode, frames_digest
 from traps_pipeline.scenes.kit import Physics
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
+from traps_pipeline.scenes.resolve import compile_scene, decisive_geoms
 from traps_pipeline.scenes.spec import SceneSpec
 
 ABLATION_FRAMES = 5  # evenly spaced void frames that are drawn once more without what they must not show
@@ -67,7 +68,10 @@ def read_clip(path: Path) -> Clip | None:
     """The clip if it is rendered; None if not. Raises DamagedClip when the file is not what its note says."""
     if not path.is_file() or not note_of(path).is_file():
         return None
-    clip = Clip(**json.loads(note_of(path).read_text(encoding="utf-8")))
+    try:
+        clip = Clip(**json.loads(note_of(path).read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise DamagedClip(f"{note_of(path)}: is not what was written ({error}); delete it and run again") from error
     check_clip(path, clip.file_sha256, clip.size_bytes)
     return clip
 
@@ -96,13 +100,12 @@ def render_pair(job: Job) -> int:
     if not missing:
         return 0
     spec, physics = job.spec, Physics(**job.spec.physics)
-    panel = Panel(**_tuples(spec.void["panel"])) if spec.void_kind == "occluder" else None
+    panel = Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None
     family = get_family(spec.family)
-    from traps_pipeline.scenes.resolve import compile_scene
 
     model, scene = compile_scene(family, family.params_from(spec.params), physics, panel)
     drawn = 0
-    with Renderer(model, Camera(**_tuples(spec.camera))) as renderer:
+    with Renderer(model, Camera.from_record(spec.camera)) as renderer:
         control: list[np.ndarray] = []
         if job.control in missing or panel is None:
             control = list(renderer.frames(job.qpos))
@@ -112,23 +115,19 @@ def render_pair(job: Job) -> int:
         if job.void in missing and panel is not None:
             void = list(renderer.frames(job.qpos, panel=True))
             drawn += len(void)
-            _save(job.void, void, physics.fps, _leaked_pixels(renderer, scene, model, job, void))
+            geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
+            _save(job.void, void, physics.fps, _leaked_pixels(renderer, geoms, job))
         elif job.void in missing:
             _save(job.void, control[: spec.void["cut_frame"]], physics.fps)
     return drawn
 
 
-def _leaked_pixels(renderer: Renderer, scene: object, model: object, job: Job, void: Sequence[np.ndarray]) -> float:
+def _leaked_pixels(renderer: Renderer, geoms: Sequence[str], job: Job) -> float:
     """Pixels that decisive bodies and the hidden element have in the void from hiding on: 0 if the panel hides."""
-    from traps_pipeline.scenes.resolve import decisive_geoms
-
-    start = job.spec.void["hidden_from_frame"]
-    geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]  # type: ignore[attr-defined, arg-type]
-    counted = range(start, len(job.qpos), 2)
-    leaked = float(renderer.visible_pixels(job.qpos[counted.start :: 2], geoms, panel=True).sum())
-    ablated = np.unique(np.linspace(start, len(job.qpos) - 1, ABLATION_FRAMES).astype(int))
-    without = renderer.frames(job.qpos[ablated], panel=True, without=geoms)
-    return leaked + sum(int((void[i] != frame).any(axis=2).sum()) for i, frame in zip(ablated, without, strict=True))
+    hidden = np.arange(job.spec.void["hidden_from_frame"], len(job.qpos))
+    ablated = np.unique(np.linspace(hidden[0], hidden[-1], ABLATION_FRAMES).astype(int))
+    seen = renderer.visible_pixels(job.qpos[hidden[::2]], geoms, panel=True)
+    return float(seen.sum()) + checks.ablation_pixels(renderer, job.qpos[ablated], geoms)
 
 
 def _save(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> None:
@@ -144,10 +143,6 @@ def _save(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: flo
         ) from error
     finally:
         part.unlink(missing_ok=True)
-
-
-def _tuples(values: dict[str, Any]) -> dict[str, Any]:
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
 
 
 # --- many pairs -------------------------------------------------------------------------------------------------------

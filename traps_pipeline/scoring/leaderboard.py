@@ -78,3 +78,9 @@ def _deviation(values: pd.Series) -> float:
 def _joined_versions(versions: pd.Series) -> str:
     """The distinct versions, sorted and joined by ` + `."""
     return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
+
+
+def wrong_intervals(board: pd.DataFrame) -> int:
+    """How many intervals of LEADERBOARD rows are out of order or outside [0, 1]; null ones are not wrong."""
+    low, high = board["pecs_ci_low"].to_numpy(float), board["pecs_ci_high"].to_numpy(float)
+    return int(((low < 0) | (low > high) | (high > 1)).sum())

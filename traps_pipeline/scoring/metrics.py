@@ -100,3 +100,11 @@ def _share(sums: pd.DataFrame, name: str) -> np.ndarray:
     """Numerator over denominator, (cells,); NaN where the denominator is 0."""
     of = sums[f"{name}_of"].to_numpy(float)
     return sums[name].to_numpy(float) / np.where(of > 0, of, np.nan)
+
+
+def wrong_figures(cells: pd.DataFrame) -> int:
+    """How many figures of METRICS rows break their definition: a share outside [0, 1], a PECS that is not
+    Acc x max(0, J). Null figures (nothing decided) are not wrong."""
+    acc, abs_rec, false_abs, pecs = (cells[name].to_numpy(float) for name in ("acc", "abs_rec", "false_abs", "pecs"))
+    outside = sum(int(((share < 0) | (share > 1)).sum()) for share in (acc, abs_rec, false_abs))
+    return outside + int((np.abs(pecs - acc * np.maximum(abs_rec - false_abs, 0)) > 1e-12).sum())

@@ -135,6 +135,14 @@ class Workspace:
         """Every vote ever paid for."""
         return Ledger(self.root / "ledger", "votes")
 
+    def failed_check(self, stage: str, check: str, key: str | None) -> Path:
+        """File that exists while a check of a partition does not pass; it holds the details."""
+        return self.root / "checks" / stage / check / f"{key or stage}.json"
+
+    def failed_checks(self, stage: str, key: str | None) -> list[str]:
+        """Names of the checks of a partition that do not pass."""
+        return sorted(path.parent.name for path in (self.root / "checks" / stage).glob(f"*/{key or stage}.json"))
+
     def clip(self, scenario_id: str, side: str, scene_hash: str) -> Path:
         """Path of a clip; its name holds the scene hash, so a corrected scene never overwrites what was judged."""
         return self.root / "clips" / scenario_id / f"{side}-{scene_hash[:16]}.mp4"
