@@ -1,0 +1,88 @@
+"""Every command of the README is run, and what it says about models, families and corrections works as it stands."""
+
+from __future__ import annotations
+
+import re
+import sys
+
+import pytest
+
+from tests.conftest import ROOT, Checkout
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("readme")]
+README = (ROOT / "README.md").read_text()
+# Run by other means: CI is `make test`; the command of `make ui` is started by tests/integration/test_ui.py.
+ELSEWHERE = ("make test", "make ui")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
+
+
+def in_this_study(study: Checkout, command: str) -> str:
+    """The command with the study's folders in place of the README's."""
+    command = (
+        command.replace("traps ", f"{sys.executable} -m traps_pipeline.cli ", 1)
+        if command.startswith("traps")
+        else command
+    )
+    command = (
+        command.replace("dagster ", f"{sys.executable} -m dagster ", 1) if command.startswith("dagster") else command
+    )
+    command = command.replace("mine.yaml", str(study.root / "mine.yaml")).replace(
+        ".workspaces/mine", str(study.workspace.parent / "mine")
+    )
+    # The real Makefile of the real checkout, on this study; its set-up is there already, or is made.
+    return f"{command} -C {ROOT} DEMO={study.workspace}" if command.startswith("make") else command
+
+
+def test_every_command_of_the_readme_runs(study: Checkout) -> None:
+    package = study.root / "traps_pipeline" / "scenes" / "families"
+    text = (package / "hidden_race.py").read_text()
+    (package / "my_race.py").write_text(text.replace('"hidden_race"', '"my_race"'))
+    entry, experiment = blocks("yaml")
+    with (study.root / "assets" / "models.yaml").open("a") as stream:
+        stream.write(entry)
+    (study.root / "mine.yaml").write_text(experiment)
+    (correction,) = blocks("json")
+    ran = 0
+    for command in "".join(blocks("sh")).splitlines():
+        if command.startswith("export") or command in ELSEWHERE:
+            continue
+        if command == "traps status demo" and ran > 6:  # the second time, after the correction
+            folder = study.root / "scene_specs" / "corrections"
+            folder.mkdir()
+            (folder / "review.jsonl").write_text(correction)
+        finished = study.run("bash", "-c", in_this_study(study, command))
+        assert finished.code == 0, (command, finished.out[-2000:], finished.err[-2000:])
+        ran += 1
+        if command.startswith("traps run demo"):
+            assert finished.counts() == {"answers": 24, "votes": 72, "frames": 0}  # one item, 8 models x 3 regimes
+        if command.startswith("traps run mine.yaml"):
+            # 16 scenarios x 2 datasets x 2 sides x 2 regimes x 3 runs
+            assert finished.counts()["answers"] == 16 * 2 * 2 * 2 * 3
+    assert ran == len("".join(blocks("sh")).splitlines()) - 1 - len(ELSEWHERE)
+    assert len((study.root / "scene_specs" / "released" / "my_race.jsonl").read_text().splitlines()) == 4
+
+
+def test_the_documents_the_readme_links_exist() -> None:
+    for target in re.findall(r"\]\(([^)#]+)\)", README):
+        assert (ROOT / target).exists(), target
+
+
+def test_the_sample_of_the_leaderboard_in_the_readme_is_what_the_demo_prints(demo_output: str) -> None:
+    (shown,) = blocks("text")
+    printed = [line[:79].rstrip() for line in demo_output.splitlines()]
+    for line in shown.splitlines():
+        if re.match(r"(oracle|confidence-noise|always-abstain|perfect-answerer) ", line):
+            assert line in printed, line
+
+
+def test_nothing_that_ships_names_a_folder_of_the_machine_it_was_made_on() -> None:
+    listed = [
+        path for folder in ("traps_pipeline", "docs", "assets", "scene_specs") for path in (ROOT / folder).rglob("*")
+    ]
+    texts = [path for path in listed if path.suffix in (".py", ".md", ".yaml", ".jsonl", ".txt", ".j2")]
+    assert texts
+    for path in texts:
+        assert str(ROOT) not in path.read_text(), path
