@@ -9,7 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,8 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+EXPERIMENT = "tests/experiments/small.yaml"  # of the small study, relative to a checkout
+SMALL = ROOT / EXPERIMENT
 
 
 @dataclass(frozen=True)
@@ -112,44 +114,100 @@ def copy_workspace(source: Path, target: Path, checkout: Path) -> None:
     link.symlink_to(checkout / "dagster.yaml")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """One worker starts with the demo, which others wait for; the other takes the tests that need no study meanwhile."""
+    needs_study = {"demo", "small", "study", "demo_study", "unasked", "one_regime"}
+
+    def turn(item: pytest.Item) -> int:
+        if "test_demo.py" in item.nodeid:
+            return 0
+        return 2 if needs_study & set(getattr(item, "fixturenames", ())) else 1
+
+    items.sort(key=turn)
+
+
+def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], str]) -> Path:
+    """A folder that is made once for all workers of a test run; `make` returns what it printed (`<name>.out`)."""
+    shared = factory.getbasetemp()
+    shared = shared.parent if os.environ.get("PYTEST_XDIST_WORKER") else shared
+    with (shared / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (shared / f"{name}.out").exists():
+            (shared / f"{name}.out").write_text(make(shared / name))
+    return shared / name
+
+
+def run_once(factory: pytest.TempPathFactory, name: str, experiment: str | Path, clips: Path | None = None) -> Checkout:
+    """A study of this checkout, run once. Clips of another study may be taken over: their names are their content."""
+
+    def make(workspace: Path) -> str:
+        if clips:
+            shutil.copytree(clips, workspace / "clips")
+        finished = Checkout(ROOT, workspace).traps("run", experiment)
+        assert finished.code == 0, finished.out + finished.err
+        return finished.out
+
+    return Checkout(ROOT, once(factory, name, make))
+
+
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Checkout:
-    """The demo, run once for all tests by the command of `make demo`. Read only: copy it before changing anything."""
-    shared = tmp_path_factory.getbasetemp()
-    shared = shared.parent if os.environ.get("PYTEST_XDIST_WORKER") else shared
-    study = Checkout(ROOT, shared / "demo")
-    with (shared / "demo.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (shared / "demo.out").exists():
-            finished = study.traps("run", "demo")
-            assert finished.code == 0, finished.out + finished.err
-            (shared / "demo.out").write_text(finished.out)
-    return study
+    """The demo, run once by the command of `make demo`. Read only: copy it before changing anything."""
+    return run_once(tmp_path_factory, "demo", "demo")
 
 
 @pytest.fixture(scope="session")
 def demo_output(demo: Checkout) -> str:
     """What the demo printed."""
-    return (demo.workspace.parent / "demo.out").read_text()
+    return demo.workspace.with_suffix(".out").read_text()
+
+
+@pytest.fixture(scope="session")
+def small(demo: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Checkout:
+    """Three models, two regimes, three scenarios a family: what a correction does there it does in any study."""
+    return run_once(tmp_path_factory, "small", SMALL, demo.workspace / "clips")
+
+
+def copied(source: Checkout, folder: Path) -> Checkout:
+    """A copy of a study in a checkout of its own, to be altered at will."""
+    root = make_checkout(folder / "checkout")
+    shutil.copytree(SMALL.parent, root / "tests" / "experiments")
+    copy_workspace(source.workspace, folder / "study", root)
+    return Checkout(root, folder / "study")
 
 
 @pytest.fixture
-def study(demo: Checkout, tmp_path: Path) -> Checkout:
-    """A copy of the finished demo in a checkout of its own, to be altered at will."""
-    root = make_checkout(tmp_path / "checkout")
-    copy_workspace(demo.workspace, tmp_path / "study", root)
-    return Checkout(root, tmp_path / "study")
+def study(small: Checkout, tmp_path: Path) -> Checkout:
+    """A copy of the small study; its experiment is `EXPERIMENT`."""
+    return copied(small, tmp_path)
 
 
 @pytest.fixture
-def unasked(study: Checkout) -> Iterator[Checkout]:
-    """The demo's clips and items, with nothing asked yet."""
+def demo_study(demo: Checkout, tmp_path: Path) -> Checkout:
+    """A copy of the finished demo."""
+    return copied(demo, tmp_path)
+
+
+def forget_answers(study: Checkout) -> Checkout:
+    """Leave clips and items, with nothing asked yet."""
     for table in ("responses", "votes", "verdicts", "metrics", "leaderboard"):
         shutil.rmtree(study.workspace / "tables" / table)
     shutil.rmtree(study.workspace / "ledger")
     shutil.rmtree(study.workspace / "reports")
     (study.workspace / "reports").mkdir()
-    yield study
+    return study
+
+
+@pytest.fixture(scope="session")
+def one_regime(demo: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Checkout:
+    """The demo's study under one regime, run without a disturbance. Read only."""
+    return run_once(tmp_path_factory, "one_regime", SMALL.with_name("one_regime.yaml"), demo.workspace / "clips")
+
+
+@pytest.fixture
+def unasked(demo_study: Checkout) -> Checkout:
+    """The demo's clips and items, with nothing asked yet."""
+    return forget_answers(demo_study)
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 
 import pytest
@@ -36,7 +37,8 @@ def in_this_study(study: Checkout, command: str) -> str:
     return f"{command} -C {ROOT} DEMO={study.workspace}" if command.startswith("make") else command
 
 
-def test_every_command_of_the_readme_runs(study: Checkout) -> None:
+def test_every_command_of_the_readme_runs(demo_study: Checkout) -> None:
+    study = demo_study
     package = study.root / "traps_pipeline" / "scenes" / "families"
     text = (package / "hidden_race.py").read_text()
     (package / "my_race.py").write_text(text.replace('"hidden_race"', '"my_race"'))
@@ -45,6 +47,8 @@ def test_every_command_of_the_readme_runs(study: Checkout) -> None:
         stream.write(entry)
     (study.root / "mine.yaml").write_text(experiment)
     (correction,) = blocks("json")
+    # The demo's clips serve here too: a clip's name is its content.
+    shutil.copytree(study.workspace / "clips", study.workspace.parent / "mine" / "clips")
     ran = 0
     for command in "".join(blocks("sh")).splitlines():
         if command.startswith("export") or command in ELSEWHERE:
@@ -72,10 +76,10 @@ def test_the_documents_the_readme_links_exist() -> None:
 
 def test_the_sample_of_the_leaderboard_in_the_readme_is_what_the_demo_prints(demo_output: str) -> None:
     (shown,) = blocks("text")
-    printed = [line[:79].rstrip() for line in demo_output.splitlines()]
+    printed = demo_output.splitlines()
     for line in shown.splitlines():
         if re.match(r"(oracle|confidence-noise|always-abstain|perfect-answerer) ", line):
-            assert line in printed, line
+            assert any(row.startswith(line) for row in printed), line
 
 
 def test_nothing_that_ships_names_a_folder_of_the_machine_it_was_made_on() -> None:

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Checkout
+from tests.conftest import EXPERIMENT, Checkout
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, METRICS, RESPONSES, SCENE_SPECS, TABLES, VIDEOS
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("corrections")]
-EVALUATIONS = 8 * 3 * 1  # models x regimes x runs of the demo
+EVALUATIONS = 3 * 2 * 1  # models x regimes x runs of the small study
 
 # Dagster's own verdict on every partition, by the resolver behind its UI.
 STALE = """
@@ -66,7 +66,7 @@ def test_a_corrected_question_asks_its_three_items_again(study: Checkout) -> Non
     before = len(study.ledger_rows("answers")), len(study.ledger_rows("votes"))
     question = "Is the hindmost domino lying down when the clip ends, yes or no?"
     study.correct("domino_chain-0001", question=question)
-    run = study.traps("run", "demo")
+    run = study.traps("run", EXPERIMENT)
     assert run.code == 0, run.err
     # Asked: control and void of `occlusion`, control of `occlusion_ill_posed`. Votes: three judges on abstention for
     # each, and on correctness for the two controls.
@@ -87,14 +87,14 @@ def test_a_corrected_ill_posed_question_asks_one_item_again(study: Checkout) -> 
     study.correct("plinko-0002", ill_posed_question="What does the triangle at the bottom weigh?")
     why = study.traps("why", "chaotic_ill_posed:plinko-0002:void").out
     assert why.count("still stands") == EVALUATIONS  # nothing is made from the correction yet
-    run = study.traps("run", "demo")
+    run = study.traps("run", EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts() == {"answers": EVALUATIONS, "votes": 3 * EVALUATIONS, "frames": 0}
 
 
 def test_versions_change_where_the_correction_reaches_and_nowhere_else(study: Checkout) -> None:
     study.correct("plinko-0002", ill_posed_question="What does the triangle at the bottom weigh?")
-    assert study.traps("run", "demo").code == 0
+    assert study.traps("run", EXPERIMENT).code == 0
     tables = Workspace.open(study.workspace).tables
     versions = tables.read_all(ITEMS).groupby("dataset")["benchmark_version"].unique()
     corrected = versions.pop("chaotic_ill_posed")
@@ -119,7 +119,7 @@ def test_dagster_shows_exactly_the_touched_partitions_stale_stage_by_stage(study
     # Votes and verdicts are made from items as well as from responses.
     stale = [f"{stage}/{cell}" for stage in ("responses", "verdicts", "votes") for cell in touched]
     assert stale_in_dagster(study) == sorted(stale)
-    run = study.traps("run", "demo")
+    run = study.traps("run", EXPERIMENT)
     assert run.counts() == {"answers": 3 * EVALUATIONS, "votes": 15 * EVALUATIONS, "frames": 0}
     assert stale_in_dagster(study) == []
 
@@ -129,7 +129,8 @@ def test_a_rematerialization_that_changes_nothing_makes_nothing_stale(study: Che
     materialize(study, "items", "occlusion")
     materialize(study, "responses", "occlusion|oracle__standard__run1")
     assert stale_in_dagster(study) == []
-    assert not re.search(r"(changed|gone|new)$", study.traps("status", "demo").out, re.MULTILINE)
+    rows = re.findall(r"^\w+ +\d+ +(\d+) +(\d+)$", study.traps("status", EXPERIMENT).out, re.MULTILINE)
+    assert rows == [("0", "0")] * 11  # stale and missing, of each stage
 
 
 def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> None:
@@ -137,12 +138,12 @@ def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> N
     before = {path: path.stat().st_mtime_ns for path in clips.rglob("*.mp4")}
     azimuth = json.loads(_released(study, "domino_chain-0002"))["params"]["azimuth_deg"]
     study.correct("domino_chain-0002", params={"azimuth_deg": azimuth + 2.0})
-    run = study.traps("run", "demo")
+    run = study.traps("run", EXPERIMENT)
     assert run.code == 0, run.err
     # Both items of `occlusion` and both of `occlusion_ill_posed` show new clips. Judges see no clip: a vote is asked
-    # again only where the new answer reads otherwise, which is so for the two random strategies at most.
+    # again only where the new answer reads otherwise, which is so for the random strategy at most.
     counts = run.counts()
-    assert counts["votes"] <= 2 * 3 * (6 + 3) * 2
+    assert counts["votes"] <= 2 * (6 + 3) * 2
     assert (counts["answers"], counts["frames"]) == (4 * EVALUATIONS, 100)
     after = {path: path.stat().st_mtime_ns for path in clips.rglob("*.mp4")}
     assert {path: time for path, time in after.items() if path in before} == before
@@ -151,14 +152,14 @@ def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> N
         ("domino_chain-0002", "control"),
         ("domino_chain-0002", "void"),
     }
-    again = study.traps("run", "demo")
+    again = study.traps("run", EXPERIMENT)
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
 
 
 def test_a_discarded_scenario_leaves_every_table_and_keeps_its_answers(study: Checkout) -> None:
     rows = len(study.ledger_rows("answers"))
-    study.correct("tumbling_dice-0004", action="discard")
-    run = study.traps("run", "demo")
+    study.correct("tumbling_dice-0003", action="discard")
+    run = study.traps("run", EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts()["frames"] == 0
     tables = Workspace.open(study.workspace).tables
@@ -166,11 +167,11 @@ def test_a_discarded_scenario_leaves_every_table_and_keeps_its_answers(study: Ch
         frame = tables.read_all(table)
         for column in ("scenario_id", "item_id", "pair_id"):
             if column in frame:
-                assert not frame[column].str.contains("tumbling_dice-0004").any(), (table.name, column)
+                assert not frame[column].str.contains("tumbling_dice-0003").any(), (table.name, column)
     cells = tables.read_all(METRICS, dataset="chaotic").query("scope == 'all'")
-    assert (cells["n_pairs"] == 15).all()
+    assert (cells["n_pairs"] == 5).all()
     assert len(study.ledger_rows("answers")) >= rows
-    assert "stay in the ledger" in study.traps("why", "chaotic:tumbling_dice-0004:void").out
+    assert "stay in the ledger" in study.traps("why", "chaotic:tumbling_dice-0003:void").out
 
 
 def test_an_added_scenario_joins_a_study_of_the_whole_benchmark(study: Checkout, tmp_path: Path) -> None:

@@ -17,8 +17,9 @@ from tests.conftest import Checkout
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import TABLES, VOLATILE
 
+ONE_REGIME = "tests/experiments/one_regime.yaml"
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("crashes")]
-ANSWERS, VOTES = 3072, 13824
+ANSWERS, VOTES = 1024, 4608  # 8 models x 1 regime x 128 items; 4.5 votes an item
 
 
 def tables(root: Path) -> dict[str, pd.DataFrame]:
@@ -36,7 +37,7 @@ def rows_written(study: Checkout, kind: str) -> int:
 
 
 def start(study: Checkout) -> subprocess.Popen[str]:
-    return study.start(sys.executable, "-m", "traps_pipeline.cli", "run", "demo")
+    return study.start(sys.executable, "-m", "traps_pipeline.cli", "run", ONE_REGIME)
 
 
 def wait_for_rows(study: Checkout, process: subprocess.Popen[str], kind: str, count: int) -> None:
@@ -46,32 +47,32 @@ def wait_for_rows(study: Checkout, process: subprocess.Popen[str], kind: str, co
 
 
 def test_three_kills_while_answering_leave_the_same_tables_and_no_call_is_made_twice(
-    unasked: Checkout, demo: Checkout
+    unasked: Checkout, one_regime: Checkout
 ) -> None:
-    moments = sorted(random.Random(20261121).sample(range(50, ANSWERS - 200), 3))
+    moments = sorted(random.Random(20261121).sample(range(30, ANSWERS - 60), 3))
     for moment in moments:
         process = start(unasked)
         wait_for_rows(unasked, process, "answers", moment)
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
         assert rows_written(unasked, "answers") < ANSWERS  # killed in the middle, not after the end
-    finished = unasked.traps("run", "demo")
+    finished = unasked.traps("run", ONE_REGIME)
     assert finished.code == 0, finished.err
     for kind, wanted in (("answers", ANSWERS), ("votes", VOTES)):
         keys = [row["key"] for row in unasked.ledger_rows(kind)]
         assert len(keys) == len(set(keys)) == wanted
-    assert_same_tables(unasked.workspace, demo.workspace)
+    assert_same_tables(unasked.workspace, one_regime.workspace)
 
 
-def test_a_kill_while_voting_leaves_the_same_tables(unasked: Checkout, demo: Checkout) -> None:
+def test_a_kill_while_voting_leaves_the_same_tables(unasked: Checkout, one_regime: Checkout) -> None:
     process = start(unasked)
-    wait_for_rows(unasked, process, "votes", 5000)
+    wait_for_rows(unasked, process, "votes", 1500)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
-    finished = unasked.traps("run", "demo")
+    finished = unasked.traps("run", ONE_REGIME)
     assert finished.code == 0, finished.err
     assert len({row["key"] for row in unasked.ledger_rows("votes")}) == len(unasked.ledger_rows("votes")) == VOTES
-    assert_same_tables(unasked.workspace, demo.workspace)
+    assert_same_tables(unasked.workspace, one_regime.workspace)
 
 
 def test_two_runs_that_want_the_same_keys_ask_each_once(unasked: Checkout) -> None:
@@ -93,7 +94,7 @@ def test_two_runs_that_want_the_same_keys_ask_each_once(unasked: Checkout) -> No
     assert len(keys) >= ANSWERS, cell_range
 
 
-def test_ctrl_c_drains_and_the_same_command_goes_on(unasked: Checkout, demo: Checkout) -> None:
+def test_ctrl_c_drains_and_the_same_command_goes_on(unasked: Checkout, one_regime: Checkout) -> None:
     process = start(unasked)
     wait_for_rows(unasked, process, "answers", 300)
     os.kill(process.pid, signal.SIGINT)
@@ -101,7 +102,7 @@ def test_ctrl_c_drains_and_the_same_command_goes_on(unasked: Checkout, demo: Che
     assert process.returncode == 130, err
     assert "interrupted" in err and "Traceback" not in err
     assert 300 <= rows_written(unasked, "answers") < ANSWERS
-    finished = unasked.traps("run", "demo")
+    finished = unasked.traps("run", ONE_REGIME)
     assert finished.code == 0, finished.err
     assert len(unasked.ledger_rows("answers")) == ANSWERS
-    assert_same_tables(unasked.workspace, demo.workspace)
+    assert_same_tables(unasked.workspace, one_regime.workspace)

@@ -77,15 +77,15 @@ def test_the_demo_ends_with_the_leaderboard_and_paths_that_exist(demo: Checkout,
         assert path.stat().st_size > 1000
 
 
-def test_a_second_run_asks_and_renders_nothing(study: Checkout) -> None:
-    again = study.traps("run", "demo")
+def test_a_second_run_asks_and_renders_nothing(demo_study: Checkout) -> None:
+    again = demo_study.traps("run", "demo")
     assert again.code == 0, again.err
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
     assert "to do" not in again.out  # no partition was materialized
 
 
-def test_status_calls_everything_fresh_and_plan_has_nothing_new(study: Checkout) -> None:
-    status = study.traps("status", "demo").out
+def test_status_calls_everything_fresh_and_plan_has_nothing_new(demo_study: Checkout) -> None:
+    status = demo_study.traps("status", "demo").out
     for stage, partitions in (
         ("scene_specs", 4),
         ("items", 4),
@@ -94,5 +94,5 @@ def test_status_calls_everything_fresh_and_plan_has_nothing_new(study: Checkout)
         ("leaderboard", 1),
     ):
         assert f"{stage:<18} {partitions:>6}      0        0" in status
-    plan = study.traps("plan", "demo").out.splitlines()[-1].split()
+    plan = demo_study.traps("plan", "demo").out.splitlines()[-1].split()
     assert plan == ["all", "3,072", "3,072", "0", "13,824", "13,824", "0"]

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.conftest import Checkout, Finished, make_checkout
+from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished, forget_answers, make_checkout
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("errors")]
 
@@ -35,48 +35,50 @@ def test_a_malformed_spec_names_file_and_line(study: Checkout) -> None:
     path = study.root / "scene_specs" / "released" / "plinko.jsonl"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0], lines[1][:50], *lines[2:]]) + "\n")
-    assert_refused(study.traps("run", "demo"), f"{path}:2", "restore the line from git")
+    assert_refused(study.traps("run", EXPERIMENT), f"{path}:2", "restore the line from git")
 
 
 def test_an_unknown_family_is_answered_with_the_known_ones(study: Checkout) -> None:
     path = edit_record(study, "plinko", 1, family="plonko")
     assert_refused(
-        study.traps("run", "demo"), f"{path}:1", "unknown family 'plonko'", "domino_chain, hidden_race, plinko"
+        study.traps("run", EXPERIMENT), f"{path}:1", "unknown family 'plonko'", "domino_chain, hidden_race, plinko"
     )
 
 
 def test_a_duplicate_scenario_names_the_second_line(study: Checkout) -> None:
     path = edit_record(study, "plinko", 2, scenario_id="plinko-0001")
-    assert_refused(study.traps("run", "demo"), f"{path}:2", "'plinko-0001' occurs twice")
+    assert_refused(study.traps("run", EXPERIMENT), f"{path}:2", "'plinko-0001' occurs twice")
 
 
 def test_a_label_outside_the_closed_set_is_refused(study: Checkout) -> None:
     study.correct("domino_chain-0001", answer="maybe")
     where = study.root / "scene_specs" / "corrections" / "review.jsonl"
-    assert_refused(study.traps("run", "demo"), f"{where}:1", "'maybe' is not one of the labels ['yes', 'no']")
+    assert_refused(study.traps("run", EXPERIMENT), f"{where}:1", "'maybe' is not one of the labels ['yes', 'no']")
 
 
 def test_a_correction_of_an_unknown_scenario_names_its_line(study: Checkout) -> None:
     study.correct("domino_chain-0001", action="keep")
     study.correct("domino_chain-0777", question="Who?")
     where = study.root / "scene_specs" / "corrections" / "review.jsonl"
-    assert_refused(study.traps("run", "demo"), f"{where}:2", "'domino_chain-0777' is unknown")
+    assert_refused(study.traps("run", EXPERIMENT), f"{where}:2", "'domino_chain-0777' is unknown")
 
 
 def test_an_altered_trajectory_is_noticed(study: Checkout) -> None:
     folder = study.root / "scene_specs" / "released" / "trajectories"
     (folder / "plinko-0001.npz").write_bytes((folder / "plinko-0002.npz").read_bytes())
     study.correct("plinko-0003", ill_posed_question="How heavy is the moon in the picture?")  # makes the category stale
-    assert_refused(study.traps("run", "demo"), "plinko-0001.npz", "is not the record's", "restore the file from git")
+    assert_refused(
+        study.traps("run", EXPERIMENT), "plinko-0001.npz", "is not the record's", "restore the file from git"
+    )
 
 
 def test_a_truncated_clip_is_noticed_and_rendered_anew_once_deleted(study: Checkout) -> None:
     clip = next((study.workspace / "clips" / "hidden_race-0001").glob("void-*.mp4"))
     whole = clip.read_bytes()
     clip.write_bytes(whole[: len(whole) // 2])
-    assert_refused(study.traps("run", "demo"), str(clip), "truncated or altered", "delete it and run again")
+    assert_refused(study.traps("run", EXPERIMENT), str(clip), "truncated or altered", "delete it and run again")
     clip.unlink()
-    again = study.traps("run", "demo")
+    again = study.traps("run", EXPERIMENT)
     assert again.code == 0, again.err
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 50}
     assert clip.read_bytes() == whole
@@ -88,7 +90,7 @@ def test_a_torn_ledger_line_is_reported_and_its_answer_alone_asked_again(study: 
     segment.write_bytes(b"".join(lines[:-1]) + lines[-1][:40])
     for table in (study.workspace / "tables" / "responses").rglob("model=oracle/regime=json/**/*.parquet"):
         table.unlink()
-    run = study.traps("run", "demo")
+    run = study.traps("run", EXPERIMENT)
     assert run.code == 0, run.err
     assert f"{segment}:{len(lines)}: torn last line ignored" in run.out
     assert run.counts()["answers"] == 1
@@ -100,14 +102,14 @@ def test_a_damaged_ledger_line_in_the_middle_names_it_and_the_remedy(study: Chec
     segment.write_bytes(b"".join([lines[0], b"{garbage}\n", *lines[2:]]))
     for table in (study.workspace / "tables" / "responses").rglob("model=oracle/regime=json/**/*.parquet"):
         table.unlink()
-    assert_refused(study.traps("run", "demo"), f"{segment}:2", "remove that line and run again")
+    assert_refused(study.traps("run", EXPERIMENT), f"{segment}:2", "remove that line and run again")
     assert segment.read_bytes().count(b"\n") == len(lines)
 
 
 def test_a_workspace_of_another_format_is_refused(study: Checkout) -> None:
     path = study.workspace / "study.yaml"
     path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"format": 99}))
-    assert_refused(study.traps("run", "demo"), str(path), "format 99", "ledger folder can be copied over")
+    assert_refused(study.traps("run", EXPERIMENT), str(path), "format 99", "ledger folder can be copied over")
 
 
 def test_a_workspace_keeps_its_benchmark(study: Checkout, tmp_path: Path) -> None:
@@ -128,12 +130,12 @@ def test_unknown_names_are_answered_with_the_known_ones(study: Checkout, tmp_pat
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 6 MB: room for the Dagster history, not for all tables and clips."""
+    """A file system of 1 MB."""
     folder = tmp_path / "small"
     folder.mkdir()
     mounted = (
         os.geteuid() == 0
-        and subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", folder], check=False).returncode == 0
+        and subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", folder], check=False).returncode == 0
     )
     if not mounted:
         pytest.skip("mounting a tmpfs needs root; tests/storage covers a full disk with a writer that raises ENOSPC")
@@ -141,32 +143,31 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", folder], check=True)
 
 
-def test_a_full_disk_ends_in_a_sentence_and_the_same_command_goes_on(
-    unasked: Checkout, small_disk: Path, demo: Checkout
-) -> None:
-    ledger = unasked.workspace / "ledger"
+def test_a_full_disk_ends_in_a_sentence_and_the_same_command_goes_on(study: Checkout, small_disk: Path) -> None:
+    forget_answers(study)
+    ledger = study.workspace / "ledger"
     ledger.symlink_to(small_disk, target_is_directory=True)
     filler = small_disk / "filler"
-    filler.write_bytes(b"0" * 5_000_000)
-    refused = unasked.traps("run", "demo")
+    filler.write_bytes(b"0" * 900_000)
+    refused = study.traps("run", EXPERIMENT)
     assert_refused(refused, "could not be written", "No space left on device", "run the same command again")
-    kept = {row["key"] for row in unasked.ledger_rows("answers")}
+    kept = {row["key"] for row in study.ledger_rows("answers")}
     assert kept
     filler.unlink()
     # Tables made so far are whole; the rest follows with room for it.
-    more = unasked.root.parent / "ledger"
+    more = study.root.parent / "ledger"
     subprocess.run(["cp", "-r", f"{small_disk}/.", more], check=True)
     ledger.unlink()
     ledger.symlink_to(more, target_is_directory=True)
-    finished = unasked.traps("run", "demo")
+    finished = study.traps("run", EXPERIMENT)
     assert finished.code == 0, finished.err
-    rows = unasked.ledger_rows("answers")
-    assert len({row["key"] for row in rows}) == len(rows) == 3072
-    assert not list(unasked.workspace.rglob("*.part"))
+    rows = study.ledger_rows("answers")
+    assert len({row["key"] for row in rows}) == len(rows) == 288  # 3 models x 2 regimes x 48 items
+    assert not list(study.workspace.rglob("*.part"))
 
 
 def test_a_fresh_checkout_without_assets_says_what_it_is(tmp_path: Path) -> None:
     root = make_checkout(tmp_path / "half")
     subprocess.run(["rm", "-r", root / "scene_specs"], check=True)
-    finished = Checkout(root, tmp_path / "none").traps("run", "demo")
+    finished = Checkout(root, tmp_path / "none").traps("run", ROOT / EXPERIMENT)
     assert_refused(finished, "scene_specs is missing", "clone the repository")

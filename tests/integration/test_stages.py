@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from tests.conftest import Checkout, Finished
+from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers
 from traps_pipeline.lineage import PARTITIONED_BY, STAGES, Lineage
 from traps_pipeline.storage.workspace import Workspace
 
@@ -36,13 +36,14 @@ def _key(stage: str) -> str | None:
     return ONE_KEY.get(PARTITIONED_BY.get(stage, ""))
 
 
-def test_a_range_of_cells_is_one_run_and_makes_exactly_its_cells(unasked: Checkout) -> None:
+def test_a_range_of_cells_is_one_run_and_makes_exactly_its_cells(study: Checkout) -> None:
+    forget_answers(study)
     for stage in ("responses", "votes", "verdicts"):
-        finished = materialize(unasked, stage, "--partition-range", RANGE)
+        finished = materialize(study, stage, "--partition-range", RANGE)
         assert finished.code == 0, (stage, finished.err[-3000:])
-        made = sorted((unasked.workspace / "tables" / stage).rglob("*.parquet"))
+        made = sorted((study.workspace / "tables" / stage).rglob("*.parquet"))
         assert len(made) == 2 * 2 * 3  # datasets x models x regimes
-    assert len(unasked.ledger_rows("answers")) == 2 * 2 * 3 * 32
+    assert len(study.ledger_rows("answers")) == 2 * 2 * 3 * 12
 
 
 def test_an_unknown_partition_exits_with_one(study: Checkout) -> None:
@@ -51,8 +52,9 @@ def test_an_unknown_partition_exits_with_one(study: Checkout) -> None:
     assert "nobody__standard__run1" in finished.out + finished.err
 
 
-def test_a_missing_upstream_exits_with_one_and_names_it(unasked: Checkout) -> None:
-    finished = materialize(unasked, "votes", "--partition", CELL)
+def test_a_missing_upstream_exits_with_one_and_names_it(study: Checkout) -> None:
+    forget_answers(study)
+    finished = materialize(study, "votes", "--partition", CELL)
     assert finished.code == 1
     assert "materialize responses for this partition first" in finished.out + finished.err
 
@@ -71,7 +73,7 @@ def test_a_failing_step_exits_with_one_and_names_the_file(study: Checkout) -> No
 def test_a_table_that_was_deleted_is_made_again_from_the_ledger(study: Checkout) -> None:
     shutil.rmtree(study.workspace / "tables" / "responses")
     shutil.rmtree(study.workspace / "tables" / "verdicts")
-    run = study.traps("run", "demo")
+    run = study.traps("run", EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts() == {"answers": 0, "votes": 0, "frames": 0}
 

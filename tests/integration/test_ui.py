@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect, sync_playwright
 
-from tests.conftest import Checkout
+from tests.conftest import EXPERIMENT, Checkout
 from traps_pipeline.definitions import ASSETS, SOURCES
 from traps_pipeline.lineage import partition_of
 from traps_pipeline.storage.workspace import Workspace
@@ -126,18 +126,18 @@ def test_a_correction_is_driven_from_the_ui_and_nothing_leaves_the_machine(
     for asset in (*ASSETS, *SOURCES):
         expect(page.get_by_text(asset.key.to_user_string(), exact=True).first).to_be_attached()
 
-    study.correct("plinko-0005", ill_posed_question="Why is the little triangle beside the board singing?")
+    study.correct("plinko-0003", ill_posed_question="Why is the little triangle beside the board singing?")
     rows = len(study.ledger_rows("answers"))
 
     for stage, key in (("scene_specs", "plinko"), ("videos", "plinko"), ("items", "chaotic_ill_posed")):
-        assert f"    {key}: " in study.traps("status", "demo").out  # stale, with the reason
+        assert f"    {key}: " in study.traps("status", EXPERIMENT).out  # stale, with the reason
         materialize_and_wait(study, page, server, stage, key)
-    cell = "chaotic_ill_posed|prior__guided__run1"
+    cell = "chaotic_ill_posed|prior__json__run1"
     materialize_and_wait(study, page, server, "responses", cell)
     assert len(study.ledger_rows("answers")) == rows + 1  # one item touched, one cell materialized
     materialize_and_wait(study, page, server, "contact_sheet")
     materialize_and_wait(study, page, server, "items", "chaotic")  # the other dataset of the category: nothing changes
-    status = study.traps("status", "demo").out
-    for stage, fresh in (("scene_specs", 4), ("videos", 4), ("items", 4), ("responses", 96 - 23), ("contact_sheet", 1)):
+    status = study.traps("status", EXPERIMENT).out
+    for stage, fresh in (("scene_specs", 4), ("videos", 4), ("items", 4), ("responses", 24 - 5), ("contact_sheet", 1)):
         assert re.search(rf"^{stage} +{fresh} ", status, re.MULTILINE), status
     assert hosts == {server.removeprefix("http://")}
