@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DEMO := $(CURDIR)/.workspaces/demo
 RENDER_PACKAGES := libosmesa6 python3-venv
 TEST_PACKAGES := $(RENDER_PACKAGES) chromium
-UI_WORKSPACE := $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO))
+UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
 .PHONY: demo test ui bench lint setup render-packages test-packages clean
 
@@ -16,7 +16,7 @@ test: test-packages setup lint ## lint, types and all tests, the slow ones too
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 ui: setup ## Dagster's web server and daemon on 127.0.0.1:3000
-	TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
+	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
 	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/dagster dev -h 127.0.0.1 -p 3000 -m traps_pipeline.definitions
 
 bench: setup ## ratios against what one would otherwise use

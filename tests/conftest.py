@@ -115,7 +115,7 @@ def copy_workspace(source: Path, target: Path, checkout: Path) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One worker starts with the demo, which others wait for; the other takes the tests that need no study meanwhile."""
+    """One worker starts with the demo, which others wait for; the other takes what needs no study meanwhile."""
     needs_study = {"demo", "small", "study", "demo_study", "unasked", "one_regime"}
 
     def turn(item: pytest.Item) -> int:

@@ -26,15 +26,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     except TrapsError as error:
         print(f"traps: {error}", file=sys.stderr)
         return FAILED
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            sys.stderr.close()
+        else:
+            where = f"{error.filename}: " if error.filename else ""
+            print(f"traps: {where}{error.strerror}; mend that and run the same command again", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
         print(
             "\ntraps: interrupted; everything answered or rendered is kept. Run the same command to go on.",
             file=sys.stderr,
         )
         return INTERRUPTED
-    except BrokenPipeError:
-        sys.stderr.close()
-        return FAILED
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -106,7 +110,7 @@ def plan(arguments: argparse.Namespace) -> int:
 
     experiment, root = _experiment(arguments), _root(arguments)
     workspace = _open(root) if (root / "study.yaml").exists() else None
-    rows = plan_calls(workspace, experiment)
+    rows, uncertain = plan_calls(workspace, experiment)
     total = (Count(), Count())
     print(f"{experiment.name} in {root if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
     print(f"{'model':<24} {'answers':>9} {'known':>9} {'new':>9}   {'votes':>9} {'known':>9} {'new':>9}")
@@ -115,8 +119,11 @@ def plan(arguments: argparse.Namespace) -> int:
             sum_.add(count.wanted, count.known)
         print(_plan_line(model, counts))
     print(_plan_line("all", total))
-    if workspace is None:
-        print("votes are an upper bound: an answer that never comes is not judged")
+    if uncertain:
+        print(
+            f"an upper bound: the items of {', '.join(uncertain)} are not made, or not since the last correction: all "
+            "of their calls are counted as new. Materialize scene_specs, videos and items for exact counts."
+        )
     return OK
 
 
@@ -166,18 +173,15 @@ def _print_results(workspace: Workspace) -> None:
 
 def status(arguments: argparse.Namespace) -> int:
     """See `traps status --help`."""
-    import dagster as dg
-
-    from traps_pipeline.defs.common import observe_sources
-    from traps_pipeline.driver import enter, wanted_keys
+    from traps_pipeline.definitions import observe_sources
+    from traps_pipeline.driver import dagster_history, wanted_keys
     from traps_pipeline.lineage import STAGES
     from traps_pipeline.plan import stage_statuses
 
     workspace = _open(_root(arguments))
     experiment = _experiment(arguments) if arguments.experiment else None
     wanted = {stage: wanted_keys(workspace, experiment, stage) for stage in STAGES} if experiment else None
-    enter(workspace)
-    with dg.DagsterInstance.get() as instance:
+    with dagster_history(workspace) as instance:
         observe_sources(instance, workspace)  # so that Dagster's UI shows the same partitions stale
     print(f"workspace {workspace.root}\n{'stage':<18} {'fresh':>6} {'stale':>6} {'missing':>8}")
     for row in stage_statuses(workspace, wanted):
@@ -187,6 +191,9 @@ def status(arguments: argparse.Namespace) -> int:
             print(f"    {key}: {'; '.join(reasons[:3])}{' ...' if len(reasons) > 3 else ''}")
         if len(row.stale) > SHOWN:
             print(f"    ... and {len(row.stale) - SHOWN} more")
+    for file in sorted((workspace.root / "checks").glob("*/*/*.json")):
+        stage, check = file.parts[-3:-1]
+        print(f"check {check} of {stage} {file.stem} does not pass: {file.read_text(encoding='utf-8')[:200]}")
     print("stale means made from something that has changed since; `traps run EXPERIMENT` makes it anew")
     return OK
 
@@ -239,13 +246,11 @@ def _create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
     from traps_pipeline.storage.workspace import Workspace
 
     workspace = Workspace.create(_root(arguments), experiment.study)
-    import dagster as dg
+    experiment.check_study(workspace.study, workspace.root / "study.yaml")
+    from traps_pipeline.driver import dagster_history
 
-    from traps_pipeline.driver import enter
-
-    enter(workspace)
-    dg.DagsterInstance.get().dispose()  # two processes that open a fresh history at once would corrupt it
-    return workspace
+    with dagster_history(workspace):  # opened once here, so that several processes may use it afterwards
+        return workspace
 
 
 def _experiment(arguments: argparse.Namespace) -> Experiment:

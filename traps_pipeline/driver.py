@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
@@ -23,7 +25,8 @@ if TYPE_CHECKING:
     import dagster as dg
 
 SHOWN = 4  # unfinished partitions named in a problem
-AGGREGATES = ("metrics", "leaderboard")  # made from whatever verdicts are there
+AGGREGATES = {"metrics": "verdicts/", "leaderboard": "metrics/"}  # made from whatever is there of these
+PID_TAG = "traps/pid"
 _INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
 _QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
 
@@ -32,6 +35,44 @@ def enter(workspace: Workspace) -> None:
     """Make every asset and Dagster itself use this workspace."""
     os.environ[VARIABLE] = str(workspace.root)
     os.environ["DAGSTER_HOME"] = str(workspace.dagster_home)
+
+
+@contextmanager
+def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
+    """Dagster's history of this workspace, opened by one process at a time (a first opening by two corrupts it).
+
+    Runs whose process was killed are marked as failed: a queue would count them for ever. Raises TrapsError when the
+    history cannot be read or written.
+    """
+    import dagster as dg
+    from sqlalchemy.exc import DBAPIError
+
+    enter(workspace)
+    try:
+        workspace.locks.mkdir(parents=True, exist_ok=True)
+        with (workspace.locks / "dagster.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            instance = dg.DagsterInstance.get()
+        with instance:
+            for run in instance.get_runs(dg.RunsFilter(statuses=[dg.DagsterRunStatus.STARTED])):
+                if PID_TAG in run.tags and not _alive(int(run.tags[PID_TAG])):
+                    instance.report_run_failed(run, "its process was killed; what it had asked and made is kept")
+            yield instance
+    except (DBAPIError, OSError) as error:
+        raise TrapsError(
+            f"{workspace.dagster_home}: Dagster's history cannot be read or written ({error}); free some space and run "
+            "the same command again: tables are whole, no answer is lost"
+        ) from error
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def wanted_keys(workspace: Workspace, experiment: Experiment, stage: str) -> list[str | None]:
@@ -65,13 +106,10 @@ class Outcome:
 
 def run_experiment(workspace: Workspace, experiment: Experiment) -> Outcome:
     """Materialize whatever of the experiment is missing or stale, stage by stage. KeyboardInterrupt passes through."""
-    import dagster as dg
+    from traps_pipeline.definitions import observe_sources
 
-    from traps_pipeline.defs.common import observe_sources
-
-    enter(workspace)
     outcome, began = Outcome(), time.monotonic()
-    with dg.DagsterInstance.get() as instance:
+    with dagster_history(workspace) as instance:
         observe_sources(instance, workspace)
         for stage in STAGES:
             _run_stage(instance, workspace, experiment, stage, outcome)
@@ -94,7 +132,7 @@ def failed_checks(workspace: Workspace, experiment: Experiment) -> list[str]:
 def _run_stage(
     instance: dg.DagsterInstance, workspace: Workspace, experiment: Experiment, stage: str, outcome: Outcome
 ) -> None:
-    from traps_pipeline.defs.common import recorded_versions
+    from traps_pipeline.definitions import recorded_versions
 
     lineage, recorded = Lineage(workspace), recorded_versions(instance, stage)
     # A crash between a table and its event leaves a table that Dagster does not know; it is materialized once more.
@@ -126,7 +164,8 @@ def _run_stage(
 def _blocked(lineage: Lineage, stage: str, key: str | None, failed: set[Node]) -> bool:
     """Whether a failure above leaves nothing sound to make a partition from."""
     if stage in AGGREGATES:
-        return bool(failed) and not lineage.inputs(stage, key)
+        scored = [name for name in lineage.inputs(stage, key) if name.startswith(AGGREGATES[stage])]
+        return bool(failed) and not scored
     return bool(failed & set(upstream(stage, key)))
 
 
@@ -163,8 +202,7 @@ def _materialize(instance: dg.DagsterInstance, stage: str, batch: tuple[str | No
     """One Dagster run; what went wrong in it, one sentence each."""
     import dagster as dg
 
-    from traps_pipeline.definitions import ASSETS, SOURCES
-    from traps_pipeline.defs.report import inputs_current
+    from traps_pipeline.definitions import ASSETS, SOURCES, inputs_current
 
     first, last = batch
     ranged = PARTITIONED_BY.get(stage) == "cell"
@@ -175,7 +213,7 @@ def _materialize(instance: dg.DagsterInstance, stage: str, batch: tuple[str | No
             selection=dg.AssetSelection.assets(stage),
             instance=instance,
             partition_key=None if ranged else first,
-            tags=tags if ranged else None,
+            tags={PID_TAG: str(os.getpid())} | (tags if ranged else {}),
             raise_on_error=False,
             run_config=_QUIET,
         )

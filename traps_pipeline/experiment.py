@@ -30,9 +30,9 @@ class Experiment(BaseModel):
     models: list[str] = Field(min_length=1)
     regimes: list[str] = list(REGIMES)
     runs: list[Annotated[int, Field(ge=1)]] = [1]
-    panel: str = "rules"
-    epoch: str = "1"
-    budget_usd: float = Field(default=0.0, ge=0.0)
+    panel: str | None = None
+    epoch: str | None = None
+    budget_usd: float | None = Field(default=None, ge=0.0)
 
     @field_validator("datasets")
     @classmethod
@@ -60,7 +60,15 @@ class Experiment(BaseModel):
     def study(self) -> Study:
         """The study that a new workspace for this experiment holds."""
         fields = ("benchmark", "scenarios", "per_family", "panel", "epoch", "budget_usd")
-        return Study(**{name: getattr(self, name) for name in fields})
+        given = {name: getattr(self, name) for name in fields}
+        return Study(**{name: value for name, value in given.items() if value is not None})
+
+    def check_study(self, study: Study, path: Path) -> None:
+        """Raises TrapsError where an existing study has another panel or epoch than this experiment asks for."""
+        for name in ("panel", "epoch"):
+            old, new = getattr(study, name), getattr(self, name)
+            if new is not None and new != old:
+                raise TrapsError(f"{path}: {name} is {old!r}, experiment {self.name} wants {new!r}; edit one of them")
 
     def cells(self) -> list[Cell]:
         """All cells asked for, model outermost; a model that has fewer runs has fewer cells. Raises TrapsError."""

@@ -22,10 +22,10 @@ from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import load_panel
 from traps_pipeline.models.prompts import prompt, system_prompt
-from traps_pipeline.models.registry import all_evaluations, get_model
+from traps_pipeline.models.registry import all_evaluations, get_model, load_models
 from traps_pipeline.partitions import CATEGORIES, DATASETS, Cell, Evaluation
 from traps_pipeline.storage.parquet import State
-from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.storage.workspace import Workspace, write_text
 from traps_pipeline.tables import TABLES
 
 REPORTS = ("pecs_landscape", "contact_sheet", "leaderboard_page")
@@ -83,7 +83,7 @@ def upstream(stage: str, key: str | None) -> list[Node]:
         case "verdicts":
             return [("items", Cell.parse(str(key)).dataset), ("responses", key), ("votes", key)]
         case "metrics":
-            return [("verdicts", Cell(str(key), e).key) for e in all_evaluations()]
+            return [("items", key), *(("verdicts", Cell(str(key), e).key) for e in all_evaluations())]
         case "leaderboard":
             verdicts = [("verdicts", Cell(d, e).key) for d in DATASETS for e in all_evaluations()]
             return [*(("metrics", d) for d in DATASETS), *verdicts]
@@ -172,11 +172,11 @@ class Lineage:
 
 
 def reread_sources() -> None:
-    """Forget what was read of specs, corrections, prompts and judges: a server that lives long sees edits then.
+    """Forget what was read of specs, corrections, prompts and registries: a server that lives long sees edits then.
 
-    The models stay: partition keys are made from them when the code location is loaded.
+    Which evaluations there are stays: partition keys are made from them when the code location is loaded.
     """
-    for cached in (load_released, folded, prompt, system_prompt, load_panel):
+    for cached in (load_released, folded, load_models, prompt, system_prompt, load_panel):
         cached.cache_clear()
 
 
@@ -193,7 +193,7 @@ def _differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterable[st
 def write_report_state(workspace: Workspace, name: str, version: str, inputs: Mapping[str, str]) -> None:
     """What a report (which is no table) was made from, beside it."""
     state = State(version, dict(inputs), rows=0, failed=0)
-    (workspace.reports / f"{name}.state.json").write_text(json.dumps(asdict(state)), encoding="utf-8")
+    write_text(workspace.reports / f"{name}.state.json", json.dumps(asdict(state)))
 
 
 def read_report_state(workspace: Workspace, name: str) -> State | None:

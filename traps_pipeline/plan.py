@@ -11,7 +11,7 @@ from traps_pipeline.benchmark.corrections import load_scenarios
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import Experiment
 from traps_pipeline.judging.panel import PANEL_SIZE, load_panel, tasks_for, wanted_ballots
-from traps_pipeline.lineage import STAGES, Lineage, keys_of
+from traps_pipeline.lineage import STAGES, Lineage, keys_of, upstream
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.registry import get_model, load_models
 from traps_pipeline.partitions import REGIMES, SIDES, Cell, Evaluation, datasets_of_category
@@ -39,28 +39,39 @@ class Count:
         self.wanted, self.known = self.wanted + wanted, self.known + known
 
 
-def plan_calls(workspace: Workspace | None, experiment: Experiment) -> dict[str, tuple[Count, Count]]:
-    """Answers and votes by model: wanted, known, new. Without a workspace, or where items are not built yet, everything
-    is new."""
+def plan_calls(workspace: Workspace | None, experiment: Experiment) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
+    """Answers and votes by model: wanted, known, new; and the datasets whose items are not current.
+
+    What those items will be is not known yet, so all of their calls are counted as new: an upper bound.
+    """
     plan = {model: (Count(), Count()) for model in experiment.models}
     study = workspace.study if workspace else experiment.study
     scenarios = load_scenarios(study).values()
-    known = _KnownKeys()
+    known, lineage, uncertain = _KnownKeys(), Lineage(workspace) if workspace else None, set[str]()
     for cell in experiment.cells():
         answers, votes = plan[cell.evaluation.model]
         pairs = sum(cell.dataset in datasets_of_category(s.category) for s in scenarios)
-        if workspace is None or Lineage(workspace).status("items", cell.dataset).kind != "fresh":
+        if workspace is None or lineage is None or not _items_current(lineage, cell.dataset):
+            uncertain.add(cell.dataset)
             answers.add(2 * pairs, 0)
             votes.add(VOTES_A_PAIR * pairs, 0)
             continue
         wanted = _answer_keys(workspace, cell)
         answers.add(len(wanted), len(wanted & known.of(workspace.answers, cell.evaluation)))
-        if Lineage(workspace).status("responses", cell.key).kind == "missing":
+        if lineage.status("responses", cell.key).kind != "fresh":
             votes.add(VOTES_A_PAIR * len(wanted) // 2, 0)
             continue
         ballots = {ballot.request.key for ballot in wanted_ballots(workspace, load_panel(study.panel), cell)}
         votes.add(len(ballots), len(ballots & known.of(workspace.votes, cell.evaluation)))
-    return plan
+    return plan, sorted(uncertain)
+
+
+def _items_current(lineage: Lineage, dataset: str) -> bool:
+    """Whether a dataset's items, and everything they are made from, are current."""
+    if lineage.state("items", dataset) is None:
+        return False
+    above = [("items", dataset), *upstream("items", dataset)]
+    return all(lineage.status(stage, key).kind == "fresh" for stage, key in above if lineage.state(stage, key))
 
 
 class _KnownKeys:

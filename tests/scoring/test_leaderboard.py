@@ -16,12 +16,8 @@ from traps_pipeline.tables import LEADERBOARD
 STRATEGIES = ["oracle", "always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle"]
 
 
-def board_of(verdicts, version="v1"):
-    """The leaderboard; `version` is one for all datasets or one a dataset."""
-    parts = [
-        cell_metrics(rows, version if isinstance(version, str) else version[dataset])
-        for dataset, rows in verdicts.groupby("dataset")
-    ]
+def board_of(verdicts):
+    parts = [cell_metrics(rows) for _, rows in verdicts.groupby("dataset")]
     return leaderboard(pd.concat(parts, ignore_index=True), pecs_intervals(verdicts, resamples=100))
 
 
@@ -100,14 +96,15 @@ def test_degenerate_strategies_score_zero_overall_and_the_oracle_one(rows, strat
 def test_overall_names_every_version_and_epoch_it_rests_on(rows):
     parts = [rows([(True, False, True)], dataset=d, epoch="e2" if d == "chaotic" else "e1") for d in DATASETS]
     versions = {d: "v1+ab12" if d == "chaotic" else "v1" for d in DATASETS}
-    board = board_of(pd.concat(parts, ignore_index=True), versions)
+    verdicts = pd.concat(parts, ignore_index=True)
+    board = board_of(verdicts.assign(benchmark_version=verdicts["dataset"].map(versions)))
     assert tuple(entry(board, "overall")[["benchmark_version", "epoch"]]) == ("v1 + v1+ab12", "e1+e2")
     assert tuple(entry(board, "chaotic")[["benchmark_version", "epoch"]]) == ("v1+ab12", "e2")
 
 
 def test_nothing_scored_gives_an_empty_board(rows, tmp_path):
     verdicts = rows([])
-    board = leaderboard(cell_metrics(verdicts, "v1"), pecs_intervals(verdicts, 10))
+    board = leaderboard(cell_metrics(verdicts), pecs_intervals(verdicts, 10))
     assert board.empty
     TableStore(tmp_path).write(LEADERBOARD, {}, board, {})
 

@@ -22,7 +22,7 @@ def one(metrics: pd.DataFrame, **equal: object) -> pd.Series:
 def test_figures_follow_their_definitions(rows):
     # Five pairs: controls right 4/5, abstained on 1/5; voids abstained on 3/5.
     pairs = [(True, False, True), (True, False, True), (True, True, True), (True, False, False), (False, False, False)]
-    cell = one(cell_metrics(rows(pairs), "v1"), scope="all")
+    cell = one(cell_metrics(rows(pairs)), scope="all")
     assert (cell.n_pairs, cell.n_missing) == (5, 0)
     # J = 0.6 - 0.2 = 0.4; PECS = 0.8 x 0.4 = 0.32; Naive = 0.8 x 0.6 = 0.48
     assert cell[FIGURES].astype(float).to_numpy() == pytest.approx([0.8, 0.6, 0.2, 0.4, 0.32, 0.48])
@@ -30,23 +30,23 @@ def test_figures_follow_their_definitions(rows):
 
 
 def test_a_control_answer_can_be_both_abstained_on_and_correct(rows):
-    cell = one(cell_metrics(rows([(True, True, True)]), "v1"), scope="all")
+    cell = one(cell_metrics(rows([(True, True, True)])), scope="all")
     assert (cell.acc, cell.false_abs, cell.j, cell.pecs) == (1.0, 1.0, 0.0, 0.0)
 
 
 def test_pecs_is_not_negative_where_j_is(rows):
-    cell = one(cell_metrics(rows([(True, True, False), (True, False, False)]), "v1"), scope="all")
+    cell = one(cell_metrics(rows([(True, True, False), (True, False, False)])), scope="all")
     assert (cell.j, cell.pecs) == (-0.5, 0.0)
 
 
 @pytest.mark.parametrize("name", ["always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle"])
 def test_degenerate_strategies_score_zero(name, rows, strategy):
-    metrics = cell_metrics(rows(strategy(name, 12), model=name, labels=("yes", "no", "no")), "v1")
+    metrics = cell_metrics(rows(strategy(name, 12), model=name, labels=("yes", "no", "no")))
     assert (metrics["pecs"] == 0.0).all()
 
 
 def test_the_oracle_scores_one_on_every_scope(rows, strategy):
-    metrics = cell_metrics(rows(strategy("oracle", 12), labels=("yes", "no", "no"), categories=("a", "b")), "v1")
+    metrics = cell_metrics(rows(strategy("oracle", 12), labels=("yes", "no", "no"), categories=("a", "b")))
     assert set(metrics["scope"]) == {
         "all",
         "category:a",
@@ -63,7 +63,7 @@ def test_undecided_items_leave_their_denominators_and_count_as_missing(rows):
     # Pair 2 lacks correctness only, pair 3 lacks control abstention only, pair 4 lacks its void, pair 5 all three.
     pairs = [(True, False, True), (None, True, True), (True, None, False), (False, False, None), (None, None, None)]
     outcomes = ["answer"] * 8 + ["refused", "empty"]
-    cell = one(cell_metrics(rows(pairs, outcomes=outcomes), "v1"), scope="all")
+    cell = one(cell_metrics(rows(pairs, outcomes=outcomes)), scope="all")
     # Missing: controls of 2, 3, 5, voids of 4, 5. Acc over pairs 1, 3, 4; FalseAbs 1, 2, 4; AbsRec 1, 2, 3.
     assert (cell.n_pairs, cell.n_missing, cell.n_refused, cell.n_empty) == (5, 5, 1, 1)
     assert [cell.acc, cell.false_abs, cell.abs_rec] == pytest.approx([2 / 3, 1 / 3, 2 / 3])
@@ -71,15 +71,15 @@ def test_undecided_items_leave_their_denominators_and_count_as_missing(rows):
 
 def test_a_verdict_that_was_never_written_counts_as_missing(rows):
     verdicts = rows([(True, False, True), (True, False, True)]).iloc[:-1]
-    cell = one(cell_metrics(verdicts, "v1"), scope="all")
+    cell = one(cell_metrics(verdicts), scope="all")
     assert (cell.n_pairs, cell.n_missing, cell.abs_rec) == (2, 1, 1.0)
 
 
 def test_an_empty_denominator_makes_a_figure_null_and_what_depends_on_it(rows):
-    cell = one(cell_metrics(rows([(True, False, None), (False, False, None)]), "v1"), scope="all")
+    cell = one(cell_metrics(rows([(True, False, None), (False, False, None)])), scope="all")
     assert (cell.acc, cell.false_abs) == (0.5, 0.0)
     assert cell[["abs_rec", "j", "pecs", "naive"]].isna().all()
-    no_correctness = one(cell_metrics(rows([(None, False, True)]), "v1"), scope="all")
+    no_correctness = one(cell_metrics(rows([(None, False, True)])), scope="all")
     assert no_correctness.j == 1.0
     assert no_correctness[["acc", "pecs", "naive"]].isna().all()
 
@@ -87,7 +87,7 @@ def test_an_empty_denominator_makes_a_figure_null_and_what_depends_on_it(rows):
 def test_a_label_groups_both_sides_by_the_control_answer(rows):
     # Labels alternate: pairs 1 and 3 are `left`, pair 2 is `right`.
     pairs = [(True, False, True), (False, False, False), (True, False, False)]
-    metrics = cell_metrics(rows(pairs, labels=("left", "right")), "v1")
+    metrics = cell_metrics(rows(pairs, labels=("left", "right")))
     left, right = one(metrics, scope="label:left"), one(metrics, scope="label:right")
     assert (left.n_pairs, left.acc, left.abs_rec) == (2, 1.0, 0.5)
     assert (right.n_pairs, right.acc, right.abs_rec) == (1, 0.0, 0.0)
@@ -96,7 +96,7 @@ def test_a_label_groups_both_sides_by_the_control_answer(rows):
 def test_cells_do_not_mix_models_regimes_or_runs(rows):
     good, bad = [(True, False, True)], [(False, False, False)]
     parts = [rows(good), rows(bad, run=2), rows(bad, regime="guided"), rows(bad, model="n")]
-    metrics = cell_metrics(pd.concat(parts, ignore_index=True), "v1")
+    metrics = cell_metrics(pd.concat(parts, ignore_index=True))
     cells = metrics[metrics["scope"] == "all"]
     assert len(cells) == 4
     assert cells["pecs"].sum() == one(cells, model="m", regime="standard", run=1).pecs == 1.0
@@ -105,20 +105,20 @@ def test_cells_do_not_mix_models_regimes_or_runs(rows):
 def test_epochs_are_joined_once_each_in_order(rows):
     verdicts = rows([(True, False, True)] * 3)
     verdicts["epoch"] = ["e2", "e1", "e2", "e2", "e1", "e1"]
-    assert one(cell_metrics(verdicts, "v1"), scope="all").epoch == "e1+e2"
+    assert one(cell_metrics(verdicts), scope="all").epoch == "e1+e2"
 
 
 def test_several_datasets_at_once_are_refused(rows):
     verdicts = pd.concat([rows([(True, False, True)], dataset=d) for d in ("occlusion", "chaotic")], ignore_index=True)
     with pytest.raises(ValueError, match="one dataset at a time"):
-        cell_metrics(verdicts, "v1")
+        cell_metrics(verdicts)
 
 
 def test_rows_fit_the_tables_schema_and_survive_a_round_trip(rows, tmp_path):
     store = TableStore(tmp_path)
     verdicts = rows([(True, False, True), (None, None, None), (False, True, None)])
     store.write(VERDICTS, {"dataset": "occlusion", "model": "m", "regime": "standard", "run": 1}, verdicts, {})
-    metrics = cell_metrics(store.read_all(VERDICTS), "v1")
+    metrics = cell_metrics(store.read_all(VERDICTS))
     store.write(METRICS, {"dataset": "occlusion"}, metrics, {})
     again = store.read_all(METRICS).set_index("scope")
     before = metrics.set_index("scope").loc[again.index]
@@ -127,6 +127,6 @@ def test_rows_fit_the_tables_schema_and_survive_a_round_trip(rows, tmp_path):
 
 
 def test_no_verdicts_give_an_empty_table(rows, tmp_path):
-    metrics = cell_metrics(rows([]), "v1")
+    metrics = cell_metrics(rows([]))
     assert metrics.empty
     TableStore(tmp_path).write(METRICS, {"dataset": "occlusion"}, metrics, {})

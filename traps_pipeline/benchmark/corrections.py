@@ -147,6 +147,8 @@ def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Cor
 
 def _corrected(where: str, known: Scenario, correction: Correction) -> Scenario:
     changes = correction.changes()
+    if correction.family not in (None, known.family):
+        raise TrapsError(f"{where}: {known.scenario_id} is of the family {known.family}; a correction cannot change it")
     if not changes:
         raise TrapsError(f"{where}: `correct` gives no change; give words, answer or params, or use `keep`")
     params = known.params
@@ -191,20 +193,26 @@ def folded() -> dict[str, Scenario]:
 
 
 def subset(scenarios: Mapping[str, Scenario], study: Study) -> dict[str, Scenario]:
-    """Named scenarios (discarded ones fall away), or the first n of each family, or all."""
+    """Named scenarios, or the first n of each family, or all. Discarded ones fall away; no other takes their place."""
     if study.scenarios is not None:
-        released = load_released()
-        unknown = [s for s in study.scenarios if s not in scenarios and s not in released]
+        unknown = sorted(set(study.scenarios) - set(scenarios) - _ever_known())
         if unknown:
             raise TrapsError(f"study.yaml: unknown scenarios {unknown}; `ls scene_specs/released` shows the families")
-        return {s: scenarios[s] for s in sorted(study.scenarios) if s in scenarios}
+        return {id_: scenarios[id_] for id_ in sorted(study.scenarios) if id_ in scenarios}
     if study.per_family is None:
         return dict(scenarios)
+    families = {id_: spec.family for id_, spec in load_released().items()}
+    families |= {id_: scenario.family for id_, scenario in scenarios.items()}
     taken: dict[str, list[str]] = {}
-    for id_, scenario in scenarios.items():
-        taken.setdefault(scenario.family, []).append(id_)
+    for id_, family in sorted(families.items()):
+        taken.setdefault(family, []).append(id_)
     chosen = {id_ for ids in taken.values() for id_ in ids[: study.per_family]}
     return {id_: scenario for id_, scenario in scenarios.items() if id_ in chosen}
+
+
+def _ever_known() -> set[str]:
+    """Ids that are or were in the benchmark: released, added, discarded."""
+    return set(load_released()) | {correction.scenario_id for _, correction in read_corrections()}
 
 
 def categories_of(scenarios: Mapping[str, Scenario]) -> list[str]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,13 @@ from traps_pipeline import progress
 from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, fold, load_scenarios, subset
 from traps_pipeline.benchmark.records import load_released, parse_record
 from traps_pipeline.benchmark.versions import spec_content, version_of
+from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import CHECKOUT, CORRECTIONS, RELEASED
-from traps_pipeline.scenes.kit import Physics
+from traps_pipeline.scenes.kit import Physics, Wording
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory
-from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.storage.workspace import Workspace, write_text
 
 
 @dataclass(frozen=True)
@@ -36,26 +36,62 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> Resolved:
     if scenario.params is None:
         spec = scenario.changed_words()
         return Resolved(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
-    name = f"{scenario.scenario_id}-{scenario.version}"
+    spec, trajectory = _resolved_anew(workspace, scenario)
+    words = dict(scenario.words)
+    if _words_still_fit(scenario):
+        assert scenario.released is not None
+        words = scenario.released.model_dump(mode="json", include=set(WORDS)) | words
+    answer = words.pop("answer", spec.ground_truth)
+    if answer != spec.ground_truth:
+        raise TrapsError(
+            f"{scenario.where}: {scenario.scenario_id}: the correction says {answer!r}, "
+            f"the simulation {spec.ground_truth!r}; leave the answer out or change the parameters"
+        )
+    return Resolved(apply_words(spec, words, scenario.where), trajectory)
+
+
+def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
+    """The scene that a correction's parameters make, with the family's words for it; simulated once and kept."""
+    name = (
+        f"{scenario.scenario_id}-{digest([scenario.family, scenario.params, _seed(scenario), _physics(scenario)])[:16]}"
+    )
     for folder in (CORRECTIONS / "trajectories", workspace.trajectories):
         if (folder / f"{name}.json").is_file():
             record = (folder / f"{name}.json").read_text(encoding="utf-8")
-            return Resolved(parse_record(record, str(folder / f"{name}.json")), folder / f"{name}.npz")
+            return parse_record(record, str(folder / f"{name}.json")), folder / f"{name}.npz"
     spec, qpos = _simulate(scenario)
-    part = workspace.trajectories / f".{name}.{os.getpid()}.part"
     try:
         save_trajectory(workspace.trajectories, name, qpos)
-        part.write_text(json.dumps(spec.model_dump(mode="json")), encoding="utf-8")
-        part.replace(workspace.trajectories / f"{name}.json")  # last, so that it vouches for the trajectory
     except OSError as error:
-        raise TrapsError(f"{part.parent / name}.json: cannot be written ({error.strerror}); free some space") from error
-    finally:
-        part.unlink(missing_ok=True)
+        raise TrapsError(f"{workspace.trajectories / name}.npz: cannot be written ({error.strerror})") from error
+    record = json.dumps(spec.model_dump(mode="json"))
+    write_text(workspace.trajectories / f"{name}.json", record)  # last, so that it vouches for the trajectory
     progress.current().note(
         f"{scenario.scenario_id}: simulated here after {scenario.where}; to freeze it for other machines copy "
         f"trajectories/{name}.* of the workspace to {CORRECTIONS.relative_to(CHECKOUT)}/trajectories/"
     )
-    return Resolved(spec, workspace.trajectories / f"{name}.npz")
+    return spec, workspace.trajectories / f"{name}.npz"
+
+
+def _seed(scenario: Scenario) -> int:
+    return scenario.released.seed if scenario.released else 0
+
+
+def _physics(scenario: Scenario) -> dict[str, Any]:
+    return scenario.released.physics if scenario.released else asdict(get_family(scenario.family).physics)
+
+
+def _wording(scenario: Scenario, params: Mapping[str, Any]) -> Wording:
+    """The family's words for some parameters, always drawn in the same way for a scenario."""
+    family = get_family(scenario.family)
+    rng = np.random.default_rng([_seed(scenario), *scenario.scenario_id.encode()])
+    return family.word(family.params_from(params), rng)
+
+
+def _words_still_fit(scenario: Scenario) -> bool:
+    """Whether the released words fit the corrected parameters: the family has the same words for both."""
+    released = scenario.released
+    return released is not None and _wording(scenario, released.params) == _wording(scenario, scenario.params or {})
 
 
 def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray]:
@@ -63,28 +99,16 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray]:
     from traps_pipeline.scenes.resolve import Rejected, resolve
 
     family = get_family(scenario.family)
-    released = scenario.released
-    seed = released.seed if released else 0
     try:
         params = family.params_from(scenario.params or {})
-        wording = family.word(params, np.random.default_rng([seed, *scenario.scenario_id.encode()]))
-        physics = Physics(**released.physics) if released else family.physics
-        spec, qpos = resolve(family, params, wording, scenario_id=scenario.scenario_id, seed=seed, physics=physics)
+        wording = _wording(scenario, scenario.params or {})
+        physics = Physics(**_physics(scenario))
+        return resolve(family, params, wording, scenario_id=scenario.scenario_id, seed=_seed(scenario), physics=physics)
     except (Rejected, ValueError, TypeError) as error:
         raise TrapsError(
             f"{scenario.where}: {scenario.scenario_id}: these parameters make no valid pair ({error}); "
             "change them or discard it"
         ) from error
-    words = dict(scenario.words)
-    if released is not None and released.labels == spec.labels:  # where they still fit, the released words stand
-        words = released.model_dump(mode="json", include=set(WORDS)) | words
-    answer = words.pop("answer", spec.ground_truth)
-    if answer != spec.ground_truth:
-        raise TrapsError(
-            f"{scenario.where}: {scenario.scenario_id}: the correction says {answer!r}, "
-            f"the simulation {spec.ground_truth!r}; leave the answer out or change the parameters"
-        )
-    return apply_words(spec, words, scenario.where), qpos
 
 
 def build_specs(workspace: Workspace, category: str) -> tuple[list[dict[str, Any]], list[Resolved]]:

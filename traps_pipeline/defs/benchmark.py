@@ -4,7 +4,7 @@ import dagster as dg
 
 from traps_pipeline import progress
 from traps_pipeline.defs import common
-from traps_pipeline.defs.common import CATEGORY, DATASET, OWNERS, Events, check, table_metadata, verdict_of
+from traps_pipeline.defs.common import CATEGORY, DATASET, OWNERS, Checks, Events, check, table_metadata
 from traps_pipeline.lineage import Lineage
 from traps_pipeline.partitions import CATEGORIES, datasets_of_category
 from traps_pipeline.progress import Tally
@@ -30,7 +30,6 @@ category_to_datasets = dg.StaticPartitionMapping({c: list(datasets_of_category(c
     metadata=table_metadata("scene_specs"),
     output_required=False,
     check_specs=[
-        check("unique_scenarios", "scene_specs", "No scenario occurs twice."),
         check(
             "outcome_settled",
             "scene_specs",
@@ -46,18 +45,12 @@ def scene_specs(context: dg.AssetExecutionContext) -> Events:
     provenance = common.provenance(context, workspace)
     rows, resolved = build_specs(workspace, category)
     inputs = Lineage(workspace).inputs("scene_specs", category)
+    checks = Checks(context, workspace)
+    checks.record("outcome_settled", category, unsettled(resolved))
     version = workspace.tables.write(SCENE_SPECS, {"category": category}, rows, inputs)
     progress.current().partition("scene_specs", category, Tally())
     yield common.materialized(context, category, version, provenance, **{"dagster/partition_row_count": len(rows)})
-    ids = [row["scenario_id"] for row in rows]
-    repeated = sorted({id_ for id_ in ids if ids.count(id_) > 1})
-    yield verdict_of(
-        "unique_scenarios", context, workspace, {category: repeated} if repeated else {}, scenarios=len(ids)
-    )
-    problems = unsettled(resolved)
-    yield verdict_of(
-        "outcome_settled", context, workspace, {category: problems} if problems else {}, scenarios=len(ids)
-    )
+    yield from checks.results()
 
 
 @dg.asset(
@@ -85,16 +78,17 @@ def videos(context: dg.AssetExecutionContext) -> Events:
     provenance = common.provenance(context, workspace)
     inputs = Lineage(workspace).inputs("videos", category)
     rows, drawn, leaks = build_videos(workspace, category)
+    shown = [(row["side"], row["frames_sha256"]) for row in rows]
+    alike = [row["path"] for row, frames in zip(rows, shown, strict=True) if shown.count(frames) > 1]
+    checks = Checks(context, workspace)
+    checks.record("panel_hides", category, {id_: pixels for id_, pixels in leaks.items() if pixels})
+    checks.record("clips_distinct", category, alike)
     version = workspace.tables.write(VIDEOS, {"category": category}, rows, inputs)
     progress.current().partition("videos", category, Tally(frames=drawn))
     size = sum(row["size_bytes"] for row in rows) / 1e6
     metadata = {"dagster/partition_row_count": len(rows), "frames rendered": drawn, "megabytes": round(size, 2)}
     yield common.materialized(context, category, version, provenance, **metadata)
-    leaking = {id_: pixels for id_, pixels in leaks.items() if pixels}
-    yield verdict_of("panel_hides", context, workspace, {category: leaking} if leaking else {}, voids=len(leaks))
-    shown = [(row["side"], row["frames_sha256"]) for row in rows]
-    alike = [row["path"] for row, frames in zip(rows, shown, strict=True) if shown.count(frames) > 1]
-    yield verdict_of("clips_distinct", context, workspace, {category: alike} if alike else {}, clips=len(rows))
+    yield from checks.results()
 
 
 @dg.asset(
@@ -125,14 +119,16 @@ def items(context: dg.AssetExecutionContext) -> Events:
     provenance = common.provenance(context, workspace)
     inputs = Lineage(workspace).inputs("items", dataset)
     rows = build_items(workspace, dataset)
-    version = workspace.tables.write(ITEMS, {"dataset": dataset}, rows, inputs)
-    progress.current().partition("items", dataset, Tally())
-    metadata = {"dagster/partition_row_count": len(rows), "benchmark version": rows[0]["benchmark_version"]}
-    yield common.materialized(context, dataset, version, provenance, **metadata)
+    checks = Checks(context, workspace)
     sides: dict[str, list[str]] = {}
     for row in rows:
         sides.setdefault(row["pair_id"], []).append(row["side"])
     odd = {pair: found for pair, found in sides.items() if sorted(found) != ["control", "void"]}
-    yield verdict_of("two_items_a_pair", context, workspace, {dataset: odd} if odd else {}, pairs=len(sides))
+    checks.record("two_items_a_pair", dataset, odd)
     absent = sorted({row["clip"] for row in rows if not workspace.resolve(row["clip"]).is_file()})
-    yield verdict_of("clips_present", context, workspace, {dataset: absent} if absent else {}, items=len(rows))
+    checks.record("clips_present", dataset, absent)
+    version = workspace.tables.write(ITEMS, {"dataset": dataset}, rows, inputs)
+    progress.current().partition("items", dataset, Tally())
+    metadata = {"dagster/partition_row_count": len(rows), "benchmark version": rows[0]["benchmark_version"]}
+    yield common.materialized(context, dataset, version, provenance, **metadata)
+    yield from checks.results()

@@ -8,16 +8,19 @@ section 3). Sources are observed on the way, so provenance never points at nothi
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import dagster as dg
 
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.lineage import PARTITIONED_BY, SOURCES, Lineage, Node, keys_of, reread_sources
 from traps_pipeline.models.registry import all_evaluations
 from traps_pipeline.partitions import CATEGORIES, DATASETS
-from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.storage.workspace import Workspace, write_text
 from traps_pipeline.tables import TABLES
 
 # Partition mappings over one dimension, observable sources and backfill policies are in beta; the version is pinned.
@@ -69,7 +72,20 @@ def materialized(
 
 
 def provenance(context: dg.AssetExecutionContext, workspace: Workspace) -> dict[str, str]:
-    """Tags that say which events of the parents are current. Taken before the tables are read."""
+    """Tags that say which events of the parents are current. Taken before the tables are read.
+
+    Raises TrapsError for a run of several stages (Dagster would skip those below a stage that hands on no output) and
+    for a Dagster history that belongs to another study.
+    """
+    selected = set(context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys)
+    if len(selected) > 1:
+        names = ", ".join(sorted(key.to_user_string() for key in selected))
+        raise TrapsError(f"one stage a run, not {names}: `traps run EXPERIMENT` walks the stages in order")
+    home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
+    if home.resolve() != workspace.dagster_home.resolve():
+        raise TrapsError(
+            f"DAGSTER_HOME={home} is not of the workspace {workspace.root}: set it to {workspace.dagster_home}"
+        )
     observe_sources(context.instance, workspace)
     tags = {_CODE_TAG: context.run_id}
     for parent in sorted(context.assets_def.asset_deps[context.asset_key]):
@@ -154,27 +170,34 @@ def check(name: str, asset: str, description: str) -> dg.AssetCheckSpec:
     return dg.AssetCheckSpec(name, asset=asset, description=description)
 
 
-def verdict_of(
-    name: str,
-    context: dg.AssetExecutionContext,
-    workspace: Workspace,
-    failing: Mapping[str | None, Any],
-    **metadata: Any,
-) -> dg.AssetCheckResult:
-    """The result of such a check over this run's partitions; `failing` has details by partition key.
+class Checks:
+    """The checks of one run, evaluated partition by partition before the partition counts as made.
 
-    A failure is also kept in the workspace until the partition passes, so that every later run and `traps status` tell.
+    A failure is kept in the workspace until its partition passes, so that every later run and `traps status` tell, even
+    if this run dies before it reports to Dagster.
     """
-    stage = context.asset_key.to_user_string()
-    for key in keys(context) if context.has_partition_key or context.has_partition_key_range else [None]:
-        file = workspace.failed_check(stage, name, key)
-        if key in failing:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(json.dumps(failing[key], default=str), encoding="utf-8")
+
+    def __init__(self, context: dg.AssetExecutionContext, workspace: Workspace) -> None:
+        self._context, self._workspace = context, workspace
+        self._stage = context.asset_key.to_user_string()
+        self._failing: dict[str, dict[str, Any]] = {}
+
+    def record(self, name: str, key: str | None, problems: Any) -> None:
+        """A check of a partition; `problems` is empty where it passes."""
+        failing = self._failing.setdefault(name, {})
+        file = self._workspace.failed_check(self._stage, name, key)
+        if problems:
+            failing[str(key)] = problems
+            write_text(file, json.dumps(problems, default=str))
         else:
             file.unlink(missing_ok=True)
-    metadata["failing"] = {str(key): details for key, details in failing.items()}
-    return dg.AssetCheckResult(check_name=name, asset_key=context.asset_key, passed=not failing, metadata=metadata)
+
+    def results(self) -> Iterator[dg.AssetCheckResult]:
+        """What Dagster is told: one result a check, with the failing partitions."""
+        for name, failing in self._failing.items():
+            yield dg.AssetCheckResult(
+                check_name=name, asset_key=self._context.asset_key, passed=not failing, metadata={"failing": failing}
+            )
 
 
 Events = Iterator[dg.AssetMaterialization | dg.AssetCheckResult]

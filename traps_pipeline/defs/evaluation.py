@@ -11,12 +11,12 @@ from traps_pipeline.defs.common import (
     CELL,
     OWNERS,
     SINGLE_RUN,
+    Checks,
     Events,
     by_dataset,
     by_evaluation,
     check,
     table_metadata,
-    verdict_of,
 )
 from traps_pipeline.lineage import Lineage
 from traps_pipeline.models.answers import FinishedCell, collect_answers
@@ -74,14 +74,15 @@ def _collect(
 )
 def responses(context: dg.AssetExecutionContext) -> Events:
     """Answers of a model under a regime in a run, one row an item; only what the ledger does not hold is asked."""
-    workspace, wrong, n_rows = Workspace.open(), dict[str | None, str](), 0
+    workspace = Workspace.open()
+    checks = Checks(context, workspace)
     for done, event in _collect(context, "responses", collect_answers):
         state = Lineage(workspace).state("items", done.cell.dataset)
-        if state is None or state.rows != done.rows:
-            wrong[done.cell.key] = f"{done.rows} rows for {state.rows if state else 0} items"
-        n_rows += done.rows
+        n_items = state.rows if state else 0
+        wrong = "" if done.rows == n_items else f"{done.rows} rows for {n_items} items"
+        checks.record("one_answer_an_item", done.cell.key, wrong)
         yield event
-    yield verdict_of("one_answer_an_item", context, workspace, wrong, rows=n_rows)
+    yield from checks.results()
 
 
 @dg.asset(
@@ -103,15 +104,15 @@ def votes(context: dg.AssetExecutionContext) -> Events:
     """Votes of the study's panel on the answers of a cell, one row a judge and task."""
     from traps_pipeline.judging.panel import collect_votes
 
-    workspace, many, n_votes = Workspace.open(), dict[str | None, str](), 0
+    workspace = Workspace.open()
+    checks = Checks(context, workspace)
     for done, event in _collect(context, "votes", collect_votes):
         valid = workspace.tables.read(VOTES, done.cell.partition, ["valid"])["valid"].to_numpy(bool)
         invalid = len(valid) - int(valid.sum())
-        if invalid > MAX_INVALID_SHARE * done.rows:
-            many[done.cell.key] = f"{invalid} of {done.rows} votes are invalid"
-        n_votes += done.rows
+        many = f"{invalid} of {len(valid)} votes are invalid" if invalid > MAX_INVALID_SHARE * len(valid) else ""
+        checks.record("few_invalid_votes", done.cell.key, many)
         yield event
-    yield verdict_of("few_invalid_votes", context, workspace, many, votes=n_votes)
+    yield from checks.results()
 
 
 @dg.asset(
@@ -130,16 +131,17 @@ def verdicts(context: dg.AssetExecutionContext) -> Events:
     from traps_pipeline.judging.panel import decide_cell
 
     workspace = Workspace.open()
-    lineage, provenance, wrong = Lineage(workspace), common.provenance(context, workspace), dict[str | None, str]()
+    lineage, provenance, checks = Lineage(workspace), common.provenance(context, workspace), Checks(context, workspace)
     for key in common.keys(context):
         cell = Cell.parse(key)
         rows = decide_cell(workspace, cell)
+        answered = workspace.tables.state(RESPONSES, cell.partition)
+        n_answers = answered.rows if answered else 0
+        wrong = "" if n_answers == len(rows) else f"{len(rows)} verdicts for {n_answers} answers"
+        checks.record("one_verdict_an_item", key, wrong)
         version = workspace.tables.write(VERDICTS, cell.partition, rows, lineage.inputs("verdicts", key))
         progress.current().partition("verdicts", key, Tally())
-        answered = workspace.tables.state(RESPONSES, cell.partition)
-        if answered is None or answered.rows != len(rows):
-            wrong[key] = f"{len(rows)} verdicts for {answered.rows if answered else 0} answers"
         undecided = sum(row["undecided"] for row in rows)
         metadata = {"dagster/partition_row_count": len(rows), "undecided": undecided}
         yield common.materialized(context, key, version, provenance, **metadata)
-    yield verdict_of("one_verdict_an_item", context, workspace, wrong)
+    yield from checks.results()

@@ -6,7 +6,8 @@ import dagster as dg
 
 from traps_pipeline import progress
 from traps_pipeline.defs import common
-from traps_pipeline.defs.common import DATASET, OWNERS, Events, by_dataset, check, table_metadata, verdict_of
+from traps_pipeline.defs.benchmark import items
+from traps_pipeline.defs.common import DATASET, OWNERS, Checks, Events, by_dataset, check, table_metadata
 from traps_pipeline.defs.evaluation import verdicts
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.lineage import Lineage
@@ -19,7 +20,7 @@ GROUP = "scoring"
 
 @dg.asset(
     partitions_def=DATASET,
-    deps=[dg.AssetDep(verdicts, partition_mapping=by_dataset)],
+    deps=[items, dg.AssetDep(verdicts, partition_mapping=by_dataset)],
     group_name=GROUP,
     kinds={"parquet"},
     owners=OWNERS,
@@ -37,18 +38,19 @@ def metrics(context: dg.AssetExecutionContext) -> Events:
     provenance = common.provenance(context, workspace)
     inputs = Lineage(workspace).inputs("metrics", dataset)
     judged = workspace.tables.read_all(VERDICTS, dataset=dataset)
+    # Cells that nobody has evaluated since a correction may still hold an item that was discarded.
+    current = workspace.tables.read(ITEMS, {"dataset": dataset}, ["item_id"])["item_id"]
+    judged = judged.loc[judged["item_id"].isin(current)]
     if judged.empty:
         raise TrapsError(f"metrics {dataset}: no verdicts yet; materialize verdicts for a cell of this dataset first")
-    benchmark_version = workspace.tables.read(ITEMS, {"dataset": dataset}, ["benchmark_version"])[
-        "benchmark_version"
-    ].iloc[0]
-    frame = cell_metrics(judged, benchmark_version)
+    frame = cell_metrics(judged)
+    wrong = wrong_figures(frame)
+    checks = Checks(context, workspace)
+    checks.record("shares_are_shares", dataset, f"{wrong} figures are wrong" if wrong else "")
     version = workspace.tables.write(METRICS, {"dataset": dataset}, frame, inputs)
     progress.current().partition("metrics", dataset, Tally())
     yield common.materialized(context, dataset, version, provenance, **{"dagster/partition_row_count": len(frame)})
-    wrong = wrong_figures(frame)
-    failing: dict[str | None, str] = {dataset: f"{wrong} figures are wrong"} if wrong else {}
-    yield verdict_of("shares_are_shares", context, workspace, failing, cells=len(frame))
+    yield from checks.results()
 
 
 @dg.asset(
@@ -74,6 +76,9 @@ def leaderboard(context: dg.AssetExecutionContext) -> Events:
     if cells.empty:
         raise TrapsError("leaderboard: no metrics yet; materialize metrics for a dataset first")
     board = rank(cells, pecs_intervals(workspace.tables.read_all(VERDICTS)))
+    wrong = wrong_intervals(board)
+    checks = Checks(context, workspace)
+    checks.record("intervals_ordered", None, f"{wrong} intervals are wrong" if wrong else "")
     version = workspace.tables.write(LEADERBOARD, {}, board, inputs)
     progress.current().partition("leaderboard", "", Tally())
     metadata: dict[str, Any] = {
@@ -84,6 +89,4 @@ def leaderboard(context: dg.AssetExecutionContext) -> Events:
     if len(overall):
         metadata["best overall PECS"] = float(overall.max())
     yield common.materialized(context, None, version, provenance, **metadata)
-    wrong = wrong_intervals(board)
-    failing: dict[str | None, str] = {None: f"{wrong} intervals are wrong"} if wrong else {}
-    yield verdict_of("intervals_ordered", context, workspace, failing, rows=len(board))
+    yield from checks.results()

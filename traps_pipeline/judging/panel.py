@@ -19,11 +19,12 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError, 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.answers import is_correct, strip_fence
-from traps_pipeline.models.answers import FinishedCell
+from traps_pipeline.models.answers import FinishedCell, answer_request
 from traps_pipeline.models.ask import Participants, Row, Work, run_work
+from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.prompts import prompt
-from traps_pipeline.models.registry import Limits
-from traps_pipeline.models.request import JUDGED, Request
+from traps_pipeline.models.registry import Limits, get_model
+from traps_pipeline.models.request import JUDGED, Backend, Request
 from traps_pipeline.partitions import Cell, check_slug
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.progress import Tally
@@ -188,8 +189,17 @@ def collect_votes(
         return FinishedCell(cell, version, len(table), tally)
 
     entries = {judge.id: (judge.backend, judge.limits) for judge in panel}
-    work = Work("votes", workspace.votes, Participants(entries), workspace.study.epoch, requests, finish)
+    work = Work("votes", workspace.votes, Participants(entries, make_judge), workspace.study.epoch, requests, finish)
     yield from run_work(work, cells)
+
+
+def make_judge(kind: str) -> Backend:
+    """A judge's backend: the rule judge, or any backend of the models."""
+    if kind == "rule":
+        from traps_pipeline.judging.rules import RuleJudge
+
+        return RuleJudge()
+    return make_backend(kind)
 
 
 @dataclass(frozen=True)
@@ -203,12 +213,17 @@ class Ballot:
 
 def wanted_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: Cell) -> list[Ballot]:
     """Every vote that the answers of a cell want."""
-    items = _items_by_id(workspace, cell.dataset)
+    items, entry = _items_by_id(workspace, cell.dataset), get_model(cell.evaluation.model)
     ballots = []
     for response in workspace.tables.read(RESPONSES, cell.partition).to_dict("records"):
         if response["outcome"] not in JUDGED:
             continue
         item = _item_of(items, response, cell)
+        if response["request_key"] != answer_request(workspace, entry, item, cell.evaluation).key:
+            raise TrapsError(
+                f"responses {cell.key}: the answer to {item['item_id']} is of an earlier question, clip or setting; "
+                "materialize responses for this cell first"
+            )
         for task in tasks_for(item["side"]):
             ballots += [Ballot(item, task, vote_request(judge, task, cell, item, response["text"])) for judge in panel]
     return ballots

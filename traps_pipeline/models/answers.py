@@ -9,6 +9,7 @@ from functools import cache
 from typing import Any
 
 from traps_pipeline.models.ask import Participants, Row, Work, run_work
+from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model, load_models
 from traps_pipeline.models.request import Request
@@ -89,5 +90,7 @@ def collect_answers(
         return FinishedCell(cell, version, len(table), tally)
 
     entries = {entry.id: (entry.backend, entry.limits) for entry in load_models().values()}
-    work = Work("responses", workspace.answers, Participants(entries), workspace.study.epoch, requests, finish)
+    work = Work(
+        "responses", workspace.answers, Participants(entries, make_backend), workspace.study.epoch, requests, finish
+    )
     yield from run_work(work, cells)

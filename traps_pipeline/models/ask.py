@@ -21,12 +21,11 @@ from typing import Any, Generic, TypeVar
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.registry import Limits
 from traps_pipeline.models.request import Backend, Outcome, Request, TransientError
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
-from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, SegmentWriter
+from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, SegmentWriter
 
 Row = dict[str, Any]
 Finished = TypeVar("Finished")
@@ -45,14 +44,14 @@ class Participant:
 class Participants:
     """Backends by participant, made when first asked; concurrency is shared by all evaluations of a run."""
 
-    def __init__(self, entries: Mapping[str, tuple[str, Limits]]) -> None:
-        self._entries = entries
+    def __init__(self, entries: Mapping[str, tuple[str, Limits]], make: Callable[[str], Backend]) -> None:
+        self._entries, self._make = entries, make
         self._made: dict[str, Participant] = {}
 
     def __getitem__(self, name: str) -> Participant:
         if name not in self._made:
             kind, limits = self._entries[name]
-            self._made[name] = Participant(make_backend(kind), limits, asyncio.Semaphore(limits.concurrency))
+            self._made[name] = Participant(self._make(kind), limits, asyncio.Semaphore(limits.concurrency))
         return self._made[name]
 
 
@@ -186,7 +185,7 @@ async def settle_evaluation(
 ) -> AsyncIterator[Settled]:
     """Settle the cells of one evaluation, asking only what its ledger does not hold. Unfinished cells are left out."""
     report = progress.current()
-    async with work.ledger.lock(evaluation.key, report.note):
+    async with work.ledger.lock(evaluation.key, report.note, stop.is_set):
         known = work.ledger.read(evaluation.key)
         for place in known.torn:
             report.note(f"{place}: torn last line ignored (a crash cut it off); its answer is asked again")
@@ -214,8 +213,12 @@ async def settle(work: Work[Any], cells: Sequence[Cell], stop: asyncio.Event) ->
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[Cell]]]) -> None:
         try:
             for evaluation, mine in evaluations:
+                if stop.is_set():
+                    return
                 async for settled in settle_evaluation(work, evaluation, mine, stop):
                     await done.put(settled)
+        except LockGivenUp:
+            return
         except Exception as error:  # noqa: BLE001 - handed to the caller, who reports it and fails the run
             await done.put(error)
         finally:

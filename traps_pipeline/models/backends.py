@@ -12,8 +12,4 @@ def make_backend(kind: str) -> Backend:
             from traps_pipeline.models.reference import ReferenceBackend
 
             return ReferenceBackend()
-        case "rule":
-            from traps_pipeline.judging.rules import RuleJudge
-
-            return RuleJudge()
-    raise ValueError(f"unknown backend {kind!r}; known: reference, rule")
+    raise ValueError(f"unknown backend {kind!r}; known: reference")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -28,6 +29,7 @@ from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.resolve import compile_scene, decisive_geoms
 from traps_pipeline.scenes.spec import SceneSpec
 
+SCENES_A_WORKER = 100  # GL drivers leak: a worker draws so many, then another takes over
 ABLATION_FRAMES = 5  # evenly spaced void frames that are drawn once more without what they must not show
 
 
@@ -158,23 +160,25 @@ def render_pairs(jobs: Sequence[Job], workers: int | None = None) -> Iterator[tu
     if not todo:
         return
     workers = min(workers or len(os.sched_getaffinity(0)), len(todo))
-    pool = ProcessPoolExecutor(
-        workers,
-        mp_context=get_context("spawn"),
-        initializer=_exit_with_parent,
-        initargs=(os.getpid(),),
-        max_tasks_per_child=100,
-    )
+    chunk = workers * SCENES_A_WORKER  # a fresh pool for each: recycling inside a pool can deadlock (CPython 3.11)
+    for start in range(0, len(todo), chunk):
+        yield from _render_chunk(todo[start : start + chunk], workers)
+
+
+def _render_chunk(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, int]]:
+    context = get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker, initargs=(os.getpid(),))
     try:
-        futures = {pool.submit(render_pair, job): job for job in todo}
+        futures = {pool.submit(render_pair, job): job for job in jobs}
         for future in as_completed(futures):
             yield futures[future], future.result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _exit_with_parent(parent: int) -> None:
-    """A worker whose parent was killed must not live on."""
+def _begin_worker(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and do not outlive it when it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
         while os.getppid() == parent:

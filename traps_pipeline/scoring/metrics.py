@@ -41,7 +41,7 @@ def pecs_of(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
     return acc * np.maximum(j, 0.0)
 
 
-def cell_metrics(verdicts: pd.DataFrame, benchmark_version: str) -> pd.DataFrame:
+def cell_metrics(verdicts: pd.DataFrame) -> pd.DataFrame:
     """METRICS rows of one dataset, from its VERDICTS rows (any models, regimes and runs).
 
     One row a cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x` (the control's answer, both sides of
@@ -57,7 +57,7 @@ def cell_metrics(verdicts: pd.DataFrame, benchmark_version: str) -> pd.DataFrame
     sums["n_pairs"] = groups["pair_id"].nunique()
     sums["n_missing"] = 2 * sums["n_pairs"] - sums["complete"]
     sums["epoch"] = groups["epoch"].agg(joined_epochs)
-    sums["benchmark_version"] = benchmark_version
+    sums["benchmark_version"] = groups["benchmark_version"].agg(lambda versions: " + ".join(sorted(set(versions))))
     return sums.assign(**_figures(sums)).reset_index().loc[:, [c.name for c in METRICS.columns]]
 
 
@@ -76,7 +76,7 @@ def _scoped(verdicts: pd.DataFrame) -> pd.DataFrame:
         n_refused=verdicts["outcome"].eq("refused").astype("int64"),
         n_empty=verdicts["outcome"].eq("empty").astype("int64"),
     )
-    items = pd.concat([verdicts[[*CELL, "pair_id", "epoch"]], flags], axis=1)
+    items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]
     scopes += [prefix + ":" + verdicts[column].astype("str") for prefix, column in SCOPED_BY.items()]
     return pd.concat([items.assign(scope=scope) for scope in scopes], ignore_index=True)

@@ -27,6 +27,10 @@ SYNC_ROWS, SYNC_SECONDS = 100, 0.5
 LOCK_POLL_SECONDS = 0.1
 
 
+class LockGivenUp(Exception):
+    """Waiting for a lock was stopped."""
+
+
 @dataclass
 class Known:
     """What a ledger holds for one evaluation: the newest row of each key, and torn last lines (file:line)."""
@@ -75,8 +79,13 @@ class Ledger:
             writer.close()
 
     @asynccontextmanager
-    async def lock(self, evaluation: str, waiting: Callable[[str], None]) -> AsyncIterator[None]:
-        """Hold the evaluation's lock; while another process has it, wait and say once who holds it."""
+    async def lock(
+        self, evaluation: str, waiting: Callable[[str], None], give_up: Callable[[], bool] = lambda: False
+    ) -> AsyncIterator[None]:
+        """Hold the evaluation's lock; while another process has it, wait and say once who holds it.
+
+        Raises LockGivenUp when `give_up` says so while waiting.
+        """
         path = self.root / "locks" / f"{self.kind}-{evaluation}.lock"
         with _writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -93,6 +102,8 @@ class Ledger:
                             f"{self.kind} of {evaluation} are being asked by {_holder(path)}; waiting for it to finish"
                         )
                         told = True
+                    if give_up():
+                        raise LockGivenUp(evaluation) from None
                     await asyncio.sleep(LOCK_POLL_SECONDS)
             with _writing(path):
                 os.ftruncate(descriptor, 0)

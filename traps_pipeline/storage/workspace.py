@@ -19,6 +19,19 @@ FORMAT = 1
 VARIABLE = "TRAPS_WORKSPACE"
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a small file whole or not at all. Raises TrapsError naming it."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise TrapsError(f"{path}: cannot be written ({error.strerror}); free some space and run again") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
 class Study(BaseModel):
     """`study.yaml`: the benchmark, its subset, the panel and the budget of everything in the workspace.
 
@@ -71,10 +84,7 @@ class Workspace:
             (root / folder).mkdir(parents=True, exist_ok=True)
         workspace = cls(root, study)
         workspace._link_dagster_yaml()
-        text = yaml.safe_dump(study.model_dump(exclude_none=True), sort_keys=False)
-        part = root / f".study.yaml.{os.getpid()}.part"
-        part.write_text(text, encoding="utf-8")
-        part.replace(root / "study.yaml")
+        write_text(root / "study.yaml", yaml.safe_dump(study.model_dump(exclude_none=True), sort_keys=False))
         return workspace
 
     @classmethod
