@@ -13,7 +13,7 @@ demo: setup ## leaderboard of eight reference models on 32 scenarios, no key nee
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
 
 test: test-packages setup lint ## lint, types and all tests, the slow ones too
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 ui: setup ## Dagster's web server and daemon on 127.0.0.1:3000
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo

@@ -14,7 +14,7 @@ from tests.conftest import EXPERIMENT, Checkout
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, METRICS, RESPONSES, SCENE_SPECS, TABLES, VIDEOS
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("corrections")]
+pytestmark = pytest.mark.slow
 EVALUATIONS = 3 * 2 * 1  # models x regimes x runs of the small study
 
 # Dagster's own verdict on every partition, by the resolver behind its UI.
@@ -116,9 +116,9 @@ def test_dagster_shows_exactly_the_touched_partitions_stale_stage_by_stage(study
     materialize(study, "videos", "hidden")
     materialize(study, "items", "occlusion", "occlusion_ill_posed")
     touched = cells("occlusion", "occlusion_ill_posed")
-    # Votes and verdicts are made from items as well as from responses.
+    # Votes, verdicts and metrics are made from items as well as from what is before them.
     stale = [f"{stage}/{cell}" for stage in ("responses", "verdicts", "votes") for cell in touched]
-    assert stale_in_dagster(study) == sorted(stale)
+    assert stale_in_dagster(study) == sorted([*stale, "metrics/occlusion", "metrics/occlusion_ill_posed"])
     run = study.traps("run", EXPERIMENT)
     assert run.counts() == {"answers": 3 * EVALUATIONS, "votes": 15 * EVALUATIONS, "frames": 0}
     assert stale_in_dagster(study) == []
@@ -157,11 +157,15 @@ def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> N
 
 
 def test_a_discarded_scenario_leaves_every_table_and_keeps_its_answers(study: Checkout) -> None:
-    rows = len(study.ledger_rows("answers"))
+    rows = study.ledger_rows("answers")
     study.correct("tumbling_dice-0003", action="discard")
     run = study.traps("run", EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts()["frames"] == 0
+    before = {row["key"] for row in rows}
+    asked = [row for row in study.ledger_rows("answers") if row["key"] not in before]
+    # Nothing is asked again but `prior`, and that where the commonest answer of the dice changed with the scenario.
+    assert {row["components"]["participant"] for row in asked} <= {"prior"}
     tables = Workspace.open(study.workspace).tables
     for table in TABLES.values():
         frame = tables.read_all(table)
@@ -170,23 +174,35 @@ def test_a_discarded_scenario_leaves_every_table_and_keeps_its_answers(study: Ch
                 assert not frame[column].str.contains("tumbling_dice-0003").any(), (table.name, column)
     cells = tables.read_all(METRICS, dataset="chaotic").query("scope == 'all'")
     assert (cells["n_pairs"] == 5).all()
-    assert len(study.ledger_rows("answers")) >= rows
+    assert before <= {row["key"] for row in study.ledger_rows("answers")}
     assert "stay in the ledger" in study.traps("why", "chaotic:tumbling_dice-0003:void").out
 
 
-def test_an_added_scenario_joins_a_study_of_the_whole_benchmark(study: Checkout, tmp_path: Path) -> None:
+def whole_benchmark(study: Checkout, folder: Path) -> Checkout:
+    """A study of all released occlusion scenarios in the same checkout; the small study's clips serve it."""
+    (folder / "whole.yaml").write_text("name: whole\nmodels: [oracle]\nregimes: [standard]\ndatasets: [occlusion]\n")
+    shutil.copytree(study.workspace / "clips", folder / "whole" / "clips")
+    return Checkout(study.root, folder / "whole")
+
+
+def test_an_added_scenario_joins_and_a_copy_is_told_by_every_run_until_it_is_gone(
+    study: Checkout, demo: Checkout, tmp_path: Path
+) -> None:
     params = json.loads(_released(study, "hidden_race-0001"))["params"]
-    params["azimuth_deg"] += 3.0  # an exact copy would be caught: no two clips may show the same frames
     study.correct("hidden_race-9001", action="add", family="hidden_race", params=params)
-    experiment = tmp_path / "whole.yaml"
-    experiment.write_text("name: whole\nmodels: [oracle]\nregimes: [standard]\ndatasets: [occlusion]\n")
-    fresh = Checkout(study.root, tmp_path / "whole")
-    # The demo's clips serve: a clip's name is its content, so only the added pair is drawn.
-    shutil.copytree(study.workspace / "clips", fresh.workspace / "clips")
-    run = fresh.traps("run", experiment)
+    shutil.rmtree(study.workspace / "clips")
+    shutil.copytree(demo.workspace / "clips", study.workspace / "clips")
+    whole = whole_benchmark(study, tmp_path)
+    for _ in range(2):  # the second run finds everything fresh, and still says so
+        run = whole.traps("run", tmp_path / "whole.yaml")
+        assert run.code == 1
+        assert "check clips_distinct of videos/hidden does not pass" in run.err
+    assert len(Workspace.open(whole.workspace).tables.read_all(RESPONSES)) == 2 * 17
+    assert "check clips_distinct of videos hidden does not pass" in whole.traps("status").out
+    study.correct("hidden_race-9001", params={"azimuth_deg": params["azimuth_deg"] + 3.0})
+    run = whole.traps("run", tmp_path / "whole.yaml")
     assert run.code == 0, run.err
     assert run.counts()["frames"] == 100
-    assert len(Workspace.open(fresh.workspace).tables.read_all(RESPONSES)) == 2 * 17
 
 
 def _released(study: Checkout, scenario_id: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -13,12 +14,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.conftest import Checkout
+from tests.conftest import EXPERIMENT, Checkout
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import TABLES, VOLATILE
 
 ONE_REGIME = "tests/experiments/one_regime.yaml"
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("crashes")]
+pytestmark = pytest.mark.slow
 ANSWERS, VOTES = 1024, 4608  # 8 models x 1 regime x 128 items; 4.5 votes an item
 
 
@@ -76,22 +77,43 @@ def test_a_kill_while_voting_leaves_the_same_tables(unasked: Checkout, one_regim
 
 
 def test_two_runs_that_want_the_same_keys_ask_each_once(unasked: Checkout) -> None:
-    cell_range = ("chaotic|oracle__standard__run1", "occlusion_ill_posed|prior__json__run1")
-    command = (sys.executable, "-m", "dagster", "asset", "materialize", "-m", "traps_pipeline.definitions")
     by_dagster = unasked.start(
-        *command,
-        "--select",
-        "responses",
-        "--partition-range",
-        "occlusion|oracle__standard__run1...chaotic_ill_posed|random-50__json__run1",
+        *(sys.executable, "-m", "dagster", "asset", "materialize", "-m", "traps_pipeline.definitions"),
+        *("--select", "responses", "--partition-range"),
+        "occlusion|oracle__standard__run1...chaotic_ill_posed|prior__json__run1",
     )
+    wait_for_rows(unasked, by_dagster, "answers", 1)
     by_traps = start(unasked)
-    for process in (by_dagster, by_traps):
-        _, err = process.communicate(timeout=300)
-        assert process.returncode == 0, err[-3000:]
+    out, err = by_traps.communicate(timeout=300)
+    assert by_traps.returncode == 0, err
+    asked, cached = map(int, re.search(r"(\d+) answers asked \((\d+) from the ledger", out).groups())  # type: ignore[union-attr]
+    assert asked + cached == ANSWERS
+    assert cached > 0  # the other run's answers were used
+    _, err = by_dagster.communicate(timeout=300)
+    assert by_dagster.returncode == 0, err[-3000:]
     keys = [row["key"] for row in unasked.ledger_rows("answers")]
-    assert len(keys) == len(set(keys))
-    assert len(keys) >= ANSWERS, cell_range
+    assert len(keys) == len(set(keys)) > ANSWERS
+
+
+def test_a_kill_while_rendering_leaves_whole_clips_that_are_not_drawn_again(study: Checkout) -> None:
+    clips = list((study.workspace / "clips").glob("domino_chain-*/*"))
+    for path in clips:
+        path.unlink()
+    process = study.start(sys.executable, "-m", "traps_pipeline.cli", "run", EXPERIMENT)
+    while not list((study.workspace / "clips").glob("domino_chain-*/*.json")):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    time.sleep(1.5)  # a worker looks for its parent every second
+    done = len(list((study.workspace / "clips").glob("domino_chain-*/*.json")))
+    assert 0 < done < 6
+    finished = study.traps("run", EXPERIMENT)
+    assert finished.code == 0, finished.err
+    assert finished.counts()["frames"] == 50 * (6 - done)
+    assert sorted(
+        path for path in (study.workspace / "clips").glob("domino_chain-*/*") if "part" not in path.name
+    ) == sorted(clips)
 
 
 def test_ctrl_c_drains_and_the_same_command_goes_on(unasked: Checkout, one_regime: Checkout) -> None:

@@ -9,7 +9,7 @@ from traps_pipeline.scoring.leaderboard import pooled_j
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, LEADERBOARD, METRICS, TABLES, VERDICTS, VIDEOS
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("demo")]
+pytestmark = pytest.mark.slow
 DEGENERATE = ("always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle")
 
 

@@ -12,8 +12,10 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished, forget_answers, make_checkout
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import METRICS, RESPONSES
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("errors")]
+pytestmark = pytest.mark.slow
 
 
 def assert_refused(finished: Finished, *words: str) -> None:
@@ -164,6 +166,31 @@ def test_a_full_disk_ends_in_a_sentence_and_the_same_command_goes_on(study: Chec
     rows = study.ledger_rows("answers")
     assert len({row["key"] for row in rows}) == len(rows) == 288  # 3 models x 2 regimes x 48 items
     assert not list(study.workspace.rglob("*.part"))
+
+
+def test_a_history_that_cannot_be_written_ends_in_a_sentence_too(study: Checkout, small_disk: Path) -> None:
+    (small_disk / "filler").write_bytes(b"0" * 700_000)
+    full = Checkout(study.root, small_disk / "study")
+    assert_refused(full.traps("run", EXPERIMENT), str(small_disk), "free some space")
+
+
+def test_failed_calls_are_told_counted_as_missing_and_asked_again(study: Checkout, tmp_path: Path) -> None:
+    text = (study.root / EXPERIMENT).read_text().replace("[oracle, random-50, prior]", "[flaky]")
+    (tmp_path / "flaky.yaml").write_text(text)
+    run = study.traps("run", tmp_path / "flaky.yaml")
+    assert run.code == 1
+    assert "calls failed" in run.err
+    rows = Workspace.open(study.workspace).tables.read_all(RESPONSES, model="flaky")
+    outcomes = rows["outcome"].value_counts().to_dict()
+    assert set(outcomes) == {"answer", "empty", "refused", "error"}
+    assert rows.loc[rows["outcome"] != "answer", "text"].isna().all()  # no failure is a text
+    cells = Workspace.open(study.workspace).tables.read_all(METRICS).query("model == 'flaky' and scope == 'all'")
+    assert cells["n_missing"].sum() == outcomes["empty"] + outcomes["refused"] + outcomes["error"]
+    assert cells["n_refused"].sum() == outcomes["refused"]
+    assert (cells["acc"] == 1.0).all()  # an oracle behind a bad provider: what is missing is not wrong
+    again = study.traps("run", tmp_path / "flaky.yaml")
+    assert again.code == 1
+    assert again.counts()["answers"] == outcomes["error"]  # those that failed, and no other
 
 
 def test_a_fresh_checkout_without_assets_says_what_it_is(tmp_path: Path) -> None:

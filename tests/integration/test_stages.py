@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -12,7 +13,7 @@ from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers
 from traps_pipeline.lineage import PARTITIONED_BY, STAGES, Lineage
 from traps_pipeline.storage.workspace import Workspace
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("stages")]
+pytestmark = pytest.mark.slow
 CELL = "occlusion|oracle__standard__run1"
 ONE_KEY = {"category": "dominoes", "dataset": "occlusion", "cell": CELL}
 RANGE = "occlusion|oracle__standard__run1...occlusion_ill_posed|always-abstain__json__run1"
@@ -57,6 +58,21 @@ def test_a_missing_upstream_exits_with_one_and_names_it(study: Checkout) -> None
     finished = materialize(study, "votes", "--partition", CELL)
     assert finished.code == 1
     assert "materialize responses for this partition first" in finished.out + finished.err
+
+
+def test_several_stages_in_one_run_are_refused_instead_of_skipped(study: Checkout) -> None:
+    finished = materialize(study, "scene_specs,videos", "--partition", "dominoes")
+    assert finished.code == 1
+    assert "one stage a run, not scene_specs, videos" in finished.out + finished.err
+
+
+def test_a_history_of_another_study_is_refused(study: Checkout, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    command = [sys.executable, "-m", "dagster", "asset", "materialize", "-m", "traps_pipeline.definitions"]
+    other = f"DAGSTER_HOME={tmp_path / 'elsewhere'}"
+    finished = study.run("env", other, *command, "--select", "items", "--partition", "occlusion")
+    assert finished.code == 1
+    assert "is not of the workspace" in finished.out + finished.err
 
 
 def test_a_failing_step_exits_with_one_and_names_the_file(study: Checkout) -> None:

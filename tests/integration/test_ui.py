@@ -22,7 +22,7 @@ from traps_pipeline.lineage import partition_of
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import TABLES
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("ui")]
+pytestmark = pytest.mark.slow
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 QUIET = (
     "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking --disable-sync "

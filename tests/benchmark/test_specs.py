@@ -1,0 +1,69 @@
+"""Corrected parameters: which words a scene keeps, and that it is simulated once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from traps_pipeline.benchmark.corrections import Correction, Scenario, fold
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.benchmark.specs import resolve_scenario
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.workspace import Study, Workspace
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    return Workspace.create(tmp_path, Study())
+
+
+def corrected(*changes: dict) -> Scenario:
+    decisions = [
+        Correction.model_validate({"action": "correct", "who": "t", "when": "2026-11-21", "why": "t", **change})
+        for change in changes
+    ]
+    folded = fold(load_released(), [(f"review.jsonl:{n}", decision) for n, decision in enumerate(decisions, 1)])
+    return folded[decisions[0].scenario_id]
+
+
+@pytest.mark.parametrize("scenario_id", ["hidden_race-0003", "domino_chain-0002"])
+def test_another_camera_keeps_every_word(workspace: Workspace, scenario_id: str) -> None:
+    released = load_released()[scenario_id]
+    azimuth = released.params["azimuth_deg"] + 2.0
+    spec = resolve_scenario(workspace, corrected({"scenario_id": scenario_id, "params": {"azimuth_deg": azimuth}})).spec
+    words = ("question", "labels", "aliases", "ill_posed_question", "answerable_question", "ground_truth")
+    assert {name: getattr(spec, name) for name in words} == {name: getattr(released, name) for name in words}
+    assert spec.scene_hash != released.scene_hash
+
+
+def test_another_colour_brings_the_words_for_it(workspace: Workspace) -> None:
+    released = load_released()["domino_chain-0001"]
+    old = released.params["last_colour"]
+    new = next(c for c in ("red", "green", "blue") if c not in released.params.values())
+    assert old in released.question
+    change = {"scenario_id": "domino_chain-0001", "params": {"last_colour": new}}
+    spec = resolve_scenario(workspace, corrected(change)).spec
+    assert new in spec.question
+    assert old not in spec.question
+
+
+def test_words_corrected_later_find_the_scene_that_was_simulated(workspace: Workspace) -> None:
+    azimuth = load_released()["hidden_race-0001"].params["azimuth_deg"] + 2.0
+    scene = {"scenario_id": "hidden_race-0001", "params": {"azimuth_deg": azimuth}}
+    first = resolve_scenario(workspace, corrected(scene))
+    simulated = {path: path.stat().st_mtime_ns for path in workspace.trajectories.iterdir()}
+    words = {"scenario_id": "hidden_race-0001", "question": "Which one leads when the balls leave the tunnel?"}
+    second = resolve_scenario(workspace, corrected(scene, words))
+    assert second.spec.question == words["question"]
+    assert second.spec.scene_hash == first.spec.scene_hash
+    assert {path: path.stat().st_mtime_ns for path in workspace.trajectories.iterdir()} == simulated
+
+
+def test_an_answer_that_the_simulation_contradicts_is_refused(workspace: Workspace) -> None:
+    released = load_released()["domino_chain-0001"]
+    wrong = next(label for label in released.labels if label != released.ground_truth)
+    azimuth = released.params["azimuth_deg"] + 2.0
+    change = {"scenario_id": "domino_chain-0001", "params": {"azimuth_deg": azimuth}, "answer": wrong}
+    with pytest.raises(TrapsError, match=r"review\.jsonl:1: .* the correction says"):
+        resolve_scenario(workspace, corrected(change))
