@@ -12,10 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.paths import RELEASED
+from traps_pipeline.scenes.camera import Camera
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip, decode, encode, frames_digest
+from traps_pipeline.scenes.kit import Physics
+from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.render import Renderer
+from traps_pipeline.scenes.resolve import compile_scene
+from traps_pipeline.scenes.spec import load_trajectory
 
 
 def frames(count: int = 20, height: int = 120, width: int = 160) -> list[np.ndarray]:
@@ -125,3 +133,19 @@ def test_a_disk_that_is_really_full_is_named_too(tiny_disk: Path) -> None:
     with pytest.raises(TrapsError, match=r"clip\.mp4: cannot be written .*free some space"):
         encode(noise, tiny_disk / "clip.mp4", 10)
     assert list(tiny_disk.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_real_clip_is_encoded_to_the_same_bytes_every_time(tmp_path: Path) -> None:
+    """With x264's macroblock tree on, one encoding in about twenty differed: a clip's digest is part of ledger keys."""
+    spec = load_released()["tumbling_dice-0001"]
+    family, physics = get_family(spec.family), Physics(**spec.physics)
+    model, _ = compile_scene(family, family.params_from(spec.params), physics)
+    qpos = load_trajectory(RELEASED / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
+    with Renderer(model, Camera.from_record(spec.camera)) as renderer:
+        frames = list(renderer.frames(qpos))
+    digests = set()
+    for _ in range(30):
+        encode(frames, tmp_path / "clip.mp4", physics.fps)
+        digests.add(file_digest(tmp_path / "clip.mp4"))
+    assert len(digests) == 1

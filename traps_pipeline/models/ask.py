@@ -326,4 +326,4 @@ class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
 
     def __exit__(self, *_: object) -> None:
         if self._main:
-            signal.signal(signal.SIGINT, self._former)
+            signal.signal(signal.SIGINT, self._former or signal.SIG_DFL)
