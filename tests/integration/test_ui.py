@@ -96,9 +96,11 @@ def materialize(page: Page, server: str, asset: str, *choices: str) -> None:
         return
     for choice in choices:
         page.get_by_text("Select a partition or create one").first.click()
-        page.get_by_placeholder("Filter partitions").fill(choice)
+        box = page.get_by_placeholder("Filter partitions")
+        box.fill(choice)
         page.get_by_text(choice, exact=True).locator("visible=true").last.click()
         page.keyboard.press("Escape")
+        expect(box).to_have_count(0)  # the next box opens only once this one is gone
     page.get_by_role("button", name="Launch").last.click()
     expect(page.get_by_role("button", name="Launch")).to_have_count(0)
 
