@@ -6,7 +6,6 @@ import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,20 +58,6 @@ def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
         metadata = {"Date": None} if kind == "svg" else {"Software": None}
         figure.savefig(stream, format=kind, metadata=metadata)  # pyright: ignore[reportArgumentType]
     return stream.getvalue()
-
-
-def save_figure(figure: Figure, stem: Path) -> tuple[Path, Path]:
-    """Write `<stem>.png` and `<stem>.svg`; returns their paths."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    paths = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
-    for path, kind in zip(paths, ("png", "svg"), strict=True):
-        path.write_bytes(figure_bytes(figure, kind))
-    return paths
-
-
-def pecs_landscape(board: pd.DataFrame) -> bytes:
-    """`landscape_figure` as PNG."""
-    return figure_bytes(landscape_figure(board))
 
 
 def landscape_figure(board: pd.DataFrame) -> Figure:
