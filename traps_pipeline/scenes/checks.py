@@ -1,12 +1,26 @@
-"""Evidence that a panel hides: pixel counts, and an ablation that catches shadows and reflections as well."""
+"""Pixel evidence: what is seen of a geom, what a panel hides, whether two worlds give one video."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from traps_pipeline.scenes.render import Renderer
+
+SAMPLED_FPS = 5  # models are shown this rate (`benchmark.md` section 3)
+
+
+def last_sampled(n_frames: int, fps: int, count: int = 3) -> list[int]:
+    """Indices of the last frames that the 5 FPS sample shows of a clip."""
+    return list(range(0, n_frames, fps // SAMPLED_FPS))[-count:]
+
+
+def least_visible(renderer: Renderer, qpos: np.ndarray, groups: Sequence[tuple[tuple[str, ...], float]]) -> list[float]:
+    """The least number of pixels that each group of geoms has in any of the given frames of the control."""
+    geoms = sorted({name for names, _ in groups for name in names})
+    counts = renderer.visible_pixels(qpos, geoms)
+    return [float(counts[:, [geoms.index(n) for n in names]].sum(axis=1).min()) for names, _ in groups]
 
 
 def hidden_from(
@@ -26,5 +40,15 @@ def ablation_pixels(renderer: Renderer, qpos: np.ndarray, geoms: Sequence[str]) 
     """How many void pixels change, over the given frames, when the geoms are taken away. 0 proves that nothing of
     them, shadow included, reaches the eye."""
     with_them = renderer.frames(qpos, panel=True)
-    without = renderer.frames(qpos, panel=True, without=geoms)
-    return sum(int((a != b).any(axis=2).sum()) for a, b in zip(with_them, without, strict=True))
+    return differing_pixels(with_them, renderer.frames(qpos, panel=True, without=geoms))[0]
+
+
+def differing_pixels(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> tuple[int, int]:
+    """Over all frames of two worlds: how many pixels differ, and the largest difference of a channel (0-255)."""
+    pixels, largest = 0, 0
+    for a, b in zip(frames, others, strict=True):
+        if not np.array_equal(a, b):
+            difference = np.abs(a.astype(np.int16) - b)
+            pixels += int(difference.any(axis=2).sum())
+            largest = max(largest, int(difference.max()))
+    return pixels, largest

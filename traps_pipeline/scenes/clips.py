@@ -24,9 +24,9 @@ from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import Camera, Panel
 from traps_pipeline.scenes.encode import DamagedClip, encode, frames_digest
 from traps_pipeline.scenes.kit import Physics
+from traps_pipeline.scenes.outcome import compile_scene, decisive_geoms
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.resolve import compile_scene, decisive_geoms
 from traps_pipeline.scenes.spec import SceneSpec
 
 SCENES_A_WORKER = 100  # GL drivers leak: a worker draws so many, then another takes over

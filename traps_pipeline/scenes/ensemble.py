@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -26,11 +26,15 @@ EARLIEST_CUT_S = 1.0
 MAX_DEVIATION_PX = 0.5
 MIN_ACCEPTED = 64
 TRIED = 128
+BATCHES = (
+    24,
+    80,
+    TRIED,
+)  # rollouts tried in all after each batch; the next batch runs only if it can change the verdict
 TOP_SHARE = 0.65
 MIN_ENTROPY_BITS = 1.0
 MIN_ENTROPY_THREE_LABELS_BITS = 0.9
 HELD_S = 0.6  # a rollout's label must have stood this long at the end, like the control's
-SCOUTS = 24  # rollouts that decide whether the others are worth their time
 HOPELESS_SHARE = 0.9  # of the scouts; a scene whose true top share is 65 % looks like that less than once in 300 times
 THREADS = 2
 
@@ -65,10 +69,14 @@ class Cut:
 
 @dataclass(frozen=True)
 class Rollout:
-    """One perturbed future. parted: first frame that looks different from the control (n_frames if none does)."""
+    """One perturbed future. parted: first frame that looks different from the control (n_frames if none does).
+
+    qpos (F, nq) float32: its trajectory, None if it parted before the earliest cut or diverged.
+    """
 
     parted: int
     label: str | None
+    qpos: np.ndarray | None = None
 
 
 def entropy_bits(counts: Mapping[str, int]) -> float:
@@ -84,47 +92,80 @@ def earliest_cut(physics: Physics) -> int:
 
 def choose_cut(
     family: Family, params: Any, physics: Physics, camera: Camera, qpos: np.ndarray, commit_frame: int, seed: int
-) -> Cut | None:
-    """The latest cut from 1.0 s on and before commitment that leaves the outcome open, or None if there is none.
+) -> tuple[Cut, Rollout] | None:
+    """The latest cut from 1.0 s on and before commitment that leaves the outcome open, and a twin; None without one.
 
-    qpos (F, nq): the control. Of 128 perturbed starts at least 64 must be accepted, with an outcome entropy of at least
-    1.0 bit (0.9 for families of three labels) and no outcome above 65 %.
+    qpos (F, nq): the control. Of at most 128 perturbed starts at least 64 must be accepted, with an outcome entropy of
+    at least 1.0 bit (0.9 for families of three labels) and no outcome above 65 %. The twin is an accepted rollout that
+    ends otherwise than the control does.
     """
     first = earliest_cut(physics)
     if commit_frame < first:
         return None
+    bound = bound_bits(family, params)
+    for rollouts in futures(family, params, physics, camera, qpos, seed):
+        if len(rollouts) == BATCHES[0]:
+            if _hopeless(rollouts, first):
+                return None
+            continue
+        cut = latest_open_cut(rollouts, range(first, commit_frame + 1), bound, family.perturbation)
+        if cut is not None:
+            model = family.build(params, physics).spec.compile()
+            truth = family.readings(replay(model, qpos, physics), params)[-1]
+            return cut, twin_of(rollouts, cut.frame, truth)
+    return None
+
+
+def bound_bits(family: Family, params: Any) -> float:
+    """The least entropy (bits) that a cut must leave open: 1.0, or 0.9 where there are three outcomes."""
+    labels = len(family.word(params, np.random.default_rng(0)).labels)
+    return MIN_ENTROPY_THREE_LABELS_BITS if labels == 3 else MIN_ENTROPY_BITS
+
+
+def futures(
+    family: Family, params: Any, physics: Physics, camera: Camera, qpos: np.ndarray, seed: int
+) -> Iterator[list[Rollout]]:
+    """Rollouts of perturbed starts of a control qpos (F, nq): all so far after each batch of `BATCHES`."""
     scene = family.build(params, physics)
     model = scene.spec.compile()
     silhouette = _Silhouette(model, camera)
     shown = np.stack([silhouette.pixels(row) for row in qpos])
     velocity = initial_velocity(model, scene.velocity)
     starts = _perturbed_starts(model, np.asarray(qpos[0], float), family.perturbation, seed)
+    first = earliest_cut(physics)
 
     def roll(start: np.ndarray) -> Rollout:
         return _roll(family, params, physics, model, start, velocity, silhouette, shown, first)
 
+    rollouts: list[Rollout] = []
     with ThreadPoolExecutor(THREADS) as pool:  # mj_step releases the GIL
-        rollouts = list(pool.map(roll, starts[:SCOUTS]))
-        if _hopeless(rollouts, first):
-            return None
-        rollouts += pool.map(roll, starts[SCOUTS:])
-    labels = len(family.word(params, np.random.default_rng(0)).labels)
-    bound = MIN_ENTROPY_THREE_LABELS_BITS if labels == 3 else MIN_ENTROPY_BITS
-    return latest_open_cut(rollouts, range(first, commit_frame + 1), bound, family.perturbation)
+        for tried in BATCHES:
+            rollouts += pool.map(roll, starts[len(rollouts) : tried])
+            yield rollouts
 
 
 def latest_open_cut(rollouts: Sequence[Rollout], frames: range, bound_bits: float, perturbation: float) -> Cut | None:
     """The last of the frames at which the accepted rollouts leave the outcome open, or None."""
-    for frame in reversed(frames):
-        alike = [r for r in rollouts if r.parted >= frame]
-        counts = Counter(r.label for r in alike if r.label is not None)
-        accepted = counts.total()
-        if accepted < MIN_ACCEPTED:
-            continue
-        entropy, top = entropy_bits(counts), max(counts.values()) / accepted
-        if entropy >= bound_bits and top <= TOP_SHARE:
-            return Cut(frame, entropy, top, accepted, len(rollouts), len(alike) - accepted, perturbation)
-    return None
+    cuts = (open_at(rollouts, frame, bound_bits, perturbation) for frame in reversed(frames))
+    return next((cut for cut in cuts if cut is not None), None)
+
+
+def open_at(rollouts: Sequence[Rollout], frame: int, bound_bits: float, perturbation: float) -> Cut | None:
+    """The cut at one frame if it leaves the outcome open, else None."""
+    alike = [r for r in rollouts if r.parted >= frame]
+    counts = Counter(r.label for r in alike if r.label is not None)
+    accepted = counts.total()
+    if accepted < MIN_ACCEPTED:
+        return None
+    entropy, top = entropy_bits(counts), max(counts.values()) / accepted
+    if entropy < bound_bits or top > TOP_SHARE:
+        return None
+    return Cut(frame, entropy, top, accepted, len(rollouts), len(alike) - accepted, perturbation)
+
+
+def twin_of(rollouts: Sequence[Rollout], frame: int, truth: str | None) -> Rollout:
+    """The first accepted rollout at a cut that ends otherwise than the truth: the same clip, another answer."""
+    return next(r for r in rollouts if r.parted >= frame and r.label not in (None, truth))
 
 
 def _hopeless(scouts: Sequence[Rollout], first: int) -> bool:
@@ -172,7 +213,8 @@ def _roll(
         mujoco.mj_step(model, data, physics.substeps)
     if not np.isfinite(frames).all():
         return Rollout(parted, None)
-    return Rollout(parted, _settled(family.readings(replay(model, frames, physics), params), physics))
+    label = _settled(family.readings(replay(model, frames, physics), params), physics)
+    return Rollout(parted, label, frames.astype(np.float32))
 
 
 def _settled(labels: Sequence[str | None], physics: Physics) -> str | None:

@@ -100,6 +100,19 @@ class View:
     fovy_deg: float = 35.0
 
 
+@dataclass(frozen=True)
+class Inventory:
+    """What a viewer can name, which ill-posed questions are made from and checked against (`wording.py`).
+
+    colours: every colour in view. objects: every noun, singular ('ball', 'ramp'). things: phrases that single one out
+    ('red ball', 'wooden ramp'), which occlusion scenes are asked about; at least three of them.
+    """
+
+    colours: tuple[str, ...] = ()
+    objects: tuple[str, ...] = ()
+    things: tuple[str, ...] = ()
+
+
 @dataclass
 class Scene:
     """A built scene: the model description and the roles its parts play.
@@ -109,7 +122,7 @@ class Scene:
     cover: what the cover panel must hide: everything decisive from hiding on, and the hidden element (occlusion).
     stage: boxes that must lie in frame besides everything that moves (the outcome zone above all).
     velocity: initial velocity of free bodies: linear (m/s, world) and angular (rad/s, body).
-    inventory: what a viewer can name: colours and objects, for ill-posed questions to be checked against.
+    inventory: what a viewer can name.
     """
 
     spec: mujoco.MjSpec
@@ -119,7 +132,7 @@ class Scene:
     hidden: tuple[str, ...] = ()
     cover: Box | None = None
     velocity: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    inventory: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    inventory: Inventory = Inventory()
 
 
 @dataclass(frozen=True)
@@ -138,7 +151,6 @@ class Wording:
     question: str
     labels: tuple[str, ...]
     aliases: Mapping[str, str]
-    ill_posed_question: str
     answerable_question: AnswerableQuestion
 
 
@@ -152,6 +164,11 @@ class Family:
     readings(motion, params): for every frame the label that holds then, or None while undecided.
     margin(motion, params): distance (m) of the end state from the nearest other outcome.
     word(params, rng): the question and its companions.
+    questions: the templates that `word` fills; no other family has the same.
+    observe(frames, question): the answer of one who sees only the 5 FPS frames (N, 360, 480, 3) RGB and the question;
+        None if the decisive thing is not to be seen.
+    legible(motion, params): groups of geoms that must be seen at the end and the least pixels of each group; by default
+        each decisive body's geoms and 150.
     twins(params): the same scene with only the hidden element changed, so that the outcome may differ (occlusion).
     """
 
@@ -166,6 +183,9 @@ class Family:
     readings: Callable[[Motion, Any], list[str | None]]
     margin: Callable[[Motion, Any], float]
     word: Callable[[Any, np.random.Generator], Wording]
+    questions: tuple[str, ...] = ()
+    observe: Callable[[np.ndarray, str], str | None] | None = None
+    legible: Callable[[Motion, Any], Sequence[tuple[tuple[str, ...], float]]] | None = None
     physics: Physics = Physics()
     min_margin_m: float = 0.005
     twins: Callable[[Any], Sequence[Any]] | None = None

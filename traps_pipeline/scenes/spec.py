@@ -23,6 +23,19 @@ class Answerable(BaseModel):
     answer: str
 
 
+class Twin(BaseModel):
+    """Another world behind the same void: what is changed, its outcome, the digest of its trajectory.
+
+    params: the whole scene with another hidden element (occlusion), or none: the same scene from the start that is the
+    first row of the twin's trajectory (chaotic).
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    params: dict[str, Any] | None
+    ground_truth: str
+    trajectory_sha256: str
+
+
 class SceneSpec(BaseModel):
     """One scenario, resolved: nothing about it is left to chance or to the code's defaults.
 
@@ -50,6 +63,7 @@ class SceneSpec(BaseModel):
     ill_posed_question: str = Field(min_length=1)
     answerable_question: Answerable
     trajectory_sha256: str
+    twin: Twin
     evidence: dict[str, Any]
 
     @model_validator(mode="after")
@@ -85,18 +99,20 @@ def trajectory_digest(qpos: np.ndarray) -> str:
     return hashlib.sha256(repr(values.shape).encode() + values.tobytes()).hexdigest()
 
 
-def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray) -> str:
-    """Write `<folder>/<scenario_id>.npz` (no pickle) and return its digest."""
+def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray, twin: np.ndarray) -> None:
+    """Write `<folder>/<scenario_id>.npz` (no pickle): the trajectory of a scenario and of its twin."""
     folder.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(folder / f"{scenario_id}.npz", qpos=np.ascontiguousarray(qpos, dtype="<f4"))
-    return trajectory_digest(qpos)
+    arrays = {"qpos": qpos, "twin": twin}
+    plain = {name: np.ascontiguousarray(values, dtype="<f4") for name, values in arrays.items()}
+    np.savez_compressed(folder / f"{scenario_id}.npz", allow_pickle=False, **plain)
 
 
-def load_trajectory(path: Path, sha256: str) -> np.ndarray:
-    """qpos at frame times (F, nq) float32. Raises ValueError naming the file when it is missing or altered."""
+def load_trajectory(path: Path, sha256: str, world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
+    """qpos at frame times (F, nq) float32 of the scenario or its twin. Raises ValueError naming a missing or altered
+    file."""
     try:
         with np.load(path, allow_pickle=False) as archive:
-            qpos = archive["qpos"]
+            qpos = archive[world]
     except FileNotFoundError:
         raise ValueError(f"{path}: no such trajectory; restore it from git or remove its record") from None
     except Exception as error:

@@ -17,6 +17,7 @@ from traps_pipeline.scenes.kit import (
     AnswerableQuestion,
     Box,
     Family,
+    Inventory,
     Physics,
     Scene,
     View,
@@ -146,10 +147,11 @@ def build(p: Params, physics: Physics) -> Scene:
         cover=Box(low, high),
         stage=(Box((ends[0], front, 0.0), (ends[1], back, (PLANK + 1.0) * h)),),
         velocity={"starter": _rolling(p)},
-        inventory={
-            "colours": (p.first_colour, p.row_colour, p.last_colour, p.ball_colour, p.plank_colour, "grey"),
-            "objects": ("domino", "ball", "plank", "post"),
-        },
+        inventory=Inventory(
+            (p.first_colour, p.row_colour, p.last_colour, p.ball_colour, p.plank_colour, "grey"),
+            ("domino", "ball", "plank", "post"),
+            (f"{p.first_colour} domino", f"{p.last_colour} domino", f"{p.ball_colour} ball", "plank"),
+        ),
     )
 
 
@@ -208,21 +210,10 @@ QUESTIONS = (
     "Does the last domino, the {last} one, get knocked over: yes or no?",
     "Is the {last} domino at the far end of the row knocked down in the end, yes or no?",
 )
-ILL_POSED = (
-    "How many grams does the {thing} weigh?",
-    "What is the temperature of the {thing} in degrees Celsius?",
-    "What did the {thing} cost?",
-    "Where will the {thing} be one hour after the clip?",
-    "How loud is the click when the {thing} is struck, in decibels?",
-    "In which year was the {thing} made?",
-    "What is the name of the person who put the {thing} there?",
-    "What is written on the underside of the {thing}?",
-)
 
 
 def word(p: Params, rng: np.random.Generator) -> Wording:
     """The last domino is named by its colour, which no other domino has."""
-    thing = str(rng.choice([f"{p.first_colour} domino", f"{p.last_colour} domino", f"{p.ball_colour} ball"]))
     return Wording(
         question=str(rng.choice(QUESTIONS)).format(last=p.last_colour),
         labels=("yes", "no"),
@@ -236,7 +227,6 @@ def word(p: Params, rng: np.random.Generator) -> Wording:
             "it stays standing": "no",
             "stays upright": "no",
         },
-        ill_posed_question=str(rng.choice(ILL_POSED)).format(thing=thing),
         answerable_question=_answerable(p, rng),
     )
 
@@ -267,6 +257,7 @@ FAMILY = Family(
     readings=readings,
     margin=margin,
     word=word,
+    questions=QUESTIONS,
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.03,
     twins=twins,

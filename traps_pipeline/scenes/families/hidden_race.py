@@ -16,6 +16,7 @@ from traps_pipeline.scenes.kit import (
     AnswerableQuestion,
     Box,
     Family,
+    Inventory,
     Physics,
     Scene,
     View,
@@ -149,10 +150,11 @@ def build(p: Params, physics: Physics) -> Scene:
         ),
         stage=(Box((ends[0], -side - wall, 0.0), (ends[1], side + wall, roof + wall)),),
         velocity={f"ball_{i}": _rolling(p, v) for i, v in enumerate(p.speeds_m_s)},
-        inventory={
-            "colours": (*p.colours, p.deck_colour, p.tunnel_colour),
-            "objects": ("ball", "tunnel", "tray", "lane"),
-        },
+        inventory=Inventory(
+            (*p.colours, p.deck_colour, p.tunnel_colour, p.tray_colour),
+            ("ball", "tunnel", "tray", "lane"),
+            (*(f"{c} ball" for c in p.colours), "tunnel", "tray"),
+        ),
     )
 
 
@@ -208,27 +210,15 @@ QUESTIONS = (
     "What colour is the first ball to come out of the tunnel: {choices}?",
     "Which colour leaves the tunnel first: {choices}?",
 )
-ILL_POSED = (
-    "How many grams does the {colour} ball weigh?",
-    "What is the temperature of the {colour} ball in degrees Celsius?",
-    "What did the {colour} ball cost?",
-    "Where will the {colour} ball be one hour after the race?",
-    "How loud is the {colour} ball when it enters the tunnel, in decibels?",
-    "In which year was the {colour} ball made?",
-    "What is the name of the person who rolled the {colour} ball?",
-    "Is the {colour} ball hollow or solid inside?",
-)
 
 
 def word(p: Params, rng: np.random.Generator) -> Wording:
     """The choices are the colours in the race, in random order."""
     choices = tuple(str(c) for c in rng.permutation(p.colours))
-    ill_posed = str(rng.choice(ILL_POSED)).format(colour=rng.choice(p.colours))
     return Wording(
         question=str(rng.choice(QUESTIONS)).format(choices=listed(choices)),
         labels=choices,
         aliases={form.format(c): c for c in choices for form in ("{} ball", "{} one", "{} ball comes out first")},
-        ill_posed_question=ill_posed,
         answerable_question=_answerable(p, rng),
     )
 
@@ -259,6 +249,7 @@ FAMILY = Family(
     readings=readings,
     margin=margin,
     word=word,
+    questions=QUESTIONS,
     min_margin_m=0.03,
     twins=twins,
 )

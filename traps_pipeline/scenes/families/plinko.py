@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from traps_pipeline.scenes.kit import (
-    COLOURS,
     AnswerableQuestion,
     Box,
     Family,
+    Inventory,
     Physics,
     Scene,
     View,
@@ -278,38 +278,12 @@ QUESTIONS = (
     "Which bucket is the {ball} ball in when it stops: {choices}?",
     "What is the number of the bucket that the {ball} ball ends up in: {choices}?",
 )
-ABSENT_COLOUR = (
-    "In which bucket does the {colour} ball stop?",
-    "How many pegs does the {colour} ball touch?",
-    "When does the {colour} ball reach the bottom?",
-    "Which bucket has the {colour} number on it?",
-    "Does the {colour} magnet pull the ball to the left or to the right?",
-)
-ABSENT_THING = (
-    "What material is the {thing} made of?",
-    "Which bucket does the {thing} land in?",
-    "How often does the ball hit the {thing}?",
-    "Is the {thing} to the left or to the right of bucket 3?",
-)
-NO_SUCH_QUANTITY = ("What is the weight of the colour {colour}?", "How loud is the colour {colour}, in decibels?")
-THINGS = (
-    "triangle",
-    "spring",
-    "trapdoor",
-    "windmill",
-    "pendulum",
-    "domino",
-    "dice cup",
-    "hammer",
-    "rubber duck",
-    "ladder",
-)
 
 
-def _inventory(p: Params) -> dict[str, tuple[str, ...]]:
+def _inventory(p: Params) -> Inventory:
     frame = {"black", "white"}  # frame, apron, digits
     colours = sorted({*p.ball_colours, p.board_colour, PEGS[p.board_colour], *frame})
-    return {"colours": tuple(colours), "objects": ("ball", "board", "peg", "bucket", "number", "wall")}
+    return Inventory(tuple(colours), ("ball", "board", "peg", "bucket", "number", "wall"))
 
 
 def word(p: Params, rng: np.random.Generator) -> Wording:
@@ -326,13 +300,10 @@ def word(p: Params, rng: np.random.Generator) -> Wording:
             f"bucket number {label}",
         )
         aliases |= dict.fromkeys(forms, label)
-    absent = [c for c in COLOURS if c not in _inventory(p)["colours"] and c not in ("navy", "wood", "grey", "white")]
-    template = str(rng.choice(ABSENT_COLOUR + ABSENT_THING + NO_SUCH_QUANTITY))
     return Wording(
         question=str(rng.choice(QUESTIONS)).format(choices=listed(labels), ball=p.ball_colours[0]),
         labels=labels,
         aliases=aliases,
-        ill_posed_question=template.format(colour=rng.choice(absent), thing=rng.choice(THINGS)),
         answerable_question=_answerable(p, rng),
     )
 
@@ -365,6 +336,7 @@ FAMILY = Family(
     readings=readings,
     margin=margin,
     word=word,
+    questions=QUESTIONS,
     min_margin_m=0.01,
     perturbation=1e-6,
 )

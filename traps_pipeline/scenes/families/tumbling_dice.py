@@ -16,6 +16,7 @@ from traps_pipeline.scenes.kit import (
     AnswerableQuestion,
     Box,
     Family,
+    Inventory,
     Physics,
     Scene,
     View,
@@ -229,28 +230,11 @@ QUESTIONS = (
     "The first die to land in the tray comes to rest with which colour facing up: {choices}?",
     "Which colour face is up when the first die to reach the tray has stopped: {choices}?",
 )
-ABSENT = (
-    "How many steps does the {colour} ball roll down?",
-    "Which colour is on top of the {thing} when it stops?",
-    "What material is the {thing} made of?",
-    "Which die hits the {thing} first?",
-    "Does the {colour} ball reach the tray before the dice?",
-    "How often does the {colour} face of the first die touch the {thing}?",
-    "Into which hole does the {colour} ball fall?",
-)
-NO_SUCH_QUANTITY = (
-    "What is the weight of the colour {face}?",
-    "How loud is the colour {face}, in decibels?",
-    "Which number is printed on the {face} face of the first die?",
-    "How many pips does the {face} face show?",
-)
-ABSENT_COLOURS = ("pink", "magenta", "golden", "silver", "purple", "white", "black")  # less those of the scene
-THINGS = ("triangle", "spring", "pyramid", "windmill", "pendulum", "domino", "cup", "hammer", "ladder", "magnet")
 
 
-def _inventory(p: Params) -> dict[str, tuple[str, ...]]:
+def _inventory(p: Params) -> Inventory:
     colours = sorted({*FACES, *p.edge_colours, *p.step_colours, p.tray_colour, "wood"})
-    return {"colours": tuple(colours), "objects": ("die", "step", "tray", "wall", "face")}
+    return Inventory(tuple(colours), ("die", "step", "tray", "wall", "face"))
 
 
 def word(p: Params, rng: np.random.Generator) -> Wording:
@@ -258,13 +242,10 @@ def word(p: Params, rng: np.random.Generator) -> Wording:
     choices = tuple(str(c) for c in rng.permutation(FACES))
     aliases = {form.format(c): c for c in FACES for form in ("{} face", "{} side", "{} on top", "{} face up")}
     aliases |= {"teal": "cyan", "turquoise": "cyan", "aqua": "cyan", "light blue": "cyan", "dark blue": "blue"}
-    absent = [c for c in ABSENT_COLOURS if c not in _inventory(p)["colours"]]
-    template = str(rng.choice(ABSENT + NO_SUCH_QUANTITY))
     return Wording(
         question=str(rng.choice(QUESTIONS)).format(choices=listed(choices)),
         labels=choices,
         aliases=aliases,
-        ill_posed_question=template.format(colour=rng.choice(absent), thing=rng.choice(THINGS), face=rng.choice(FACES)),
         answerable_question=_answerable(p, rng),
     )
 
@@ -296,6 +277,7 @@ FAMILY = Family(
     readings=readings,
     margin=margin,
     word=word,
+    questions=QUESTIONS,
     physics=Physics(timestep_s=0.001, gravity_m_s2=4.4),
     min_margin_m=0.03,
     perturbation=1e-6,

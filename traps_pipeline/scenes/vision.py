@@ -1,0 +1,97 @@
+"""Classical vision for observers: where a colour is in a frame, and how it moves (OpenCV, no knowledge of the scene).
+
+Frames are RGB uint8, shape (360, 480, 3); pixel coordinates are x to the right, y down. Colours are named as in
+`kit.COLOURS`. A colour that is none of them (a repainted panel) belongs to no mask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+# Hue (degrees), least saturation and value (0-1) of the saturated colours. Shade lowers the value, not the hue.
+_HUES: Mapping[str, tuple[float, float, float, float]] = {
+    "red": (346, 8, 0.62, 0.22),
+    "orange": (18, 37, 0.74, 0.30),
+    "yellow": (40, 60, 0.62, 0.35),
+    "green": (115, 155, 0.50, 0.16),
+    "cyan": (174, 196, 0.50, 0.25),
+    "blue": (208, 236, 0.55, 0.33),
+    "purple": (268, 300, 0.40, 0.20),
+}
+
+
+@dataclass(frozen=True)
+class Blob:
+    """A connected region: centroid, bounding box (x, y, width, height) and area, all in pixels."""
+
+    x: float
+    y: float
+    box: tuple[int, int, int, int]
+    area: int
+
+    @property
+    def fill(self) -> float:
+        """Share of the bounding box that the region covers: 1 for an upright rectangle, 0.79 for a disc."""
+        return self.area / (self.box[2] * self.box[3])
+
+
+def colour_mask(frame: np.ndarray, colour: str) -> np.ndarray:
+    """Where a frame has a colour, bool (360, 480), tolerant of shade and of compression."""
+    hsv = cv2.cvtColor(frame.astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
+    hue, saturation, value = hsv[..., 0], hsv[..., 1], hsv[..., 2]
+    if colour in _HUES:
+        low, high, least_saturation, least_value = _HUES[colour]
+        inside = (hue >= low) & (hue <= high) if low < high else (hue >= low) | (hue <= high)
+        return inside & (saturation >= least_saturation) & (value >= least_value)
+    match colour:
+        case "wood":
+            return (hue >= 18) & (hue <= 42) & (saturation >= 0.40) & (saturation < 0.72) & (value >= 0.2)
+        case "white":
+            return (saturation < 0.10) & (value >= 0.86)
+        case "grey":
+            return (saturation < 0.12) & (value >= 0.25) & (value < 0.68)
+        case "black":
+            return (value < 0.19) & ((saturation < 0.35) | (value < 0.07))
+        case "navy":
+            return (hue >= 215) & (hue <= 245) & (saturation >= 0.5) & (value < 0.33)
+    raise ValueError(f"no colour {colour!r}")
+
+
+def blobs(mask: np.ndarray, min_area: int = 12) -> list[Blob]:
+    """Connected regions of a mask, largest first."""
+    count, _, stats, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    found = [
+        Blob(
+            float(centres[i][0]),
+            float(centres[i][1]),
+            (int(stats[i][0]), int(stats[i][1]), int(stats[i][2]), int(stats[i][3])),
+            int(stats[i][4]),
+        )
+        for i in range(1, count)
+        if stats[i][4] >= min_area
+    ]
+    return sorted(found, key=lambda blob: -blob.area)
+
+
+def largest(frame: np.ndarray, colour: str, min_area: int = 12) -> Blob | None:
+    """The largest region of a colour, None if the colour is not seen."""
+    return next(iter(blobs(colour_mask(frame, colour), min_area)), None)
+
+
+def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int = 12) -> list[Blob | None]:
+    """The largest region of a colour in every frame."""
+    return [largest(frame, colour, min_area) for frame in frames]
+
+
+def at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.5) -> bool:
+    """Whether the tracked thing is seen in each of the last frames and stays where it is."""
+    tail = path[-last:]
+    seen = [blob for blob in tail if blob is not None]
+    if len(seen) < last:
+        return False
+    xs, ys = [blob.x for blob in seen], [blob.y for blob in seen]
+    return max(xs) - min(xs) <= tolerance_px and max(ys) - min(ys) <= tolerance_px

@@ -1,0 +1,207 @@
+"""The words of a scenario: question templates that can be read back, and ill-posed questions with their proof.
+
+An ill-posed question is drawn from shared templates over the scene's inventory, and checked by vocabulary alone, so
+that a question which a reviewer wrote is checked in the same way (`benchmark.md` section 2, ill-posed questions).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
+
+import numpy as np
+
+from traps_pipeline.scenes.kit import COLOURS, Inventory, Taxonomy
+
+# --- well-posed questions ---------------------------------------------------------------------------------------------
+
+
+@cache
+def _pattern(template: str) -> re.Pattern[str]:
+    parts = re.split(r"\{(\w+)\}", template)
+    seen: set[str] = set()
+    pattern = ""
+    for i, part in enumerate(parts):
+        if i % 2 == 0:
+            pattern += re.escape(part)
+        else:
+            pattern += f"(?P={part})" if part in seen else f"(?P<{part}>.+?)"
+            seen.add(part)
+    return re.compile(pattern)
+
+
+def asked(templates: Sequence[str], question: str) -> dict[str, str] | None:
+    """The values that a question fills its template's placeholders with; None if it fits none of the templates."""
+    for template in templates:
+        match = _pattern(template).fullmatch(question)
+        if match:
+            return match.groupdict()
+    return None
+
+
+def choices_in(text: str) -> tuple[str, ...]:
+    """The choices that `kit.listed` reads out: 'red, blue or green' -> red, blue, green."""
+    return tuple(re.split(r", | or ", text))
+
+
+# --- ill-posed questions about what no video shows (occlusion) --------------------------------------------------------
+
+# Property -> (words that ask for it, templates over a thing that is in view).
+BEYOND_VIDEO: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "mass": (
+        r"\b(grams?|kilograms?|weighs?|weight|mass)\b",
+        ("How many grams does the {thing} weigh?", "What is the mass of the {thing} in kilograms?"),
+    ),
+    "temperature": (
+        r"\b(temperature|degrees celsius|warm|hot|cold)\b",
+        ("What is the temperature of the {thing} in degrees Celsius?",),
+    ),
+    "price": (r"\b(costs?|price|paid)\b", ("What did the {thing} cost?", "What is the price of the {thing}?")),
+    "age": (
+        r"\b(year was|how old|years old)\b",
+        ("In which year was the {thing} made?", "How old is the {thing} in years?"),
+    ),
+    "maker": (
+        r"\b(name of the (person|company)|who (made|built|owns))\b",
+        ("What is the name of the person who set up the {thing}?", "Who owns the {thing}?", "Who made the {thing}?"),
+    ),
+    "sound": (
+        r"\b(loud|decibels?|sounds? like|noise)\b",
+        ("How loud is the {thing}, in decibels?", "How much noise does the {thing} make when it is touched?"),
+    ),
+    "smell or taste": (r"\b(smells?|taste)\b", ("What does the {thing} smell of?",)),
+    "inside": (
+        r"\b(hollow|inside of the)\b",
+        ("Is the {thing} hollow or solid?", "What colour is the inside of the {thing}?"),
+    ),
+    "later": (
+        r"\b(hours? later|one hour after|next day|a year later|tomorrow)\b",
+        (
+            "Where will the {thing} be one hour after the clip ends?",
+            "Will the {thing} still be in the same place the next day?",
+        ),
+    ),
+    "earlier": (
+        r"\b(before the clip|the day before|yesterday)\b",
+        ("Where was the {thing} the day before?", "Who touched the {thing} just before the clip began?"),
+    ),
+    "off screen": (
+        r"\b(behind the camera|outside the picture)\b",
+        ("How far is the {thing} from the wall behind the camera?",),
+    ),
+    "electric charge": (r"\b(electric charge|volts)\b", ("What is the electric charge of the {thing}?",)),
+    "material strength": (
+        r"\b(newtons?|break)\b",
+        ("How many newtons would it take to break the {thing}?",),
+    ),
+}
+
+
+def beyond_video(question: str) -> str | None:
+    """The property that no video shows and that the question asks for; None if it asks for none of them."""
+    text = question.lower()
+    return next((name for name, (words, _) in BEYOND_VIDEO.items() if re.search(words, text)), None)
+
+
+# --- ill-posed questions with a false premise (chaotic) ---------------------------------------------------------------
+
+ABSENT_COLOURS = ("pink", "magenta", "gold", "silver", "violet", "red", "green", "blue", "yellow", "orange", "purple")
+ABSENT_OBJECTS = (
+    "triangle",
+    "spring",
+    "trapdoor",
+    "windmill",
+    "pendulum",
+    "domino",
+    "hammer",
+    "rubber duck",
+    "ladder",
+    "pyramid",
+    "magnet",
+    "balloon",
+    "bell",
+    "candle",
+    "clock",
+    "ring",
+    "rope",
+    "toy car",
+    "feather",
+    "propeller",
+)
+# What colours do not have, whatever the scene shows.
+NO_QUALITY_OF_A_COLOUR = r"\b(weight|mass|price|sound|decibels|temperature|speed|weigh|loud|cost)\b.*\bcolou?r (\w+)"
+_FALSE_PREMISES = (
+    "What material is the {absent} made of?",
+    "How often does the {object} hit the {absent}?",
+    "What colour is the {absent}?",
+    "Is the {absent} to the left or to the right of the {object}?",
+    "How far does the {absent} travel?",
+    "How many {absent}s does the {object} touch?",
+    "When does the {object} pass the {absent}?",
+    "What is written on the {absent}?",
+    "Does the {absent} move before or after the {object}?",
+    "Where does the {colour} {object} end up?",
+    "How many times does the {colour} {object} turn over?",
+    "What does the {colour} {object} hit first?",
+    "Which way does the {colour} arrow point?",
+    "How many {colour} stripes does the {object} have?",
+    "What is the weight of the colour {present}?",
+    "How loud is the colour {present}, in decibels?",
+    "What is the temperature of the colour {present}?",
+    "What does the colour {present} cost?",
+)
+_COLOUR_WORDS = frozenset(COLOURS) - {"wood"} | frozenset(ABSENT_COLOURS)
+
+
+def false_premise(question: str, inventory: Inventory) -> str | None:
+    """What the question presumes and the scene's inventory refutes; None if it presumes nothing of the kind."""
+    text = question.lower()
+    for thing in (*ABSENT_OBJECTS, "arrow", "stripe"):
+        if re.search(rf"\b{thing}(s|es)?\b", text) and thing not in inventory.objects:
+            return f"there is no {thing}"
+    quality = re.search(NO_QUALITY_OF_A_COLOUR, text)
+    if quality:
+        return f"a colour has no {quality.group(1)}"
+    for colour in sorted(_COLOUR_WORDS):
+        if re.search(rf"\b{colour}\b", text) and colour not in inventory.colours:
+            return f"nothing is {colour}"
+    return None
+
+
+def refutation(taxonomy: Taxonomy, question: str, inventory: Inventory) -> str | None:
+    """Why the question cannot be answered from the control; None if nothing says so."""
+    return beyond_video(question) if taxonomy == "occlusion" else false_premise(question, inventory)
+
+
+def draw_ill_posed(
+    taxonomy: Taxonomy, inventory: Inventory, rng: np.random.Generator, free: Callable[[str], bool] = lambda _: True
+) -> str:
+    """An ill-posed question about a scene that is still free to use. Raises ValueError when all are taken."""
+    questions = list(_beyond_video(inventory) if taxonomy == "occlusion" else _false_premises(inventory, rng))
+    for i in rng.permutation(len(questions)):
+        question = questions[i]
+        if free(question) and refutation(taxonomy, question, inventory) is not None:
+            return question
+    raise ValueError("every ill-posed question about this scene is taken; name more things in its inventory")
+
+
+def _beyond_video(inventory: Inventory) -> Iterator[str]:
+    for _, templates in BEYOND_VIDEO.values():
+        for template in templates:
+            for thing in inventory.things:
+                yield template.format(thing=thing)
+
+
+def _false_premises(inventory: Inventory, rng: np.random.Generator) -> Iterator[str]:
+    absent = [thing for thing in ABSENT_OBJECTS if thing not in inventory.objects]
+    colours = [colour for colour in ABSENT_COLOURS if colour not in inventory.colours]
+    present = [colour for colour in inventory.colours if colour in _COLOUR_WORDS]
+    for template in _FALSE_PREMISES:
+        for _ in range(6):
+            yield template.format(
+                absent=rng.choice(absent),
+                colour=rng.choice(colours),
+                present=rng.choice(present),
+                object=rng.choice(inventory.objects),
+            )
