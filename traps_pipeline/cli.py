@@ -71,13 +71,19 @@ def build_parser() -> argparse.ArgumentParser:
     add("why", why, "why an item's answers stand or will be asked again").add_argument(
         "item", help="dataset:scenario:side"
     )
-    sample = add(
-        "sample", sample_scenarios, "draw scenarios of a family and write them as released records", workspace=False
-    )
-    sample.add_argument("family")
-    sample.add_argument("--count", type=int, default=8)
-    sample.add_argument("--seed", type=int, default=1)
-    sample.add_argument("--out", type=Path, required=True, help="folder of records, e.g. scene_specs/released")
+    certify = add("certify", certify_benchmark, "re-derive every certificate of the released records", workspace=False)
+    certify.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
+    certify.add_argument("--families", nargs="+", metavar="FAMILY", help="these only")
+    certify.add_argument("--workers", type=int, help="processes (default: one a core)")
+    certify.add_argument("--fresh", action="store_true", help="certify again what an earlier call has certified")
+    sample = add("sample", sample_scenarios, "draw a fresh benchmark, certified like the released one", workspace=False)
+    sample.add_argument("--seed", type=int, required=True, help="the same seed gives the same scenarios")
+    sample.add_argument("--out", type=Path, required=True, help="folder of the new benchmark")
+    sample.add_argument("--name", help="its name (default: private-SEED)")
+    sample.add_argument("--families", nargs="+", metavar="FAMILY", help="these only (default: all)")
+    sample.add_argument("--scale", type=float, default=1.0, help="times as many scenarios as the released benchmark")
+    sample.add_argument("--count", type=int, help="so many scenarios of each family instead")
+    sample.add_argument("--workers", type=int, help="processes (default: one a core)")
     return parser
 
 
@@ -210,20 +216,53 @@ def why(arguments: argparse.Namespace) -> int:
     return OK
 
 
+def certify_benchmark(arguments: argparse.Namespace) -> int:
+    """See `traps certify --help`."""
+    from traps_pipeline.benchmark.certificates import certify_all, family_table
+    from traps_pipeline.paths import CHECKOUT, SCENE_SPECS
+
+    folder = (arguments.specs or SCENE_SPECS).absolute()
+    kept = CHECKOUT / ".workspaces" / "certificates"
+    verdicts, problems = certify_all(
+        folder,
+        kept,
+        families=arguments.families,
+        workers=arguments.workers,
+        fresh=arguments.fresh,
+        report=lambda line: print(line, file=sys.stderr, flush=True),
+    )
+    print(family_table(folder, verdicts))
+    for problem in problems:
+        print(f"traps: {problem}", file=sys.stderr)
+    passed = sum(verdict.passed for verdict in verdicts)
+    print(f"{passed} of {len(verdicts)} scenarios certified")
+    return FAILED if problems else OK
+
+
 def sample_scenarios(arguments: argparse.Namespace) -> int:
     """See `traps sample --help`."""
-    from traps_pipeline.scenes.registry import get_family
-    from traps_pipeline.scenes.sample import sample_family, write_released
+    from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
 
-    try:
-        family = get_family(arguments.family)
-        drawn = sample_family(family, arguments.count, arguments.seed, report=lambda line: print(line, flush=True))
-    except (KeyError, RuntimeError) as error:
-        raise TrapsError(str(error.args[0])) from error
-    write_released(arguments.out, family, drawn)
-    for reason, count in drawn.rejections.most_common():
-        print(f"rejected {count}: {reason}")
-    print(f"{len(drawn.scenarios)} scenarios written to {arguments.out}")
+    counts = load_composition()
+    unknown = sorted(set(arguments.families or ()) - set(counts))
+    if unknown:
+        raise TrapsError(f"unknown families {', '.join(unknown)}; known: {', '.join(counts)}")
+    wanted = {
+        family: arguments.count or max(1, round(count * arguments.scale))
+        for family, count in counts.items()
+        if family in (arguments.families or counts)
+    }
+    name = arguments.name or f"private-{arguments.seed}"
+    sample_benchmark(
+        arguments.out.absolute(),
+        wanted,
+        arguments.seed,
+        name,
+        workers=arguments.workers,
+        report=lambda line: print(line, flush=True),
+    )
+    print(f"{sum(wanted.values())} scenarios of {len(wanted)} families in {arguments.out}")
+    print(f"next: traps certify --specs {arguments.out}; to use it: export TRAPS_SCENE_SPECS={arguments.out}")
     return OK
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from traps_pipeline.errors import TrapsError
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 ASSETS = CHECKOUT / "assets"
-SCENE_SPECS = CHECKOUT / "scene_specs"
+SPECS_VARIABLE = "TRAPS_SCENE_SPECS"  # names the folder of a sampled benchmark
+SCENE_SPECS = Path(os.environ.get(SPECS_VARIABLE) or CHECKOUT / "scene_specs").absolute()
 RELEASED = SCENE_SPECS / "released"
 CORRECTIONS = SCENE_SPECS / "corrections"
 

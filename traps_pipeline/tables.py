@@ -105,6 +105,7 @@ SCENE_SPECS = Table(
     spec_hash str digest of the whole record
     trajectory str path of the frozen qpos, relative to the checkout or the workspace
     trajectory_sha256 str digest of its values
+    twin str JSON: another world behind the same void: its parameters, answer, digest of its trajectory
     commit_s float time (s) from which the outcome holds
     margin_m float distance (m) of the end state from another outcome
     void_from_s float time (s) from which the void shows nothing decisive: hiding or cut
@@ -123,7 +124,7 @@ VIDEOS = Table(
         """
     scenario_id str family and number
     category str one of twelve
-    side str control or void (a twin may join them)
+    side str control, void, or twin (the other world behind the same void, uncovered)
     path str mp4, relative to the workspace
     file_sha256 str digest of the file
     frames_sha256 str digest of the RGB frames before encoding

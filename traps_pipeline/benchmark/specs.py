@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -59,9 +59,9 @@ def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
         if (folder / f"{name}.json").is_file():
             record = (folder / f"{name}.json").read_text(encoding="utf-8")
             return parse_record(record, str(folder / f"{name}.json")), folder / f"{name}.npz"
-    spec, qpos = _simulate(scenario)
+    spec, qpos, twin = _simulate(scenario)
     try:
-        save_trajectory(workspace.trajectories, name, qpos)
+        save_trajectory(workspace.trajectories, name, qpos, twin)
     except OSError as error:
         raise TrapsError(f"{workspace.trajectories / name}.npz: cannot be written ({error.strerror})") from error
     record = json.dumps(spec.model_dump(mode="json"))
@@ -94,16 +94,29 @@ def _words_still_fit(scenario: Scenario) -> bool:
     return released is not None and _wording(scenario, released.params) == _wording(scenario, scenario.params or {})
 
 
-def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray]:
+def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
     """Resolve a scene whose parameters a correction gave. Raises TrapsError naming the correction."""
-    from traps_pipeline.scenes.resolve import Rejected, resolve
+    from traps_pipeline.scenes.outcome import Rejected
+    from traps_pipeline.scenes.resolve import resolve
+    from traps_pipeline.scenes.wording import draw_ill_posed
 
     family = get_family(scenario.family)
     try:
         params = family.params_from(scenario.params or {})
         wording = _wording(scenario, scenario.params or {})
         physics = Physics(**_physics(scenario))
-        return resolve(family, params, wording, scenario_id=scenario.scenario_id, seed=_seed(scenario), physics=physics)
+        rng = np.random.default_rng([_seed(scenario), *scenario.scenario_id.encode(), 1])
+        question = draw_ill_posed(family.taxonomy, family.build(params, physics).inventory, rng)
+        found = resolve(
+            family,
+            params,
+            wording,
+            question,
+            scenario_id=scenario.scenario_id,
+            seed=_seed(scenario),
+            physics=physics,
+        )
+        return found.spec, found.qpos, found.twin
     except (Rejected, ValueError, TypeError) as error:
         raise TrapsError(
             f"{scenario.where}: {scenario.scenario_id}: these parameters make no valid pair ({error}); "
@@ -141,7 +154,7 @@ def void_from_s(spec: SceneSpec) -> float:
 def _row(workspace: Workspace, item: Resolved, version: str) -> dict[str, Any]:
     spec = item.spec
     record = spec.model_dump(mode="json", exclude={"evidence"})
-    for name in ("params", "physics", "camera", "void", "aliases", "answerable_question"):
+    for name in ("params", "physics", "camera", "void", "aliases", "answerable_question", "twin"):
         record[name] = json.dumps(record[name], sort_keys=True, ensure_ascii=False)
     inside = item.trajectory.is_relative_to(workspace.root)
     return record | {
@@ -159,25 +172,26 @@ def _row(workspace: Workspace, item: Resolved, version: str) -> dict[str, Any]:
 def spec_of(row: dict[str, Any]) -> SceneSpec:
     """A row of scene_specs back to its record."""
     record = {name: row[name] for name in SceneSpec.model_fields}
-    for name in ("params", "physics", "camera", "void", "aliases", "answerable_question", "evidence"):
+    for name in ("params", "physics", "camera", "void", "aliases", "answerable_question", "twin", "evidence"):
         record[name] = json.loads(record[name])
     record["labels"] = list(record["labels"])
     return SceneSpec.model_validate(record)
 
 
-def trajectory_of(workspace: Workspace, row: dict[str, Any]) -> np.ndarray:
-    """The frozen qpos (F, nq) of a row of scene_specs. Raises TrapsError."""
+def trajectory_of(workspace: Workspace, row: dict[str, Any], world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
+    """The frozen qpos (F, nq) of a row of scene_specs, or its twin's. Raises TrapsError."""
     candidates: Sequence[Path] = (CHECKOUT / row["trajectory"], workspace.resolve(row["trajectory"]))
     path = next((p for p in candidates if p.is_file()), candidates[0])
     try:
-        return load_trajectory(path, row["trajectory_sha256"])
+        sha256 = row["trajectory_sha256"] if world == "qpos" else json.loads(row["twin"])["trajectory_sha256"]
+        return load_trajectory(path, sha256, world)
     except ValueError as error:
         raise TrapsError(str(error)) from error
 
 
 def unsettled(resolved: Sequence[Resolved]) -> list[str]:
     """Problems with outcomes: replay each frozen trajectory and compare what it shows with the record."""
-    from traps_pipeline.scenes.resolve import Rejected, compile_scene, read_outcome
+    from traps_pipeline.scenes.outcome import Rejected, compile_scene, read_outcome
     from traps_pipeline.scenes.simulate import replay
 
     problems = []

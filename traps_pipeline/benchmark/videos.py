@@ -9,16 +9,17 @@ from traps_pipeline import progress
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import SIDES
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.clips import Job, read_clip, render_pairs, rendered
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import SCENE_SPECS, VIDEOS
 
+CLIPS = ("control", "void", "twin")
+
 
 def build_videos(workspace: Workspace, category: str) -> tuple[list[dict[str, Any]], int, dict[str, float]]:
-    """Rows of the category's clips, the frames drawn for them, and the leaked pixels of each occluded void."""
+    """Rows of the category's clips (three a scenario), frames drawn for them, leaked pixels of each occluded void."""
     specs: list[dict[str, Any]] = workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
     jobs = [_job(workspace, row) for row in specs]
     drawn = 0
@@ -39,13 +40,13 @@ def build_videos(workspace: Workspace, category: str) -> tuple[list[dict[str, An
 
 def _job(workspace: Workspace, row: dict[str, Any]) -> Job:
     spec = spec_of(row)
-    control, void = (workspace.clip(spec.scenario_id, side, row["scene_hash"]) for side in SIDES)
-    return Job(spec, trajectory_of(workspace, row), control, void)
+    control, void, twin = (workspace.clip(spec.scenario_id, side, row["scene_hash"]) for side in CLIPS)
+    return Job(spec, trajectory_of(workspace, row), trajectory_of(workspace, row, "twin"), control, void, twin)
 
 
 def _rows(workspace: Workspace, row: dict[str, Any], job: Job, version: str) -> list[dict[str, Any]]:
     rows = []
-    for side, path in zip(SIDES, (job.control, job.void), strict=True):
+    for side, path in zip(CLIPS, job.clips, strict=True):
         clip = read_clip(path)
         if clip is None:
             raise TrapsError(f"{path}: was not rendered; run again")

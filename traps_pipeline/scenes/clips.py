@@ -7,13 +7,8 @@ from __future__ import annotations
 
 import json
 import os
-import signal
-import threading
-import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -23,13 +18,13 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import Camera, Panel
 from traps_pipeline.scenes.encode import DamagedClip, encode, frames_digest
-from traps_pipeline.scenes.kit import Physics
+from traps_pipeline.scenes.kit import Family, Physics
 from traps_pipeline.scenes.outcome import compile_scene, decisive_geoms
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.workers import run_in_order
 
-SCENES_A_WORKER = 100  # GL drivers leak: a worker draws so many, then another takes over
 ABLATION_FRAMES = 5  # evenly spaced void frames that are drawn once more without what they must not show
 
 
@@ -53,12 +48,19 @@ class Clip:
 
 @dataclass(frozen=True)
 class Job:
-    """A pair to render: record, trajectory, and where the clips go."""
+    """A pair and its twin to render: record, trajectories (F, nq), and where the clips go."""
 
     spec: SceneSpec
     qpos: np.ndarray
+    twin_qpos: np.ndarray
     control: Path
     void: Path
+    twin: Path
+
+    @property
+    def clips(self) -> tuple[Path, Path, Path]:
+        """All files of the job."""
+        return self.control, self.void, self.twin
 
 
 def note_of(clip: Path) -> Path:
@@ -97,14 +99,28 @@ def rendered(path: Path) -> bool:
 
 
 def render_pair(job: Job) -> int:
-    """Render and encode what is missing of a pair; returns the number of frames drawn into clips."""
-    missing = [path for path in (job.control, job.void) if read_clip(path) is None]
+    """Render and encode what is missing of a pair and its twin; returns the number of frames drawn into clips.
+
+    The twin's clip is its control: the other world as it is when nothing hides it.
+    """
+    missing = [path for path in job.clips if read_clip(path) is None]
     if not missing:
         return 0
-    spec, physics = job.spec, Physics(**job.spec.physics)
-    panel = Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None
-    family = get_family(spec.family)
+    family, physics = get_family(job.spec.family), Physics(**job.spec.physics)
+    drawn = 0
+    if job.control in missing or job.void in missing:
+        drawn += _render_control_and_void(job, family, physics, missing)
+    if job.twin in missing:
+        params = job.spec.params if job.spec.twin.params is None else job.spec.twin.params
+        model, _ = compile_scene(family, family.params_from(params), physics)
+        with Renderer(model, Camera.from_record(job.spec.camera)) as renderer:
+            drawn += _save(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
+    return drawn
 
+
+def _render_control_and_void(job: Job, family: Family, physics: Physics, missing: Sequence[Path]) -> int:
+    spec = job.spec
+    panel = Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None
     model, scene = compile_scene(family, family.params_from(spec.params), physics, panel)
     drawn = 0
     with Renderer(model, Camera.from_record(spec.camera)) as renderer:
@@ -115,10 +131,9 @@ def render_pair(job: Job) -> int:
         if job.control in missing:
             _save(job.control, control, physics.fps)
         if job.void in missing and panel is not None:
-            void = list(renderer.frames(job.qpos, panel=True))
-            drawn += len(void)
             geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
-            _save(job.void, void, physics.fps, _leaked_pixels(renderer, geoms, job))
+            void = list(renderer.frames(job.qpos, panel=True))
+            drawn += _save(job.void, void, physics.fps, _leaked_pixels(renderer, geoms, job))
         elif job.void in missing:
             _save(job.void, control[: spec.void["cut_frame"]], physics.fps)
     return drawn
@@ -132,7 +147,8 @@ def _leaked_pixels(renderer: Renderer, geoms: Sequence[str], job: Job) -> float:
     return float(seen.sum()) + checks.ablation_pixels(renderer, job.qpos[ablated], geoms)
 
 
-def _save(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> None:
+def _save(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:
+    """Encode frames and write the note that vouches for them; returns how many there are."""
     encode(frames, path, fps)
     clip = Clip(file_digest(path), frames_digest(frames), len(frames), fps, path.stat().st_size, leaked_pixels)
     part = note_of(path).with_suffix(f".{os.getpid()}.part")
@@ -145,44 +161,14 @@ def _save(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: flo
         ) from error
     finally:
         part.unlink(missing_ok=True)
+    return len(frames)
 
 
 # --- many pairs -------------------------------------------------------------------------------------------------------
 
 
 def render_pairs(jobs: Sequence[Job], workers: int | None = None) -> Iterator[tuple[Job, int]]:
-    """Render pairs with one process a core; yields each job with its frames drawn as it is done.
-
-    A GL context belongs to a process, so each worker keeps its own; workers are recycled, since drivers leak.
-    """
-    todo = [job for job in jobs if read_clip(job.control) is None or read_clip(job.void) is None]
+    """Render pairs with one process a core; yields each job with its frames drawn as it is done."""
+    todo = [job for job in jobs if any(read_clip(path) is None for path in job.clips)]
     yield from ((job, 0) for job in jobs if job not in todo)
-    if not todo:
-        return
-    workers = min(workers or len(os.sched_getaffinity(0)), len(todo))
-    chunk = workers * SCENES_A_WORKER  # a fresh pool for each: recycling inside a pool can deadlock (CPython 3.11)
-    for start in range(0, len(todo), chunk):
-        yield from _render_chunk(todo[start : start + chunk], workers)
-
-
-def _render_chunk(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, int]]:
-    context = get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker, initargs=(os.getpid(),))
-    try:
-        futures = {pool.submit(render_pair, job): job for job in jobs}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _begin_worker(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and do not outlive it when it is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(1.0)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    yield from run_in_order(render_pair, todo, min(workers or len(os.sched_getaffinity(0)), max(1, len(todo))))

@@ -168,11 +168,19 @@ def twin_of(rollouts: Sequence[Rollout], frame: int, truth: str | None) -> Rollo
     return next(r for r in rollouts if r.parted >= frame and r.label not in (None, truth))
 
 
+def deviation_px(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray, twin: np.ndarray) -> float:
+    """The furthest (px) that any corner or outline point of a moving body is from its place in the other trajectory."""
+    silhouette = _Silhouette(model, camera)
+    return max(
+        float(np.abs(silhouette.pixels(a) - silhouette.pixels(b)).max()) for a, b in zip(qpos, twin, strict=True)
+    )
+
+
 def _hopeless(scouts: Sequence[Rollout], first: int) -> bool:
     """Whether hardly any scout looks like the control at the earliest cut, or nearly all of them end alike."""
     counts = Counter(r.label for r in scouts if r.parted >= first and r.label is not None)
     few = counts.total() < len(scouts) * MIN_ACCEPTED / TRIED / 2
-    return few or max(counts.values()) > HOPELESS_SHARE * counts.total()
+    return few or max(counts.values(), default=0) > HOPELESS_SHARE * counts.total()
 
 
 def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, seed: int) -> np.ndarray:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 SUPERSAMPLE = 2
 _gl_context: object | None = None
+_renderer_open = False  # contexts of two models in one GL context would draw into each other's buffers
 
 
 class RenderingUnavailable(RuntimeError):
@@ -46,6 +47,9 @@ class Renderer:
     """Draws one model from one camera. Use as a context manager; every frame is (360, 480, 3) uint8 RGB."""
 
     def __init__(self, model: mujoco.MjModel, camera: Camera) -> None:
+        global _renderer_open
+        if _renderer_open:
+            raise RuntimeError("a Renderer is open in this process; close it before the next one")
         self._width, self._height = WIDTH * SUPERSAMPLE, HEIGHT * SUPERSAMPLE
         _make_current(self._width, self._height)
         import mujoco
@@ -64,11 +68,14 @@ class Renderer:
         self._camera.lookat[:] = camera.lookat
         self._camera.distance = camera.distance
         self._camera.azimuth, self._camera.elevation = camera.azimuth_deg, camera.elevation_deg
+        _renderer_open = True
 
     def __enter__(self) -> Renderer:
         return self
 
     def __exit__(self, *_: object) -> None:
+        global _renderer_open
+        _renderer_open = False
         self._context.free()
 
     def frames(

@@ -39,7 +39,7 @@ class Twin(BaseModel):
 class SceneSpec(BaseModel):
     """One scenario, resolved: nothing about it is left to chance or to the code's defaults.
 
-    Hashes: `scene_hash` covers what decides the pixels (family, params, physics, camera, void, trajectory),
+    Hashes: `scene_hash` covers what decides the pixels (family, params, physics, camera, void, trajectory, twin),
     `spec_hash` covers everything. Both are derived, never read from the file.
     """
 
@@ -84,8 +84,9 @@ class SceneSpec(BaseModel):
     @property
     def scene_hash(self) -> str:
         """Digest of what the clips show; a corrected question leaves it alone."""
-        parts = ("family", "params", "physics", "camera", "void_kind", "void", "trajectory_sha256")
-        return digest({part: getattr(self, part) for part in parts})
+        parts = ("family", "params", "physics", "camera", "void_kind", "void", "trajectory_sha256", "twin")
+        record = self.model_dump(mode="json", include=set(parts))
+        return digest(record)
 
     @property
     def spec_hash(self) -> str:

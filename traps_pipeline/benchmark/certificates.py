@@ -1,0 +1,135 @@
+"""Certifying a whole benchmark: all records on all cores, resumable, and the table of what was found."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from traps_pipeline.benchmark.composition import load_composition, load_draws, problems
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.digests import digest, file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.paths import CHECKOUT
+from traps_pipeline.scenes.certify import Verdict, certify
+from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.workers import run_in_order
+from traps_pipeline.storage.workspace import write_text
+
+
+@dataclass(frozen=True)
+class Case:
+    """A record to certify, its trajectories' file, and where its verdict is kept."""
+
+    spec: SceneSpec
+    trajectory: Path
+    verdict: Path
+
+
+def certify_all(
+    folder: Path,
+    kept: Path,
+    *,
+    families: Sequence[str] | None = None,
+    workers: int | None = None,
+    fresh: bool = False,
+    report: Callable[[str], None] = lambda _: None,
+) -> tuple[list[Verdict], list[str]]:
+    """Verdicts on the records of a benchmark folder, and every problem in words, scenarios first.
+
+    Verdicts are kept under `kept` by record and code, so that a stopped call goes on where it was.
+    """
+    released = folder / "released"
+    specs = [s for s in load_released(released).values() if families is None or s.family in families]
+    if not specs:
+        raise TrapsError(f"{released}: holds no records of {', '.join(families or ())}")
+    cases = [_case(released, kept, spec) for spec in specs]
+    if fresh:
+        for case in cases:
+            case.verdict.unlink(missing_ok=True)
+    verdicts = []
+    for done, (_, verdict) in enumerate(run_in_order(judge, cases, workers), start=1):
+        verdicts.append(verdict)
+        if not verdict.passed or done % 20 == 0 or done == len(cases):
+            report(f"{done} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}")
+    found = [f"{v.scenario_id}: {name}: {why}" for v in verdicts for name, why in v.failures.items()]
+    whole = families is None and (folder / "composition.yaml").is_file()
+    found += problems(specs, load_composition(folder / "composition.yaml") if whole else None)
+    return verdicts, found + _alike(verdicts)
+
+
+def _case(released: Path, kept: Path, spec: SceneSpec) -> Case:
+    trajectory = released / "trajectories" / f"{spec.scenario_id}.npz"
+    content = file_digest(trajectory) if trajectory.is_file() else "missing"
+    name = digest([spec.spec_hash, content, code_digest(spec.family)])[:24]
+    return Case(spec, trajectory, kept / f"{spec.scenario_id}-{name}.json")
+
+
+@cache
+def code_digest(family: str) -> str:
+    """Digest of the code that certifies a family: verdicts of other code are not believed."""
+    folder = CHECKOUT / "traps_pipeline" / "scenes"
+    files = [*sorted(folder.glob("*.py")), folder / "families" / f"{family}.py"]
+    return digest([[path.name, file_digest(path)] for path in files])
+
+
+def judge(case: Case) -> Verdict:
+    """The verdict on one record, from its file if it is known."""
+    if case.verdict.is_file():
+        return Verdict(**json.loads(case.verdict.read_text(encoding="utf-8")))
+    spec = case.spec
+    try:
+        qpos = load_trajectory(case.trajectory, spec.trajectory_sha256)
+        twin = load_trajectory(case.trajectory, spec.twin.trajectory_sha256, "twin")
+        verdict = certify(spec, qpos, twin)
+    except (ValueError, KeyError, TypeError) as error:  # an altered record may not even build
+        verdict = Verdict(spec.scenario_id, spec.family, {"record": str(error)}, {}, same_physics=False)
+    write_text(case.verdict, json.dumps(asdict(verdict)))
+    return verdict
+
+
+def _alike(verdicts: Iterable[Verdict]) -> list[str]:
+    """Clips of different scenarios that end in the same frame: no clip may serve two scenarios."""
+    found = []
+    for side in ("control_end", "void_end"):
+        owners: defaultdict[str, list[str]] = defaultdict(list)
+        for verdict in verdicts:
+            if getattr(verdict, side):
+                owners[getattr(verdict, side)].append(verdict.scenario_id)
+        found += [f"{', '.join(ids)}: clips end in the same frame" for ids in owners.values() if len(ids) > 1]
+    return found
+
+
+def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
+    """One line a family: scenarios, passed, draws rejected, entropy, margins, twins, CPU seconds."""
+    draws = load_draws(folder / "released")
+    members: defaultdict[str, list[Verdict]] = defaultdict(list)
+    for verdict in verdicts:
+        members[verdict.family].append(verdict)
+    head = f"{'family':<20}{'scenarios':>10}{'passed':>8}{'rejected':>10}{'entropy':>12}{'margin m':>14}"
+    lines = [head + f"{'twins':>7}{'CPU s':>7}{'other physics':>15}"]
+    for family, found in sorted(members.items()):
+        twins = sum("twin" not in v.failures and "record" not in v.failures for v in found)
+        rejected = sum(Counter(draws.get(family, {}).get("rejected", {})).values())
+        others = sum(not v.same_physics for v in found)
+        lines.append(
+            f"{family:<20}{len(found):>10}{sum(v.passed for v in found):>8}{rejected:>10}"
+            f"{_span(found, 'entropy_bits', 2):>12}{_span(found, 'margin_m', 3):>14}"
+            f"{twins:>7}{np.median([v.cpu_s for v in found]):>7.1f}{others:>15}"
+        )
+    if any(not v.same_physics for v in verdicts):
+        lines.append(
+            "other physics: simulating here does not give the frozen trajectory bit by bit (another CPU or version); "
+            "outcome, visibility and frames are certified on the trajectory as shipped, futures are not simulated"
+        )
+    return "\n".join(lines)
+
+
+def _span(verdicts: Sequence[Verdict], name: str, digits: int) -> str:
+    values = [v.measured[name] for v in verdicts if name in v.measured]
+    return f"{min(values):.{digits}f}-{max(values):.{digits}f}" if values else "-"

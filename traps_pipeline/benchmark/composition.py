@@ -1,0 +1,156 @@
+"""A whole benchmark: how many scenarios of each family, drawing one, and what must hold across scenarios."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+
+import yaml
+from pydantic import RootModel, ValidationError
+
+from traps_pipeline.benchmark.items import commonest_answers
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.paths import SCENE_SPECS
+from traps_pipeline.scenes.sample import Sample, answer_quota, ill_posed_quota, sample_family, write_released
+from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.storage.workspace import write_text
+from traps_pipeline.yamlfile import explain, read_yaml
+
+PRIOR_AT_MOST = 0.55  # accuracy of the commonest answer, occlusion and chaotic weighted equally
+DRAWS = "draws.json"  # beside the records: draws and rejections of each family
+
+
+class Composition(RootModel[dict[str, int]]):
+    """Family to number of scenarios."""
+
+
+def load_composition(path: Path = SCENE_SPECS / "composition.yaml") -> dict[str, int]:
+    """Scenarios of each family. Raises TrapsError naming the file."""
+    try:
+        return Composition.model_validate(read_yaml(path)).root
+    except ValidationError as error:
+        raise TrapsError(f"{path}: {explain(error)}") from error
+
+
+def sample_benchmark(
+    out: Path,
+    counts: Mapping[str, int],
+    seed: int,
+    name: str,
+    *,
+    workers: int | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> None:
+    """Draw a benchmark into `out`: released records, trajectories, `benchmark.yaml` with a canary of its own.
+
+    A family whose records are there in that number is left alone, so that a stopped sampling goes on. Raises
+    TrapsError when a family cannot be filled.
+    """
+    released = out / "released"
+    for family, count in counts.items():
+        lines = _lines(released / f"{family}.jsonl")
+        if len(lines) == count:
+            report(f"{family}: {count} scenarios are there")
+            continue
+        draws = out / ".draws" / f"{family}-{seed}"
+        try:
+            sample = sample_family(family, count, seed, draws, workers=workers, report=report)
+        except RuntimeError as error:
+            raise TrapsError(f"{error}; the draws are kept in {draws}") from error
+        write_released(released, family, sample)
+        _note_draws(released / DRAWS, family, sample)
+        report(f"{family}: {count} of {sample.draws} draws; {_tally(sample)}")
+    if not (out / "benchmark.yaml").exists():
+        release = {"name": name, "version": "1.0.0", "canary": f"{name.upper()}:CANARY:{uuid.uuid4()}"}
+        write_text(out / "benchmark.yaml", yaml.safe_dump(release, sort_keys=False))
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+
+
+def _tally(sample: Sample) -> str:
+    return ", ".join(f"{n} x {reason}" for reason, n in sample.rejections.most_common()) or "none rejected"
+
+
+def _note_draws(path: Path, family: str, sample: Sample) -> None:
+    notes = load_draws(path.parent)
+    notes[family] = {"draws": sample.draws, "rejected": dict(sample.rejections.most_common())}
+    write_text(path, json.dumps(notes, indent=1, sort_keys=True) + "\n")
+
+
+def load_draws(released: Path) -> dict[str, dict]:
+    """Family to how many draws its scenarios took and why the others were rejected."""
+    path = released / DRAWS
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
+    """What is wrong with a set of records as a whole; one sentence each, naming the family.
+
+    counts: the wanted number of scenarios of each family; not checked if None.
+    """
+    families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
+    for spec in specs:
+        families[spec.family].append(spec)
+    found = [] if counts is None else _wrong_counts(families, counts)
+    for family, members in families.items():
+        found += _unbalanced(family, members)
+        found += _repeated_questions(family, members)
+    found += _repeated(families, "trajectory", lambda spec: spec.trajectory_sha256 + spec.scene_hash)
+    if counts is not None:
+        found += _predictable(specs)
+    return found
+
+
+def _wrong_counts(families: Mapping[str, Sequence[SceneSpec]], counts: Mapping[str, int]) -> list[str]:
+    return [
+        f"{family}: {len(families.get(family, ()))} scenarios, {counts.get(family, 0)} wanted"
+        for family in sorted({*families, *counts})
+        if len(families.get(family, ())) != counts.get(family, 0)
+    ]
+
+
+def _unbalanced(family: str, members: Sequence[SceneSpec]) -> list[str]:
+    found = []
+    for answer, n in Counter(spec.ground_truth for spec in members).items():
+        choices = [len(spec.labels) for spec in members if answer in spec.labels]
+        most = answer_quota(len(members), len(members) / sum(1 / c for c in choices))  # the fair share of this answer
+        if n > most:
+            found.append(f"{family}: answer {answer!r} occurs {n} times, at most {most} allowed")
+    return found
+
+
+def _repeated_questions(family: str, members: Sequence[SceneSpec]) -> list[str]:
+    most = ill_posed_quota(members[0].taxonomy, len(members))
+    texts = Counter(spec.ill_posed_question for spec in members)
+    return [f"{family}: {text!r} is asked {n} times, at most {most} allowed" for text, n in texts.items() if n > most]
+
+
+def _repeated(families: Mapping[str, Iterable[SceneSpec]], what: str, key: Callable[[SceneSpec], str]) -> list[str]:
+    owners: defaultdict[str, list[str]] = defaultdict(list)
+    for members in families.values():
+        for spec in members:
+            owners[key(spec)].append(spec.scenario_id)
+    return [f"{', '.join(ids)}: the same {what}" for ids in owners.values() if len(ids) > 1]
+
+
+def _predictable(specs: Sequence[SceneSpec]) -> list[str]:
+    accuracy = prior_accuracy(specs)
+    if accuracy <= PRIOR_AT_MOST:
+        return []
+    return [f"the commonest answer of each sub-scenario is right in {accuracy:.3f}, at most {PRIOR_AT_MOST} allowed"]
+
+
+def prior_accuracy(specs: Sequence[SceneSpec]) -> float:
+    """Accuracy of always giving a sub-scenario's commonest answer; occlusion and chaotic weighted equally."""
+    commonest = commonest_answers([spec.model_dump(mode="json") for spec in specs])
+    shares = []
+    for taxonomy in ("occlusion", "chaotic"):
+        hits = [spec.ground_truth == commonest[spec.sub_scenario] for spec in specs if spec.taxonomy == taxonomy]
+        if hits:
+            shares.append(sum(hits) / len(hits))
+    return sum(shares) / len(shares)
