@@ -173,7 +173,7 @@ def _print_results(workspace: Workspace) -> None:
     from traps_pipeline.tables import LEADERBOARD
 
     print(leaderboard_text(workspace.tables.read(LEADERBOARD, {})))
-    for name in ("leaderboard.html", "leaderboard.md", "pecs_landscape.png", "contact_sheet.png"):
+    for name in ("leaderboard.html", "leaderboard.md", "pecs_landscape.png", "contact_sheet.png", "gallery.html"):
         print(workspace.reports / name)
 
 

@@ -35,10 +35,34 @@ category_to_datasets = dg.StaticPartitionMapping({c: list(datasets_of_category(c
             "scene_specs",
             "Replayed from the frozen trajectory, every outcome is the ground truth, settled 0.6 s before the end.",
         ),
+        check(
+            "control_certified",
+            "scene_specs",
+            "By the evidence in each record, the control can be answered: settled in time, with a margin, legible.",
+        ),
+        check(
+            "void_certified",
+            "scene_specs",
+            "By the evidence in each record, the void cannot be answered: hidden without a trace and with a twin of "
+            "another answer (occlusion), futures that disagree (chaotic). `traps certify` derives it all anew.",
+        ),
+        check(
+            "ill_posed_certified",
+            "scene_specs",
+            "The inventory refutes each ill-posed question, or it asks what no video shows; no well-posed one is.",
+        ),
+        check(
+            "answers_balanced",
+            "scene_specs",
+            "Within a family no answer and no ill-posed text is too frequent, and no scene occurs twice (whole "
+            "benchmarks only).",
+        ),
     ],
 )
 def scene_specs(context: dg.AssetExecutionContext) -> Events:
     """Scenarios of a category after corrections, one row each; a corrected parameter is simulated here, once."""
+    from traps_pipeline.benchmark import evidence
+    from traps_pipeline.benchmark.composition import problems
     from traps_pipeline.benchmark.specs import build_specs, unsettled
 
     workspace, category = Workspace.open(), context.partition_key
@@ -46,7 +70,12 @@ def scene_specs(context: dg.AssetExecutionContext) -> Events:
     rows, resolved = build_specs(workspace, category)
     inputs = Lineage(workspace).inputs("scene_specs", category)
     checks = Checks(context, workspace)
+    specs = [item.spec for item in resolved]
     checks.record("outcome_settled", category, unsettled(resolved))
+    checks.record("control_certified", category, evidence.unanswerable_controls(specs))
+    checks.record("void_certified", category, evidence.answerable_voids(specs))
+    checks.record("ill_posed_certified", category, evidence.answerable_ill_posed(specs))
+    checks.record("answers_balanced", category, [] if workspace.study.is_subset else problems(specs))
     version = workspace.tables.write(SCENE_SPECS, {"category": category}, rows, inputs)
     progress.current().partition("scene_specs", category, Tally())
     yield common.materialized(context, category, version, provenance, **{"dagster/partition_row_count": len(rows)})

@@ -10,14 +10,14 @@ import dagster as dg
 
 from traps_pipeline import progress
 from traps_pipeline.defs import common
-from traps_pipeline.defs.benchmark import items
+from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.common import OWNERS, Events
 from traps_pipeline.defs.scoring import leaderboard
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.lineage import Lineage, write_report_state
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, LEADERBOARD
+from traps_pipeline.tables import ITEMS, LEADERBOARD, SCENE_SPECS, VIDEOS
 
 GROUP = "report"
 Files = dict[str, bytes]
@@ -33,7 +33,7 @@ def _report(
         description=doc,
         deps=deps,
         group_name=GROUP,
-        kinds={"png" if "page" not in name else "html"},
+        kinds={"html" if name in ("gallery", "leaderboard_page") else "png"},
         owners=OWNERS,
         output_required=False,
     )
@@ -47,7 +47,8 @@ def _report(
         version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
         write_report_state(workspace, name, version, inputs)
         progress.current().partition(name, "", Tally())
-        metadata = {file: dg.MetadataValue.path(str(workspace.reports / file)) for file in files}
+        shown = [file for file in files if "/" not in file]  # posters are parts of a page
+        metadata = {file: dg.MetadataValue.path(str(workspace.reports / file)) for file in shown}
         pictures = {f"preview of {f}": _preview(content) for f, content in files.items() if f.endswith(".png")}
         yield common.materialized(context, None, version, provenance, **metadata, **pictures)
 
@@ -55,6 +56,7 @@ def _report(
 
 
 def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     part.write_bytes(content)
     part.replace(path)
@@ -72,12 +74,26 @@ def _landscape(workspace: Workspace) -> Files:
 
 
 def _sheet(workspace: Workspace) -> Files:
-    from traps_pipeline.report.contact_sheet import contact_sheet
+    from traps_pipeline.report.contact_sheet import contact_sheet, six_pairs
 
     rows = workspace.tables.read_all(ITEMS)
     if rows.empty:
         raise TrapsError("contact_sheet: no items yet; materialize items first")
-    return {"contact_sheet.png": contact_sheet(rows, workspace.root)}
+    return {
+        "contact_sheet.png": contact_sheet(rows, workspace.root),
+        "six_pairs.png": contact_sheet(six_pairs(rows), workspace.root),
+    }
+
+
+def _gallery(workspace: Workspace) -> Files:
+    from traps_pipeline.benchmark.records import load_release
+    from traps_pipeline.report.gallery import gallery_files
+
+    specs, clips = workspace.tables.read_all(SCENE_SPECS), workspace.tables.read_all(VIDEOS)
+    if clips.empty:
+        raise TrapsError("gallery: no clips yet; materialize videos first")
+    release = load_release()
+    return gallery_files(specs, clips, workspace.root, f"{release.name} {release.version}: all pairs")
 
 
 def _page(workspace: Workspace) -> Files:
@@ -102,6 +118,12 @@ contact_sheet = _report(
     "Control and void frames of one pair of each sub-scenario, with question and ground truth.",
     [items],
     _sheet,
+)
+gallery = _report(
+    "gallery",
+    "Control, void and twin of every scenario on a page that opens from disk, with words and certificates.",
+    [scene_specs, videos],
+    _gallery,
 )
 leaderboard_page = _report(
     "leaderboard_page",
@@ -128,4 +150,6 @@ def _inputs_current(asset: dg.AssetsDefinition) -> dg.AssetChecksDefinition:
     return current
 
 
-inputs_current = [_inputs_current(asset) for asset in (leaderboard, pecs_landscape, contact_sheet, leaderboard_page)]
+inputs_current = [
+    _inputs_current(asset) for asset in (leaderboard, pecs_landscape, contact_sheet, gallery, leaderboard_page)
+]

@@ -12,4 +12,8 @@ def make_backend(kind: str) -> Backend:
             from traps_pipeline.models.reference import ReferenceBackend
 
             return ReferenceBackend()
-    raise ValueError(f"unknown backend {kind!r}; known: reference")
+        case "observer":
+            from traps_pipeline.models.observer import ObserverBackend
+
+            return ObserverBackend()
+    raise ValueError(f"unknown backend {kind!r}; known: reference, observer")

@@ -40,7 +40,7 @@ class ModelEntry(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     id: str
-    backend: Literal["reference"]
+    backend: Literal["reference", "observer"]
     params: dict[str, Any] = Field(default_factory=dict, description="exactly what is sent; part of the ledger key")
     runs: int = Field(default=3, ge=1, le=9)
     limits: Limits = Limits()

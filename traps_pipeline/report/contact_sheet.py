@@ -61,6 +61,18 @@ def contact_sheet(items: pd.DataFrame, root: Path, per_family: int | None = 1, c
         return figure_bytes(figure)
 
 
+def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
+    """ITEMS rows of six visual pairs for a figure like the paper's: three of either taxonomy, of as many sub-scenarios
+    as there are, fewer where there are fewer."""
+    visual = items[items["dataset"].isin(["occlusion", "chaotic"])]
+    chosen: list[str] = []
+    for _, rows in visual.groupby("taxonomy", sort=True):
+        pairs = rows.drop_duplicates("pair_id").sort_values(["category", "sub_scenario", "pair_id"])
+        firsts = [*pairs.drop_duplicates("category")["pair_id"], *pairs["pair_id"]]
+        chosen += list(dict.fromkeys(firsts))[:3]
+    return visual[visual["pair_id"].isin(chosen)]
+
+
 def chosen_pairs(items: pd.DataFrame, per_family: int | None) -> list[pd.DataFrame]:
     """The pairs to show, as frames of two rows indexed by side. Raises ValueError for none or more than 80."""
     whole = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2].sort_values(

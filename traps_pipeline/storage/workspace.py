@@ -47,6 +47,11 @@ class Study(BaseModel):
     epoch: str = Field(default="1", pattern=r"^[A-Za-z0-9._-]+$")
     budget_usd: float = Field(default=0.0, ge=0.0)
 
+    @property
+    def is_subset(self) -> bool:
+        """Whether the study leaves scenarios of its benchmark out."""
+        return self.scenarios is not None or self.per_family is not None
+
     @model_validator(mode="after")
     def _one_subset(self) -> Study:
         if self.scenarios is not None and self.per_family is not None:

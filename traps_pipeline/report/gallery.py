@@ -1,0 +1,122 @@
+"""Every pair on one page that opens from disk: control, void and twin side by side, words, answers, certificates.
+
+The page plays the workspace's clips where they lie; it makes no request of its own. All text is escaped by Jinja2.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.report.page import TEMPLATES
+from traps_pipeline.scenes.encode import decode
+
+POSTER_WIDTH, POSTER_HEIGHT = 240, 180
+POSTERS = "gallery"  # folder beside the page
+SIDES = ("control", "void", "twin")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A clip on the page: paths relative to it, and the words below it."""
+
+    side: str
+    clip: str
+    poster: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A scenario on the page."""
+
+    scenario_id: str
+    question: str
+    labels: str
+    ill_posed_question: str
+    pictures: tuple[Picture, ...]
+    certificate: Mapping[str, str]
+
+
+def gallery_files(specs: pd.DataFrame, videos: pd.DataFrame, root: Path, title: str) -> dict[str, bytes]:
+    """`gallery.html` and its posters, by path under the reports folder. specs are SCENE_SPECS rows, videos VIDEOS rows.
+
+    Raises DamagedClip when a clip cannot be decoded.
+    """
+    clips = {(row["scenario_id"], row["side"]): str(row["path"]) for row in videos.to_dict("records")}
+    files: dict[str, bytes] = {}
+    sections: defaultdict[str, list[Entry]] = defaultdict(list)
+    for spec in specs.sort_values("scenario_id").to_dict("records"):
+        if all((spec["scenario_id"], side) in clips for side in SIDES):
+            for side in SIDES:
+                files[_poster(spec["scenario_id"], side)] = _last_frame(root / clips[spec["scenario_id"], side])
+            sections[spec["family"]].append(_entry(spec, clips))
+    files["gallery.html"] = _render(title, dict(sorted(sections.items()))).encode()
+    return files
+
+
+def _poster(scenario_id: str, side: str) -> str:
+    return f"{POSTERS}/{scenario_id}-{side}.jpg"
+
+
+def _last_frame(clip: Path) -> bytes:
+    import cv2
+
+    frames, _ = decode(clip)
+    small = cv2.resize(frames[-1], (POSTER_WIDTH, POSTER_HEIGHT), interpolation=cv2.INTER_AREA)
+    _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 82])
+    return jpeg.tobytes()
+
+
+def _entry(spec: Mapping[str, Any], clips: Mapping[tuple[str, str], str]) -> Entry:
+    scenario_id, evidence, twin = spec["scenario_id"], json.loads(spec["evidence"]), json.loads(spec["twin"])
+    captions = {
+        "control": f"control: {spec['ground_truth']}",
+        "void": f"void: {_what_is_done(spec)}",
+        "twin": f"twin, same void: {twin['ground_truth']}",
+    }
+    pictures = tuple(
+        Picture(side, f"../{clips[scenario_id, side]}", _poster(scenario_id, side), captions[side]) for side in SIDES
+    )
+    labels = ", ".join(spec["labels"])
+    certificate = dict(_certificate(evidence))
+    return Entry(scenario_id, spec["question"], labels, spec["ill_posed_question"], pictures, certificate)
+
+
+def _what_is_done(spec: Mapping[str, Any]) -> str:
+    at = f"{spec['void_from_s']:.1f} s"
+    return f"hidden from {at}" if spec["void_kind"] == "occluder" else f"cut at {at}"
+
+
+_NAMES = {
+    "commit_s": "outcome settled at {} s",
+    "margin_m": "margin {} m",
+    "least_visible_px": "at least {:.0f} pixels at the end",
+    "ablation_px": "{} pixels change without what is hidden",
+    "twin_px": "{} pixels between void and twin's void",
+    "entropy_bits": "futures disagree by {:.2f} bits",
+    "top_share": "commonest future {:.0%}",
+    "accepted": "{} futures look alike",
+    "twin_largest_difference": "twin differs by at most {} of 255 before the cut",
+}
+
+
+def _certificate(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    for name, words in _NAMES.items():
+        if name in evidence:
+            yield name, words.format(evidence[name])
+
+
+def _render(title: str, sections: Mapping[str, list[Entry]]) -> str:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined)
+    count = sum(len(entries) for entries in sections.values())
+    return environment.get_template("gallery.html.j2").render(title=title, sections=sections, count=count)

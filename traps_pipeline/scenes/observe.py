@@ -1,0 +1,29 @@
+"""The observer: what classical vision can answer from the sampled frames and the question alone.
+
+It shows that the benchmark is solvable from pixels. It finds the family by the words of the question, so a question
+that no family asks, an ill-posed one above all, is one it cannot answer.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+from traps_pipeline.scenes.encode import decode_sampled
+from traps_pipeline.scenes.kit import Family
+from traps_pipeline.scenes.registry import families
+from traps_pipeline.scenes.wording import asked
+
+
+@cache
+def family_asking(question: str) -> Family | None:
+    """The family whose templates the question fits, None if there is none."""
+    return next((family for family in families() if asked(family.questions, question) is not None), None)
+
+
+def observe(clip: Path, question: str) -> str | None:
+    """The answer that is seen in a clip (5 FPS, at most 25 frames); None where the decisive thing is not to be seen."""
+    family = family_asking(question)
+    if family is None or family.observe is None:
+        return None
+    return family.observe(decode_sampled(clip), question)
