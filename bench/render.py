@@ -14,9 +14,9 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera
 from traps_pipeline.scenes.kit import Physics
+from traps_pipeline.scenes.outcome import compile_scene
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.resolve import compile_scene
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
 
 SCENES = ("domino_chain-0001", "hidden_race-0001", "plinko-0001", "tumbling_dice-0001")

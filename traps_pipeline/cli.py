@@ -242,16 +242,14 @@ def certify_benchmark(arguments: argparse.Namespace) -> int:
 def sample_scenarios(arguments: argparse.Namespace) -> int:
     """See `traps sample --help`."""
     from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
+    from traps_pipeline.scenes.registry import family_names
 
     counts = load_composition()
-    unknown = sorted(set(arguments.families or ()) - set(counts))
+    names = arguments.families or list(counts)
+    unknown = sorted(set(names) - (set(family_names()) if arguments.count else set(counts)))
     if unknown:
-        raise TrapsError(f"unknown families {', '.join(unknown)}; known: {', '.join(counts)}")
-    wanted = {
-        family: arguments.count or max(1, round(count * arguments.scale))
-        for family, count in counts.items()
-        if family in (arguments.families or counts)
-    }
+        raise TrapsError(f"unknown families {', '.join(unknown)}; known: {', '.join(family_names())}")
+    wanted = {name: arguments.count or max(1, round(counts[name] * arguments.scale)) for name in names}
     name = arguments.name or f"private-{arguments.seed}"
     sample_benchmark(
         arguments.out.absolute(),

@@ -20,9 +20,9 @@ from traps_pipeline.scenes.camera import Camera
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip, decode, encode, frames_digest
 from traps_pipeline.scenes.kit import Physics
+from traps_pipeline.scenes.outcome import compile_scene
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.resolve import compile_scene
 from traps_pipeline.scenes.spec import load_trajectory
 
 

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.registry import family_names, get_family
-from traps_pipeline.scenes.sample import Sample, answer_quota, sample_family, write_released
+from traps_pipeline.scenes.sample import answer_quota, sample_family
 from traps_pipeline.scenes.spec import load_trajectory
 
 
 @pytest.mark.parametrize(
     ("count", "labels", "quota"),
     [
-        (8, 2, 4),  # two labels: the even split, no slack
-        (9, 2, 5),
-        (1, 2, 1),
-        (9, 3, 4),  # three labels or more: one more than the even split rounded up
-        (8, 3, 4),
-        (8, 6, 3),
-        (125, 7, 19),
+        (8, 2, 5),  # under ten: once more than the even split
+        (7, 2, 5),
+        (3, 3, 2),
+        (6, 4, 3),
+        (50, 2, 30),  # 60 % of two answers
+        (200, 3, 100),  # 1.5 times the fair share
+        (200, 6, 50),
+        (50, 4, 18),
     ],
 )
 def test_the_quota_of_an_answer(count: int, labels: int, quota: int) -> None:
@@ -33,34 +31,43 @@ def test_the_quota_of_an_answer(count: int, labels: int, quota: int) -> None:
     assert answer_quota(count, labels) * labels >= count  # the quotas can be filled
 
 
-def test_released_answers_keep_their_quota() -> None:
-    by_family: dict[str, list[str]] = {}
-    labels: dict[str, int] = {}
-    for spec in load_released().values():
-        by_family.setdefault(spec.family, []).append(spec.ground_truth)
-        labels[spec.family] = max(labels.get(spec.family, 0), len(spec.labels))
-    for family, answers in by_family.items():
-        for answer in set(answers):
-            assert answers.count(answer) <= answer_quota(len(answers), labels[family]), (family, answer)
+def test_a_stopped_sampling_goes_on_and_gives_the_same_scenarios(tmp_path: Path) -> None:
+    sample_family("hidden_race", 2, 11, tmp_path / "whole", workers=1)
+    said: list[str] = []
+
+    def stop(line: str) -> None:
+        said.append(line)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample_family("hidden_race", 2, 11, tmp_path / "halves", workers=1, report=stop)
+    first = (tmp_path / "halves" / "hidden_race.jsonl").read_text(encoding="utf-8")
+    assert len(first.splitlines()) == 1
+    with (tmp_path / "halves" / "hidden_race.jsonl").open("a", encoding="utf-8") as lines:
+        lines.write('{"scenario_id": "hidden_race-00')  # what a kill leaves of a line
+    sample_family("hidden_race", 2, 11, tmp_path / "halves", workers=1, report=said.append)
+    assert [line.split(":")[0] for line in said] == ["hidden_race-0001", "hidden_race-0002"]
+    for name in ("hidden_race.jsonl", "draws.json"):
+        assert (tmp_path / "halves" / name).read_text(encoding="utf-8") == (tmp_path / "whole" / name).read_text(
+            encoding="utf-8"
+        )
+    specs = load_released(tmp_path / "whole").values()
+    load_released.cache_clear()
+    assert len({spec.ill_posed_question for spec in specs}) == 2
+    for spec in specs:
+        path = tmp_path / "halves" / "trajectories" / f"{spec.scenario_id}.npz"
+        load_trajectory(path, spec.trajectory_sha256)
+        load_trajectory(path, spec.twin.trajectory_sha256, "twin")
 
 
-def test_too_few_draws_are_an_error_that_says_what_was_rejected() -> None:
-    with pytest.raises(RuntimeError, match=r"domino_chain: 0 of 3 after 0 draws; rejected: "):
-        sample_family(get_family("domino_chain"), 3, 1, max_draws=0)
-
-
-def test_written_records_are_read_back_equal_with_their_trajectories(tmp_path: Path) -> None:
-    spec = load_released()["hidden_race-0001"]
-    qpos = load_trajectory(RELEASED / "trajectories" / "hidden_race-0001.npz", spec.trajectory_sha256)
-    write_released(tmp_path, get_family("hidden_race"), Sample([(spec, qpos)]))
-    try:
-        assert load_released(tmp_path) == {"hidden_race-0001": spec}
-    finally:
-        load_released.cache_clear()
-    read = load_trajectory(tmp_path / "trajectories" / "hidden_race-0001.npz", spec.trajectory_sha256)
-    assert np.array_equal(read, qpos)
-    (line,) = (tmp_path / "hidden_race.jsonl").read_text(encoding="utf-8").splitlines()
-    assert json.loads(line) == spec.model_dump(mode="json")
+def test_another_seed_replaces_what_is_there(tmp_path: Path) -> None:
+    tally = sample_family("hidden_race", 1, 11, tmp_path, workers=1)
+    assert (tally.seed, tally.wanted, tally.draws >= 1) == (11, 1, True)
+    before = (tmp_path / "hidden_race.jsonl").read_text(encoding="utf-8")
+    sample_family("hidden_race", 1, 12, tmp_path, workers=1)
+    after = (tmp_path / "hidden_race.jsonl").read_text(encoding="utf-8")
+    assert len(after.splitlines()) == 1
+    assert after != before
 
 
 def test_families_are_found_by_file_and_an_unknown_one_is_answered_with_the_known() -> None:

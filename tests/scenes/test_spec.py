@@ -26,17 +26,19 @@ def test_a_digest_is_over_shape_and_little_endian_values() -> None:
 
 
 def test_a_trajectory_comes_back_bit_for_bit(tmp_path: Path) -> None:
-    digest = save_trajectory(tmp_path / "new", "plinko-0001", QPOS)
+    save_trajectory(tmp_path / "new", "plinko-0001", QPOS, QPOS + 1)
+    digest = trajectory_digest(QPOS)
     read = load_trajectory(tmp_path / "new" / "plinko-0001.npz", digest)
     assert read.dtype == np.float32
     assert np.array_equal(read, QPOS)
 
 
 def test_an_altered_trajectory_is_named_with_the_remedy(tmp_path: Path) -> None:
-    digest = save_trajectory(tmp_path, "plinko-0001", QPOS)
+    save_trajectory(tmp_path, "plinko-0001", QPOS, QPOS)
+    digest = trajectory_digest(QPOS)
     altered = QPOS.copy()
     altered[2, 1] += 1e-6
-    save_trajectory(tmp_path, "plinko-0001", altered)
+    save_trajectory(tmp_path, "plinko-0001", altered, QPOS)
     with pytest.raises(
         ValueError, match=r"plinko-0001\.npz: digest .* is not the record's .*restore the file from git"
     ):
@@ -45,7 +47,8 @@ def test_an_altered_trajectory_is_named_with_the_remedy(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", [b"", b"no archive", None])
 def test_an_unreadable_trajectory_is_named_with_the_remedy(tmp_path: Path, damage: bytes | None) -> None:
-    digest = save_trajectory(tmp_path, "plinko-0001", QPOS)
+    save_trajectory(tmp_path, "plinko-0001", QPOS, QPOS)
+    digest = trajectory_digest(QPOS)
     path = tmp_path / "plinko-0001.npz"
     path.write_bytes(path.read_bytes()[:-30] if damage is None else damage)
     with pytest.raises(ValueError, match=r"plinko-0001\.npz: not a readable trajectory .*restore it from git"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.benchmark.composition import load_composition, load_draws, problems
+from traps_pipeline.benchmark.composition import load_composition, problems
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import CHECKOUT
 from traps_pipeline.scenes.certify import Verdict, certify
+from traps_pipeline.scenes.sample import Tally, load_tallies
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
 from traps_pipeline.scenes.workers import run_in_order
 from traps_pipeline.storage.workspace import write_text
@@ -107,7 +108,7 @@ def _alike(verdicts: Iterable[Verdict]) -> list[str]:
 
 def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
     """One line a family: scenarios, passed, draws rejected, entropy, margins, twins, CPU seconds."""
-    draws = load_draws(folder / "released")
+    tallies = load_tallies(folder / "released")
     members: defaultdict[str, list[Verdict]] = defaultdict(list)
     for verdict in verdicts:
         members[verdict.family].append(verdict)
@@ -115,7 +116,7 @@ def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
     lines = [head + f"{'twins':>7}{'CPU s':>7}{'other physics':>15}"]
     for family, found in sorted(members.items()):
         twins = sum("twin" not in v.failures and "record" not in v.failures for v in found)
-        rejected = sum(Counter(draws.get(family, {}).get("rejected", {})).values())
+        rejected = tallies.get(family, Tally(0, 0)).rejected.total()
         others = sum(not v.same_physics for v in found)
         lines.append(
             f"{family:<20}{len(found):>10}{sum(v.passed for v in found):>8}{rejected:>10}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import uuid
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -14,13 +13,12 @@ from pydantic import RootModel, ValidationError
 from traps_pipeline.benchmark.items import commonest_answers
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import SCENE_SPECS
-from traps_pipeline.scenes.sample import Sample, answer_quota, ill_posed_quota, sample_family, write_released
+from traps_pipeline.scenes.sample import answer_quota, ill_posed_quota, sample_family
 from traps_pipeline.scenes.spec import SceneSpec
 from traps_pipeline.storage.workspace import write_text
 from traps_pipeline.yamlfile import explain, read_yaml
 
 PRIOR_AT_MOST = 0.55  # accuracy of the commonest answer, occlusion and chaotic weighted equally
-DRAWS = "draws.json"  # beside the records: draws and rejections of each family
 
 
 class Composition(RootModel[dict[str, int]]):
@@ -46,46 +44,19 @@ def sample_benchmark(
 ) -> None:
     """Draw a benchmark into `out`: released records, trajectories, `benchmark.yaml` with a canary of its own.
 
-    A family whose records are there in that number is left alone, so that a stopped sampling goes on. Raises
-    TrapsError when a family cannot be filled.
+    What is there of the same seed and numbers stays: a stopped sampling goes on. Raises TrapsError when a family cannot
+    be filled.
     """
-    released = out / "released"
     for family, count in counts.items():
-        lines = _lines(released / f"{family}.jsonl")
-        if len(lines) == count:
-            report(f"{family}: {count} scenarios are there")
-            continue
-        draws = out / ".draws" / f"{family}-{seed}"
         try:
-            sample = sample_family(family, count, seed, draws, workers=workers, report=report)
+            tally = sample_family(family, count, seed, out / "released", workers=workers, report=report)
         except RuntimeError as error:
-            raise TrapsError(f"{error}; the draws are kept in {draws}") from error
-        write_released(released, family, sample)
-        _note_draws(released / DRAWS, family, sample)
-        report(f"{family}: {count} of {sample.draws} draws; {_tally(sample)}")
+            raise TrapsError(str(error)) from error
+        reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"
+        report(f"{family}: {count} of {tally.draws} draws; {reasons}")
     if not (out / "benchmark.yaml").exists():
         release = {"name": name, "version": "1.0.0", "canary": f"{name.upper()}:CANARY:{uuid.uuid4()}"}
         write_text(out / "benchmark.yaml", yaml.safe_dump(release, sort_keys=False))
-
-
-def _lines(path: Path) -> list[str]:
-    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-
-
-def _tally(sample: Sample) -> str:
-    return ", ".join(f"{n} x {reason}" for reason, n in sample.rejections.most_common()) or "none rejected"
-
-
-def _note_draws(path: Path, family: str, sample: Sample) -> None:
-    notes = load_draws(path.parent)
-    notes[family] = {"draws": sample.draws, "rejected": dict(sample.rejections.most_common())}
-    write_text(path, json.dumps(notes, indent=1, sort_keys=True) + "\n")
-
-
-def load_draws(released: Path) -> dict[str, dict]:
-    """Family to how many draws its scenarios took and why the others were rejected."""
-    path = released / DRAWS
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:

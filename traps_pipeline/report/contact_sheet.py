@@ -64,13 +64,13 @@ def contact_sheet(items: pd.DataFrame, root: Path, per_family: int | None = 1, c
 def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
     """ITEMS rows of six visual pairs for a figure like the paper's: three of either taxonomy, of as many sub-scenarios
     as there are, fewer where there are fewer."""
-    visual = items[items["dataset"].isin(["occlusion", "chaotic"])]
+    visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
     chosen: list[str] = []
     for _, rows in visual.groupby("taxonomy", sort=True):
         pairs = rows.drop_duplicates("pair_id").sort_values(["category", "sub_scenario", "pair_id"])
         firsts = [*pairs.drop_duplicates("category")["pair_id"], *pairs["pair_id"]]
         chosen += list(dict.fromkeys(firsts))[:3]
-    return visual[visual["pair_id"].isin(chosen)]
+    return visual.loc[visual["pair_id"].isin(chosen)]
 
 
 def chosen_pairs(items: pd.DataFrame, per_family: int | None) -> list[pd.DataFrame]:

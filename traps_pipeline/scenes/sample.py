@@ -1,7 +1,7 @@
 """Drawing scenarios of a family until its quotas are full, and writing them down as released records.
 
 Draws are numbered and independent, so they run on all cores; acceptance goes through them in order, so that the same
-seed gives the same scenarios. Every finished draw is kept on disk at once: a sampling that was stopped goes on.
+seed gives the same scenarios. Every accepted scenario is written at once: a sampling that was stopped goes on.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,21 +22,32 @@ from traps_pipeline.scenes.outcome import Rejected, compile_scene, read_outcome
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.resolve import Resolved, resolve
 from traps_pipeline.scenes.simulate import replay, simulate
-from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory
+from traps_pipeline.scenes.spec import SceneSpec, save_trajectory
 from traps_pipeline.scenes.wording import draw_ill_posed
 from traps_pipeline.scenes.workers import run_in_order
 
 MOST_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
+DRAWS = "draws.json"  # beside the records: how each family was drawn
 _UNASKED = "?"  # stands for the ill-posed question until the scenario has its place
 
 
 @dataclass
-class Sample:
-    """Accepted scenarios with their trajectories, how many draws they took, and why the others were rejected."""
+class Tally:
+    """How a family was drawn: the seed, scenarios wanted, draws made, and why the others were rejected."""
 
-    scenarios: list[Resolved] = field(default_factory=list)
+    seed: int
+    wanted: int
     draws: int = 0
-    rejections: Counter[str] = field(default_factory=Counter)
+    rejected: Counter[str] = field(default_factory=Counter)
+
+
+def load_tallies(released: Path) -> dict[str, Tally]:
+    """Family to how its records were drawn, from `draws.json` beside them."""
+    path = released / DRAWS
+    if not path.is_file():
+        return {}
+    notes = json.loads(path.read_text(encoding="utf-8"))
+    return {name: Tally(**note | {"rejected": Counter(note["rejected"])}) for name, note in notes.items()}
 
 
 def answer_quota(count: int, n_labels: float) -> int:
@@ -62,57 +73,101 @@ class Draw:
     seed: int
     number: int
     closed: frozenset[str]
-    folder: Path
-
-    @property
-    def file(self) -> Path:
-        """Where its result is kept."""
-        return self.folder / f"{self.number:05d}.json"
 
 
 def sample_family(
     name: str,
     count: int,
     seed: int,
-    folder: Path,
+    released: Path,
     *,
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
-) -> Sample:
-    """Draw until `count` scenarios are accepted. The same seed gives the same scenarios on the same machine type.
+) -> Tally:
+    """Draw until `released` holds `count` scenarios of a family; the same seed gives the same ones on a machine type.
 
-    folder keeps the draws, so that a sampling that was stopped goes on. Raises RuntimeError with the tally of
-    rejections when 40 draws a scenario are not enough.
+    Goes on where a stopped call with the same seed and count was; anything else of the family is replaced. Raises
+    RuntimeError with the tally of rejections when 40 draws a scenario are not enough.
     """
-    family, sample = get_family(name), Sample()
-    answers, texts = Counter[str](), Counter[str]()
-    folder.mkdir(parents=True, exist_ok=True)
+    family, records = get_family(name), Records(released, name)
+    tally = load_tallies(released).get(name)
+    if tally is None or (tally.seed, tally.wanted) != (seed, count):
+        tally = Tally(seed, count)
+        records.clear()
+    specs = records.read(tally)
+    answers = Counter(spec.ground_truth for spec in specs)
+    texts = Counter(spec.ill_posed_question for spec in specs)
+    if len(specs) == count:
+        return tally
 
     def jobs() -> Iterator[Draw]:
-        for number in range(MOST_DRAWS * count):
-            yield Draw(name, seed, number, _closed(answers, count, family), folder)
+        for number in range(tally.draws, MOST_DRAWS * count):
+            yield Draw(name, seed, number, _closed(answers, count, family))
 
     results = run_in_order(try_draw, jobs(), workers)
     try:
-        for draw, reason in results:
-            sample.draws += 1
-            found = None if reason else _load(draw)
-            if found is not None and found.spec.ground_truth in _closed(answers, count, family):
-                found, reason = None, f"answer {found.spec.ground_truth!r} has its quota"
-            if found is None:
-                sample.rejections[str(reason).split(":")[0]] += 1
+        for draw, found in results:
+            tally.draws += 1
+            if isinstance(found, Resolved) and found.spec.ground_truth in _closed(answers, count, family):
+                found = f"answer {found.spec.ground_truth!r} has its quota"
+            if isinstance(found, str):
+                tally.rejected[found.split(":")[0]] += 1
                 continue
-            named = _named(family, found, draw, len(sample.scenarios) + 1, texts, count)
+            named = _named(family, found, draw, answers.total() + 1, texts, count)
             answers[named.spec.ground_truth] += 1
             texts[named.spec.ill_posed_question] += 1
-            sample.scenarios.append(named)
-            report(f"{named.spec.scenario_id}: {named.spec.ground_truth} after {sample.draws} draws")
-            if len(sample.scenarios) == count:
-                return sample
+            records.append(named, tally)
+            report(f"{named.spec.scenario_id}: {named.spec.ground_truth} after {tally.draws} draws")
+            if answers.total() == count:
+                return tally
     finally:
         results.close()  # type: ignore[attr-defined]
-    tally = ", ".join(f"{n} x {reason}" for reason, n in sample.rejections.most_common())
-    raise RuntimeError(f"{name}: {len(sample.scenarios)} of {count} after {sample.draws} draws; rejected: {tally}")
+    reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common())
+    raise RuntimeError(f"{name}: {answers.total()} of {count} after {tally.draws} draws; rejected: {reasons}")
+
+
+class Records:
+    """The released files of a family: `<family>.jsonl`, one record a line, `trajectories/<scenario_id>.npz`, and the
+    family's place in `draws.json`, which is written last and so vouches for the others."""
+
+    def __init__(self, released: Path, family: str) -> None:
+        self._released, self._family = released, family
+        self._lines = released / f"{family}.jsonl"
+
+    def clear(self) -> None:
+        """Take away whatever is there of the family."""
+        self._lines.unlink(missing_ok=True)
+        for old in (self._released / "trajectories").glob(f"{self._family}-*.npz"):
+            old.unlink()
+
+    def read(self, tally: Tally) -> list[SceneSpec]:
+        """The records of the draws that the tally counts; a record after them was cut off and is dropped."""
+        if not self._lines.is_file():
+            return []
+        specs = []
+        for line in self._lines.read_text(encoding="utf-8").splitlines():
+            try:
+                specs.append(SceneSpec.model_validate(json.loads(line)))
+            except ValueError:  # a line that a kill tore
+                break
+        kept = [spec for spec in specs if spec.seed < tally.draws]
+        self._lines.write_text("".join(_line(spec) for spec in kept), encoding="utf-8")
+        return kept
+
+    def append(self, found: Resolved, tally: Tally) -> None:
+        """Add a scenario and note how far the drawing is."""
+        save_trajectory(self._released / "trajectories", found.spec.scenario_id, found.qpos, found.twin)
+        with self._lines.open("a", encoding="utf-8") as lines:
+            lines.write(_line(found.spec))
+        notes = {name: asdict(each) for name, each in load_tallies(self._released).items()}
+        notes[self._family] = asdict(tally)
+        part = self._released / f".{DRAWS}.part"
+        part.write_text(json.dumps(notes, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        part.replace(self._released / DRAWS)
+
+
+def _line(spec: SceneSpec) -> str:
+    return json.dumps(spec.model_dump(mode="json"), ensure_ascii=False) + "\n"
 
 
 def _closed(answers: Counter[str], count: int, family: Family) -> frozenset[str]:
@@ -127,45 +182,19 @@ def _label_count(family: Family) -> float:
     return float(np.mean([len(family.word(family.draw(rng), rng).labels) for _ in range(32)]))
 
 
-def try_draw(draw: Draw) -> str | None:
-    """Resolve a draw and keep it; None if it is a valid pair, else why it is rejected."""
-    if draw.file.is_file():
-        return json.loads(draw.file.read_text(encoding="utf-8")).get("rejected")
+def try_draw(draw: Draw) -> Resolved | str:
+    """A draw, resolved, or why it is rejected."""
     family = get_family(draw.family)
-    rng = _generator(draw)
+    rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number])
     params = family.draw(rng)
     wording = family.word(params, rng)
     try:
         answer = simulated_answer(family, params)
         if answer in draw.closed:
-            return f"answer {answer!r} has its quota"  # not kept: it depends on the draws before
-        found = resolve(family, params, wording, _UNASKED, scenario_id=f"{family.name}-0000", seed=draw.number)
+            return f"answer {answer!r} has its quota"
+        return resolve(family, params, wording, _UNASKED, scenario_id=f"{family.name}-0000", seed=draw.number)
     except Rejected as rejected:
-        _write(draw.file, {"rejected": str(rejected)})
         return str(rejected)
-    save_trajectory(draw.folder, draw.file.stem, found.qpos, found.twin)
-    _write(draw.file, {"record": found.spec.model_dump(mode="json")})
-    return None
-
-
-def _generator(draw: Draw) -> np.random.Generator:
-    return np.random.default_rng([draw.seed, *draw.family.encode(), draw.number])
-
-
-def _write(path: Path, record: dict[str, Any]) -> None:
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(record), encoding="utf-8")
-    part.replace(path)
-
-
-def _load(draw: Draw) -> Resolved:
-    spec = SceneSpec.model_validate(json.loads(draw.file.read_text(encoding="utf-8"))["record"])
-    path = draw.file.with_suffix(".npz")
-    return Resolved(
-        spec,
-        load_trajectory(path, spec.trajectory_sha256),
-        load_trajectory(path, spec.twin.trajectory_sha256, "twin"),
-    )
 
 
 def _named(family: Family, found: Resolved, draw: Draw, place: int, texts: Counter[str], count: int) -> Resolved:
@@ -187,14 +216,3 @@ def simulated_answer(family: Family, params: Any) -> str:
     except FloatingPointError as error:
         raise Rejected(str(error)) from error
     return read_outcome(family, replay(model, qpos, family.physics), params).label
-
-
-def write_released(folder: Path, name: str, sample: Sample) -> None:
-    """`<folder>/<family>.jsonl`, one record a line, and `<folder>/trajectories/<scenario_id>.npz`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for old in (folder / "trajectories").glob(f"{name}-*.npz"):
-        old.unlink()
-    for found in sample.scenarios:
-        save_trajectory(folder / "trajectories", found.spec.scenario_id, found.qpos, found.twin)
-    lines = [json.dumps(found.spec.model_dump(mode="json"), ensure_ascii=False) for found in sample.scenarios]
-    (folder / f"{name}.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")

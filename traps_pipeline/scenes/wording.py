@@ -130,7 +130,7 @@ ABSENT_OBJECTS = (
     "propeller",
 )
 # What colours do not have, whatever the scene shows.
-NO_QUALITY_OF_A_COLOUR = r"\b(weight|mass|price|sound|decibels|temperature|speed|weigh|loud|cost)\b.*\bcolou?r (\w+)"
+NO_QUALITY_OF_A_COLOUR = r"\b(weight|mass|price|sound|decibels|temperature|speed|weigh|loud|cost)\b.*\bcolou?r\b"
 _FALSE_PREMISES = (
     "What material is the {absent} made of?",
     "How often does the {object} hit the {absent}?",

@@ -1,0 +1,162 @@
+"""A benchmark as a whole: counts, balance, repeated texts and scenes; and certifying a folder of records."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from traps_pipeline.benchmark.composition import load_composition, prior_accuracy, problems
+from traps_pipeline.benchmark.evidence import answerable_ill_posed, answerable_voids, unanswerable_controls
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.cli import main
+from traps_pipeline.paths import RELEASED
+from traps_pipeline.scenes.registry import family_names, get_family
+from traps_pipeline.scenes.spec import SceneSpec
+
+PAPER = {  # counts of the paper's composition table (`benchmark.md` section 2)
+    "ramps_rolling": 39,
+    "pendulums_levers": 32,
+    "trajectories_drops": 29,
+    "hidden": 28,
+    "collisions": 23,
+    "dominoes": 20,
+    "stacks": 8,
+    "other": 23,
+    "pachinko_waterfall": 50,
+    "plinko": 50,
+    "seesaw_sorter": 200,
+    "tumbling_dice": 200,
+}
+
+
+def test_the_composition_is_the_papers() -> None:
+    counts = load_composition()
+    assert sorted(counts) == list(family_names())
+    categories = Counter[str]()
+    for name, count in counts.items():
+        categories[get_family(name).category] += count
+    assert categories == PAPER
+    assert sum(PAPER.values()) == 702
+
+
+def race(answers: str) -> list[SceneSpec]:
+    """Records of one family with the given answers, otherwise fine."""
+    spec = load_released()["domino_chain-0001"]
+    return [
+        spec.model_copy(
+            update={
+                "scenario_id": f"domino_chain-{i:04d}",
+                "ground_truth": "yes" if answer == "y" else "no",
+                "ill_posed_question": f"How many grams does domino {i} weigh?",
+                "trajectory_sha256": f"{i:064d}",
+            }
+        )
+        for i, answer in enumerate(answers)
+    ]
+
+
+def test_an_answer_may_come_once_more_than_the_even_split() -> None:
+    assert problems(race("yyyyynnn")) == []
+    assert problems(race("yyyyyynn")) == ["domino_chain: answer 'yes' occurs 6 times, at most 5 allowed"]
+
+
+def test_of_ten_or_more_an_answer_of_two_may_be_60_percent() -> None:
+    assert problems(race("y" * 12 + "n" * 8)) == []
+    assert problems(race("y" * 13 + "n" * 7)) == ["domino_chain: answer 'yes' occurs 13 times, at most 12 allowed"]
+
+
+def test_a_text_or_a_scene_that_occurs_twice_is_named() -> None:
+    specs = race("ynyn")
+    twice = [*specs[:3], specs[3].model_copy(update={"ill_posed_question": specs[0].ill_posed_question})]
+    assert problems(twice) == [
+        "domino_chain: 'How many grams does domino 0 weigh?' is asked 2 times, at most 1 allowed"
+    ]
+    copied = [*specs[:3], specs[0].model_copy(update={"scenario_id": "domino_chain-0099", "ill_posed_question": "?"})]
+    assert problems(copied) == ["domino_chain-0000, domino_chain-0099: the same trajectory"]
+
+
+def test_missing_scenarios_are_counted() -> None:
+    found = problems(race("yn"), {"domino_chain": 2, "plinko": 1})
+    assert found == ["plinko: 0 scenarios, 1 wanted"]
+
+
+def test_the_prior_knows_only_the_commonest_answer_of_a_sub_scenario() -> None:
+    assert prior_accuracy(race("yyyn")) == 0.75
+
+
+def test_released_records_carry_evidence_that_holds() -> None:
+    specs = list(load_released().values())
+    assert unanswerable_controls(specs) == []
+    assert answerable_voids(specs) == []
+    assert answerable_ill_posed(specs) == []
+    assert problems(specs) == []
+
+
+@pytest.mark.parametrize(
+    ("evidence", "found"),
+    [
+        ({"twin_px": 3}, "twin does not hold"),
+        ({"ablation_px": 1}, "nothing leaks does not hold"),
+        ({"hidden_from_s": 4.8}, "hidden before it is settled does not hold"),
+    ],
+)
+def test_evidence_beyond_its_threshold_is_found(evidence: dict[str, Any], found: str) -> None:
+    spec = load_released()["domino_chain-0001"]
+    worse = spec.model_copy(update={"evidence": spec.evidence | evidence})
+    assert answerable_voids([worse]) == [f"domino_chain-0001: {found}"]
+    bare = spec.model_copy(update={"evidence": {}})
+    assert len(answerable_voids([bare])) == 3
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A benchmark of one scenario."""
+    (tmp_path / "released" / "trajectories").mkdir(parents=True)
+    line = (RELEASED / "hidden_race.jsonl").read_text(encoding="utf-8").splitlines()[0]
+    (tmp_path / "released" / "hidden_race.jsonl").write_text(line + "\n", encoding="utf-8")
+    shutil.copy(RELEASED / "trajectories" / "hidden_race-0001.npz", tmp_path / "released" / "trajectories")
+    return tmp_path
+
+
+def alter(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    path = folder / "released" / "hidden_race.jsonl"
+    record = json.loads(path.read_text(encoding="utf-8"))
+    change(record)
+    path.write_text(json.dumps(record) + "\n", encoding="utf-8")
+    load_released.cache_clear()
+
+
+def test_certify_passes_what_is_released_and_names_what_is_altered(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["certify", "--specs", str(folder), "--workers", "1"]
+    assert main(command) == 0
+    said = capsys.readouterr()
+    assert "1 of 1 scenarios certified" in said.out
+    assert "hidden_race" in said.out
+
+    def answer(record: dict[str, Any]) -> None:
+        record["ground_truth"] = record["twin"]["ground_truth"]
+
+    alter(folder, answer)
+    assert main(command) == 1
+    said = capsys.readouterr()
+    assert "hidden_race-0001: outcome: the control shows" in said.err
+    assert "0 of 1 scenarios certified" in said.out
+
+    def nonsense(record: dict[str, Any]) -> None:
+        record["params"] = {"direction": 1}
+
+    alter(folder, nonsense)
+    assert main(command) == 1
+    assert "hidden_race-0001: record: family hidden_race: unknown parameters []" in capsys.readouterr().err
+    (folder / "released" / "trajectories" / "hidden_race-0001.npz").unlink()
+    assert main(command) == 1
+    assert "no such trajectory" in capsys.readouterr().err
+    load_released.cache_clear()

@@ -1,0 +1,87 @@
+"""Released records with everything rebuilt from them, shared by the tests of scenes."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("MUJOCO_GL", "osmesa")
+
+import numpy as np
+
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.paths import RELEASED
+from traps_pipeline.scenes.camera import Camera, Panel
+from traps_pipeline.scenes.kit import Family, Physics
+from traps_pipeline.scenes.outcome import compile_scene
+from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.render import Renderer
+from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+
+SAMPLED = slice(None, None, 2)  # the 5 FPS frames that models are shown
+
+
+@dataclass(frozen=True)
+class Released:
+    """A released scenario, its values restored."""
+
+    spec: SceneSpec
+    qpos: np.ndarray
+    twin: np.ndarray
+
+    @property
+    def family(self) -> Family:
+        return get_family(self.spec.family)
+
+    @property
+    def params(self) -> Any:
+        return self.family.params_from(self.spec.params)
+
+    @property
+    def physics(self) -> Physics:
+        return Physics(**self.spec.physics)
+
+    @property
+    def camera(self) -> Camera:
+        return Camera.from_record(self.spec.camera)
+
+    @property
+    def panel(self) -> Panel | None:
+        return Panel.from_record(self.spec.void["panel"]) if self.spec.void_kind == "occluder" else None
+
+    @cached_property
+    def control_frames(self) -> np.ndarray:
+        """The control as it is sampled, (25, 360, 480, 3)."""
+        model, _ = compile_scene(self.family, self.params, self.physics)
+        with Renderer(model, self.camera) as renderer:
+            return np.stack(list(renderer.frames(self.qpos[SAMPLED])))
+
+    def void_frames(self, panel_rgb: tuple[float, float, float] | None = None) -> np.ndarray:
+        """The void as it is sampled; its panel in another colour if one is given."""
+        if self.panel is None:
+            return self.control_frames[: -(-self.spec.void["cut_frame"] // 2)]
+        model, _ = compile_scene(self.family, self.params, self.physics, self.panel)
+        if panel_rgb is not None:
+            model.geom_rgba[model.geom("cover_panel").id, :3] = panel_rgb
+        with Renderer(model, self.camera) as renderer:
+            return np.stack(list(renderer.frames(self.qpos[SAMPLED], panel=True)))
+
+
+def load(scenario_id: str, folder: Path = RELEASED) -> Released:
+    """A released scenario by id."""
+    spec = load_released()[scenario_id]
+    path = folder / "trajectories" / f"{scenario_id}.npz"
+    qpos = load_trajectory(path, spec.trajectory_sha256)
+    return Released(spec, qpos, load_trajectory(path, spec.twin.trajectory_sha256, "twin"))
+
+
+def first_of_each(void_kind: str) -> list[str]:
+    """The first released scenario of every family of a kind."""
+    firsts: dict[str, str] = {}
+    for scenario_id, spec in load_released().items():
+        if spec.void_kind == void_kind:
+            firsts.setdefault(spec.family, scenario_id)
+    return sorted(firsts.values())

@@ -1,0 +1,91 @@
+"""Observers see the answer in the control and nothing in the void, whatever the panel looks like and however long the
+clip is. One scenario of every family, on its sampled frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.scenes.released import first_of_each, load
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH
+from traps_pipeline.scenes.kit import COLOURS
+from traps_pipeline.scenes.observe import family_asking
+from traps_pipeline.scenes.outcome import compile_scene
+from traps_pipeline.scenes.simulate import swept_points
+from traps_pipeline.scenes.vision import blobs, colour_mask
+from traps_pipeline.scenes.wording import asked
+
+MAGENTA, OLIVE = (0.75, 0.10, 0.50), (0.42, 0.42, 0.10)
+PATCH = 56  # pixels of a panel that hides nothing
+ALL = [*first_of_each("occluder"), *first_of_each("truncation")]
+
+
+@pytest.mark.parametrize("scenario_id", ALL)
+def test_the_observer_answers_the_control_and_abstains_on_the_void(scenario_id: str) -> None:
+    case = load(scenario_id)
+    observe, question, void = case.family.observe, case.spec.question, case.void_frames()
+    assert observe is not None
+    assert observe(case.control_frames, question) == case.spec.ground_truth
+    assert observe(void, question) is None
+    assert observe(case.control_frames, case.spec.ill_posed_question) is None
+    elsewhere = _with_panel_elsewhere(scenario_id, case.control_frames)
+    assert observe(elsewhere, question) == case.spec.ground_truth
+    if case.panel is None:
+        padded = np.concatenate([void, np.repeat(void[-1:], len(case.control_frames) - len(void), axis=0)])
+        assert observe(padded, question) is None
+
+
+@pytest.mark.parametrize("scenario_id", first_of_each("occluder"))
+def test_the_colour_of_the_panel_tells_the_observer_nothing(scenario_id: str) -> None:
+    case = load(scenario_id)
+    assert case.family.observe is not None
+    for rgb in (MAGENTA, OLIVE):
+        assert case.family.observe(case.void_frames(rgb), case.spec.question) is None
+
+
+def _with_panel_elsewhere(scenario_id: str, frames: np.ndarray) -> np.ndarray:
+    """A navy patch in a corner where nothing moves and no outcome is; no change if all corners are taken."""
+    case = load(scenario_id)
+    model, scene = compile_scene(case.family, case.params, case.physics)
+    points = np.concatenate([swept_points(model, case.qpos[::5]), *(box.corners() for box in scene.stage)])
+    x, y = case.camera.project(points).T
+    for left in (4, WIDTH - PATCH - 4):
+        for top in (4, HEIGHT - PATCH - 4):
+            if not ((x > left - 6) & (x < left + PATCH + 6) & (y > top - 6) & (y < top + PATCH + 6)).any():
+                changed = frames.copy()
+                changed[:, top : top + PATCH, left : left + PATCH] = np.array(COLOURS["navy"]) * 255
+                return changed
+    return frames
+
+
+def test_every_released_question_belongs_to_its_own_family_alone() -> None:
+    for spec in load_released().values():
+        family = family_asking(spec.question)
+        assert family is not None
+        assert family.name == spec.family, spec.question
+        assert family_asking(spec.ill_posed_question) is None, spec.ill_posed_question
+
+
+def test_a_question_gives_its_template_and_values_back() -> None:
+    templates = ("Does the {ball} ball pass the {line} line, yes or no?", "Where is the {ball} ball: left or right?")
+    assert asked(templates, "Does the red ball pass the blue line, yes or no?") == {"ball": "red", "line": "blue"}
+    assert asked(templates, "Where is the red ball: left or right?") == {"ball": "red"}
+    assert asked(templates, "Where is the red ball?") is None
+    assert asked(("{a} or {a}?",), "x or y?") is None  # the same placeholder, two values
+
+
+@pytest.mark.parametrize("colour", [c for c in COLOURS if c not in ("white", "grey", "wood", "black")])
+def test_a_lit_and_a_shaded_patch_are_of_their_colour_and_of_no_other(colour: str) -> None:
+    frame = np.full((HEIGHT, WIDTH, 3), 200, np.uint8)  # the warm-grey floor
+    frame[..., 2] = 188
+    rgb = np.array(COLOURS[colour]) * 255
+    frame[100:120, 50:80] = rgb
+    frame[200:220, 300:330] = rgb * 0.75
+    found = blobs(colour_mask(frame, colour))
+    assert [(blob.box, blob.area, blob.fill) for blob in sorted(found, key=lambda b: b.y)] == [
+        ((50, 100, 30, 20), 600, 1.0),
+        ((300, 200, 30, 20), 600, 1.0),
+    ]
+    others = [c for c in COLOURS if c not in (colour, "grey", "black")]
+    assert all(not colour_mask(frame, other)[105:115, 55:75].any() for other in others)

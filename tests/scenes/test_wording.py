@@ -1,0 +1,85 @@
+"""Ill-posed questions: drawn from the inventory, refuted by it or beyond any video; well-posed ones are neither."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from traps_pipeline.scenes.kit import Inventory
+from traps_pipeline.scenes.wording import (
+    BEYOND_VIDEO,
+    beyond_video,
+    choices_in,
+    draw_ill_posed,
+    false_premise,
+)
+
+SCENE = Inventory(
+    colours=("red", "wood", "black"),
+    objects=("ball", "ramp", "line"),
+    things=("red ball", "wooden ramp", "black line"),
+)
+
+
+@pytest.mark.parametrize(
+    ("question", "property_"),
+    [
+        ("How many grams does the red ball weigh?", "mass"),
+        ("What is the temperature of the ramp in degrees Celsius?", "temperature"),
+        ("Where will the ball be one hour after the clip ends?", "later"),
+        ("In which year was the ramp made?", "age"),
+        ("Does the red ball pass the black line, yes or no?", None),
+        ("What colour is the ramp?", None),
+    ],
+)
+def test_a_question_beyond_the_video_names_a_listed_property(question: str, property_: str | None) -> None:
+    assert beyond_video(question) == property_
+
+
+def test_every_template_asks_for_its_own_property() -> None:
+    for name, (_, templates) in BEYOND_VIDEO.items():
+        for template in templates:
+            assert beyond_video(template.format(thing="red ball")) == name, template
+
+
+@pytest.mark.parametrize(
+    ("question", "why"),
+    [
+        ("What material are the triangles made of?", "there is no triangle"),  # the paper's own
+        ("What is the weight of the red color?", "a colour has no weight"),  # and this one
+        ("What is the weight of the colour red?", "a colour has no weight"),
+        ("Where does the blue ball end up?", "nothing is blue"),
+        ("Where does the red ball end up?", None),
+        ("How often does the ball hit the magnet?", "there is no magnet"),
+    ],
+)
+def test_a_false_premise_is_refuted_by_the_inventory(question: str, why: str | None) -> None:
+    assert false_premise(question, SCENE) == why
+
+
+@pytest.mark.parametrize("taxonomy", ["occlusion", "chaotic"])
+def test_drawn_questions_are_refuted_and_plenty(taxonomy: str) -> None:
+    texts = Counter[str]()
+    most = 1 if taxonomy == "occlusion" else 10
+    for draw in range(40 if taxonomy == "occlusion" else 200):
+        question = draw_ill_posed(
+            taxonomy,  # type: ignore[arg-type]
+            SCENE,
+            np.random.default_rng(draw),
+            lambda text: texts[text] < most,
+        )
+        assert (beyond_video(question) if taxonomy == "occlusion" else false_premise(question, SCENE)) is not None
+        texts[question] += 1
+    assert max(texts.values()) <= most
+
+
+def test_a_scene_with_every_question_taken_is_refused() -> None:
+    with pytest.raises(ValueError, match="name more things"):
+        draw_ill_posed("occlusion", SCENE, np.random.default_rng(0), lambda _: False)
+
+
+def test_choices_are_read_as_they_are_listed() -> None:
+    assert choices_in("red, blue or green") == ("red", "blue", "green")
+    assert choices_in("0-2, 3-4 or 5-6") == ("0-2", "3-4", "5-6")
