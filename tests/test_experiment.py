@@ -19,9 +19,9 @@ def experiment(tmp_path: Path, text: str) -> str:
 
 def test_the_demo_is_eight_reference_models_by_three_regimes_on_32_named_scenarios() -> None:
     demo = load_experiment("demo")
-    assert len(demo.models) == 8 and demo.regimes == list(REGIMES) and demo.runs == [1]
+    assert len(demo.models) == 9 and demo.regimes == list(REGIMES) and demo.runs == [1]
     assert demo.scenarios is not None and len(set(demo.scenarios)) == 32
-    assert len(demo.cells()) == 8 * 3 * 1 * 4
+    assert len(demo.cells()) == 9 * 3 * 1 * 4
 
 
 def test_all_datasets_and_regimes_are_asked_where_none_is_named_and_a_model_has_no_more_runs_than_it_has(

@@ -103,7 +103,7 @@ SCENE_SPECS = Table(
     answerable_question str JSON: question, labels, answer that even the void shows
     scene_hash str digest of what the clips show
     spec_hash str digest of the whole record
-    trajectory str path of the frozen qpos, relative to the checkout or the workspace
+    trajectory str path of the frozen qpos, relative to the checkout or the workspace if it lies there
     trajectory_sha256 str digest of its values
     twin str JSON: another world behind the same void: its parameters, answer, digest of its trajectory
     commit_s float time (s) from which the outcome holds

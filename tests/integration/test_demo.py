@@ -67,7 +67,7 @@ def test_every_table_knows_its_benchmark_version(workspace: Workspace) -> None:
 
 def test_the_demo_ends_with_the_leaderboard_and_paths_that_exist(demo: Checkout, demo_output: str) -> None:
     assert (
-        "3072 answers asked (0 from the ledger), 13824 votes asked (0 from the ledger), 2400 frames rendered"
+        "3456 answers asked (0 from the ledger), 15552 votes asked (0 from the ledger), 4000 frames rendered"
         in demo_output
     )
     lines = demo_output.splitlines()
@@ -95,4 +95,4 @@ def test_status_calls_everything_fresh_and_plan_has_nothing_new(demo_study: Chec
     ):
         assert f"{stage:<18} {partitions:>6}      0        0" in status
     plan = demo_study.traps("plan", "demo").out.splitlines()[-1].split()
-    assert plan == ["all", "3,072", "3,072", "0", "13,824", "13,824", "0"]
+    assert plan == ["all", "3,456", "3,456", "0", "15,552", "15,552", "0"]

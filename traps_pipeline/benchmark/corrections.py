@@ -22,11 +22,11 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.benchmark.records import load_release, load_released
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import CATEGORIES
-from traps_pipeline.paths import CORRECTIONS
+from traps_pipeline.paths import CHECKOUT, CORRECTIONS, SCENE_SPECS, SPECS_VARIABLE
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.spec import Answerable, SceneSpec, Slug
 from traps_pipeline.storage.workspace import Study
@@ -183,7 +183,18 @@ def _added(where: str, correction: Correction) -> Scenario:
 
 def load_scenarios(study: Study) -> dict[str, Scenario]:
     """The scenarios of a study: folded, then the study's subset. Raises TrapsError for an unknown named scenario."""
+    check_benchmark(study)
     return subset(folded(), study)
+
+
+def check_benchmark(study: Study) -> None:
+    """Raises TrapsError unless the records in force are of the study's benchmark."""
+    there = "released" if SCENE_SPECS == CHECKOUT / "scene_specs" else load_release().name
+    if study.benchmark != there:
+        raise TrapsError(
+            f"study.yaml: its benchmark is {study.benchmark!r}, the records in {SCENE_SPECS} are {there!r}; set "
+            f"{SPECS_VARIABLE} to the folder of {study.benchmark!r}, or write `benchmark: {there}` in a new study"
+        )
 
 
 @cache

@@ -156,17 +156,22 @@ def _row(workspace: Workspace, item: Resolved, version: str) -> dict[str, Any]:
     record = spec.model_dump(mode="json", exclude={"evidence"})
     for name in ("params", "physics", "camera", "void", "aliases", "answerable_question", "twin"):
         record[name] = json.dumps(record[name], sort_keys=True, ensure_ascii=False)
-    inside = item.trajectory.is_relative_to(workspace.root)
     return record | {
         "scene_hash": spec.scene_hash,
         "spec_hash": spec.spec_hash,
-        "trajectory": item.trajectory.relative_to(workspace.root if inside else CHECKOUT).as_posix(),
+        "trajectory": _relative(item.trajectory, workspace.root, CHECKOUT),
         "commit_s": float(spec.evidence["commit_s"]),
         "margin_m": float(spec.evidence["margin_m"]),
         "void_from_s": void_from_s(spec),
         "evidence": json.dumps(spec.evidence, sort_keys=True),
         "benchmark_version": version,
     }
+
+
+def _relative(path: Path, *roots: Path) -> str:
+    """The path relative to the first root it lies under; as it is under none (a benchmark of one's own)."""
+    root = next((root for root in roots if path.is_relative_to(root)), None)
+    return (path.relative_to(root) if root else path).as_posix()
 
 
 def spec_of(row: dict[str, Any]) -> SceneSpec:
