@@ -29,6 +29,8 @@ from traps_pipeline.scenes.kit import (
     new_spec,
     uniform,
 )
+from traps_pipeline.scenes.vision import at_rest, colour_mask, track
+from traps_pipeline.scenes.wording import asked
 
 if TYPE_CHECKING:
     import mujoco
@@ -42,7 +44,7 @@ BALL_AT = 0.55 + BALL  # centre of the kicked ball, from the front face of the l
 POSTS_AT = 1.75  # near face of the posts, from there as well: the stopped ball is past that domino's reach
 
 STILL_M = 0.002  # a domino that moves less than this any more is at rest
-DOMINO_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple", "white")
+DOMINO_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ def draw(rng: np.random.Generator) -> Params:
     """Half of the rows have a gap; nothing that can be seen tells."""
     direction = int(rng.choice([-1, 1]))
     concealed = int(rng.integers(3, 5))
-    first, row, last, ball = distinct_colours(rng, 4, DOMINO_COLOURS)
+    first, row, last, ball = colours = distinct_colours(rng, 4, DOMINO_COLOURS)
     return Params(
         direction=direction,
         height_m=uniform(rng, 0.17, 0.21),
@@ -93,7 +95,7 @@ def draw(rng: np.random.Generator) -> Params:
         row_colour=row,
         last_colour=last,
         ball_colour=ball,
-        plank_colour=str(rng.choice(["wood", "grey", "black"])),
+        plank_colour=str(rng.choice(["grey", "black"] if "orange" in colours else ["wood", "grey", "black"])),
         azimuth_deg=90 - direction * uniform(rng, -32, 18),
         elevation_deg=uniform(rng, -36, -24),
     )
@@ -245,6 +247,20 @@ def _answerable(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, choices, p.ball_colour)
 
 
+def observe(frames: np.ndarray, question: str) -> str | None:
+    """Whether the last domino, once at rest, is no longer where it stood at first."""
+    values = asked(QUESTIONS, question)
+    if values is None:
+        return None
+    path = track(frames, values["last"], min_area=60)
+    if path[0] is None or not at_rest(path):
+        return None
+    x, y, w, h = path[0].box
+    part = np.s_[y : y + h // 2, x : x + w]
+    before, after = (colour_mask(frame, values["last"])[part] for frame in (frames[0], frames[-1]))
+    return "no" if (before & after).sum() > 0.7 * before.sum() else "yes"
+
+
 FAMILY = Family(
     name="domino_chain",
     taxonomy="occlusion",
@@ -258,7 +274,8 @@ FAMILY = Family(
     margin=margin,
     word=word,
     questions=QUESTIONS,
-    physics=Physics(timestep_s=0.001),
+    observe=observe,
+    physics=Physics(timestep_s=0.001, tolerance=0.0),  # a solver that stops early makes rounding visible in the twin
     min_margin_m=0.03,
     twins=twins,
 )

@@ -28,6 +28,8 @@ from traps_pipeline.scenes.kit import (
     new_spec,
     uniform,
 )
+from traps_pipeline.scenes.vision import blobs, colour_mask
+from traps_pipeline.scenes.wording import asked, choices_in
 
 if TYPE_CHECKING:
     import mujoco
@@ -237,6 +239,34 @@ def _answerable(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, choices, nearest)
 
 
+def observe(frames: np.ndarray, question: str) -> str | None:
+    """The ball that is seen again first after it was out of sight, once all of them are."""
+    values = asked(QUESTIONS, question)
+    if values is None:
+        return None
+    colours = choices_in(values["choices"])
+    out = [_seen_again(frames, colour) for colour in colours]
+    seen = [frame for frame in out if frame is not None]
+    if len(seen) < len(out) or seen.count(min(seen)) > 1:
+        return None
+    return colours[seen.index(min(seen))]
+
+
+def _seen_again(frames: np.ndarray, colour: str) -> int | None:
+    """First frame that shows at least half of the ball after the tunnel, None if it stays out of sight."""
+    areas = np.array([_ball_pixels(frame, colour) for frame in frames])
+    gone = np.flatnonzero(areas == 0)
+    if not gone.size or areas[-3:].min() == 0:
+        return None
+    back = np.flatnonzero(areas >= np.median(areas[-3:]) / 2)
+    return int(back[back > gone[0]][0])
+
+
+def _ball_pixels(frame: np.ndarray, colour: str) -> int:
+    sizes = [blob.area for blob in blobs(colour_mask(frame, colour), 20) if max(blob.box[2:]) < 80]
+    return max(sizes, default=0)
+
+
 FAMILY = Family(
     name="hidden_race",
     taxonomy="occlusion",
@@ -250,6 +280,7 @@ FAMILY = Family(
     margin=margin,
     word=word,
     questions=QUESTIONS,
+    observe=observe,
     min_margin_m=0.03,
     twins=twins,
 )

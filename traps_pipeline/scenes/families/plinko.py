@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from traps_pipeline.scenes.kit import (
@@ -24,11 +25,14 @@ from traps_pipeline.scenes.kit import (
     Wording,
     add_ball,
     add_box,
+    distinct_colours,
     listed,
     new_spec,
     rgba,
     uniform,
 )
+from traps_pipeline.scenes.vision import Blob, blobs, colour_mask
+from traps_pipeline.scenes.wording import asked, choices_in
 
 if TYPE_CHECKING:
     import mujoco
@@ -42,14 +46,14 @@ BUCKET_M = 0.16  # length of the walls between the buckets
 WALL_M = 0.008  # half the thickness of the walls
 GLASS_GAP_M = 0.006  # play of the ball under the glass that keeps it on the board
 BOUNCE = (-20000.0, -12.0)  # direct stiffness and damping of the pegs: a lively ball
-# Boards, and the balls that stand out against them.
+# Boards, and the balls that stand out against them. No ball has a colour of walls, pegs, apron or digits.
 SCHEMES = {
-    "wood": ("white", "black", "blue", "purple"),
-    "white": ("red", "black", "blue", "purple", "orange"),
-    "blue": ("white", "yellow", "orange"),
-    "green": ("white", "yellow", "black"),
-    "purple": ("white", "yellow", "cyan"),
-    "black": ("white", "yellow", "cyan", "orange"),
+    "wood": ("red", "green", "blue", "purple"),
+    "white": ("red", "green", "blue", "purple", "orange"),
+    "blue": ("red", "yellow", "orange"),
+    "green": ("red", "yellow", "purple"),
+    "purple": ("green", "yellow", "cyan"),
+    "black": ("red", "yellow", "cyan", "orange"),
 }
 PEGS = {"wood": "grey", "white": "wood", "blue": "cyan", "green": "wood", "purple": "grey", "black": "grey"}
 # Which segments a digit lights: a top, b upper right, c lower right, d bottom, e lower left, f upper left, g middle.
@@ -120,7 +124,7 @@ def draw(rng: np.random.Generator) -> Params:
         peg_radius_m=uniform(rng, 0.012, 0.016),
         tilt_deg=tilt,
         ball_radius_m=uniform(rng, 0.0345, 0.037),
-        ball_colours=tuple(str(c) for c in rng.permutation(SCHEMES[board])[:balls]),
+        ball_colours=distinct_colours(rng, balls, SCHEMES[board]),
         starts_m=tuple(round(float(sides[i] * rng.uniform(0.12, 0.40)), 4) for i in range(balls)),
         pushes_m_s=tuple(round(float(-sides[i] * rng.uniform(0.1, 0.6)), 4) for i in range(balls)),
         rises_m=tuple(uniform(rng, 0.26, 0.36) for _ in range(balls)),
@@ -324,6 +328,48 @@ def _answerable(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(f"What colour is the board behind the pegs: {listed(choices)}?", choices, p.board_colour)
 
 
+# In lengths of the apron's lower edge, which is as long as the board is wide (1.18 to 1.43 m): a ball that lies in a
+# bucket is 0.15 to 0.18 above that edge, one that has yet to enter a bucket at least 0.23.
+IN_BUCKET = 0.205
+FRAME = 0.012  # share of that edge below the frame at either side
+
+
+def observe(frames: np.ndarray, question: str) -> str | None:
+    """The bucket above whose share of the apron's lower edge the ball is, if it is low enough to lie in one."""
+    values = asked(QUESTIONS, question)
+    if values is None:
+        return None
+    choices, last = choices_in(values["choices"]), frames[-1]
+    ball, edge = _ball(last, values["ball"]), _lower_edge(last)
+    if ball is None or edge is None:
+        return None
+    left, right = edge
+    along, offset = right - left, np.array([ball.x, ball.y]) - left
+    share = float(offset @ along / (along @ along) - FRAME) / (1 - 2 * FRAME)
+    height = float(along[1] * offset[0] - along[0] * offset[1]) / float(along @ along)
+    if not (0 < share < 1 and 0 < height < IN_BUCKET):
+        return None
+    return choices[int(share * len(choices))]
+
+
+def _ball(frame: np.ndarray, colour: str) -> Blob | None:
+    """The largest round thing of a ball's size; None for a colour that no ball has."""
+    if not any(colour in pool for pool in SCHEMES.values()):
+        return None
+    found = blobs(colour_mask(frame, colour), min_area=90)
+    return next((b for b in found if b.area < 900 and b.fill > 0.6 and 0.7 < b.box[2] / b.box[3] < 1.4), None)
+
+
+def _lower_edge(frame: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """The lower left and right corner of the white apron: no white is lower."""
+    outlines, _ = cv2.findContours((frame.min(axis=2) > 225).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    large = [outline[:, 0] for outline in outlines if cv2.contourArea(outline) > 1500]
+    if not large:
+        return None
+    points = np.concatenate(large).astype(float)
+    return points[np.argmax(points[:, 1] - points[:, 0])], points[np.argmax(points[:, 1] + points[:, 0])]
+
+
 FAMILY = Family(
     name="plinko",
     taxonomy="chaotic",
@@ -337,6 +383,7 @@ FAMILY = Family(
     margin=margin,
     word=word,
     questions=QUESTIONS,
+    observe=observe,
     min_margin_m=0.01,
     perturbation=1e-6,
 )

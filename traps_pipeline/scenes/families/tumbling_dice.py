@@ -6,10 +6,13 @@ no pixel shows; gravity is low, which nothing in view betrays, so that many tumb
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from traps_pipeline.scenes.kit import (
@@ -26,6 +29,8 @@ from traps_pipeline.scenes.kit import (
     new_spec,
     uniform,
 )
+from traps_pipeline.scenes.vision import blobs, colour_mask
+from traps_pipeline.scenes.wording import asked
 
 if TYPE_CHECKING:
     import mujoco
@@ -34,12 +39,15 @@ if TYPE_CHECKING:
 
 Span = tuple[float, float]
 FACES = ("red", "green", "blue", "cyan", "orange", "yellow")
-EDGES = ("white", "black", "purple", "grey")
+EDGES = ("white", "black", "purple")  # nothing else in the scene has them
 NORMALS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))  # in the order of `faces`
 WALL_M = 0.02
 TRAY_M = 0.05  # height of the tray's floor
 FLAT_RAD = math.radians(8)  # a die that leans more lies on no face
+LEGIBLE_PIXELS = 200.0
 LEAD_S = 0.2  # a closer finish could fall between two sampled frames
+PLATE = 0.78  # of a face: the rest is its edge, by which a viewer tells the dice apart
+DARK_WOOD = (0.50, 0.35, 0.22, 1.0)
 STILL = 0.1  # share of its size by which a lying die may move from one frame to the next
 
 
@@ -61,7 +69,7 @@ class Params:
     spins_rad_s: tuple[tuple[float, ...], ...]
     bounce: float  # damping of the contact: the lower, the livelier
     edge_colours: tuple[str, ...]  # one per die, so that each can be followed
-    step_colours: tuple[str, str]  # in turn, down the steps
+    dark_first: bool  # dark and light wood in turn, down the steps
     azimuth_deg: float
     elevation_deg: float
 
@@ -70,26 +78,20 @@ class Params:
         """Where the steps end and the tray begins."""
         return self.steps * self.step_m
 
-    @property
-    def tray_colour(self) -> str:
-        """A colour that no step has."""
-        return next(c for c in ("black", "white", "grey") if c not in self.step_colours)
-
     def floor_m(self, step: int) -> float:
         """Height of a step, the tray being one after the last."""
         return TRAY_M + (self.steps - step) * self.drop_m
 
 
 def draw(rng: np.random.Generator) -> Params:
-    """Two to four dice, thrown up in a zigzag so that they do not touch before they land."""
-    dice, direction = int(rng.choice([2, 3, 3, 4])), int(rng.choice([-1, 1]))
+    """Two or three dice, thrown up in a zigzag so that they do not touch before they land."""
+    dice, direction = int(rng.choice([2, 3, 3])), int(rng.choice([-1, 1]))
     half, steps = uniform(rng, 0.060, 0.068), int(rng.integers(4, 8))
     step = round(uniform(rng, 1.35, 1.65) / steps, 4)
     width = round(max(0.46, (2.5 * dice + 1.4) * half), 4)  # room for a turning die beside each wall
     lanes = [(i - (dice - 1) / 2) * 2.5 * half for i in range(dice)]
     ahead = int(rng.integers(2))
     turns = rng.normal(size=(dice, 4))
-    light, dark = ("white", "wood"), ("grey", "black")
     return Params(
         direction=direction,
         steps=steps,
@@ -110,8 +112,8 @@ def draw(rng: np.random.Generator) -> Params:
         spins_rad_s=tuple(tuple(uniform(rng, -7, 7) for _ in range(3)) for _ in range(dice)),
         bounce=uniform(rng, 14, 26),
         edge_colours=tuple(str(c) for c in rng.permutation(EDGES)[:dice]),
-        step_colours=(str(rng.choice(light)), str(rng.choice(dark))) if rng.random() < 0.5 else ("grey", "wood"),
-        azimuth_deg=90 + uniform(rng, -22, 22),
+        dark_first=bool(rng.random() < 0.5),
+        azimuth_deg=90 + uniform(rng, -15, 15),
         elevation_deg=uniform(rng, -58, -46),
     )
 
@@ -119,6 +121,7 @@ def draw(rng: np.random.Generator) -> Params:
 def build(p: Params, physics: Physics) -> Scene:
     """Steps and tray between two walls. Lengths run down the steps and are mirrored by `direction`."""
     spec = new_spec(physics)
+    spec.add_material(name="bright", emission=0.5, specular=0.0, shininess=0.0)  # edges that keep their colour in shade
     side, end, high = p.width_m / 2, p.run_m + p.tray_m, p.floor_m(0)
 
     def block(name: str, along: Span, across: Span, z: Span, colour: str) -> mujoco.MjsGeom:
@@ -128,11 +131,13 @@ def build(p: Params, physics: Physics) -> Scene:
 
     for i in range(p.steps):
         along = (i * p.step_m, (i + 1) * p.step_m)
-        block(f"step_{i}", along, (-side, side), (0, p.floor_m(i)), p.step_colours[i % 2])
-    block("tray", (p.run_m, end), (-side, side), (0, TRAY_M), p.tray_colour)
-    low_rim, rim = TRAY_M + 1.6 * p.half_m, TRAY_M + 4 * p.half_m
+        step = block(f"step_{i}", along, (-side, side), (0, p.floor_m(i)), "wood")
+        if i % 2 != p.dark_first:
+            step.rgba = DARK_WOOD
+    block("tray", (p.run_m, end), (-side, side), (0, TRAY_M), "grey")
+    rim = TRAY_M + 1.6 * p.half_m  # low, so that it hides and shades no die; glass stands on it
     block("tray_end", (end, end + WALL_M), (-side, side), (0, rim), "wood")
-    block("tray_front", (p.run_m, end + WALL_M), (-side - WALL_M, -side), (0, low_rim), "wood")
+    block("tray_front", (p.run_m, end + WALL_M), (-side - WALL_M, -side), (0, rim), "wood")
     block("wall_back", (-WALL_M, end + WALL_M), (side, side + WALL_M), (0, high + 2 * p.half_m), "wood")
     for i in range(p.steps):  # a low front wall that follows the steps, so that it hides nothing
         along = (i * p.step_m, (i + 1) * p.step_m)
@@ -166,9 +171,11 @@ def _add_die(spec: mujoco.MjSpec, p: Params, i: int) -> None:
     body.add_freejoint()
     h = p.half_m
     cube = add_box(body, f"die_{i}", (0, 0, 0), (h, h, h), p.edge_colours[i], density=600.0, condim=4)
+    if p.edge_colours[i] != "black":
+        cube.material = "bright"
     cube.friction, cube.solref, cube.priority = [0.5, 0.003, 0.0001], [-6000.0, -p.bounce], 1
     for colour, normal in zip(p.faces[i], NORMALS, strict=True):
-        half = [0.0015 if n else 0.84 * h for n in normal]
+        half = [0.0015 if n else PLATE * h for n in normal]
         add_box(body, f"die_{i}_{colour}", [h * n for n in normal], half, colour, contype=0, conaffinity=0, mass=0)
 
 
@@ -177,21 +184,28 @@ def _throw(p: Params, i: int) -> tuple[float, ...]:
     return (p.direction * along, across, up, *p.spins_rad_s[i])
 
 
-def _short_of_tray(motion: Motion, p: Params) -> np.ndarray:
-    """How far (m) each die is from being past the last step and low enough to touch the tray, (F, dice)."""
+def _short_of_tray(motion: Motion, p: Params) -> tuple[np.ndarray, np.ndarray]:
+    """How far (m) each die is from being past the last step, and from being low enough to touch the tray, (F, dice)."""
     places = np.stack([motion.pos(f"die_{i}") for i in range(len(p.faces))], axis=1)
-    return np.maximum(p.run_m - p.direction * places[..., 0], places[..., 2] - TRAY_M - 2.1 * p.half_m)
+    return p.run_m - p.direction * places[..., 0], places[..., 2] - TRAY_M - 2.1 * p.half_m
 
 
 def _first_die(motion: Motion, p: Params) -> tuple[int, int] | None:
-    """The first die in the tray and the frame it is there; None if there is none or the next one comes too soon."""
-    inside = _short_of_tray(motion, p) <= 0
-    arrivals = np.where(inside.any(axis=0), motion.times[inside.argmax(axis=0)], math.inf)
+    """The first die in the tray and the frame it is there; None without one. By the look of it, a die may reach the
+    tray when it is past the steps or when it lands: the same die must be clearly the first by either."""
+    along, above = _short_of_tray(motion, p)
+    firsts = [_first(reached, motion.times) for reached in (along <= 0, np.maximum(along, above) <= 0)]
+    return firsts[1] if firsts[0] and firsts[1] and firsts[0][0] == firsts[1][0] else None
+
+
+def _first(reached: np.ndarray, times: np.ndarray) -> tuple[int, int] | None:
+    """The die (column) that is first to reach something, and the frame; None if another comes too soon after."""
+    arrivals = np.where(reached.any(axis=0), times[reached.argmax(axis=0)], math.inf)
     first, second = np.sort(arrivals)[:2]
     if math.isinf(first) or second - first < LEAD_S - 1e-9:
         return None
     die = int(arrivals.argmin())
-    return die, int(inside[:, die].argmax())
+    return die, int(reached[:, die].argmax())
 
 
 def _lean(motion: Motion, die: int) -> tuple[np.ndarray, np.ndarray]:
@@ -220,9 +234,18 @@ def margin(motion: Motion, p: Params) -> float:
     if found is None:
         return 0.0
     die, arrival = found
-    lead = np.min(np.delete(_short_of_tray(motion, p)[arrival], die))
+    lead = np.min(np.delete(np.maximum(*_short_of_tray(motion, p))[arrival], die))
     lean = _lean(motion, die)[1][-1]
     return float(min(lead, 2 * p.half_m * math.sin(max(0.0, math.pi / 4 - lean))))
+
+
+def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
+    """The face that lies on top of the first die in the tray."""
+    found = _first_die(motion, p)
+    if found is None:
+        return []
+    die = found[0]
+    return [((f"die_{die}_{p.faces[die][_lean(motion, die)[0][-1]]}",), LEGIBLE_PIXELS)]
 
 
 QUESTIONS = (
@@ -233,7 +256,7 @@ QUESTIONS = (
 
 
 def _inventory(p: Params) -> Inventory:
-    colours = sorted({*FACES, *p.edge_colours, *p.step_colours, p.tray_colour, "wood"})
+    colours = sorted({*FACES, *p.edge_colours, "grey", "wood"})
     return Inventory(tuple(colours), ("die", "step", "tray", "wall", "face"))
 
 
@@ -253,7 +276,7 @@ def word(p: Params, rng: np.random.Generator) -> Wording:
 def _answerable(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     kind = rng.integers(3)
     if kind == 0:
-        return AnswerableQuestion("How many dice are there, 2, 3 or 4?", ("2", "3", "4"), str(len(p.faces)))
+        return AnswerableQuestion("How many dice are there, 2 or 3?", ("2", "3"), str(len(p.faces)))
     if kind == 1:
         side = "left" if p.direction < 0 else "right"
         return AnswerableQuestion("Do the steps go down to the left or to the right?", ("left", "right"), side)
@@ -263,6 +286,111 @@ def _answerable(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
         ("yes", "no"),
         "yes" if edge in p.edge_colours else "no",
     )
+
+
+# --- what one sees ----------------------------------------------------------------------------------------------------
+
+SMALL_STEP_PX = 3.0  # from one sampled frame to the next: a die that comes to rest ends its slide with such steps
+TAIL_STEP_PX = 4.0
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """A die in one frame (pixels): the middle of its outline, the root of its area, and the outline as a mask."""
+
+    x: float
+    y: float
+    size: float
+    outline: np.ndarray
+
+
+def observe(frames: np.ndarray, question: str) -> str | None:
+    """Follows the dice by the colours of their edges, and reads the upper face of the first one past the steps once it
+    has slid to a stop. A die that freezes in full motion has not come to rest."""
+    if asked(QUESTIONS, question) is None:
+        return None
+    paths = {colour: [_sight(frame, colour) for frame in frames] for colour in EDGES}
+    dice = [path for path in paths.values() if sum(sight is not None for sight in path) >= len(frames) / 2]
+    path = _first_over(_tray_edge(frames), dice)
+    if path is None or not _slid_to_rest(path):
+        return None
+    tops = {_upper_face(frame, sight) for frame, sight in zip(frames[-3:], path[-3:], strict=True) if sight is not None}
+    return tops.pop() if len(tops) == 1 else None
+
+
+def _sight(frame: np.ndarray, edge: str) -> _Sight | None:
+    """The die with edges of a colour: the largest region of that colour whose outline holds much vivid face."""
+    high, low = frame.max(axis=2).astype(int), frame.min(axis=2)
+    vivid = (high - low > 0.68 * high) & (high > 60)
+    if edge == "white":
+        mask = (low > 220) & (high - low < 30)
+    else:
+        mask = high < 52 if edge == "black" else colour_mask(frame, edge)
+    count, names = cv2.connectedComponents(cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)))
+    sizes = np.bincount(names[mask], minlength=count)
+    for region in np.argsort(-sizes)[:5]:
+        hull = cv2.convexHull(cv2.findNonZero((names == region).astype(np.uint8)))
+        outline = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), hull, 1) > 0
+        if sizes[region] >= 40 and outline.sum() < 2500 and vivid[outline].mean() > 0.25:
+            y, x = np.nonzero(outline)
+            return _Sight(float(x.mean()), float(y.mean()), math.sqrt(len(x)), outline)
+    return None
+
+
+def _tray_edge(frames: np.ndarray) -> tuple[int, float, float] | None:
+    """Where the steps end: the line x = slope y + offset, and on which side of it the tray lies (+1: right)."""
+    still = np.median(frames, axis=0).astype(np.uint8)
+    shade = still.mean(axis=2)
+    grey = (np.ptp(still, axis=2) < 22) & (shade > 125) & (shade < 185)
+    wood = np.nonzero(colour_mask(still, "wood"))[1]
+    tray = next(iter(blobs(grey, 400)), None)
+    if tray is None or not wood.size:
+        return None
+    side = 1 if tray.x > wood.mean() else -1
+    left, top, width, height = tray.box
+    rows = [y for y in range(top + height // 5, top + 4 * height // 5) if grey[y, left : left + width].any()]
+    edge = np.array([left + np.flatnonzero(grey[y, left : left + width])[0 if side > 0 else -1] for y in rows])
+    if len(rows) < 5:
+        return None
+    slope, offset = np.polyfit(rows, edge, 1)
+    near = np.abs(edge - slope * np.array(rows) - offset) < 6
+    if near.sum() < 5:
+        return None
+    slope, offset = np.polyfit(np.array(rows)[near], edge[near], 1)
+    return side, float(slope), float(offset)
+
+
+def _first_over(
+    edge: tuple[int, float, float] | None, dice: Sequence[Sequence[_Sight | None]]
+) -> Sequence[_Sight | None] | None:
+    """The path of the die that is first past the edge; of two in one frame, the one that is farther past it."""
+    if edge is None or not dice:
+        return None
+    side, slope, offset = edge
+    for sights in zip(*dice, strict=True):
+        past = [
+            -math.inf if s is None else side * (s.x - slope * (s.y + 0.3 * s.size) - offset)  # where it stands
+            for s in sights
+        ]
+        if max(past) > 0:
+            return dice[int(np.argmax(past))]
+    return None
+
+
+def _slid_to_rest(path: Sequence[_Sight | None]) -> bool:
+    """Whether a die lies still at the end, and its last motion before that was small."""
+    if any(sight is None for sight in path[-3:]):
+        return False
+    steps = [math.dist((a.x, a.y), (b.x, b.y)) for a, b in itertools.pairwise(path) if a is not None and b is not None]
+    moves = [step for step in steps if step > 0.5]
+    return max(steps[-2:]) <= TAIL_STEP_PX and bool(moves) and moves[-1] <= SMALL_STEP_PX
+
+
+def _upper_face(frame: np.ndarray, die: _Sight) -> str | None:
+    """Seen from above, the upper face is the highest in the picture."""
+    faces = {colour: blobs(colour_mask(frame, colour) & die.outline, 60) for colour in FACES}
+    heights = {colour: found[0].y for colour, found in faces.items() if found}
+    return min(heights, key=lambda colour: heights[colour], default=None)
 
 
 FAMILY = Family(
@@ -278,6 +406,8 @@ FAMILY = Family(
     margin=margin,
     word=word,
     questions=QUESTIONS,
+    observe=observe,
+    legible=legible,
     physics=Physics(timestep_s=0.001, gravity_m_s2=4.4),
     min_margin_m=0.03,
     perturbation=1e-6,
