@@ -10,7 +10,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -159,8 +159,8 @@ class Records:
         save_trajectory(self._released / "trajectories", found.spec.scenario_id, found.qpos, found.twin)
         with self._lines.open("a", encoding="utf-8") as lines:
             lines.write(_line(found.spec))
-        notes = {name: asdict(each) for name, each in load_tallies(self._released).items()}
-        notes[self._family] = asdict(tally)
+        tallies = load_tallies(self._released) | {self._family: tally}
+        notes = {name: vars(each) | {"rejected": dict(each.rejected)} for name, each in tallies.items()}
         part = self._released / f".{DRAWS}.part"
         part.write_text(json.dumps(notes, indent=1, sort_keys=True) + "\n", encoding="utf-8")
         part.replace(self._released / DRAWS)

@@ -40,7 +40,7 @@ Span = tuple[float, float]
 BOARD_M = 0.016  # thickness of a ramp
 WALL_M = 0.012
 ROUGH_M = 0.16  # length of the rough board
-ARRIVING = 0.855  # share of its energy that a ball still has after the foot of the ramp, as measured
+ARRIVING = 0.86  # share of its energy that a ball still has after the foot of the ramp, as measured
 MIN_LEAD_S = 0.35  # a closer finish could fall between two sampled frames
 NAMED_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
@@ -81,7 +81,7 @@ def draw(rng: np.random.Generator) -> Params:
     """The rough track and the starting places are drawn apart."""
     left, right = distinct_colours(rng, 2, NAMED_COLOURS)
     tray, first, second = (str(c) for c in rng.permutation(["wood", "grey", "black"]))
-    ramp, lower = uniform(rng, 0.54, 0.64), uniform(rng, 0.08, 0.13)
+    ramp, lower = uniform(rng, 0.60, 0.70), uniform(rng, 0.08, 0.13)
     starts = [ramp - 0.07, ramp - 0.07 - lower]
     if rng.integers(2):
         starts.reverse()
@@ -90,7 +90,7 @@ def draw(rng: np.random.Generator) -> Params:
         colours=(left, right),
         rough_track=int(rng.integers(2)),
         starts_m=(round(starts[0], 4), round(starts[1], 4)),
-        slope_deg=uniform(rng, 13, 17),
+        slope_deg=uniform(rng, 12.5, 15.5),
         ramp_m=ramp,
         creep_m_s=uniform(rng, 0.16, 0.22),
         radius_m=radius,
@@ -101,8 +101,8 @@ def draw(rng: np.random.Generator) -> Params:
         lead_m=uniform(rng, 0.075, 0.11),
         track_colours=(first, first if rng.integers(2) else second),
         tray_colour=tray,
-        azimuth_deg=90 + uniform(rng, -22, 22),
-        elevation_deg=uniform(rng, -40, -30),
+        azimuth_deg=90 + uniform(rng, -16, 16),
+        elevation_deg=uniform(rng, -42, -33),
     )
 
 
@@ -131,14 +131,14 @@ def build(p: Params, physics: Physics) -> Scene:
     half = p.apart_m / 2 + side + 0.02
     floor = block("tray_floor", (-half, half), (0, p.tray_m), (0, WALL_M), p.tray_colour)
     floor.friction = [0.8, 0.005, 0.006]
-    block("tray_front", (-half - WALL_M, half + WALL_M), (-WALL_M, 0), (0, 1.3 * r), p.tray_colour)
+    block("tray_front", (-half - WALL_M, half + WALL_M), (-WALL_M, 0), (0, 1.1 * r), p.tray_colour)
     for k in (-1, 1):
         x = sorted((k * half, k * (half + WALL_M)))
         block(f"tray_side_{k}", (x[0], x[1]), (0, p.tray_m), (0, p.track_m + 0.01), p.tray_colour)
     block("divider", (-0.006, 0.006), (0, p.tray_m), (0, 0.9 * r), p.tray_colour)
 
     hidden_y = rough[1] + 1.8 * r + 0.03  # the ball that feels the rough board is behind the panel with its shadow
-    high = p.track_m + 2 * r + 0.04
+    high = p.track_m + 2 * r + 0.015
     rise = float(p.ramp_m * np.sin(_slope(p)))
     back = p.foot_m + float(p.ramp_m * np.cos(_slope(p)))
     low_x, high_x = -half - WALL_M, half + WALL_M
