@@ -45,6 +45,7 @@ WALL_M = 0.012
 PEG_M = 0.008  # radius of the peg
 STILL_M = 0.002  # a ball that moves less than this any more is at rest
 COLOURS = ("red", "green", "blue", "yellow", "cyan", "purple")
+LARGEST_PX = 6000  # nothing of the scene is larger: what is, is a panel
 LIVELY = [-20000.0, -8.0]
 
 
@@ -133,7 +134,10 @@ def build(p: Params, physics: Physics) -> Scene:
     for geom, rolling in ((deck, 1.5e-3), (floor, 2e-3)):
         geom.friction, geom.condim, geom.priority = [0.4, 0.005, rolling], 6, 2
     rim = DECK_M + 0.25 * r
-    for name, y in (("rim_front", (-half_width - WALL_M, -half_width)), ("rim_back", (half_width, half_width + WALL_M))):
+    for name, y in (
+        ("rim_front", (-half_width - WALL_M, -half_width)),
+        ("rim_back", (half_width, half_width + WALL_M)),
+    ):
         block(name, (p.ramp_m, p.box_at_m), y, (0, rim), p.ramp_colour)
         block(f"box_{name}", (p.box_at_m, end), y, (0, DECK_M), p.box_colour)
     wall = block("box_end", (end, end + WALL_M), (side[0] - WALL_M, side[1] + WALL_M), (0, DECK_M + r), p.box_colour)
@@ -276,7 +280,7 @@ def observe(frames: np.ndarray, question: str) -> str | None:
     path = track(frames, values["last"], min_area=60)
     box = largest(frames[0], values["box"], min_area=60)
     first, last = path[0], path[-1]
-    if first is None or last is None or box is None or not at_rest(path):
+    if first is None or last is None or box is None or not at_rest(path) or max(last.area, box.area) > LARGEST_PX:
         return None
     start, way = np.array([first.x, first.y]), np.array([box.x - first.x, box.y - first.y])
     return "yes" if (np.array([last.x, last.y]) - start) @ way / (way @ way) > 0.6 else "no"

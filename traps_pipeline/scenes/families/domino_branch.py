@@ -46,6 +46,7 @@ STOP_AT = 2.9  # where the post stops that centre: behind the panel, out of the 
 PUSH = 0.10  # how far the stopped ball has pushed into either branch
 
 STILL_M = 0.002  # a domino that moves less than this any more is at rest
+LARGEST_PX = 6000  # nothing of the scene is larger: what is, is a panel
 DOMINO_COLOURS = ("red", "green", "blue", "yellow", "cyan", "purple")
 BRANCHES = {"left": -1, "right": 1}
 
@@ -111,7 +112,9 @@ def build(p: Params, physics: Physics) -> Scene:
     ball_z = (BOARD + BALL) * h
 
     centre = (h * (right - left) / 2, -h * (front - 2.4) / 2, BOARD * h / 2)
-    add_box(spec.worldbody, "board", centre, (h * (right + left) / 2, h * (front + 2.4) / 2, BOARD * h / 2), p.board_colour)
+    add_box(
+        spec.worldbody, "board", centre, (h * (right + left) / 2, h * (front + 2.4) / 2, BOARD * h / 2), p.board_colour
+    )
     for name, along in (("starter", -1.8), ("kicked", face + BALL_AT)):
         ball = add_ball(spec, name, (0, -along * h, ball_z), BALL * h, p.ball_colour, density=300)
         ball.friction = [0.1, 0.005, 0.0004]  # the board grips it, a domino slides over it and squeezes it out
@@ -225,7 +228,14 @@ def word(p: Params, rng: np.random.Generator) -> Wording:
     """Both end dominoes are named by their colours, which nothing else has."""
     aliases = {}
     for side, colour in (("left", p.left_colour), ("right", p.right_colour)):
-        forms = (f"the {side} one", f"{side} branch", f"the {side} branch", colour, f"{colour} domino", f"the {colour} one")
+        forms = (
+            f"the {side} one",
+            f"{side} branch",
+            f"the {side} branch",
+            colour,
+            f"{colour} domino",
+            f"the {colour} one",
+        )
         aliases |= dict.fromkeys(forms, side)
     return Wording(
         question=str(rng.choice(QUESTIONS)).format(left=p.left_colour, right=p.right_colour),
@@ -258,7 +268,7 @@ def observe(frames: np.ndarray, question: str) -> str | None:
 def _stands(frames: np.ndarray, colour: str) -> bool | None:
     """Whether the upper half of the thing of that colour is where it was; None if it is not to be seen at the end."""
     first, last = largest(frames[0], colour, min_area=60), largest(frames[-1], colour, min_area=60)
-    if first is None or last is None:
+    if first is None or last is None or max(first.area, last.area) > LARGEST_PX:
         return None
     x, y, w, h = first.box
     part = np.s_[y : y + h // 2, x : x + w]

@@ -195,7 +195,7 @@ def _tops_m(motion: Motion, p: Params) -> np.ndarray:
 
 
 def readings(motion: Motion, p: Params) -> list[str | None]:
-    """The choice that holds how many tops are below 0.6 of a domino's height, from when none of the second row moves."""
+    """The choice for how many tops are below 0.6 of a domino's height, from when none of the second row moves."""
     fallen = (_tops_m(motion, p) < 0.6 * p.height_m).sum(axis=1)
     moves = [np.linalg.norm(motion.pos(b) - motion.pos(b)[-1], axis=1) > STILL_M for b in _second(p)]
     restless = np.flatnonzero(np.any(moves, axis=0))

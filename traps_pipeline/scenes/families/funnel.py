@@ -100,13 +100,13 @@ def draw(rng: np.random.Generator) -> Params:
         speed_m_s=uniform(rng, 0.50, 0.62),
         run_m=uniform(rng, 0.28, 0.38),
         rise_m=uniform(rng, 0.24, 0.30),
-        throat_at_m=uniform(rng, 0.30, 0.36),
+        throat_at_m=uniform(rng, 0.28, 0.33),
         board_m=uniform(rng, 0.32, 0.38),
         slope_deg=uniform(rng, 44, 54),
         half_throat=throats[first],
         other_half_throat=throats[1 - first],
-        cup_half_m=uniform(rng, 0.15, 0.18),
-        cup_m=uniform(rng, 0.11, 0.15),
+        cup_half_m=uniform(rng, 0.19, 0.22),
+        cup_m=uniform(rng, 0.12, 0.15),
         ball_colour=ball,
         cup_colour=cup,
         shelf_colour=shelf,
@@ -144,8 +144,9 @@ def build(p: Params, physics: Physics) -> Scene:
     block("cup_back", (-half, half), wall, (0, p.cup_m), p.cup_colour)
     block("cup_front", (-half, half), (-DEPTH_M, WALL_M - DEPTH_M), (0, FLOOR_M + 0.4 * r), p.cup_colour)
     side = p.rim_half_m + 0.03
-    beyond = side + (0.12 if p.direction < 0 else 0.0)  # the shadow of a ball from the right falls on the wall as well
-    block("back", (-beyond, side), (DEPTH_M, DEPTH_M + WALL_M), (0, p.mouth_m), p.back_colour)
+    beyond = side + 0.12  # shadows fall to the right: the wall is there to catch them
+    wall_ends = (-side, beyond) if p.direction > 0 else (-beyond, side)
+    block("back", wall_ends, (DEPTH_M, DEPTH_M + WALL_M), (0, p.mouth_m), p.back_colour)
     _add_funnel(spec, p)
 
     outline = Box((-side, -DEPTH_M, 0.0), (beyond, DEPTH_M + WALL_M, p.mouth_m))

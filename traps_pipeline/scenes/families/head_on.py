@@ -46,6 +46,7 @@ BOARD_M = 0.10
 STILL_M = 0.003  # a ball that moves less than this any more is at rest
 BALL_COLOURS = ("red", "green", "blue", "yellow", "cyan", "purple")
 LINE_COLOUR = "black"
+LARGEST_PX = 6000  # nothing of the scene is larger: what is, is a panel
 SIDES = (-1, 1)
 
 
@@ -100,7 +101,9 @@ def build(p: Params, physics: Physics) -> Scene:
 
     def block(name: str, x: Span, across: Span, z: Span, colour: str) -> mujoco.MjsGeom:
         mid = (sum(x) / 2, sum(across) / 2, sum(z) / 2)
-        return add_box(spec.worldbody, name, mid, ((x[1] - x[0]) / 2, (across[1] - across[0]) / 2, (z[1] - z[0]) / 2), colour)
+        return add_box(
+            spec.worldbody, name, mid, ((x[1] - x[0]) / 2, (across[1] - across[0]) / 2, (z[1] - z[0]) / 2), colour
+        )
 
     side, inner = (-half_width, half_width), p.board_at_m - BOARD_M
     for s, name in zip(SIDES, ("left", "right"), strict=True):
@@ -117,7 +120,10 @@ def build(p: Params, physics: Physics) -> Scene:
     line = block("line", (-LINE_M, LINE_M), side, (0, DECK_M), LINE_COLOUR)
     line.friction, line.condim, line.priority = [0.8, 0.005, 8e-4], 6, 2
     rim = DECK_M + 0.2 * r
-    for name, y in (("rim_front", (-half_width - WALL_M, -half_width)), ("rim_back", (half_width, half_width + WALL_M))):
+    for name, y in (
+        ("rim_front", (-half_width - WALL_M, -half_width)),
+        ("rim_back", (half_width, half_width + WALL_M)),
+    ):
         block(name, (-half, half), y, (0, rim), p.ramp_colour)
 
     height = DECK_M + 2 * r
@@ -240,7 +246,11 @@ def observe(frames: np.ndarray, question: str) -> str | None:
     paths = [track(frames, colour, min_area=60) for colour in choices]
     starts, ends = [path[0] for path in paths], [path[-1] for path in paths]
     line = largest(frames[0], LINE_COLOUR)
-    if line is None or any(b is None for b in (*starts, *ends)) or not all(at_rest(path) for path in paths):
+    if (
+        line is None
+        or any(b is None or b.area > LARGEST_PX for b in (*starts, *ends))
+        or not all(at_rest(path) for path in paths)
+    ):
         return None
     from_line = [[b.x - line.x for b in balls if b is not None] for balls in (starts, ends)]
     kept = [c for c, start, end in zip(choices, *from_line, strict=True) if start * end > 0]

@@ -188,7 +188,7 @@ def _standing(motion: Motion, p: Params) -> np.ndarray:
 
 
 def readings(motion: Motion, p: Params) -> list[str | None]:
-    """The range that the number of standing blocks is in, from when the pusher has gone all its way and no block moves."""
+    """The range of the number of standing blocks, from when the pusher has gone all its way and no block moves."""
     at = np.stack([motion.pos(f"block_{i}") for i in range(BLOCKS)], axis=1)
     restless = np.flatnonzero((np.linalg.norm(at - at[-1], axis=2) > STILL_M).any(axis=1))
     still_from = int(restless[-1]) + 1 if restless.size else 0

@@ -43,6 +43,7 @@ STEP_M = 0.022  # the ramp ends this high over the deck
 WALL_M = 0.014
 STILL_M = 0.002  # a block that moves less than this any more is at rest
 COLOURS = ("red", "green", "blue", "yellow", "cyan", "purple")
+LARGEST_PX = 6000  # nothing of the scene is larger: what is, is a panel
 LIVELY = [-20000.0, -25.0]
 
 
@@ -132,9 +133,14 @@ def build(p: Params, physics: Physics) -> Scene:
     zone = block("zone", (p.zone_at_m, end), side, (0, DECK_M), p.zone_colour)
     zone.friction, zone.condim, zone.priority = [0.25, 0.005, 4e-4], 6, 2
     rim = DECK_M + 0.016
-    for name, y in (("rim_front", (-half_width - WALL_M, -half_width)), ("rim_back", (half_width, half_width + WALL_M))):
+    for name, y in (
+        ("rim_front", (-half_width - WALL_M, -half_width)),
+        ("rim_back", (half_width, half_width + WALL_M)),
+    ):
         block(name, (p.ramp_m, end), y, (0, rim), p.ramp_colour)
-    wall = block("end_wall", (end, end + WALL_M), (side[0] - WALL_M, side[1] + WALL_M), (0, DECK_M + 0.05), p.ramp_colour)
+    wall = block(
+        "end_wall", (end, end + WALL_M), (side[0] - WALL_M, side[1] + WALL_M), (0, DECK_M + 0.05), p.ramp_colour
+    )
     wall.priority = 3  # dead: the block stays where it strikes the wall
     _add_target(spec, p)
 
@@ -263,7 +269,7 @@ def observe(frames: np.ndarray, question: str) -> str | None:
     path = track(frames, values["block"], min_area=60)
     zone = largest(frames[0], values["zone"], min_area=60)
     first, last = path[0], path[-1]
-    if first is None or last is None or zone is None or not at_rest(path):
+    if first is None or last is None or zone is None or not at_rest(path) or max(last.area, zone.area) > LARGEST_PX:
         return None
     start, end = (np.array([b.x, b.box[1] + 0.8 * b.box[3]]) for b in (first, last))
     way = np.array([zone.x, zone.y]) - start
