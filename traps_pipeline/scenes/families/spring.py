@@ -1,4 +1,4 @@
-"""A ball rolls through a tunnel and off a deck towards a plunger; the question is whether it is thrown back over a line.
+"""A ball rolls through a tunnel and off a deck to a plunger; the question is whether it is thrown back over a line.
 
 Control: plunger and line are in view. Void: the panel stands before both.
 Hidden element: the plunger, whose spring is lively or stuck fast in thick grease. The ball arrives the same either way;

@@ -6,7 +6,6 @@ no pixel shows; gravity is low, which nothing in view betrays, so that many tumb
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -290,7 +289,8 @@ def _answerable(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 # --- what one sees ----------------------------------------------------------------------------------------------------
 
-SMALL_STEP_PX = 3.0  # from one sampled frame to the next: a die that comes to rest ends its slide with such steps
+NEAR_PX = 2.5  # of the place where a die lies
+LAST_STEP_PX = 6.0  # between two sampled frames, when a die slides to rest
 TAIL_STEP_PX = 4.0
 
 
@@ -378,12 +378,17 @@ def _first_over(
 
 
 def _slid_to_rest(path: Sequence[_Sight | None]) -> bool:
-    """Whether a die lies still at the end, and its last motion before that was small."""
-    if any(sight is None for sight in path[-3:]):
+    """Whether a die lies still at the end, and came there by ever smaller steps instead of freezing in full motion."""
+    places = [None if sight is None else np.array([sight.x, sight.y]) for sight in path]
+    if any(place is None for place in places[-3:]):
         return False
-    steps = [math.dist((a.x, a.y), (b.x, b.y)) for a, b in itertools.pairwise(path) if a is not None and b is not None]
-    moves = [step for step in steps if step > 0.5]
-    return max(steps[-2:]) <= TAIL_STEP_PX and bool(moves) and moves[-1] <= SMALL_STEP_PX
+    seen = np.array([place for place in places if place is not None])
+    steps = np.linalg.norm(np.diff(seen, axis=0), axis=1)
+    away = np.flatnonzero(np.linalg.norm(seen - np.median(seen[-3:], axis=0), axis=1) > NEAR_PX)
+    if not away.size or max(steps[-2:]) > TAIL_STEP_PX:
+        return False
+    last = int(away[-1])  # before the step by which the die comes near the place where it lies
+    return steps[last] <= LAST_STEP_PX and (last == 0 or steps[last - 1] <= 2 * LAST_STEP_PX)
 
 
 def _upper_face(frame: np.ndarray, die: _Sight) -> str | None:
