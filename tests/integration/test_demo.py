@@ -53,7 +53,7 @@ def test_every_dataset_has_sixteen_pairs_of_two_items(workspace: Workspace) -> N
 
 def test_clips_are_five_second_masters_and_chaotic_voids_are_prefixes(workspace: Workspace) -> None:
     clips = workspace.tables.read_all(VIDEOS)
-    assert len(clips) == 64
+    assert len(clips) == 96  # control, void, twin
     assert set(zip(clips["width"], clips["height"], clips["fps"], strict=True)) == {(480, 360, 10)}
     assert (clips.query("side == 'control'")["n_frames"] == 50).all()
     chaotic = clips[clips["category"].isin(["plinko", "tumbling_dice"])].query("side == 'void'")

@@ -43,7 +43,7 @@ def test_a_malformed_spec_names_file_and_line(study: Checkout) -> None:
 def test_an_unknown_family_is_answered_with_the_known_ones(study: Checkout) -> None:
     path = edit_record(study, "plinko", 1, family="plonko")
     assert_refused(
-        study.traps("run", EXPERIMENT), f"{path}:1", "unknown family 'plonko'", "domino_chain, hidden_race, plinko"
+        study.traps("run", EXPERIMENT), f"{path}:1", "unknown family 'plonko'", "domino_chain, domino_count"
     )
 
 

@@ -308,8 +308,8 @@ def readings(motion: Motion, p: Params) -> list[str | None]:
     """How many balls' centres are in the asked zone, while all are in some zone; None before."""
     across, up = _places(motion, p)
     low, high = p.edges_m[p.asked : p.asked + 2]
-    counts = ((across > low) & (across < high)).sum(axis=1)
-    return [str(n) if down else None for n, down in zip(counts, (up < p.rim_m).all(axis=1), strict=True)]
+    inside, down = (across > low) & (across < high), up < p.rim_m
+    return [str(i.sum()) if d.all() else None for i, d in zip(inside, down, strict=True)]
 
 
 def margin(motion: Motion, p: Params) -> float:
@@ -387,11 +387,13 @@ def _round(frame: np.ndarray, colour: str) -> list[Blob]:
 
 
 def _ground(frame: np.ndarray, colour: str) -> np.ndarray | None:
-    """Convex outline of the largest region of a zone's colour, None if there is none of a zone's size."""
+    """Convex outline of a zone's colour, which balls may part into regions; None if it has not a zone's size."""
     mask = colour_mask(frame, colour).astype(np.uint8)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    largest = max(outlines, key=cv2.contourArea, default=None)
-    return None if largest is None or cv2.contourArea(largest) < 600 else cv2.convexHull(largest)
+    regions = [outline for outline in outlines if cv2.contourArea(outline) > 40]
+    if sum(cv2.contourArea(region) for region in regions) < 600:
+        return None
+    return cv2.convexHull(np.concatenate(regions))
 
 
 def _home(ball: Blob, grounds: dict[str, np.ndarray | None]) -> str | None:

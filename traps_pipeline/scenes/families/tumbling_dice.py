@@ -289,9 +289,8 @@ def _answerable(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 # --- what one sees ----------------------------------------------------------------------------------------------------
 
-NEAR_PX = 2.5  # of the place where a die lies
-LAST_STEP_PX = 6.0  # between two sampled frames, when a die slides to rest
-TAIL_STEP_PX = 4.0
+NEAR_PX = 3.5  # of the place where a die lies
+LAST_STEP_PX = 5.0  # between two sampled frames, when a die slides to rest
 
 
 @dataclass(frozen=True)
@@ -312,7 +311,7 @@ def observe(frames: np.ndarray, question: str) -> str | None:
     paths = {colour: [_sight(frame, colour) for frame in frames] for colour in EDGES}
     dice = [path for path in paths.values() if sum(sight is not None for sight in path) >= len(frames) / 2]
     path = _first_over(_tray_edge(frames), dice)
-    if path is None or not _slid_to_rest(path):
+    if path is None or not _came_to_rest(frames, path):
         return None
     tops = {_upper_face(frame, sight) for frame, sight in zip(frames[-3:], path[-3:], strict=True) if sight is not None}
     return tops.pop() if len(tops) == 1 else None
@@ -377,18 +376,19 @@ def _first_over(
     return None
 
 
-def _slid_to_rest(path: Sequence[_Sight | None]) -> bool:
-    """Whether a die lies still at the end, and came there by ever smaller steps instead of freezing in full motion."""
-    places = [None if sight is None else np.array([sight.x, sight.y]) for sight in path]
-    if any(place is None for place in places[-3:]):
+def _came_to_rest(frames: np.ndarray, path: Sequence[_Sight | None]) -> bool:
+    """Whether a die lies still at the end and came there by itself: other things went on moving, or its last steps were
+    small. A clip that merely freezes stops everything at once, in full motion."""
+    places = np.array([(math.nan, math.nan) if sight is None else (sight.x, sight.y) for sight in path])
+    lies = np.linalg.norm(places - np.median(places[-3:], axis=0), axis=1) <= NEAR_PX
+    if lies.all() or not lies[-3:].all():
         return False
-    seen = np.array([place for place in places if place is not None])
-    steps = np.linalg.norm(np.diff(seen, axis=0), axis=1)
-    away = np.flatnonzero(np.linalg.norm(seen - np.median(seen[-3:], axis=0), axis=1) > NEAR_PX)
-    if not away.size or max(steps[-2:]) > TAIL_STEP_PX:
-        return False
-    last = int(away[-1])  # before the step by which the die comes near the place where it lies
-    return steps[last] <= LAST_STEP_PX and (last == 0 or steps[last - 1] <= 2 * LAST_STEP_PX)
+    since = int(np.flatnonzero(~lies)[-1]) + 1
+    changes = np.abs(np.diff(frames[since:].astype(np.int16), axis=0)).max(axis=3) > 40
+    if (changes.sum(axis=(1, 2)) > 60).sum() >= 2:
+        return True
+    steps = np.linalg.norm(np.diff(places[max(since - 2, 0) : since + 1], axis=0), axis=1)
+    return bool(steps[-1] <= LAST_STEP_PX and steps[0] <= 2 * LAST_STEP_PX)
 
 
 def _upper_face(frame: np.ndarray, die: _Sight) -> str | None:
