@@ -260,7 +260,7 @@ def sample_scenarios(arguments: argparse.Namespace) -> int:
         report=lambda line: print(line, flush=True),
     )
     print(f"{sum(wanted.values())} scenarios of {len(wanted)} families in {arguments.out}")
-    print(f"next: traps certify --specs {arguments.out}; to run studies on it: export TRAPS_SCENE_SPECS={arguments.out}")
+    print(f"next: traps certify --specs {arguments.out}; to run studies on it, TRAPS_SCENE_SPECS={arguments.out}")
     return OK
 
 

@@ -42,9 +42,7 @@ def test_a_malformed_spec_names_file_and_line(study: Checkout) -> None:
 
 def test_an_unknown_family_is_answered_with_the_known_ones(study: Checkout) -> None:
     path = edit_record(study, "plinko", 1, family="plonko")
-    assert_refused(
-        study.traps("run", EXPERIMENT), f"{path}:1", "unknown family 'plonko'", "domino_chain, domino_count"
-    )
+    assert_refused(study.traps("run", EXPERIMENT), f"{path}:1", "unknown family 'plonko'", "domino_chain, domino_count")
 
 
 def test_a_duplicate_scenario_names_the_second_line(study: Checkout) -> None:
