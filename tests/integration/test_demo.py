@@ -89,8 +89,8 @@ def test_status_calls_everything_fresh_and_plan_has_nothing_new(demo_study: Chec
     for stage, partitions in (
         ("scene_specs", 4),
         ("items", 4),
-        ("responses", 96),
-        ("verdicts", 96),
+        ("responses", 108),
+        ("verdicts", 108),
         ("leaderboard", 1),
     ):
         assert f"{stage:<18} {partitions:>6}      0        0" in status

@@ -8,7 +8,7 @@ from __future__ import annotations
 import atexit
 import os
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -58,6 +58,7 @@ class Renderer:
         model.vis.global_.fovy = camera.fovy_deg
         model.stat.extent = camera.extent
         model.stat.center[:] = camera.centre
+        self._pixels = np.empty((self._height, self._width, 4), np.uint8)
         self._model, self._data = model, mujoco.MjData(model)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
@@ -86,7 +87,8 @@ class Renderer:
 
         for row in qpos:
             raw = self._draw(row, panel=panel, without=without)
-            yield cv2.resize(raw, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+            small = cv2.resize(raw, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+            yield cv2.flip(cv2.cvtColor(small, cv2.COLOR_RGBA2RGB), 0)
 
     def visible_pixels(
         self, qpos: Sequence[np.ndarray] | np.ndarray, geoms: Sequence[str], *, panel: bool = False
@@ -122,7 +124,7 @@ class Renderer:
             self._model.geom_group[self._model.geom(name).id] = REMOVED_GROUP
         try:
             self._data.qpos[:] = qpos
-            mujoco.mj_forward(self._model, self._data)
+            self._place()
             everything = mujoco.mjtCatBit.mjCAT_ALL
             mujoco.mjv_updateScene(
                 self._model, self._data, option, mujoco.MjvPerturb(), self._camera, everything, self._scene
@@ -133,11 +135,18 @@ class Renderer:
         mujoco.mjr_render(viewport, self._scene, self._context)
         return self._read()
 
+    def _place(self) -> None:
+        """Where everything is at the present qpos: all that drawing needs of mj_forward (no contacts, no dynamics)."""
+        import mujoco
+
+        for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_tendon):
+            step(self._model, self._data)
+
     def _read(self) -> np.ndarray:
-        """The off-screen buffer, top row first. A direct RGBA read is 30 times faster than mjr_readPixels."""
+        """The off-screen buffer, RGBA, *bottom* row first; overwritten by the next call. Read directly: 30 times
+        faster than mjr_readPixels, and cheaper to turn and to strip of alpha once it is small."""
         from OpenGL import GL
 
         GL.glReadBuffer(GL.GL_COLOR_ATTACHMENT0)
-        raw = GL.glReadPixels(0, 0, self._width, self._height, GL.GL_RGBA, GL.GL_UNSIGNED_BYTE)
-        pixels = np.frombuffer(cast(bytes, raw), np.uint8).reshape(self._height, self._width, 4)
-        return np.ascontiguousarray(pixels[::-1, :, :3])
+        GL.glReadPixels(0, 0, self._width, self._height, GL.GL_RGBA, GL.GL_UNSIGNED_BYTE, self._pixels)
+        return self._pixels

@@ -95,3 +95,8 @@ def at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.
         return False
     xs, ys = [blob.x for blob in seen], [blob.y for blob in seen]
     return max(xs) - min(xs) <= tolerance_px and max(ys) - min(ys) <= tolerance_px
+
+
+def is_panel(blob: Blob, longest_px: int = 130) -> bool:
+    """Whether a region is too long for a thing of a tabletop scene, or so thin that only a panel's edge is."""
+    return max(blob.box[2:]) > longest_px or min(blob.box[2:]) < 5

@@ -29,7 +29,7 @@ from traps_pipeline.scenes.kit import (
     new_spec,
     uniform,
 )
-from traps_pipeline.scenes.vision import at_rest, largest, track
+from traps_pipeline.scenes.vision import at_rest, is_panel, largest, track
 from traps_pipeline.scenes.wording import asked
 
 if TYPE_CHECKING:
@@ -45,7 +45,6 @@ WALL_M = 0.012
 PEG_M = 0.008  # radius of the peg
 STILL_M = 0.002  # a ball that moves less than this any more is at rest
 COLOURS = ("red", "green", "blue", "yellow", "cyan", "purple")
-LARGEST_PX = 6000  # nothing of the scene is larger: what is, is a panel
 LIVELY = [-20000.0, -8.0]
 
 
@@ -280,7 +279,7 @@ def observe(frames: np.ndarray, question: str) -> str | None:
     path = track(frames, values["last"], min_area=60)
     box = largest(frames[0], values["box"], min_area=60)
     first, last = path[0], path[-1]
-    if first is None or last is None or box is None or not at_rest(path) or max(last.area, box.area) > LARGEST_PX:
+    if first is None or last is None or box is None or not at_rest(path) or is_panel(last) or is_panel(box):
         return None
     start, way = np.array([first.x, first.y]), np.array([box.x - first.x, box.y - first.y])
     return "yes" if (np.array([last.x, last.y]) - start) @ way / (way @ way) > 0.6 else "no"

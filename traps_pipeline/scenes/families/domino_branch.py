@@ -30,7 +30,7 @@ from traps_pipeline.scenes.kit import (
     new_spec,
     uniform,
 )
-from traps_pipeline.scenes.vision import colour_mask, largest
+from traps_pipeline.scenes.vision import colour_mask, is_panel, largest
 from traps_pipeline.scenes.wording import asked
 
 if TYPE_CHECKING:
@@ -46,7 +46,6 @@ STOP_AT = 2.9  # where the post stops that centre: behind the panel, out of the 
 PUSH = 0.10  # how far the stopped ball has pushed into either branch
 
 STILL_M = 0.002  # a domino that moves less than this any more is at rest
-LARGEST_PX = 6000  # nothing of the scene is larger: what is, is a panel
 DOMINO_COLOURS = ("red", "green", "blue", "yellow", "cyan", "purple")
 BRANCHES = {"left": -1, "right": 1}
 
@@ -268,7 +267,7 @@ def observe(frames: np.ndarray, question: str) -> str | None:
 def _stands(frames: np.ndarray, colour: str) -> bool | None:
     """Whether the upper half of the thing of that colour is where it was; None if it is not to be seen at the end."""
     first, last = largest(frames[0], colour, min_area=60), largest(frames[-1], colour, min_area=60)
-    if first is None or last is None or max(first.area, last.area) > LARGEST_PX:
+    if first is None or last is None or is_panel(first) or is_panel(last):
         return None
     x, y, w, h = first.box
     part = np.s_[y : y + h // 2, x : x + w]

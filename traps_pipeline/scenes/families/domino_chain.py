@@ -29,7 +29,7 @@ from traps_pipeline.scenes.kit import (
     new_spec,
     uniform,
 )
-from traps_pipeline.scenes.vision import at_rest, colour_mask, track
+from traps_pipeline.scenes.vision import at_rest, colour_mask, is_panel, track
 from traps_pipeline.scenes.wording import asked
 
 if TYPE_CHECKING:
@@ -44,7 +44,6 @@ BALL_AT = 0.55 + BALL  # centre of the kicked ball, from the front face of the l
 POSTS_AT = 1.75  # near face of the posts, from there as well: the stopped ball is past that domino's reach
 
 STILL_M = 0.002  # a domino that moves less than this any more is at rest
-LARGEST_PX = 6000  # nothing of the scene is larger: what is, is a panel
 DOMINO_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 
 
@@ -254,7 +253,7 @@ def observe(frames: np.ndarray, question: str) -> str | None:
     if values is None:
         return None
     path = track(frames, values["last"], min_area=60)
-    if path[0] is None or path[0].area > LARGEST_PX or not at_rest(path):
+    if path[0] is None or is_panel(path[0]) or not at_rest(path):
         return None
     x, y, w, h = path[0].box
     part = np.s_[y : y + h // 2, x : x + w]

@@ -29,7 +29,7 @@ from traps_pipeline.scenes.kit import (
     new_spec,
     uniform,
 )
-from traps_pipeline.scenes.vision import at_rest, largest, track
+from traps_pipeline.scenes.vision import at_rest, is_panel, largest, track
 from traps_pipeline.scenes.wording import asked, choices_in
 
 if TYPE_CHECKING:
@@ -46,7 +46,6 @@ BOARD_M = 0.10
 STILL_M = 0.003  # a ball that moves less than this any more is at rest
 BALL_COLOURS = ("red", "green", "blue", "yellow", "cyan", "purple")
 LINE_COLOUR = "black"
-LARGEST_PX = 6000  # nothing of the scene is larger: what is, is a panel
 SIDES = (-1, 1)
 
 
@@ -248,7 +247,7 @@ def observe(frames: np.ndarray, question: str) -> str | None:
     line = largest(frames[0], LINE_COLOUR)
     if (
         line is None
-        or any(b is None or b.area > LARGEST_PX for b in (*starts, *ends))
+        or any(b is None or is_panel(b) for b in (*starts, *ends))
         or not all(at_rest(path) for path in paths)
     ):
         return None

@@ -29,7 +29,7 @@ from traps_pipeline.scenes.kit import (
     new_spec,
     uniform,
 )
-from traps_pipeline.scenes.vision import at_rest, largest, track
+from traps_pipeline.scenes.vision import at_rest, is_panel, largest, track
 from traps_pipeline.scenes.wording import asked
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ STEP_M = 0.022  # the ramp ends this high over the deck
 WALL_M = 0.014
 STILL_M = 0.002  # a block that moves less than this any more is at rest
 COLOURS = ("red", "green", "blue", "yellow", "cyan", "purple")
-LARGEST_PX = 6000  # nothing of the scene is larger: what is, is a panel
 LIVELY = [-20000.0, -25.0]
 
 
@@ -269,7 +268,7 @@ def observe(frames: np.ndarray, question: str) -> str | None:
     path = track(frames, values["block"], min_area=60)
     zone = largest(frames[0], values["zone"], min_area=60)
     first, last = path[0], path[-1]
-    if first is None or last is None or zone is None or not at_rest(path) or max(last.area, zone.area) > LARGEST_PX:
+    if first is None or last is None or zone is None or not at_rest(path) or is_panel(last) or is_panel(zone):
         return None
     start, end = (np.array([b.x, b.box[1] + 0.8 * b.box[3]]) for b in (first, last))
     way = np.array([zone.x, zone.y]) - start
