@@ -1,48 +1,56 @@
-"""Frames a second of our renderer against stock `mujoco.Renderer` with 4x MSAA, same scenes, same size, one run.
+"""Our rendering against stock `mujoco.Renderer` with 4x MSAA, and the videos stage against its OpenGL calls alone: the
+same scenes, the same size, one run.
 
 python bench/render.py
 """
 
 from __future__ import annotations
 
+import os
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
 
+import mujoco
 import numpy as np
 
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera
+from traps_pipeline.scenes.clips import Job, render_pair
 from traps_pipeline.scenes.kit import Physics
 from traps_pipeline.scenes.outcome import compile_scene
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.workers import run_in_order
 
-SCENES = ("domino_chain-0001", "hidden_race-0001", "plinko-0001", "tumbling_dice-0001")
-FRAMES = 20
+SCENES = ("domino_chain-0001", "hidden_race-0001", "plinko-0001", "seesaw_sorter-0001", "tumbling_dice-0001")
 
 
-def _scene(spec: SceneSpec) -> tuple[object, Camera, np.ndarray]:
+def _qpos(spec: SceneSpec, world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
+    digest = spec.trajectory_sha256 if world == "qpos" else spec.twin.trajectory_sha256
+    return load_trajectory(RELEASED / "trajectories" / f"{spec.scenario_id}.npz", digest, world)
+
+
+def _model(spec: SceneSpec) -> mujoco.MjModel:
     family = get_family(spec.family)
-    model, _ = compile_scene(family, family.params_from(spec.params), Physics(**spec.physics))
-    camera = Camera.from_record(spec.camera)
-    qpos = load_trajectory(RELEASED / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
-    return model, camera, qpos[:FRAMES]
+    return compile_scene(family, family.params_from(spec.params), Physics(**spec.physics))[0]
 
 
-def ours(spec: SceneSpec) -> None:
-    model, camera, qpos = _scene(spec)
-    with Renderer(model, camera) as renderer:  # type: ignore[arg-type]
-        for _ in renderer.frames(qpos):
-            pass
+def ours(spec: SceneSpec) -> int:
+    """Frames of the control as the videos stage draws them; how many."""
+    with Renderer(_model(spec), Camera.from_record(spec.camera)) as renderer:
+        return sum(1 for _ in renderer.frames(_qpos(spec)))
 
 
-def stock(spec: SceneSpec) -> None:
-    import mujoco
-
-    model, camera, qpos = _scene(spec)
-    model.vis.quality.offsamples = 4  # type: ignore[attr-defined]
+def stock(spec: SceneSpec) -> int:
+    """The same frames through `mujoco.Renderer`, as MuJoCo's own tutorial draws them; how many."""
+    model, camera, qpos = _model(spec), Camera.from_record(spec.camera), _qpos(spec)
+    model.vis.quality.offsamples = 4
     data = mujoco.MjData(model)
     view = mujoco.MjvCamera()
     view.lookat[:], view.distance = camera.lookat, camera.distance
@@ -53,25 +61,66 @@ def stock(spec: SceneSpec) -> None:
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, view)
             renderer.render()
+    return len(qpos)
 
 
-def _seconds(render: Callable[[SceneSpec], None], spec: SceneSpec) -> float:
+def _rate(draw: Callable[[], int]) -> float:
     began = time.perf_counter()
-    render(spec)
-    return time.perf_counter() - began
+    return draw() / (time.perf_counter() - began)
+
+
+def _on_all_cores(specs: list[SceneSpec]) -> int:
+    return sum(frames for _, frames in run_in_order(ours, specs))
+
+
+@contextmanager
+def _gl_seconds() -> Iterator[list[float]]:
+    """Seconds inside OpenGL draw calls while the context is open, drawing included that the driver would put off."""
+    from OpenGL import GL
+
+    module: Any = mujoco
+    spent, draw = [0.0], module.mjr_render
+
+    def timed(*args: object) -> None:
+        began = time.perf_counter()
+        draw(*args)
+        GL.glFinish()
+        spent[0] += time.perf_counter() - began
+
+    module.mjr_render = timed
+    try:
+        yield spent
+    finally:
+        module.mjr_render = draw
+
+
+def stage_against_gl(specs: list[SceneSpec]) -> float:
+    """Time of the videos stage (control, void, twin, checks, encoding) over the time inside its draw calls."""
+    with tempfile.TemporaryDirectory() as folder, _gl_seconds() as gl:
+        began = time.perf_counter()
+        for spec in specs:
+            clips = [Path(folder) / f"{spec.scenario_id}-{side}.mp4" for side in ("control", "void", "twin")]
+            render_pair(Job(spec, _qpos(spec), _qpos(spec, "twin"), clips[0], clips[1], clips[2]))
+        return (time.perf_counter() - began) / gl[0]
 
 
 def main() -> None:
     specs = [load_released()[name] for name in SCENES]
-    for render in (ours, stock):
-        render(specs[0])  # first use compiles and opens contexts
-    totals = {"ours": 0.0, "stock": 0.0}
-    print(f"{'scene':<22} {'ours, frames/s':>15} {'stock 4x MSAA':>15} {'ratio':>7}")
+    for draw in (ours, stock):
+        draw(specs[0])  # first use opens contexts and compiles shaders
+    print(f"frames a second at {WIDTH} x {HEIGHT}")
+    print(f"{'scene':<22} {'ours':>7} {'stock 4x MSAA':>15} {'ratio':>7}")
+    seconds = {"ours": 0.0, "stock": 0.0}
     for spec in specs:
-        a, b = _seconds(ours, spec), _seconds(stock, spec)
-        totals["ours"], totals["stock"] = totals["ours"] + a, totals["stock"] + b
-        print(f"{spec.scenario_id:<22} {FRAMES / a:>15.1f} {FRAMES / b:>15.1f} {b / a:>7.2f}")
-    print(f"ratio over all scenes: {totals['stock'] / totals['ours']:.2f}")
+        a, b = _rate(lambda: ours(spec)), _rate(lambda: stock(spec))  # noqa: B023 (called at once)
+        seconds = {"ours": seconds["ours"] + 1 / a, "stock": seconds["stock"] + 1 / b}
+        print(f"{spec.scenario_id:<22} {a:>7.1f} {b:>15.1f} {a / b:>7.2f}")
+    one, stock_rate = len(specs) / seconds["ours"], len(specs) / seconds["stock"]
+    print(f"{'one process':<22} {one:>7.1f} {stock_rate:>15.1f} {one / stock_rate:>7.2f}")
+    all_cores = _rate(lambda: _on_all_cores(specs * 8))
+    cores = f"{len(os.sched_getaffinity(0))} processes"
+    print(f"{cores:<22} {all_cores:>7.1f} {stock_rate:>15.1f} {all_cores / stock_rate:>7.2f}  (stock: one process)")
+    print(f"videos stage / its OpenGL draw calls: {stage_against_gl(specs):.2f}")
 
 
 if __name__ == "__main__":

@@ -102,11 +102,10 @@ class Renderer:
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
         try:
             for i, row in enumerate(qpos):
-                raw = self._draw(row, panel=panel, without=()).astype(np.int32)
-                segments = raw[..., 0] + (raw[..., 1] << 8) + (raw[..., 2] << 16)
+                rgba = self._draw(row, panel=panel, without=())
+                pixels = np.bincount((rgba.view("<u4") & 0xFFFFFF).ravel())  # a segment's id is its colour
                 drawn = {g.segid + 1: g.objid for g in self._scene.geoms[: self._scene.ngeom] if g.objtype == 5}
-                present, pixels = np.unique(segments, return_counts=True)
-                seen = {drawn[s]: n for s, n in zip(present, pixels, strict=True) if s in drawn}
+                seen = {geom: pixels[id_] for id_, geom in drawn.items() if id_ < len(pixels)}
                 counts[i] = [seen.get(g, 0) / SUPERSAMPLE**2 for g in ids]
         finally:
             flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
