@@ -24,6 +24,7 @@ ASSETS = [
     report.pecs_landscape,
     report.contact_sheet,
     report.gallery,
+    report.shortcuts,
     report.leaderboard_page,
 ]
 # In process: a run costs 2 s instead of 5, and rendering and asking bring their own processes and connections.

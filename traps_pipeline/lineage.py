@@ -28,7 +28,7 @@ from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace, write_text
 from traps_pipeline.tables import TABLES
 
-REPORTS = ("pecs_landscape", "contact_sheet", "gallery", "leaderboard_page")
+REPORTS = ("pecs_landscape", "contact_sheet", "gallery", "shortcuts", "leaderboard_page")
 STAGES = ("scene_specs", "videos", "items", "responses", "votes", "verdicts", "metrics", "leaderboard", *REPORTS)
 SOURCES = ("released_specs", "corrections", "models", "prompts", "judges")
 PARTITIONED_BY: Mapping[str, Literal["category", "dataset", "cell", "evaluation"]] = {
@@ -93,8 +93,10 @@ def upstream(stage: str, key: str | None) -> list[Node]:
             return [("items", d) for d in DATASETS]
         case "gallery":
             return [(s, c) for c in CATEGORIES for s in ("scene_specs", "videos")]
+        case "shortcuts":
+            return [*(("items", d) for d in DATASETS), *(("videos", c) for c in CATEGORIES)]
         case "leaderboard_page":
-            return [("leaderboard", None), ("pecs_landscape", None), ("contact_sheet", None)]
+            return [("leaderboard", None), *((s, None) for s in ("pecs_landscape", "contact_sheet", "shortcuts"))]
     raise KeyError(f"unknown stage {stage!r}; known: {', '.join(STAGES)}")
 
 

@@ -16,6 +16,7 @@ from traps_pipeline.defs.scoring import leaderboard
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.lineage import Lineage, write_report_state
 from traps_pipeline.progress import Tally
+from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, LEADERBOARD, SCENE_SPECS, VIDEOS
 
@@ -96,12 +97,29 @@ def _gallery(workspace: Workspace) -> Files:
     return gallery_files(specs, clips, workspace.root, f"{release.name} {release.version}: all pairs")
 
 
+def _shortcuts(workspace: Workspace) -> Files:
+    from traps_pipeline.benchmark.shortcuts import shortcuts
+    from traps_pipeline.report.figures import figure_bytes, shortcut_figure
+
+    rows = workspace.tables.read_all(ITEMS)
+    if rows.empty:
+        raise TrapsError("shortcuts: no items yet; materialize items first")
+    try:
+        table = shortcuts(rows, workspace.tables.read_all(VIDEOS), workspace.root)
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
+    figure = shortcut_figure(table)
+    pictures = {f"shortcuts.{kind}": figure_bytes(figure, kind) for kind in ("png", "svg")}
+    return pictures | {"shortcuts.csv": table.to_csv(index=False, float_format="%.4f").encode()}
+
+
 def _page(workspace: Workspace) -> Files:
     from traps_pipeline.report.page import leaderboard_html, leaderboard_markdown
 
     board = workspace.tables.read(LEADERBOARD, {})
     pictures = {
         "Accuracy against discrimination": (workspace.reports / "pecs_landscape.png").read_bytes(),
+        "Control told from void by one cue alone (0.5 is chance)": (workspace.reports / "shortcuts.png").read_bytes(),
         "Pairs: control above, void below": (workspace.reports / "contact_sheet.png").read_bytes(),
     }
     return {
@@ -125,10 +143,17 @@ gallery = _report(
     [scene_specs, videos],
     _gallery,
 )
+shortcuts = _report(
+    "shortcuts",
+    "How well control and void can be told apart by the question's words, the clip's length, its first frame or its "
+    "file size alone: a figure and a table.",
+    [items, videos],
+    _shortcuts,
+)
 leaderboard_page = _report(
     "leaderboard_page",
     "The leaderboard as a page that opens from disk (HTML) and as Markdown.",
-    [leaderboard, pecs_landscape, contact_sheet],
+    [leaderboard, pecs_landscape, contact_sheet, shortcuts],
     _page,
 )
 
@@ -151,5 +176,5 @@ def _inputs_current(asset: dg.AssetsDefinition) -> dg.AssetChecksDefinition:
 
 
 inputs_current = [
-    _inputs_current(asset) for asset in (leaderboard, pecs_landscape, contact_sheet, gallery, leaderboard_page)
+    _inputs_current(asset) for asset in (leaderboard, pecs_landscape, contact_sheet, gallery, shortcuts, leaderboard_page)
 ]

@@ -77,6 +77,20 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([p[0] for p in pairs]), np.array([p[1] for p in pairs])
 
 
+def decode_first(path: Path) -> np.ndarray:
+    """The first frame (H, W, 3) uint8 RGB alone. Raises DamagedClip."""
+    import av
+    from av.error import FFmpegError
+
+    try:
+        with av.open(str(path)) as container:
+            return next(container.decode(video=0)).to_ndarray(format="rgb24")
+    except (FFmpegError, OSError, IndexError, StopIteration) as error:
+        raise DamagedClip(
+            f"{path}: cannot be decoded ({error}); delete the file and materialize videos again"
+        ) from error
+
+
 def decode_sampled(path: Path, fps: float = 5.0, most: int = 25) -> np.ndarray:
     """The frames (N, H, W, 3) uint8 RGB shown at the times 0, 1/fps, 2/fps, ..., at most `most` (`benchmark.md`
     section 3). Raises DamagedClip."""

@@ -1,0 +1,86 @@
+"""A cue that differs between the sides is found, one that does not gives chance: on real clips with a planted cue."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from traps_pipeline.benchmark.shortcuts import shortcuts
+from traps_pipeline.report.figures import figure_bytes, shortcut_figure
+from traps_pipeline.scenes.encode import encode
+
+SCENARIOS = 10
+
+
+def _clip(path: Path, rng: np.random.Generator, frames: int, panel: bool) -> dict[str, object]:
+    video = np.full((frames, 96, 128, 3), 180, np.uint8)
+    video[:, 60:80, 10 : 20 + rng.integers(80)] = rng.integers(0, 255, 3)  # scenes differ
+    if panel:
+        video[:, 20:50, 40:90] = (20, 30, 90)
+    encode(list(video), path, 10)
+    return {"path": path.name, "duration_s": frames / 10, "size_bytes": path.stat().st_size}
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+    """occlusion: a panel in the void's first frame; chaotic: the void is shorter; ill-posed: another question."""
+    root, rng = tmp_path_factory.mktemp("clips"), np.random.default_rng(0)
+    items: list[dict[str, str]] = []
+    clips: list[dict[str, object]] = []
+    for taxonomy in ("occlusion", "chaotic"):
+        for k in range(SCENARIOS):
+            name = f"{taxonomy}-{k}"
+            scene = np.random.default_rng(k)
+            clips.append(_clip(root / f"{name}-control.mp4", scene, 10, panel=False))
+            scene = np.random.default_rng(k)  # the same scene again
+            hidden = taxonomy == "occlusion"
+            clips.append(_clip(root / f"{name}-void.mp4", scene, 10 if hidden else 5 + int(rng.integers(3)), hidden))
+            for dataset, side, clip, question in (
+                (taxonomy, "control", "control", "Does it fall?"),
+                (taxonomy, "void", "void", "Does it fall?"),
+                (f"{taxonomy}_ill_posed", "control", "control", "Does it fall?"),
+                (f"{taxonomy}_ill_posed", "void", "control", "What is its mass in grams?"),
+            ):
+                items.append(
+                    {
+                        "dataset": dataset,
+                        "scenario_id": name,
+                        "pair_id": f"{dataset}:{name}",
+                        "side": side,
+                        "question": question,
+                        "clip": f"{name}-{clip}.mp4",
+                    }
+                )
+    return shortcuts(pd.DataFrame(items), pd.DataFrame(clips), root)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "telling", "silent"),
+    [
+        ("occlusion", {"first frame"}, {"question", "clip length"}),
+        ("chaotic", {"clip length", "file size"}, {"question", "first frame"}),
+        ("occlusion_ill_posed", {"question"}, {"clip length", "first frame", "file size"}),
+        ("chaotic_ill_posed", {"question"}, {"clip length", "first frame", "file size"}),
+    ],
+)
+def test_only_the_planted_cue_tells_control_from_void(
+    table: pd.DataFrame, dataset: str, telling: set[str], silent: set[str]
+) -> None:
+    rows = table.loc[table["dataset"] == dataset].set_index("cue")
+    assert (rows["n_pairs"] == SCENARIOS).all()
+    assert (rows.loc[sorted(telling), "accuracy"] >= 0.8).all(), rows
+    assert (rows.loc[sorted(silent), "accuracy"] == 0.5).all(), rows
+
+
+def test_the_figure_is_the_same_on_a_second_build(table: pd.DataFrame) -> None:
+    assert figure_bytes(shortcut_figure(table), "svg") == figure_bytes(shortcut_figure(table), "svg")
+
+
+def test_too_few_scenarios_give_no_row_and_still_a_figure(table: pd.DataFrame) -> None:
+    items = pd.DataFrame({c: [] for c in ("dataset", "scenario_id", "pair_id", "side", "question", "clip")})
+    few = shortcuts(items, pd.DataFrame({c: [] for c in ("path", "duration_s", "size_bytes")}), Path())
+    assert list(few.columns) == list(table.columns) and few.empty
+    assert figure_bytes(shortcut_figure(few)).startswith(b"\x89PNG")
