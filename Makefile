@@ -9,7 +9,7 @@ UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
 .PHONY: demo test ui bench lint setup render-packages test-packages clean
 
-demo: setup ## leaderboard of nine reference models on 32 scenarios, no key needed
+demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
 
 test: test-packages setup lint ## lint, types and all tests, the slow ones too

@@ -173,7 +173,8 @@ def _print_results(workspace: Workspace) -> None:
     from traps_pipeline.tables import LEADERBOARD
 
     print(leaderboard_text(workspace.tables.read(LEADERBOARD, {})))
-    for name in ("leaderboard.html", "leaderboard.md", "pecs_landscape.png", "contact_sheet.png", "gallery.html"):
+    pictures = ("pecs_landscape.png", "contact_sheet.png", "shortcuts.png")
+    for name in ("leaderboard.html", "leaderboard.md", "gallery.html", *pictures):
         print(workspace.reports / name)
 
 

@@ -71,7 +71,7 @@ def test_the_demo_ends_with_the_leaderboard_and_paths_that_exist(demo: Checkout,
         in demo_output
     )
     lines = demo_output.splitlines()
-    for name in ("leaderboard.html", "leaderboard.md", "pecs_landscape.png", "contact_sheet.png"):
+    for name in ("leaderboard.html", "gallery.html", "pecs_landscape.png", "contact_sheet.png", "shortcuts.png"):
         path = demo.workspace / "reports" / name
         assert str(path) in lines
         assert path.stat().st_size > 1000
