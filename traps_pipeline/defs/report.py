@@ -176,5 +176,6 @@ def _inputs_current(asset: dg.AssetsDefinition) -> dg.AssetChecksDefinition:
 
 
 inputs_current = [
-    _inputs_current(asset) for asset in (leaderboard, pecs_landscape, contact_sheet, gallery, shortcuts, leaderboard_page)
+    _inputs_current(asset)
+    for asset in (leaderboard, pecs_landscape, contact_sheet, gallery, shortcuts, leaderboard_page)
 ]
