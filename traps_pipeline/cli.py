@@ -6,19 +6,21 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.errors import TrapsError
 
 if TYPE_CHECKING:
     from traps_pipeline.experiment import Experiment
+    from traps_pipeline.models.forecast import Forecast
     from traps_pipeline.storage.workspace import Workspace
 
-OK, FAILED, BAD_USAGE, INTERRUPTED = 0, 1, 2, 130
+OK, FAILED, BAD_USAGE, OVER_BUDGET, INTERRUPTED = 0, 1, 2, 4, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a subcommand; returns the exit code: 0 done, 1 something failed, 2 bad usage, 130 interrupted."""
+    """Run a subcommand; returns the exit code: 0 done, 1 something failed, 2 bad usage, 4 a budget is reached, 130
+    interrupted."""
     arguments = build_parser().parse_args(argv)
     command: Callable[[argparse.Namespace], int] = arguments.command
     try:
@@ -66,11 +68,38 @@ def build_parser() -> argparse.ArgumentParser:
     add("plan", plan, "count the calls of an experiment: wanted, known, new; nothing is sent").add_argument(
         "experiment"
     )
-    add("run", run, "materialize whatever of an experiment is missing or stale").add_argument("experiment")
+    running = add("run", run, "materialize whatever of an experiment is missing or stale")
+    running.add_argument("experiment")
+    running.add_argument(
+        "--budget-usd", action="append", default=[], metavar="[MODEL=]USD",
+        help="spend no more on calls over the network, in this study or on one model or judge; kept in study.yaml",
+    )  # fmt: skip
+    running.add_argument(
+        "--allow-unknown-prices",
+        action="store_true",
+        default=None,
+        help="ask models that have no price in the registry",
+    )
     add("status", status, "what is there, missing and stale, and why").add_argument("experiment", nargs="?")
     add("why", why, "why an item's answers stand or will be asked again").add_argument(
         "item", help="dataset:scenario:side"
     )
+    requests = commands.add_parser("requests", help="calls for others to make").add_subparsers(required=True)
+    export = requests.add_parser("export", help="write an experiment's missing calls and their media to a folder")
+    export.set_defaults(command=export_calls)
+    export.add_argument("experiment")
+    export.add_argument("--out", type=Path, required=True, help="folder of requests.jsonl and media/")
+    answers = commands.add_parser("answers", help="answers that others got").add_subparsers(required=True)
+    imported = answers.add_parser("import", help="take answers (JSON lines by key) into the ledger")
+    imported.set_defaults(command=import_given)
+    imported.add_argument("experiment")
+    imported.add_argument("file", type=Path)
+    for sub in (export, imported):
+        sub.add_argument("--workspace", type=Path, help="study folder (default: $TRAPS_WORKSPACE)")
+    models = commands.add_parser("models", help="entries of the registry").add_subparsers(required=True)
+    check = models.add_parser("check", help="show what models and judges are really sent; no key, nothing leaves here")
+    check.set_defaults(command=check_models)
+    check.add_argument("names", nargs="*", metavar="MODEL", help="these models and judges only")
     certify = add("certify", certify_benchmark, "re-derive every certificate of the released records", workspace=False)
     certify.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
     certify.add_argument("--families", nargs="+", metavar="FAMILY", help="these only")
@@ -112,25 +141,51 @@ def init(arguments: argparse.Namespace) -> int:
 
 def plan(arguments: argparse.Namespace) -> int:
     """See `traps plan --help`."""
-    from traps_pipeline.plan import Count, plan_calls
+    from traps_pipeline.plan import Count, make_plan
 
     experiment, root = _experiment(arguments), _root(arguments)
     workspace = _open(root) if (root / "study.yaml").exists() else None
-    rows, uncertain = plan_calls(workspace, experiment)
+    planned = make_plan(workspace, experiment)
     total = (Count(), Count())
     print(f"{experiment.name} in {root if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
     print(f"{'model':<24} {'answers':>9} {'known':>9} {'new':>9}   {'votes':>9} {'known':>9} {'new':>9}")
-    for model, counts in rows.items():
+    for model, counts in planned.calls.items():
         for sum_, count in zip(total, counts, strict=True):
             sum_.add(count.wanted, count.known)
         print(_plan_line(model, counts))
     print(_plan_line("all", total))
-    if uncertain:
+    if planned.forecasts:
+        _print_forecasts(planned.forecasts)
+    if planned.uncertain:
         print(
-            f"an upper bound: the items of {', '.join(uncertain)} are not made, or not since the last correction: all "
+            f"an upper bound: the items of {', '.join(planned.uncertain)} are not made, or are outdated: all "
             "of their calls are counted as new. Materialize scene_specs, videos and items for exact counts."
         )
     return OK
+
+
+def _print_forecasts(forecasts: Sequence[Forecast]) -> None:
+    """Tokens, dollars and minutes of the new calls over the network; an unknown price stays unknown in the sum."""
+    print(
+        f"\n{'over the network':<24} {'new calls':>9} {'M tokens in, out':>18}   {'USD low':>10} {'expected':>10}",
+        end="",
+    )
+    print(f" {'high':>10} {'minutes':>8}")
+    for row in forecasts:
+        tokens = f"{row.prompt_tokens / 1e6:.2f}, {row.completion_tokens / 1e6:.2f}"
+        print(f"{row.participant:<24} {row.calls:>9,} {tokens:>18}   {_dollars(row.dollars)} {row.minutes:>8,.0f}")
+    known = [row.dollars for row in forecasts if row.dollars is not None]
+    total = (sum(d[0] for d in known), sum(d[1] for d in known), sum(d[2] for d in known))
+    longest = max(row.minutes for row in forecasts)
+    calls = sum(row.calls for row in forecasts)
+    print(f"{'all, side by side':<24} {calls:>9,} {'':>18}   {_dollars(total)} {longest:>8,.0f}")
+    if len(known) < len(forecasts):
+        unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
+        print(f"price unknown, not in the sum: {unknown}")
+
+
+def _dollars(amounts: tuple[float, float, float] | None) -> str:
+    return " ".join(f"{'unknown' if amounts is None else f'{amounts[k]:,.2f}':>10}" for k in range(3))
 
 
 def _plan_line(name: str, counts: tuple) -> str:
@@ -146,7 +201,7 @@ def run(arguments: argparse.Namespace) -> int:
     from traps_pipeline.progress import Tally, TerminalProgress, clock, reporting
 
     experiment = _experiment(arguments)
-    workspace = _create(arguments, experiment)
+    workspace = _allow(_create(arguments, experiment), arguments)
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
     with reporting(TerminalProgress()) as progress:
         outcome = run_experiment(workspace, experiment)
@@ -163,9 +218,37 @@ def run(arguments: argparse.Namespace) -> int:
             f"traps: {len(outcome.problems)} problem(s); what is done is kept: run the same command to go on",
             file=sys.stderr,
         )
-        return FAILED
+        return OVER_BUDGET if outcome.over_budget else FAILED
     _print_results(workspace)
     return OK
+
+
+def _allow(workspace: Workspace, arguments: argparse.Namespace) -> Workspace:
+    """The workspace with what the command line says about money in its study. Raises TrapsError for a wrong amount."""
+    money: dict[str, Any] = {} if arguments.allow_unknown_prices is None else {"allow_unknown_prices": True}
+    for text in arguments.budget_usd:
+        name, _, amount = text.rpartition("=")
+        try:
+            dollars = float(amount)
+        except ValueError:
+            dollars = -1.0
+        if not 0 <= dollars < float("inf"):
+            raise TrapsError(
+                f"--budget-usd {text}: give dollars (20 or 20.50), or MODEL=dollars for one model or judge"
+            )
+        if name:
+            caps = money.setdefault("model_budgets_usd", dict(workspace.study.model_budgets_usd))
+            caps[_known_participant(name)] = dollars
+        else:
+            money["budget_usd"] = dollars
+    return workspace.allow(**money) if money else workspace
+
+
+def _known_participant(name: str) -> str:
+    from traps_pipeline.judging.panel import load_judges
+    from traps_pipeline.models.registry import get_model
+
+    return name if name in load_judges() else get_model(name).id
 
 
 def _print_results(workspace: Workspace) -> None:
@@ -215,6 +298,39 @@ def why(arguments: argparse.Namespace) -> int:
     for line in explain(_open(_root(arguments)), arguments.item):
         print(line)
     return OK
+
+
+def export_calls(arguments: argparse.Namespace) -> int:
+    """See `traps requests export --help`."""
+    from traps_pipeline.models.exchange import REQUESTS, export_requests
+
+    experiment = _experiment(arguments)
+    count = export_requests(_open(_root(arguments)), experiment, arguments.out.absolute())
+    print(f"{count} requests in {arguments.out / REQUESTS}")
+    print(f"next: have them answered, then traps answers import {arguments.experiment} ANSWERS.jsonl")
+    return OK
+
+
+def import_given(arguments: argparse.Namespace) -> int:
+    """See `traps answers import --help`."""
+    from traps_pipeline.models.exchange import import_answers
+
+    imported = import_answers(_open(_root(arguments)), _experiment(arguments), arguments.file)
+    print(f"{imported.new} answers imported, {imported.known} were there already")
+    print(f"next: traps run {arguments.experiment}")
+    return OK
+
+
+def check_models(arguments: argparse.Namespace) -> int:
+    """See `traps models check --help`."""
+    from traps_pipeline.models.wire import check_named
+
+    wrong = 0
+    for checked in check_named(arguments.names):
+        print("\n    ".join([checked.line, *checked.problems]), flush=True)
+        wrong += bool(checked.problems)
+    print("every entry sends what it declares" if not wrong else f"{wrong} entries do not send what they declare")
+    return FAILED if wrong else OK
 
 
 def certify_benchmark(arguments: argparse.Namespace) -> int:

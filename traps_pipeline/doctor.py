@@ -30,6 +30,7 @@ def examine(workspace_root: Path) -> Iterator[Finding]:
         ("encoding", _encoding),
         ("disk", lambda: _disk(workspace_root)),
         ("workspace", lambda: _workspace(workspace_root)),
+        ("keys", _keys),
     ):
         yield _finding(what, look)
 
@@ -107,3 +108,13 @@ def _workspace(root: Path) -> str:
         return f"{root} not made yet (`traps init` or `traps run demo` makes it)"
     study = Workspace.open(root).study
     return f"{root}: benchmark {study.benchmark}, panel {study.panel}, budget {study.budget_usd} dollars"
+
+
+def _keys() -> str:
+    """Which keys are not set, and who cannot be asked without them. None is needed for the demo."""
+    from traps_pipeline.judging.panel import load_judges
+    from traps_pipeline.models.registry import load_models, missing_keys
+
+    entries = [*load_models().values(), *load_judges().values()]
+    missing = [f"{name} not set ({', '.join(who)} cannot be asked)" for name, who in missing_keys(entries).items()]
+    return "; ".join(missing) or "all set"

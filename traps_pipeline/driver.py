@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import Experiment
 from traps_pipeline.lineage import PARTITIONED_BY, STAGES, Lineage, Node, name_of, upstream
+from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.models.registry import all_evaluations
 from traps_pipeline.partitions import CATEGORIES, DATASETS, Cell, datasets_of_category
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 SHOWN = 4  # unfinished partitions named in a problem
 AGGREGATES = {"metrics": "verdicts/", "leaderboard": "metrics/"}  # made from whatever is there of these
 PID_TAG = "traps/pid"
+_SENTENCES = (TrapsError.__name__, BudgetReached.__name__)  # errors whose message is for people
 _INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
 _QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
 
@@ -97,9 +100,10 @@ def _datasets(experiment: Experiment, categories: Sequence[str]) -> list[str]:
 
 @dataclass
 class Outcome:
-    """What a run did: problems by partition, and checks that did not pass."""
+    """What a run did: problems by partition, and checks that did not pass; whether a budget ended it."""
 
     problems: list[str] = field(default_factory=list)
+    over_budget: bool = False
     failed: set[Node] = field(default_factory=set)
     seconds: float = 0.0
 
@@ -148,7 +152,9 @@ def _run_stage(
         return
     progress.current().stage(stage, len(todo))
     for batch in batches(stage, todo):
-        outcome.problems += _materialize(instance, stage, batch)
+        problems, over_budget = _materialize(instance, stage, batch)
+        outcome.problems += problems
+        outcome.over_budget |= over_budget
     after = Lineage(workspace)
     statuses = {(stage, key): after.status(stage, key) for key in todo}
     unfinished = [node for node, status in statuses.items() if status.kind == "missing" or status.outdated]
@@ -198,8 +204,10 @@ def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
     return spans
 
 
-def _materialize(instance: dg.DagsterInstance, stage: str, batch: tuple[str | None, str | None]) -> list[str]:
-    """One Dagster run; what went wrong in it, one sentence each."""
+def _materialize(
+    instance: dg.DagsterInstance, stage: str, batch: tuple[str | None, str | None]
+) -> tuple[list[str], bool]:
+    """One Dagster run; what went wrong in it, one sentence each, and whether a budget was reached."""
     import dagster as dg
 
     from traps_pipeline.definitions import ASSETS, SOURCES, inputs_current
@@ -225,7 +233,8 @@ def _materialize(instance: dg.DagsterInstance, stage: str, batch: tuple[str | No
     problems = [_reason(event) for event in failures]
     if not result.success and not problems:
         problems.append(f"{stage} {first or ''}: the run failed; see its log in Dagster")
-    return problems
+    over_budget = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _chain(event))
+    return problems, over_budget
 
 
 def _chain(event: dg.DagsterEvent) -> list[Any]:
@@ -240,7 +249,7 @@ def _chain(event: dg.DagsterEvent) -> list[Any]:
 def _reason(event: dg.DagsterEvent) -> str:
     """The error of a failed step: our own sentence where there is one, else the innermost exception."""
     chain = _chain(event)
-    told = [error for error in chain if error.cls_name == TrapsError.__name__]
+    told = [error for error in chain if error.cls_name in _SENTENCES]
     if not told:
         return chain[-1].message.strip() if chain else "the step failed"
-    return told[0].message.strip().removeprefix(f"{TrapsError.__module__}.{TrapsError.__name__}: ")
+    return re.sub(rf"^\S*\b{told[0].cls_name}: ", "", told[0].message.strip())

@@ -33,6 +33,8 @@ class Experiment(BaseModel):
     panel: str | None = None
     epoch: str | None = None
     budget_usd: float | None = Field(default=None, ge=0.0)
+    model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] | None = None
+    allow_unknown_prices: bool | None = None
 
     @field_validator("datasets")
     @classmethod
@@ -59,7 +61,8 @@ class Experiment(BaseModel):
     @property
     def study(self) -> Study:
         """The study that a new workspace for this experiment holds."""
-        fields = ("benchmark", "scenarios", "per_family", "panel", "epoch", "budget_usd")
+        fields = ("benchmark", "scenarios", "per_family", "panel", "epoch", "budget_usd", "model_budgets_usd")
+        fields += ("allow_unknown_prices",)
         given = {name: getattr(self, name) for name in fields}
         return Study(**{name: value for name, value in given.items() if value is not None})
 

@@ -20,9 +20,9 @@ from traps_pipeline.benchmark.specs import released_in_study
 from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import load_panel
+from traps_pipeline.judging.panel import load_judges, load_panel
 from traps_pipeline.models.prompts import prompt, system_prompt
-from traps_pipeline.models.registry import all_evaluations, get_model, load_models
+from traps_pipeline.models.registry import all_evaluations, get_model, load_accounts, load_models
 from traps_pipeline.partitions import CATEGORIES, DATASETS, Cell, Evaluation
 from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace, write_text
@@ -166,11 +166,15 @@ class Lineage:
                 return digest([[s.scenario_id, s.version] for s in scenarios if s.category == key])[:16]
             case "models":
                 entry = get_model(Evaluation.parse(str(key)).model)
-                return digest([entry.id, entry.backend, entry.params])[:16]
+                media = entry.media.model_dump(mode="json") if entry.media else None
+                return digest([entry.id, entry.backend, entry.provider_id, entry.params, entry.json_schema, media])[:16]
             case "prompts":
                 return digest(system_prompt(Evaluation.parse(str(key)).regime))[:16]
             case "judges":
-                panel = [[judge.id, judge.backend, judge.params] for judge in load_panel(self._workspace.study.panel)]
+                panel = [
+                    [judge.id, judge.backend, judge.provider_id, judge.params]
+                    for judge in load_panel(self._workspace.study.panel)
+                ]
                 return digest([panel, prompt("judge_abstention"), prompt("judge_correctness")])[:16]
         raise KeyError(f"unknown source {name!r}; known: {', '.join(SOURCES)}")
 
@@ -180,7 +184,7 @@ def reread_sources() -> None:
 
     Which evaluations there are stays: partition keys are made from them when the code location is loaded.
     """
-    for cached in (load_released, folded, load_models, prompt, system_prompt, load_panel):
+    for cached in (load_released, folded, load_models, load_accounts, prompt, system_prompt, load_judges, load_panel):
         cached.cache_clear()
 
 

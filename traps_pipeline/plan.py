@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +12,9 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import Experiment
 from traps_pipeline.judging.panel import PANEL_SIZE, load_panel, tasks_for, wanted_ballots
 from traps_pipeline.lineage import STAGES, Lineage, keys_of, upstream
-from traps_pipeline.models.answers import answer_request
-from traps_pipeline.models.registry import get_model, load_models
+from traps_pipeline.models.answers import answer_request, is_prepared
+from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast
+from traps_pipeline.models.registry import NETWORK, Entry, get_model, load_models
 from traps_pipeline.partitions import REGIMES, SIDES, Cell, Evaluation, datasets_of_category
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.workspace import Workspace
@@ -39,11 +40,38 @@ class Count:
         self.wanted, self.known = self.wanted + wanted, self.known + known
 
 
-def plan_calls(workspace: Workspace | None, experiment: Experiment) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
-    """Answers and votes by model: wanted, known, new; and the datasets whose items are not current.
+@dataclass(frozen=True)
+class Plan:
+    """What an experiment will ask. calls: answers and votes by model. uncertain: datasets whose items are not current:
+    what those will be is not known yet, so all of their calls are counted as new, an upper bound. forecasts: what the
+    new calls over the network take, by model and judge."""
 
-    What those items will be is not known yet, so all of their calls are counted as new: an upper bound.
-    """
+    calls: Mapping[str, tuple[Count, Count]]
+    uncertain: Sequence[str]
+    forecasts: Sequence[Forecast]
+
+
+def make_plan(workspace: Workspace | None, experiment: Experiment) -> Plan:
+    """Count the calls of an experiment and say what they take; nothing is sent and nothing is made."""
+    calls, uncertain = _count_calls(workspace, experiment)
+    votes = sum(count.new for _, count in calls.values())
+    panel = load_panel((workspace.study if workspace else experiment.study).panel)
+    new: list[tuple[Entry, int]] = [(get_model(model), answers.new) for model, (answers, _) in calls.items()]
+    new += [(judge, votes // PANEL_SIZE) for judge in panel]
+    forecasts = [
+        forecast(entry, count, _experience(workspace, entry.id)) for entry, count in new if entry.backend == NETWORK
+    ]
+    return Plan(calls, uncertain, forecasts)
+
+
+def _experience(workspace: Workspace | None, participant: str) -> Experience:
+    ledgers = (workspace.answers, workspace.votes) if workspace else ()
+    return experience(row for ledger in ledgers for row in ledger.rows_of(participant))
+
+
+def _count_calls(
+    workspace: Workspace | None, experiment: Experiment
+) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
     plan = {model: (Count(), Count()) for model in experiment.models}
     study = workspace.study if workspace else experiment.study
     scenarios = load_scenarios(study).values()
@@ -56,10 +84,10 @@ def plan_calls(workspace: Workspace | None, experiment: Experiment) -> tuple[dic
             answers.add(2 * pairs, 0)
             votes.add(VOTES_A_PAIR * pairs, 0)
             continue
-        wanted = _answer_keys(workspace, cell)
-        answers.add(len(wanted), len(wanted & known.of(workspace.answers, cell.evaluation)))
+        keys, wanted = _answer_keys(workspace, cell), 2 * pairs
+        answers.add(wanted, len(keys & known.of(workspace.answers, cell.evaluation)))
         if lineage.status("responses", cell.key).kind != "fresh":
-            votes.add(VOTES_A_PAIR * len(wanted) // 2, 0)
+            votes.add(VOTES_A_PAIR * pairs, 0)
             continue
         ballots = {ballot.request.key for ballot in wanted_ballots(workspace, load_panel(study.panel), cell)}
         votes.add(len(ballots), len(ballots & known.of(workspace.votes, cell.evaluation)))
@@ -91,7 +119,8 @@ class _KnownKeys:
 def _answer_keys(workspace: Workspace, cell: Cell) -> set[str]:
     entry = get_model(cell.evaluation.model)
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}).to_dict("records")
-    return {answer_request(workspace, entry, item, cell.evaluation).key for item in items}
+    sent = [item for item in items if is_prepared(workspace, entry, item)]  # what was never prepared was never asked
+    return {answer_request(workspace, entry, item, cell.evaluation).key for item in sent}
 
 
 # --- status -----------------------------------------------------------------------------------------------------------

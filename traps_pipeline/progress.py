@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from rich.live import Live
+    from rich.table import Table
 
 LIVE_SECONDS = 30.0
+REDRAW_SECONDS, SLOW_CALL_SECONDS = 0.25, 0.2
 
 
 @dataclass
@@ -30,10 +36,57 @@ class Tally:
 
 
 @dataclass
+class Traffic:
+    """Calls to one model or judge in a stage, while they are made. Latencies (s) are the last 500."""
+
+    cached: int = 0
+    wanted: int = 0
+    done: int = 0
+    errors: int = 0
+    dollars: float = 0.0
+    began: float = field(default_factory=time.monotonic)
+    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=500))
+
+    def called(self, failed: bool, latency_s: float, dollars: float) -> None:
+        """A call has come back."""
+        self.done, self.errors, self.dollars = self.done + 1, self.errors + failed, self.dollars + dollars
+        self.latencies.append(latency_s)
+
+    @property
+    def per_second(self) -> float:
+        """Answers a second since the first call."""
+        return self.done / max(time.monotonic() - self.began, 1e-9)
+
+    def latency_s(self, share: float) -> float:
+        """The latency that this share of the last calls did not exceed."""
+        ordered = sorted(self.latencies)
+        return ordered[min(int(share * len(ordered)), len(ordered) - 1)] if ordered else 0.0
+
+    @property
+    def left_s(self) -> float:
+        """Seconds until what is wanted so far is done."""
+        return (self.wanted - self.done) / self.per_second if self.done else 0.0
+
+    def cells(self) -> list[str]:
+        """done, cached, errors, calls a second, p50 and p95 latency, dollars, time left."""
+        return [
+            f"{self.done:,} of {self.wanted:,}",
+            f"{self.cached:,}",
+            f"{self.errors:,}",
+            f"{self.per_second:.1f}/s",
+            f"{self.latency_s(0.5):.1f} s",
+            f"{self.latency_s(0.95):.1f} s",
+            f"${self.dollars:,.2f}",
+            f"{clock(self.left_s)} left",
+        ]
+
+
+@dataclass
 class Progress:
-    """Silent progress: counts only. `totals` is by stage."""
+    """Silent progress: counts only. `totals` is by stage, `traffic` by stage and by who is asked."""
 
     totals: dict[str, Tally] = field(default_factory=dict)
+    traffic: dict[tuple[str, str], Traffic] = field(default_factory=dict)
 
     def stage(self, name: str, partitions: int) -> None:
         """A stage begins, with so many partitions to do."""
@@ -45,21 +98,37 @@ class Progress:
     def tick(self, stage: str, what: str, done: int, total: int) -> None:
         """A unit of a partition (a clip, a call) is done."""
 
+    def asking(self, stage: str, who: str, wanted: int, cached: int) -> None:
+        """So many more calls are about to be made, so many were in the ledger."""
+        traffic = self.traffic.setdefault((stage, who), Traffic())
+        traffic.wanted, traffic.cached = traffic.wanted + wanted, traffic.cached + cached
+
+    def called(self, stage: str, who: str, failed: bool, latency_s: float, dollars: float) -> None:
+        """A call has come back."""
+        self.traffic[stage, who].called(failed, latency_s, dollars)
+
+    def close(self) -> None:
+        """No more is coming."""
+
     def note(self, text: str) -> None:
         """Something a person should know."""
         print(text, file=sys.stderr)
 
 
 class TerminalProgress(Progress):
-    """One line a partition with calls, cache hits and time left; a line every 30 s inside a long one."""
+    """One line a partition with calls, cache hits and time left. Inside a long one: on a terminal a live table of who
+    is asked, elsewhere a line for each every 30 s."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         super().__init__()
         self._stream = stream or sys.stdout
+        self._live: Live | None = None
         self._done, self._total, self._began, self._spoke = 0, 0, time.monotonic(), time.monotonic()
+        self._drawn = 0.0
 
     def stage(self, name: str, partitions: int) -> None:
         """See `Progress`."""
+        self.close()
         self._done, self._total, self._began = 0, partitions, time.monotonic()
         self._say(f"{name}: {partitions} partition{'s' if partitions != 1 else ''} to do")
 
@@ -77,13 +146,56 @@ class TerminalProgress(Progress):
         if time.monotonic() - self._spoke >= LIVE_SECONDS:
             self._say(f"  {stage:<12} ... {what}: {done} of {total}")
 
+    def called(self, stage: str, who: str, failed: bool, latency_s: float, dollars: float) -> None:
+        """See `Progress`."""
+        super().called(stage, who, failed, latency_s, dollars)
+        if self._stream.isatty():
+            self._show(stage)
+        elif time.monotonic() - self._spoke >= LIVE_SECONDS:
+            for (of, name), traffic in self.traffic.items():
+                if of == stage and traffic.done < traffic.wanted:
+                    self._say(f"  {stage:<12} {name}: {', '.join(traffic.cells())}")
+
+    def close(self) -> None:
+        """Take the live table off the terminal."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def _show(self, stage: str) -> None:
+        """Draw the live table, a few times a second at most, once a call has taken long enough to wait for."""
+        now = time.monotonic()
+        if self._live is None:
+            if max(traffic.latency_s(1.0) for traffic in self.traffic.values()) < SLOW_CALL_SECONDS:
+                return
+            from rich.console import Console
+            from rich.live import Live
+
+            self._live = Live(console=Console(file=self._stream), auto_refresh=False, transient=True)
+            self._live.start()
+        if now - self._drawn >= REDRAW_SECONDS:
+            self._drawn = now
+            self._live.update(self._table(stage), refresh=True)
+
+    def _table(self, stage: str) -> Table:
+        from rich.table import Table
+
+        table = Table("asked", "done", "cached", "errors", "calls", "p50", "p95", "spent", "left", title=stage)
+        for (of, name), traffic in self.traffic.items():
+            if of == stage:
+                table.add_row(name, *traffic.cells())
+        return table
+
     def note(self, text: str) -> None:
         """See `Progress`."""
         self._say(f"  ! {text}")
 
     def _say(self, line: str) -> None:
         self._spoke = time.monotonic()
-        print(line, file=self._stream, flush=True)
+        if self._live is not None:
+            self._live.console.print(line, markup=False, highlight=False)
+        else:
+            print(line, file=self._stream, flush=True)
 
 
 def clock(seconds: float) -> str:
@@ -108,3 +220,4 @@ def reporting(progress: Progress) -> Iterator[Progress]:
         yield progress
     finally:
         _current.pop()
+        progress.close()

@@ -276,11 +276,15 @@ METRICS = Table(
     n_missing int items (of 2 n_pairs) without an answer or a majority
     n_refused int items refused
     n_empty int items answered with no text
+    n_errors int items whose call failed
+    n_answered int items answered with a text, whole or truncated
     acc float? share of decided controls answered correctly
     abs_rec float? share of decided voids abstained on
     false_abs float? share of decided controls abstained on
     j float? abs_rec - false_abs
     pecs float? acc x max(0, j)
+    pecs_low float pecs if every missing decision were as bad for the model as can be, of all pairs
+    pecs_high float pecs if every missing decision were as good for the model as can be, of all pairs
     naive float? acc x abs_rec
     epoch str campaigns of the answers, joined by +
 """
@@ -301,6 +305,11 @@ LEADERBOARD = Table(
     n_runs int runs averaged
     n_pairs int pairs a run
     n_missing int items without an answer or a majority, over runs
+    n_refused int items refused, over runs
+    n_empty int items answered with no text, over runs
+    n_errors int items whose call failed, over runs
+    answered float share of items (2 a pair and run) answered with a text, whole or truncated
+    incomplete bool whether answered is below 0.99, on overall that of any of its datasets
     acc float? mean over runs
     acc_std float? population standard deviation over runs
     abs_rec float? mean over runs
@@ -313,6 +322,8 @@ LEADERBOARD = Table(
     pecs_std float? population standard deviation over runs
     pecs_ci_low float? 95 % percentile interval, cluster bootstrap over scenarios
     pecs_ci_high float? 95 % percentile interval, cluster bootstrap over scenarios
+    pecs_low float mean over runs: pecs if every missing decision were as bad for the model as can be
+    pecs_high float mean over runs: pecs if every missing decision were as good for the model as can be
     naive float? acc x abs_rec, mean over runs
     epoch str campaigns of the answers, joined by +
 """

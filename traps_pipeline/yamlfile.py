@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,10 +35,12 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
             yield number, line
 
 
-def parse_yaml_model(model: type[Model], data: Any, path: Path, where: str = "") -> Model:
-    """Validate parsed YAML. Raises TrapsError naming file, entry and field."""
+def parse_yaml_model(
+    model: type[Model], data: Any, path: Path, where: str = "", context: Mapping[str, Any] | None = None
+) -> Model:
+    """Validate parsed YAML; validators see `context`. Raises TrapsError naming file, entry and field."""
     try:
-        return model.model_validate(data)
+        return model.model_validate(data, context=context)
     except ValidationError as error:
         raise TrapsError(f"{path}{where and ': ' + where}: {explain(error)}") from error
 

@@ -17,8 +17,9 @@ import pytest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models import ask
 from traps_pipeline.models.answers import answer_request
-from traps_pipeline.models.ask import Participant, Row, Work, run_work, settle
-from traps_pipeline.models.registry import Limits, get_model
+from traps_pipeline.models.ask import Participants, Row, Work, run_work, settle
+from traps_pipeline.models.budget import Budget
+from traps_pipeline.models.registry import Entry, Limits, get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
@@ -63,9 +64,9 @@ def work(
     def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> dict[str, Any]:
         return {"cell": cell, "rows": list(rows.values()), "tally": tally}
 
-    free = {name: asyncio.Semaphore(limits.concurrency) for name in backends}
-    participants: Any = {name: Participant(backend, limits, free[name]) for name, backend in backends.items()}
-    return Work("responses", Ledger(root, "answers"), participants, "1", wanted, finish)
+    entries = {name: Entry(id=name, backend="test", limits=limits) for name in backends}
+    participants = Participants(entries, lambda entry: backends[entry.id], Study())
+    return Work("responses", Ledger(root, "answers"), participants, Budget(0.0, {}, {}), "1", wanted, finish)
 
 
 def ten(_: Cell) -> list[Request]:
@@ -293,11 +294,13 @@ def test_stopping_does_not_wait_for_a_provider_that_asked_for_an_hour(tmp_path: 
 INTERRUPTED = """
 import asyncio, sys
 from pathlib import Path
-from traps_pipeline.models.ask import Participant, Work, run_work
-from traps_pipeline.models.registry import Limits
+from traps_pipeline.models.ask import Participants, Work, run_work
+from traps_pipeline.models.budget import Budget
+from traps_pipeline.models.registry import Entry, Limits
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.workspace import Study
 class Slow:
     asked = 0
     async def ask(self, request):
@@ -307,8 +310,10 @@ class Slow:
         await asyncio.sleep(0.3)
         return Outcome("answer", "left")
 requests = [Request("m", "test", {}, "s", "u", {"item_id": str(n)}) for n in range(40)]
-participants = {"m": Participant(Slow(), Limits(concurrency=4), asyncio.Semaphore(4))}
-work = Work("responses", Ledger(Path(sys.argv[1]), "answers"), participants, "1", lambda _: requests, lambda *_: 1)
+entry = Entry(id="m", backend="test", limits=Limits(concurrency=4))
+participants = Participants({"m": entry}, lambda _: Slow(), Study())
+ledger, budget = Ledger(Path(sys.argv[1]), "answers"), Budget(0.0, {}, {})
+work = Work("responses", ledger, participants, budget, "1", lambda _: requests, lambda *_: 1)
 try:
     list(run_work(work, [Cell("occlusion", Evaluation("m", "standard", 1))]))
 except KeyboardInterrupt:

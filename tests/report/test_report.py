@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from html.parser import HTMLParser
 
 import numpy as np
 import pandas as pd
@@ -47,7 +48,16 @@ def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6
         **{"model": model, "regime": regime, "dataset": dataset, "n_runs": 3, "n_pairs": 1404, "n_missing": 0},
         **{name: float(value) for name, value in figures.items()},
         **{f"{name}_std": 0.01 for name in figures},
-        **{"pecs_ci_low": pecs, "pecs_ci_high": pecs, "naive": acc * abs_rec, "epoch": "e1", "benchmark_version": "v1"},
+        **{"n_refused": 0, "n_empty": 0, "n_errors": 0, "answered": 1.0, "incomplete": False},
+        **{
+            "pecs_low": pecs,
+            "pecs_high": pecs,
+            "pecs_ci_low": pecs,
+            "pecs_ci_high": pecs,
+            "naive": acc * abs_rec,
+            "epoch": "e1",
+            "benchmark_version": "v1",
+        },
     }
     return {**row, **other}
 
@@ -103,12 +113,130 @@ def test_missing_items_are_marked_wherever_the_model_stands():
     assert "†" not in leaderboard_text(board_of(board_row("whole")))
 
 
+class Rows(HTMLParser):
+    """The cells' texts of every table row of a page."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.rows, self.inside = [], False
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "tr":
+            self.rows.append([])
+        elif tag in ("td", "th"):
+            self.rows[-1].append("")
+            self.inside = True
+
+    def handle_endtag(self, tag):
+        self.inside = self.inside and tag not in ("td", "th")
+
+    def handle_data(self, data):
+        if self.inside:
+            self.rows[-1][-1] += data
+
+
+def tables(board):
+    """Header and rows of the ranked table in a terminal, in Markdown and in HTML: model first, then from the PECS of
+    the datasets on (HTML's runs left out)."""
+    text = [re.split(r"\s{2,}", line.strip()) for line in leaderboard_text(board).split("\n\n")[1].splitlines()]
+    text = [text[0], *text[2:]]
+    lines = [line for line in leaderboard_markdown(board).splitlines() if line.startswith("|")]
+    markdown = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in [lines[0], *lines[2:]]]
+    html = [[cell.strip() for cell in row] for row in Rows(leaderboard_html(board)).rows[: len(text)]]
+    return (
+        [[row[0], *row[8:]] for row in text],
+        [[row[0], *row[8:]] for row in markdown],
+        [[row[0], *row[9:14], *row[15:]] for row in html],
+    )
+
+
+def cells_with_gaps(model="gaps"):
+    """A model that lost 60 items of `chaotic`, so that this and overall are incomplete; occlusion lacks a majority."""
+    lost = {"n_missing": 60, "n_refused": 41, "n_empty": 7, "n_errors": 12, "answered": 0.98, "incomplete": True}
+    return [
+        board_row(model, **{**lost, "n_missing": 61, "pecs_low": 0.2, "pecs_high": 0.31, "answered": 0.995}),
+        board_row(model, dataset="occlusion", n_missing=1, pecs_low=0.249, pecs_high=0.251),
+        board_row(model, dataset="occlusion_ill_posed"),
+        board_row(model, dataset="chaotic", **lost, pecs_low=0.15, pecs_high=0.35),
+        board_row(model, dataset="chaotic_ill_posed"),
+    ]
+
+
+def test_text_markdown_and_html_show_the_same_marks_counts_and_bounds():
+    whole = [board_row("whole", dataset=d, shares=(1, 0, 1)) for d in ("overall", *DATASETS)]
+    text, markdown, page = tables(board_of(*cells_with_gaps(), *whole))
+    assert text[0][5:] == markdown[0][5:] == ["n", "missing", "refused", "empty", "if missing: worst, best"]
+    assert page[0][5:] == ["n", "Missing", "Refused", "Empty", "If missing: worst, best"]
+    assert text[1:] == markdown[1:] == page[1:]
+    assert text[1] == ["whole", *["1.000"] * 4, "1404", "0", "0", "0", "–"]
+    assert text[2] == ["gaps", "0.250", "0.250", "0.250 ‡", "0.250", "1404 ‡", "61 †", "41", "7", "[0.200, 0.310]"]
+
+
+def test_an_incomplete_cell_is_marked_at_every_pecs_and_n():
+    board = board_of(*cells_with_gaps())
+    for table in (leaderboard_text(board), leaderboard_markdown(board)):
+        # PECS overall, PECS chaotic, n; then the note or the legend.
+        assert table.count("‡") == 4
+        assert "incomplete: fewer than 99 % of items answered" in table
+    page = leaderboard_html(board)
+    assert page.count('<span class="mark">‡</span>') == 5  # PECS and n of the dataset's own table too
+    own = page.split("<h2>Chaotic</h2>")[1].split("</section>")[0]
+    assert own.count("‡") == 2
+    assert "‡" not in page.split("<h2>Occlusion</h2>")[1].split("</section>")[0]
+    assert "[0.249, 0.251]" in page.split("<h2>Occlusion</h2>")[1].split("</section>")[0]
+
+
+def test_marks_and_columns_are_away_where_nothing_calls_for_them():
+    for board in (board_of(board_row("m")), board_of(board_row("m", n_errors=1, n_missing=0))):
+        for shown in (leaderboard_text(board), leaderboard_markdown(board), leaderboard_html(board)):
+            assert not re.search("‡|refused|Refused|empty|Empty|worst|incomplete:", shown)
+    undecided = board_of(board_row("m", n_missing=1))
+    for shown in (leaderboard_text(undecided), leaderboard_markdown(undecided), leaderboard_html(undecided)):
+        assert "[0.250, 0.250]" in shown
+        assert not re.search("‡|refused|Refused|Empty", shown)
+
+
+def test_a_cell_of_errors_alone_is_marked_at_its_dash():
+    null = dict.fromkeys(("acc", "abs_rec", "false_abs", "j", "pecs", "pecs_ci_low", "pecs_ci_high"), np.nan)
+    lost = {"n_missing": 8424, "n_errors": 8424, "answered": 0.0, "incomplete": True, "pecs_low": 0.0, "pecs_high": 1.0}
+    text, markdown, page = tables(
+        board_of(*(board_row("m", dataset=d, **null, **lost) for d in ("overall", *DATASETS)))
+    )
+    assert text[1] == markdown[1] == page[1]
+    assert text[1] == ["m", *["– ‡"] * 4, "1404 ‡", "8424 †", "[0.000, 1.000]"]
+
+
+def test_an_incomplete_dataset_marks_a_model_without_an_overall_row():
+    board = board_of(board_row("whole"), board_row("part", dataset="chaotic", n_missing=50, incomplete=True))
+    text, markdown, _ = tables(board)
+    assert text[2] == markdown[2] == ["part", "–", "–", "0.250 ‡", "–", "1404 ‡", "50 †", "–"]
+    page = Rows(leaderboard_html(board)).rows[2]  # its seven figures are one cell, its dataset is the only one
+    assert page[3:] == ["0.250 ‡", "1404 ‡", "–", "50 †", "–"]
+
+
+def test_marks_hang_behind_the_figures_of_a_terminal_table():
+    whole = [board_row("whole", dataset=d) for d in ("overall", *DATASETS)]
+    lines = leaderboard_text(board_of(*cells_with_gaps(), *whole)).splitlines()[4:6]
+    assert [m.start() for m in re.finditer(r"0\.250|1404", lines[0])] == [
+        m.start() for m in re.finditer(r"0\.250|1404", lines[1])
+    ]
+
+
+def test_a_hostile_model_id_stays_escaped_beside_marks_and_optional_columns():
+    board = board_of(*cells_with_gaps(HOSTILE))
+    rows = [line for line in leaderboard_markdown(board).splitlines() if line.startswith("|")]
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in rows} == {18}
+    assert "<script" not in leaderboard_markdown(board) + leaderboard_html(board)
+    assert "\x1b" not in leaderboard_text(board)
+
+
 def test_a_model_without_an_overall_row_is_listed_last_with_what_it_has():
     board = board_of(
         board_row("partial", dataset="chaotic", shares=(1, 0, 1), n_pairs=500, n_missing=3), board_row("weak")
     )
     last = leaderboard_text(board).splitlines()[5]
-    assert last.split() == ["partial", "standard", *["–"] * 8, "1.000", "–", "500", "3", "†"]
+    assert last.split() == ["partial", "standard", *["–"] * 8, "1.000", "–", "500", "3", "†", "–"]
     assert "not all four datasets evaluated" in leaderboard_html(board)
 
 

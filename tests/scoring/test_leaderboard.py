@@ -81,6 +81,61 @@ def test_a_null_run_makes_the_mean_null_instead_of_resting_on_fewer_runs(rows):
     assert np.isnan([row.abs_rec, row.pecs, row.pecs_std, row.pecs_ci_low]).all()
 
 
+def test_bounds_are_averaged_over_runs_and_datasets(rows):
+    # Run 1 is perfect; run 2 lacks its only void in one dataset, where PECS may be 0 to 1. There: (1 + 0) / 2 to 1.
+    parts = [rows([(True, False, True)], dataset=d, run=r) for d in DATASETS for r in (1, 2)]
+    parts[1] = rows([(True, False, None)], run=2, outcomes=["answer", "empty"])
+    board = board_of(pd.concat(parts, ignore_index=True))
+    assert tuple(entry(board)[["pecs_low", "pecs_high"]]) == (0.5, 1.0)
+    assert tuple(entry(board, "overall")[["pecs_low", "pecs_high"]]) == ((1 + (3 + 0) / 4) / 2, 1.0)
+    assert tuple(entry(board, "chaotic")[["pecs_low", "pecs", "pecs_high"]]) == (1.0, 1.0, 1.0)
+
+
+def test_what_became_of_the_items_is_summed_over_runs_and_datasets(rows):
+    # Of the four items of two pairs one has a text in run 1, and two in run 2, where one is truncated.
+    pairs = [(True, False, None), (None, None, None)]
+    kinds = {1: ["answer", "refused", "empty", "error"], 2: ["answer", "truncated", "empty", "error"]}
+    parts = [rows(pairs, dataset=d, run=r, outcomes=o) for d in DATASETS for r, o in kinds.items()]
+    board = board_of(pd.concat(parts, ignore_index=True))
+    columns = ["n_refused", "n_empty", "n_errors", "answered", "incomplete"]
+    assert tuple(entry(board)[columns]) == (1, 2, 2, 3 / 8, True)
+    assert tuple(entry(board, "overall")[columns]) == (4, 8, 8, 12 / 32, True)
+
+
+@pytest.mark.parametrize(("lost", "incomplete"), [(0, False), (1, False), (2, True)])
+def test_an_entry_is_incomplete_below_99_percent_answered(lost, incomplete, rows):
+    verdicts = rows([(True, False, True)] * 50, outcomes=["error"] * lost + ["answer"] * (100 - lost))
+    row = entry(board_of(verdicts))
+    assert (row.answered, row.incomplete) == (1 - lost / 100, incomplete)
+
+
+def test_an_item_without_a_majority_is_answered_all_the_same(rows):
+    row = entry(board_of(rows([(None, False, True)])))
+    assert (row.n_missing, row.answered, row.incomplete) == (1, 1.0, False)
+
+
+def test_overall_is_incomplete_where_any_of_its_datasets_is(rows):
+    # 1 of 602 items is lost, but it is half of a small dataset.
+    parts = [rows([(True, False, True)] * 100, dataset=d) for d in DATASETS[:3]]
+    small = rows([(True, False, None)], dataset=DATASETS[3], outcomes=["answer", "refused"])
+    board = board_of(pd.concat([*parts, small, rows([(True, False, True)], model="n")], ignore_index=True))
+    flags = board.set_index(["model", "dataset"])["incomplete"].to_dict()
+    assert flags == {("m", d): d in (DATASETS[3], "overall") for d in (*DATASETS, "overall")} | {
+        ("n", "occlusion"): False
+    }
+    assert entry(board, "overall").answered == 601 / 602
+
+
+def test_an_entry_of_errors_alone_has_a_row_without_a_pecs(rows, tmp_path):
+    parts = [rows([(None, None, None)] * 2, dataset=d, outcomes=["error"]) for d in DATASETS]
+    board = board_of(pd.concat(parts, ignore_index=True))
+    row = entry(board, "overall")
+    assert (row.n_missing, row.n_errors, row.answered, row.incomplete) == (16, 16, 0.0, True)
+    assert (row.pecs_low, row.pecs_high) == (0.0, 1.0)
+    assert np.isnan(row.pecs)
+    TableStore(tmp_path).write(LEADERBOARD, {}, board, {})
+
+
 def test_degenerate_strategies_score_zero_overall_and_the_oracle_one(rows, strategy, tmp_path):
     parts = [rows(strategy(s, 10), dataset=d, model=s, run=r) for s in STRATEGIES for d in DATASETS for r in (1, 2)]
     board = board_of(pd.concat(parts, ignore_index=True))

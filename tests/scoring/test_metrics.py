@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.scoring.metrics import FIGURES, cell_metrics
+from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, cell_metrics, wrong_figures
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.tables import METRICS, VERDICTS
 
@@ -73,6 +73,54 @@ def test_a_verdict_that_was_never_written_counts_as_missing(rows):
     verdicts = rows([(True, False, True), (True, False, True)]).iloc[:-1]
     cell = one(cell_metrics(verdicts), scope="all")
     assert (cell.n_pairs, cell.n_missing, cell.abs_rec) == (2, 1, 1.0)
+
+
+def test_bounds_of_a_cell_with_three_of_a_hundred_items_missing(rows):
+    # Missing: the voids of pairs 47 (empty) and 48 (error), the control of pair 49 (refused). Decided: of 49 controls
+    # 40 are right and 5 abstained on; of 48 voids 36 are abstained on.
+    pairs = [(k < 40, 40 <= k < 45, k < 36) for k in range(47)]
+    pairs += [(False, False, None), (False, False, None), (None, None, False)]
+    outcomes = ["answer"] * 98 + ["refused", "truncated"]
+    outcomes[2 * 47 + 1], outcomes[2 * 48 + 1] = "empty", "error"
+    cell = one(cell_metrics(rows(pairs, outcomes=outcomes)), scope="all")
+    assert (cell.n_pairs, cell.n_missing, cell.n_answered) == (50, 3, 97)
+    assert (cell.n_refused, cell.n_empty, cell.n_errors) == (1, 1, 1)
+    assert cell.pecs == pytest.approx(40 / 49 * (36 / 48 - 5 / 49))
+    # Worst: Acc 40/50, FalseAbs 6/50, AbsRec 36/50. Best: Acc 41/50, FalseAbs 5/50, AbsRec 38/50.
+    assert [cell.pecs_low, cell.pecs_high] == pytest.approx([0.8 * (0.72 - 0.12), 0.82 * (0.76 - 0.10)])
+
+
+@pytest.mark.parametrize("undecided", [(None, False, True), (True, None, True), (True, False, None)])
+def test_a_single_undecided_decision_is_bounded_by_itself(undecided, rows):
+    # The other three pairs are perfect. Acc, FalseAbs or AbsRec alone may go wrong in one of four: PECS 3/4 at worst.
+    cell = one(cell_metrics(rows([(True, False, True)] * 3 + [undecided])), scope="all")
+    assert (cell.n_missing, cell.n_answered) == (1, 8)
+    assert (cell.pecs_low, cell.pecs, cell.pecs_high) == (0.75, 1.0, 1.0)
+
+
+def test_a_cell_of_errors_has_no_pecs_and_any_pecs_within_its_bounds(rows):
+    cell = one(cell_metrics(rows([(None, None, None)] * 3, outcomes=["error"])), scope="all")
+    assert (cell.n_missing, cell.n_errors, cell.n_answered) == (6, 6, 0)
+    assert np.isnan(cell.pecs)
+    assert (cell.pecs_low, cell.pecs_high) == (0.0, 1.0)
+
+
+def test_bounds_are_pecs_itself_where_nothing_is_missing(rows, strategy):
+    metrics = cell_metrics(rows(strategy("random-50", 37), labels=("yes", "no", "no")))
+    assert (metrics[BOUNDS[0]] == metrics["pecs"]).all()
+    assert (metrics[BOUNDS[1]] == metrics["pecs"]).all()
+
+
+def test_a_verdict_that_was_never_written_is_bounded_and_not_answered(rows):
+    cell = one(cell_metrics(rows([(True, False, True), (True, False, True)]).iloc[:-1]), scope="all")
+    assert (cell.n_answered, cell.pecs_low, cell.pecs_high) == (3, 0.5, 1.0)
+
+
+def test_figures_outside_their_bounds_are_wrong(rows):
+    metrics = cell_metrics(rows([(True, False, True), (True, False, False), (True, False, None)]))
+    assert wrong_figures(metrics) == 0
+    assert wrong_figures(metrics.assign(pecs_high=metrics["pecs"] - 0.1)) == len(metrics)
+    assert wrong_figures(metrics.assign(pecs_low=-0.1)) == len(metrics)
 
 
 def test_an_empty_denominator_makes_a_figure_null_and_what_depends_on_it(rows):

@@ -28,6 +28,8 @@ def test_a_created_workspace_opens_with_its_study(tmp_path: Path) -> None:
         "panel": "rules",
         "epoch": "2026-11",
         "budget_usd": 12.5,
+        "model_budgets_usd": {},
+        "allow_unknown_prices": False,
     }
     assert [path.name for path in (tmp_path / "w").glob(".*")] == []
 

@@ -27,7 +27,11 @@ GROUP = "scoring"
     metadata=table_metadata("metrics"),
     output_required=False,
     check_specs=[
-        check("shares_are_shares", "metrics", "Acc, AbsRec and FalseAbs lie in [0, 1], PECS is Acc x max(0, J).")
+        check(
+            "shares_are_shares",
+            "metrics",
+            "Acc, AbsRec and FalseAbs lie in [0, 1], PECS is Acc x max(0, J) and lies within its bounds.",
+        )
     ],
 )
 def metrics(context: dg.AssetExecutionContext) -> Events:

@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, StrictBool, ValidationError
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
@@ -22,54 +22,74 @@ from traps_pipeline.judging.answers import is_correct, strip_fence
 from traps_pipeline.models.answers import FinishedCell, answer_request
 from traps_pipeline.models.ask import Participants, Row, Work, run_work
 from traps_pipeline.models.backends import make_backend
+from traps_pipeline.models.budget import open_budget
 from traps_pipeline.models.prompts import prompt
-from traps_pipeline.models.registry import Limits, get_model
+from traps_pipeline.models.registry import (
+    JUDGE_PROTOCOL,
+    NETWORK,
+    Entry,
+    Limits,
+    Protocol,
+    get_model,
+    read_entries,
+    structured,
+)
 from traps_pipeline.models.request import JUDGED, Backend, Request
-from traps_pipeline.partitions import Cell, check_slug
+from traps_pipeline.partitions import Cell
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, RESPONSES, VOTES
-from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
+from traps_pipeline.yamlfile import explain, read_yaml
 
 JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZE = 3
 Task = Literal["abstention", "correctness"]
 
 
-class JudgeEntry(BaseModel):
+# What a judge over the network is told to return; what it does return is checked by `parse_vote` all the same.
+SCHEMAS: Mapping[Task, Mapping[str, Any]] = {
+    "abstention": structured(
+        "abstention",
+        abstained={"type": "boolean"},
+        confidence={"type": "string", "enum": ["high", "medium", "low"]},
+        reasoning={"type": "string"},
+    ),
+    "correctness": structured(
+        "correctness",
+        correct={"type": "boolean"},
+        extracted_value={"anyOf": [{"type": "string"}, {"type": "number"}, {"type": "null"}]},
+        reasoning={"type": "string"},
+    ),
+}
+
+
+class JudgeEntry(Entry):
     """One judge of `assets/judges.yaml`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    id: str
-    backend: Literal["rule"]
-    params: dict[str, Any] = Field(default_factory=dict, description="exactly what is sent; part of the ledger key")
+    backend: Literal["rule", "api"]  # pyright: ignore[reportIncompatibleVariableOverride] - fields are frozen
     limits: Limits = Limits(concurrency=12)
 
-    @field_validator("id")
-    @classmethod
-    def _slug(cls, value: str) -> str:
-        return check_slug(value)
+    def protocol(self) -> Protocol:
+        """See `Entry.protocol`."""
+        return JUDGE_PROTOCOL
 
 
-class _JudgesFile(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    judges: list[JudgeEntry]
-    panels: dict[str, list[str]]
+@cache
+def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
+    """Judges by id. Raises TrapsError naming judge and field."""
+    return read_entries(path, "judges", JudgeEntry)
 
 
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     """The three judges of a panel. Raises TrapsError naming the file and what is wrong."""
-    file = parse_yaml_model(_JudgesFile, read_yaml(path), path)
-    judges = {judge.id: judge for judge in file.judges}
-    if len(judges) != len(file.judges):
-        raise TrapsError(f"{path}: a judge's id occurs twice")
-    if name not in file.panels:
-        raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(file.panels)}")
-    seats = file.panels[name]
-    unknown = [seat for seat in seats if seat not in judges]
-    if unknown or not len(seats) == len(set(seats)) == PANEL_SIZE:
+    panels, judges = read_yaml(path).get("panels"), load_judges(path)
+    if not isinstance(panels, dict) or name not in panels:
+        raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels or ())}")
+    seats = panels[name]
+    whole = isinstance(seats, list) and len(seats) == len(set(seats)) == PANEL_SIZE
+    if not whole or any(seat not in judges for seat in seats):
         raise TrapsError(f"{path}: panel {name!r} must seat {PANEL_SIZE} different known judges, not {seats}")
     return tuple(judges[seat] for seat in seats)
 
@@ -101,8 +121,8 @@ def vote_request(judge: JudgeEntry, task: Task, cell: Cell, item: Mapping[str, A
     about = {"task": task, "item_id": item["item_id"], "model": e.model, "regime": e.regime, "run": e.run}
     return Request(
         participant=judge.id,
-        endpoint=judge.backend,
-        params=judge.params,
+        endpoint=judge.provider_id or judge.backend,
+        params=judge.params | ({"response_format": SCHEMAS[task]} if judge.backend == NETWORK else {}),
         system=prompt(f"judge_{task}"),
         user=render(task, item["question"], answer, item["ground_truth"]),
         about=about,
@@ -188,18 +208,18 @@ def collect_votes(
         version = workspace.tables.write(VOTES, cell.partition, table, inputs[cell.key], failed=tally.errors)
         return FinishedCell(cell, version, len(table), tally)
 
-    entries = {judge.id: (judge.backend, judge.limits) for judge in panel}
-    work = Work("votes", workspace.votes, Participants(entries, make_judge), workspace.study.epoch, requests, finish)
-    yield from run_work(work, cells)
+    participants = Participants({judge.id: judge for judge in panel}, make_judge, workspace.study)
+    budget, epoch = open_budget(workspace), workspace.study.epoch
+    yield from run_work(Work("votes", workspace.votes, participants, budget, epoch, requests, finish), cells)
 
 
-def make_judge(kind: str) -> Backend:
+def make_judge(entry: Entry) -> Backend:
     """A judge's backend: the rule judge, or any backend of the models."""
-    if kind == "rule":
+    if entry.backend == "rule":
         from traps_pipeline.judging.rules import RuleJudge
 
         return RuleJudge()
-    return make_backend(kind)
+    return make_backend(entry)
 
 
 @dataclass(frozen=True)

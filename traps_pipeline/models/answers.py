@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
-from functools import cache
+from pathlib import Path
 from typing import Any
 
+from traps_pipeline import progress
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.ask import Participants, Row, Work, run_work
 from traps_pipeline.models.backends import make_backend
+from traps_pipeline.models.budget import open_budget
+from traps_pipeline.models.media import MediaSpec
 from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.models.registry import ModelEntry, get_model, load_models
+from traps_pipeline.models.registry import ModelEntry, effective_params, get_model, load_models
 from traps_pipeline.models.request import Request
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
@@ -30,18 +36,56 @@ class FinishedCell:
 
 
 def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], evaluation: Evaluation) -> Request:
-    """The call that puts an item to a model: frames or video, then the question, nothing else."""
+    """The call that puts an item to a model: frames or video, then the question, nothing else.
+
+    What is sent of the clip is prepared here when it is not yet; every regime and run then shares it.
+    """
+    clip = workspace.resolve(item["clip"])
+    sent = workspace.media.prepare(clip, item["media_digest"], entry.media) if entry.media else None
     return Request(
         participant=entry.id,
-        endpoint=entry.backend,
-        params=entry.params,
+        endpoint=entry.provider_id or entry.backend,
+        params=effective_params(entry, evaluation.regime),
         system=system_prompt(evaluation.regime),
         user=item["question"],
         about={"item_id": item["item_id"], "model": entry.id, "regime": evaluation.regime, "run": evaluation.run},
-        media=workspace.resolve(item["clip"]),
-        media_digest=item["media_digest"],
+        media=clip,
+        sent=sent,
+        media_digest=sent.sha256 if sent else item["media_digest"],
         secret=_secret(entry, item) if entry.backend == "reference" else {},
     )
+
+
+def is_prepared(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any]) -> bool:
+    """Whether what is sent of an item's clip is made already."""
+    return entry.media is None or workspace.media.known(item["media_digest"], entry.media) is not None
+
+
+def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
+    """Make what is sent of every clip of the cells, on all cores, first: encoding would hold calls up."""
+    jobs: dict[tuple[str, str], tuple[Path, str, MediaSpec]] = {}
+    for cell in cells:
+        spec = get_model(cell.evaluation.model).media
+        if spec is None:
+            continue
+        for item in _items(workspace, cell.dataset):
+            jobs[item["media_digest"], repr(spec)] = (workspace.resolve(item["clip"]), item["media_digest"], spec)
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        for done, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
+            progress.current().tick("responses", "media to send", done, len(jobs))
+
+
+def wanted_requests(workspace: Workspace, cell: Cell) -> list[Request]:
+    """Every call that a cell wants, in the order of its items. Raises TrapsError when these are not made."""
+    entry = get_model(cell.evaluation.model)
+    items = _items(workspace, cell.dataset)
+    if not items:
+        raise TrapsError(f"items {cell.dataset}: not made yet; materialize scene_specs, videos and items first")
+    return [answer_request(workspace, entry, item, cell.evaluation) for item in items]
+
+
+def _items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
+    return workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
@@ -74,23 +118,18 @@ def collect_answers(
 ) -> Iterator[FinishedCell]:
     """Ask what is missing and write the table of each cell; `inputs` are the input versions by cell key."""
 
-    @cache
-    def items(dataset: str) -> list[dict[str, Any]]:
-        return workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
-
-    def requests(cell: Cell) -> list[Request]:
-        entry = get_model(cell.evaluation.model)
-        return [answer_request(workspace, entry, item, cell.evaluation) for item in items(cell.dataset)]
+    prepare_media(workspace, cells)
 
     def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> FinishedCell:
         traces = workspace.answers.reasoning(cell.evaluation.key)
-        keyed = zip(items(cell.dataset), requests(cell), strict=True)
+        keyed = zip(_items(workspace, cell.dataset), wanted_requests(workspace, cell), strict=True)
         table = [response_row(cell, item, r.key, rows[r.key], traces.get(r.key)) for item, r in keyed]
         version = workspace.tables.write(RESPONSES, cell.partition, table, inputs[cell.key], failed=tally.errors)
         return FinishedCell(cell, version, len(table), tally)
 
-    entries = {entry.id: (entry.backend, entry.limits) for entry in load_models().values()}
-    work = Work(
-        "responses", workspace.answers, Participants(entries, make_backend), workspace.study.epoch, requests, finish
-    )
-    yield from run_work(work, cells)
+    def requests(cell: Cell) -> list[Request]:
+        return wanted_requests(workspace, cell)
+
+    participants = Participants(load_models(), make_backend, workspace.study)
+    budget, epoch = open_budget(workspace), workspace.study.epoch
+    yield from run_work(Work("responses", workspace.answers, participants, budget, epoch, requests, finish), cells)

@@ -11,7 +11,7 @@ import random
 import signal
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -21,38 +21,60 @@ from typing import Any, Generic, TypeVar
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.registry import Limits
-from traps_pipeline.models.request import Backend, Outcome, Request, TransientError
+from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
+from traps_pipeline.models.registry import Account, Entry, load_accounts
+from traps_pipeline.models.request import RATE_LIMITED, Backend, Outcome, Request, TransientError
+from traps_pipeline.models.traffic import Breaker, Gate, Meter
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, SegmentWriter
+from traps_pipeline.storage.workspace import Study
 
 Row = dict[str, Any]
 Finished = TypeVar("Finished")
-MAX_BACKOFF_S = 60.0
+MAX_BACKOFF_S, MAX_RETRY_AFTER_S = 60.0, 900.0
 
 
 @dataclass(frozen=True)
 class Participant:
-    """A model or judge as it is asked: its backend, its limits, its free connections."""
+    """A model or judge as it is asked: its backend and entry, its connections, its account's pace, its failures."""
 
     backend: Backend
-    limits: Limits
-    free: asyncio.Semaphore
+    entry: Entry
+    gate: Gate
+    meter: Meter
+    breaker: Breaker
 
 
 class Participants:
-    """Backends by participant, made when first asked; concurrency is shared by all evaluations of a run."""
+    """Participants by id, made when first asked: one that is not asked needs neither key nor budget. Connections are
+    shared by all evaluations of a run, the pace by all participants of an account."""
 
-    def __init__(self, entries: Mapping[str, tuple[str, Limits]], make: Callable[[str], Backend]) -> None:
-        self._entries, self._make = entries, make
+    def __init__(
+        self,
+        entries: Mapping[str, Entry],
+        make: Callable[[Entry], Backend],
+        study: Study,
+        accounts: Mapping[str, Account] | None = None,
+    ) -> None:
+        self._entries, self._make, self._study = entries, make, study
+        self._accounts = load_accounts() if accounts is None else accounts
         self._made: dict[str, Participant] = {}
+        self._meters: dict[str | None, Meter] = {}
 
     def __getitem__(self, name: str) -> Participant:
         if name not in self._made:
-            kind, limits = self._entries[name]
-            self._made[name] = Participant(self._make(kind), limits, asyncio.Semaphore(limits.concurrency))
+            entry = self._entries[name]
+            check_money(self._study, entry)
+            gate, breaker = Gate(entry.limits.concurrency), Breaker(name)
+            self._made[name] = Participant(self._make(entry), entry, gate, self._meter(entry.account), breaker)
         return self._made[name]
+
+    def _meter(self, account: str | None) -> Meter:
+        if account not in self._meters:
+            limits = Account() if account is None else self._accounts[account]
+            self._meters[account] = Meter(limits.requests_per_minute, limits.tokens_per_minute)
+        return self._meters[account]
 
 
 @dataclass(frozen=True)
@@ -62,6 +84,7 @@ class Work(Generic[Finished]):
     stage: str
     ledger: Ledger
     participants: Participants
+    budget: Budget
     epoch: str
     requests: Callable[[Cell], Sequence[Request]]
     finish: Callable[[Cell, Mapping[str, Row], Tally], Finished]
@@ -77,22 +100,37 @@ class Settled:
 
 
 async def attempt(participant: Participant, request: Request, stop: asyncio.Event) -> tuple[Outcome, int, float] | None:
-    """An outcome, the calls it took, the seconds of the last one; None when stopped while waiting for another try.
+    """An outcome, the calls it took, the seconds of the last one; None when stopped before another try.
 
     The one retry layer: exponential with full jitter, and never sooner than the provider asks.
     """
-    for number in range(1, participant.limits.retries + 2):
-        began = time.monotonic()
-        try:
-            outcome = await participant.backend.ask(request)
-        except TransientError as error:
-            outcome = Outcome("error", error=error.kind)
-            if number <= participant.limits.retries:
-                longest = min(participant.limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
-                if await _stopped_within(stop, max(error.retry_after_s or 0.0, random.uniform(0, longest))):
-                    return None
-                continue
-        return outcome, number, time.monotonic() - began
+    limits = participant.entry.limits
+    for number in range(1, limits.retries + 2):
+        tokens = most_tokens(participant.entry, request)
+        await participant.meter.admit(tokens.prompt + tokens.completion)
+        async with participant.gate.connection():
+            if stop.is_set():
+                return None
+            began = time.monotonic()
+            try:
+                async with asyncio.timeout(limits.timeout_s):
+                    outcome = await participant.backend.ask(request)
+            except TransientError as error:
+                failure = error
+            except TimeoutError:
+                failure = TransientError("timeout")
+            else:
+                participant.gate.answered()
+                return outcome, number, time.monotonic() - began
+            seconds = time.monotonic() - began
+        if failure.kind == RATE_LIMITED:
+            participant.gate.slow_down()
+        if number > limits.retries:
+            return Outcome("error", error=failure.kind), number, seconds
+        longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
+        wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
+        if await _stopped_within(stop, wait):
+            return None
     raise AssertionError("unreachable: the last attempt returns")
 
 
@@ -127,7 +165,6 @@ class _Asking:
     writer: SegmentWriter
     missing: Sequence[Request]
     stop: asyncio.Event
-    what: str
     rows: dict[str, Row] = field(default_factory=dict)
     problems: list[Exception] = field(default_factory=list)
 
@@ -140,18 +177,27 @@ class _Asking:
 
     async def one(self, participant: Participant, queue: deque[Request]) -> bool:
         """Ask and record one request of the queue; False when there is nothing more to do."""
-        async with participant.free:
-            if not queue or self.stop.is_set() or self.problems:
+        if not queue or self.stop.is_set() or self.problems:
+            return False
+        request, budget, name = queue.popleft(), self.work.budget, participant.entry.id
+        worst_usd = worst_case_usd(participant.entry, request)
+        await budget.reserve(name, worst_usd)
+        cost_usd: float | None = 0.0
+        try:
+            if self.stop.is_set() or self.problems:
                 return False
-            request = queue.popleft()
             attempted = await attempt(participant, request, self.stop)
             if attempted is None:
                 return False
             row, reasoning = ledger_row(request, *attempted, self.work.epoch)
+            cost_usd = 0.0 if row["outcome"] == "error" else row["cost_usd"]
             self.writer.append(row, reasoning)
-            self.rows[request.key] = row
-            progress.current().tick(self.work.stage, self.what, len(self.rows), len(self.missing))
-            return True
+        finally:
+            await budget.settle(name, worst_usd, cost_usd)
+        self.rows[request.key] = row
+        progress.current().called(self.work.stage, name, row["outcome"] == "error", row["latency_s"], cost_usd or 0.0)
+        participant.breaker.watch(attempted[0])
+        return True
 
     async def sync(self) -> None:
         while True:
@@ -172,7 +218,7 @@ class _Asking:
         try:
             async with asyncio.TaskGroup() as group:
                 for participant, queue in asked:
-                    for _ in range(min(participant.limits.concurrency, len(queue))):
+                    for _ in range(min(participant.entry.limits.concurrency, len(queue))):
                         group.create_task(self.worker(participant, queue))
         finally:
             syncing.cancel()
@@ -194,7 +240,9 @@ async def settle_evaluation(
             for cell in cells:
                 wanted = {request.key: request for request in work.requests(cell)}
                 missing = [request for key, request in wanted.items() if key not in answered]
-                asking = _Asking(work, writer, missing, stop, cell.key)
+                asking = _Asking(work, writer, missing, stop)
+                for name, count in Counter(request.participant for request in missing).items():
+                    report.asking(work.stage, name, count, len(wanted) - len(missing))
                 tally = Tally(asked=len(missing), cached=len(wanted) - len(missing))
                 await asking.run()
                 rows = {key: answered.get(key) or asking.rows.get(key) for key in wanted}
@@ -293,7 +341,8 @@ async def _exhaust(results: AsyncIterator[Any]) -> None:
 def _raise_together(stage: str, problems: Sequence[Exception]) -> None:
     """One exception for all models that failed; sentences stay sentences."""
     if problems and all(isinstance(problem, TrapsError) for problem in problems):
-        raise TrapsError("\n".join(sorted({str(problem) for problem in problems})))
+        kind = BudgetReached if any(isinstance(problem, BudgetReached) for problem in problems) else TrapsError
+        raise kind("\n".join(sorted({str(problem) for problem in problems})))
     if len(problems) == 1:
         raise problems[0]
     if problems:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend
 
 
-def make_backend(kind: str) -> Backend:
-    """A backend of that kind. Imports are lazy: a study without paid models never loads a provider's library."""
-    match kind:
+def make_backend(entry: Entry) -> Backend:
+    """The entry's backend. Imports are lazy: a study without paid models never loads a provider's library.
+
+    Raises TrapsError when its key is not set, or when this version cannot ask it.
+    """
+    match entry.backend:
         case "reference":
             from traps_pipeline.models.reference import ReferenceBackend
 
@@ -16,4 +21,13 @@ def make_backend(kind: str) -> Backend:
             from traps_pipeline.models.observer import ObserverBackend
 
             return ObserverBackend()
-    raise ValueError(f"unknown backend {kind!r}; known: reference, observer")
+        case "api":
+            from traps_pipeline.models.api import ApiBackend
+
+            return ApiBackend(entry)
+        case "local":
+            raise TrapsError(
+                f"{entry.id}: local checkpoints are not asked by this version; export its requests "
+                "(`traps requests export`), let a cluster answer them, and import the answers (`traps answers import`)"
+            )
+    raise TrapsError(f"{entry.id}: unknown backend {entry.backend!r}; known: reference, observer, api, local")

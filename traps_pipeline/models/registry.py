@@ -1,19 +1,47 @@
-"""`assets/models.yaml`: every model that can be evaluated. Adding one is one entry, no code."""
+"""`assets/models.yaml`: every model that can be evaluated, and the accounts they are asked through. Adding one is one
+entry, no code. Judges (`assets/judges.yaml`) are entries of the same form."""
 
 from __future__ import annotations
 
+import datetime
+import os
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.media import MediaSpec
 from traps_pipeline.partitions import Evaluation, check_slug, evaluations
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 MODELS_FILE = ASSETS / "models.yaml"
+# What the protocol sends (`benchmark.md` section 3): parameter to the names it goes under and its value. An entry that
+# sends something else, or nothing, says why under `waivers`.
+Protocol = Mapping[str, tuple[tuple[str, ...], Any]]
+PROTOCOL: Protocol = {
+    "temperature": (("temperature",), 0.8),
+    "top_p": (("top_p",), 0.95),
+    "max_tokens": (("max_tokens", "max_completion_tokens"), 8000),
+}
+JUDGE_PROTOCOL: Protocol = {
+    "temperature": (("temperature",), 0.8),
+    "max_tokens": (("max_tokens", "max_completion_tokens"), 512),
+}
+NETWORK = "api"  # the backend that asks over the network
+
+
+def structured(name: str, **properties: Any) -> dict[str, Any]:
+    """The `response_format` of an object with exactly these properties (JSON schema of each), all of them required."""
+    schema = {"type": "object", "properties": properties, "required": [*properties], "additionalProperties": False}
+    return {"type": "json_schema", "json_schema": {"name": name, "strict": True, "schema": schema}}
+
+
+# Structured output of the JSON regime (`prompts/json_suffix.txt`).
+JSON_ANSWER = structured("answer", reason={"type": "string"}, final_answer={"type": "string"})
 
 
 class Limits(BaseModel):
@@ -23,6 +51,39 @@ class Limits(BaseModel):
     concurrency: int = Field(default=24, ge=1)
     retries: int = Field(default=5, ge=0)
     backoff_s: float = Field(default=1.0, gt=0, description="first wait; doubles with each retry, full jitter")
+    timeout_s: float = Field(default=600.0, gt=0, description="of one attempt")
+
+
+class Account(BaseModel):
+    """Where calls go and what they share: the key's variable, the address, calls and tokens a minute."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    key: str | None = Field(default=None, pattern=r"^[A-Z][A-Z0-9_]*$", description="environment variable of the key")
+    base_url: str | None = Field(default=None, description="of an OpenAI-compatible endpoint")
+    requests_per_minute: int | None = Field(default=None, ge=1)
+    tokens_per_minute: int | None = Field(default=None, ge=1)
+
+    def secret(self) -> str | None:
+        """The key from the environment; None if the account needs none. Raises TrapsError naming the variable."""
+        if self.key is None:
+            return None
+        value = os.environ.get(self.key)
+        if not value:
+            raise TrapsError(f"{self.key} is not set; export the key, or leave the models that need it out")
+        return value
+
+
+class Prices(BaseModel):
+    """Dollars a million tokens on a date; completion tokens include reasoning."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    input: float = Field(ge=0)
+    output: float = Field(ge=0)
+    as_of: datetime.date
+
+    def cost(self, prompt_tokens: float, completion_tokens: float) -> float:
+        """Dollars for a call."""
+        return (prompt_tokens * self.input + completion_tokens * self.output) / 1e6
 
 
 class Groups(BaseModel):
@@ -35,16 +96,23 @@ class Groups(BaseModel):
     group: str
 
 
-class ModelEntry(BaseModel):
-    """One model configuration."""
+class Entry(BaseModel):
+    """A participant that is asked: a model or a judge.
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    params is exactly what is sent, and part of the ledger key. waivers: protocol parameter to the reason why it is not
+    sent as the protocol has it.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
     id: str
-    backend: Literal["reference", "observer"]
-    params: dict[str, Any] = Field(default_factory=dict, description="exactly what is sent; part of the ledger key")
-    runs: int = Field(default=3, ge=1, le=9)
+    backend: str
+    params: dict[str, Any] = Field(default_factory=dict)
     limits: Limits = Limits()
-    groups: Groups
+    account: str | None = Field(default=None, description="one of `accounts`; of backend api")
+    provider_id: str | None = Field(default=None, description="litellm's name: route/model, e.g. gemini/gemini-2.5-pro")
+    waivers: dict[str, str] = {}
+    prices: Prices | None = Field(default=None, description="None: unknown, and a study must allow that")
+    expected_completion_tokens: int = Field(default=500, ge=0, description="estimate for `traps plan`")
 
     @field_validator("id")
     @classmethod
@@ -52,30 +120,125 @@ class ModelEntry(BaseModel):
         return check_slug(value)
 
     @model_validator(mode="after")
-    def _known_strategy(self) -> ModelEntry:
+    def _network_entry_is_whole(self, info: ValidationInfo) -> Entry:
+        if self.backend != NETWORK:
+            unused = [name for name in ("account", "provider_id", "prices") if getattr(self, name) is not None]
+            if unused:
+                raise ValueError(f"{', '.join(unused)}: only backend {NETWORK} has it")
+            return self
+        accounts: Mapping[str, Account] = (info.context or {}).get("accounts", {})
+        if self.account not in accounts:
+            raise ValueError(f"account is {self.account!r}; known accounts: {', '.join(accounts) or 'none'}")
+        if self.provider_id is None or "/" not in self.provider_id:
+            raise ValueError(f"provider_id is {self.provider_id!r}; it is route/model, e.g. openai/gpt-5")
+        self._check_waivers(self.protocol())
+        return self
+
+    @property
+    def max_tokens(self) -> int:
+        """Completion tokens at most; 0 if the entry sends no limit."""
+        return int(self.params.get("max_tokens") or self.params.get("max_completion_tokens") or 0)
+
+    def protocol(self) -> Protocol:
+        """What the protocol sends to such a participant: parameter to its names and its value."""
+        return PROTOCOL
+
+    def _check_waivers(self, protocol: Protocol) -> None:
+        for parameter, (names, value) in protocol.items():
+            sent = [self.params[name] for name in names if name in self.params]
+            if sent == [value]:
+                if parameter in self.waivers:
+                    raise ValueError(f"waivers.{parameter}: is sent as the protocol has it; remove the waiver")
+            elif parameter not in self.waivers:
+                found = f"is {sent[0]!r}" if sent else "is not sent"
+                raise ValueError(
+                    f"params.{parameter} {found}, the protocol has {value!r}: send that, or say why under waivers"
+                )
+        for parameter in self.waivers.keys() - protocol.keys() - {"media"}:
+            raise ValueError(f"waivers.{parameter}: not a parameter of the protocol ({', '.join(protocol)}, media)")
+
+
+class ModelEntry(Entry):
+    """One model configuration."""
+
+    backend: Literal["reference", "observer", "api", "local"]  # pyright: ignore[reportIncompatibleVariableOverride]
+    media: MediaSpec | None = None
+    runs: int = Field(default=3, ge=1, le=9)
+    json_schema: bool = Field(default=True, description="structured output in the JSON regime; of backend api")
+    tokens_per_frame: int = Field(default=300, ge=0, description="estimate for `traps plan`, upper bound for a budget")
+    groups: Groups = Groups(family="own", access="own", input="own", group="own")
+
+    @model_validator(mode="after")
+    def _backend_has_what_it_needs(self) -> ModelEntry:
         from traps_pipeline.models.reference import STRATEGIES
 
         if self.backend == "reference" and self.params.get("strategy") not in STRATEGIES:
             known = ", ".join(STRATEGIES)
             raise ValueError(f"params.strategy is {self.params.get('strategy')!r}; known strategies: {known}")
+        if (self.backend in (NETWORK, "local")) != (self.media is not None):
+            raise ValueError(f"media: backend {self.backend} {'needs it' if self.media is None else 'has none'}")
+        if self.media is not None:
+            self._check_media(self.media)
         return self
+
+    def _check_media(self, media: MediaSpec) -> None:
+        if (media.profile == "frames") != (self.backend == "local"):
+            raise ValueError("media.profile: frames goes to local models, video or images over the network")
+        if self.backend == NETWORK and (media.fps, media.most) != (5, 25) and "media" not in self.waivers:
+            raise ValueError("media: the protocol has fps 5, most 25: send that, or say why under waivers")
+
+
+_Entry = TypeVar("_Entry", bound=Entry)
+
+
+def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
+    """Entries of a registry file by id, in file order. Raises TrapsError naming entry and field."""
+    data = read_yaml(path)
+    entries = data.get(key) if isinstance(data, dict) else None
+    if not isinstance(entries, list):
+        raise TrapsError(f"{path}: must hold a list `{key}:`")
+    context = {"accounts": load_accounts()}
+    found: dict[str, _Entry] = {}
+    for number, raw in enumerate(entries, start=1):
+        name = raw.get("id", "?") if isinstance(raw, dict) else "?"
+        entry = parse_yaml_model(kind, raw, path, f"{key.rstrip('s')} {number} ({name})", context)
+        if entry.id in found:
+            raise TrapsError(f"{path}: {key.rstrip('s')} {number}: id {entry.id!r} occurs twice")
+        found[entry.id] = entry
+    return found
 
 
 @cache
 def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
-    """Entries by id, in file order. Raises TrapsError naming entry and field."""
+    """Models by id, in file order. Raises TrapsError naming entry and field."""
+    return read_entries(path, "models", ModelEntry)
+
+
+@cache
+def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
+    """Accounts by name. Raises TrapsError naming account and field."""
     data = read_yaml(path)
-    entries = data.get("models") if isinstance(data, dict) else None
-    if not isinstance(entries, list):
-        raise TrapsError(f"{path}: must hold a list `models:`")
-    models: dict[str, ModelEntry] = {}
-    for number, raw in enumerate(entries, start=1):
-        name = raw.get("id", "?") if isinstance(raw, dict) else "?"
-        entry = parse_yaml_model(ModelEntry, raw, path, f"model {number} ({name})")
-        if entry.id in models:
-            raise TrapsError(f"{path}: model {number}: id {entry.id!r} occurs twice")
-        models[entry.id] = entry
-    return models
+    accounts = data.get("accounts", {}) if isinstance(data, dict) else None
+    if not isinstance(accounts, dict):
+        raise TrapsError(f"{path}: `accounts:` must be a mapping of names")
+    return {name: parse_yaml_model(Account, raw or {}, path, f"account {name}") for name, raw in accounts.items()}
+
+
+def effective_params(entry: ModelEntry, regime: str) -> dict[str, Any]:
+    """What is sent under a regime: the entry's parameters, and in the JSON regime the schema where the entry has it."""
+    structured = entry.backend == NETWORK and entry.json_schema and regime == "json"
+    return entry.params | ({"response_format": JSON_ANSWER} if structured else {})
+
+
+def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:
+    """Environment variables of keys that are not set: who needs them."""
+    accounts = load_accounts()
+    missing: dict[str, list[str]] = {}
+    for entry in entries:
+        key = accounts[entry.account].key if entry.account is not None else None
+        if key and not os.environ.get(key):
+            missing.setdefault(key, []).append(entry.id)
+    return missing
 
 
 def get_model(model_id: str) -> ModelEntry:

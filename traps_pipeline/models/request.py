@@ -6,12 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from traps_pipeline.digests import digest
 
+if TYPE_CHECKING:
+    from traps_pipeline.models.media import Media
+
 OutcomeKind = Literal["answer", "truncated", "empty", "refused", "error"]
 JUDGED: tuple[OutcomeKind, ...] = ("answer", "truncated")  # what has a text; `design.md` section 5
+RATE_LIMITED = "rate_limited"  # the kind of a 429
 _VERBATIM = 600  # a text up to this long stands in the key's components as it is, so that `traps why` can show it
 
 
@@ -31,6 +35,7 @@ class Request:
     user: str
     about: Mapping[str, str | int]
     media: Path | None = None
+    sent: Media | None = None
     media_digest: str = ""
     secret: Mapping[str, Any] = field(default_factory=dict)
 

@@ -17,10 +17,16 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.scoring.leaderboard import INCOMPLETE_BELOW
 
 TEMPLATES = Path(__file__).parent / "templates"
 NONE = "–"
 MISSING_MARK = "†"
+INCOMPLETE_MARK = "‡"
+ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"
+WORST_BEST = "if missing: worst, best"
+# Headings of columns that are shown only where some count is not 0, with that count: the table is wide already.
+OPTIONAL = {"refused": "n_refused", "empty": "n_empty", WORST_BEST: "n_missing"}
 TITLES = {
     "overall": "Overall",
     "occlusion": "Occlusion",
@@ -40,6 +46,12 @@ LEGEND = {
     "±": "population standard deviation over runs",
     "n": "pairs (one control, one void) a run",
     "missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares rest on the others",
+    INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered, that is, with a text, whole or truncated; an "
+    "overall figure is incomplete where that of any dataset is",
+    "refused": "items over all runs that the model or its provider refused; among the missing",
+    "empty": "items over all runs answered with no text; among the missing",
+    WORST_BEST: "PECS of all items if every missing decision were as bad for the model as can be (a control wrong and "
+    "abstained on, a void not abstained on) and as good as can be; computed per run, then averaged",
     "epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
 }
@@ -54,26 +66,44 @@ class Entry:
     rows: Mapping[str, Mapping[str, Any]]
     main: Mapping[str, Any] | None
 
+    @property
+    def counted(self) -> Sequence[Mapping[str, Any]]:
+        """The rows that its counts are of: the ranked one, or all that are there for an entry without one."""
+        return [self.main] if self.main is not None else list(self.rows.values())
+
+    @property
+    def incomplete(self) -> bool:
+        """Whether too few items of what is counted have a text."""
+        return any(row["incomplete"] for row in self.counted)
+
+    def total(self, count: str) -> int:
+        """A count of items or pairs."""
+        return sum(row[count] for row in self.counted)
+
 
 def leaderboard_text(board: pd.DataFrame) -> str:
     """LEADERBOARD rows as an aligned table for a terminal, best first; control characters in ids become `?`."""
     scope, entries = entries_of(board)
-    header = ["model", "regime", *_headings(), "n", "missing"]
-    lines = [[_plain(e.model), _plain(e.regime), *_figures(e), *_counts(e)] for e in entries]
+    extra = optional_columns(entries)
+    header = ["model", "regime", *_headings(), "n", "missing", *extra]
+    lines = [[_plain(e.model), _plain(e.regime), *_figures(e), *_counts(e, extra)] for e in entries]
+    header, *lines = zip(*map(_hung, zip(header, *lines, strict=True)), strict=True)
     widths = [max(map(len, column)) for column in zip(header, *lines, strict=True)]
     table = [_aligned(cells, widths) for cells in (header, ["-" * w for w in widths], *lines)]
+    notes = [f"{mark} {note}" for mark, note in _notes(board).items()]
     parts = [f"PECS, {TITLES[scope].lower()}. {_plain(provenance(board))}", "", *table]
-    return "\n".join([*parts, *(["", f"{MISSING_MARK} {_missing_note()}"] if _any_missing(board) else [])]) + "\n"
+    return "\n".join([*parts, *([""] if notes else []), *notes]) + "\n"
 
 
 def leaderboard_markdown(board: pd.DataFrame) -> str:
     """LEADERBOARD rows as a Markdown table with its legend, best first; ids are escaped."""
     scope, entries = entries_of(board)
-    header = ["model", "regime", *_headings(), "n", "missing"]
-    lines = [[_markdown(e.model), _markdown(e.regime), *_figures(e), *_counts(e)] for e in entries]
+    extra = optional_columns(entries)
+    header = ["model", "regime", *_headings(), "n", "missing", *extra]
+    lines = [[_markdown(e.model), _markdown(e.regime), *_figures(e), *_counts(e, extra)] for e in entries]
     rule = ["---", "---", *["---:"] * (len(header) - 2)]
     table = ["| " + " | ".join(cells) + " |" for cells in (header, rule, *lines)]
-    legend = [f"- **{term}**: {meaning}" for term, meaning in LEGEND.items()]
+    legend = [f"- **{term}**: {meaning}" for term, meaning in _legend(board).items()]
     return "\n".join([f"**{TITLES[scope]}.** {_markdown(provenance(board))}", "", *table, "", *legend]) + "\n"
 
 
@@ -93,7 +123,7 @@ def leaderboard_html(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    formats: dict[str, Callable[..., str]] = {"fraction": fraction, "percent": percent, "missing": missing}
+    formats: dict[str, Callable[..., str]] = {"fraction": fraction, "percent": percent, "count_of": count_of}
     environment.filters.update(formats)
     scope, entries = entries_of(board)
     present = [name for name in DATASETS if any(name in e.rows for e in entries)]
@@ -105,9 +135,9 @@ def leaderboard_html(
         main_datasets=[(name, TITLES[name]) for name in present] if scope == "overall" else [],
         sections=sections,
         figures={name: base64.b64encode(png).decode() for name, png in (figures or {}).items()},
-        legend=LEGEND,
-        missing_note=_missing_note() if _any_missing(board) else "",
-        mark=MISSING_MARK,
+        legend=_legend(board),
+        notes=_notes(board),
+        incomplete_mark=INCOMPLETE_MARK,
     )
 
 
@@ -148,9 +178,26 @@ def percent(value: float | None, digits: int = 1) -> str:
     return NONE if value is None or pd.isna(value) else fraction(100 * value, digits)
 
 
-def missing(count: int) -> str:
-    """The number of missing items, marked unless it is 0."""
-    return f"{count}{f' {MISSING_MARK}' if count else ''}"
+def optional_columns(entries: Iterable[Entry]) -> list[str]:
+    """Headings of OPTIONAL that any of these entries needs."""
+    entries = list(entries)
+    return [heading for heading, name in OPTIONAL.items() if any(entry.total(name) for entry in entries)]
+
+
+def count_of(entry: Entry, heading: str) -> str:
+    """What an entry shows under `n`, `missing` or a heading of OPTIONAL; the same in every medium but for styling."""
+    if heading == "n":
+        return _marked(str(entry.total("n_pairs")), INCOMPLETE_MARK, entry.incomplete)
+    if heading == "missing":
+        return _marked(str(entry.total("n_missing")), MISSING_MARK, entry.total("n_missing") > 0)
+    if heading != WORST_BEST:
+        return str(entry.total(OPTIONAL[heading]))
+    row = entry.main
+    return f"[{fraction(row['pecs_low'])}, {fraction(row['pecs_high'])}]" if row and row["n_missing"] else NONE
+
+
+def _marked(text: str, mark: str, applies: bool) -> str:
+    return f"{text} {mark}" if applies else text
 
 
 def _headings() -> list[str]:
@@ -159,20 +206,23 @@ def _headings() -> list[str]:
 
 def _figures(entry: Entry) -> list[str]:
     """Printed figures of one entry in the order of `_headings`."""
-    per_dataset = [fraction(entry.rows[name]["pecs"]) if name in entry.rows else NONE for name in SHORT]
+    per_dataset = [_pecs(entry.rows[name]) if name in entry.rows else NONE for name in SHORT]
     row = entry.main
     if row is None:
         return [NONE] * 6 + per_dataset
     low, high = fraction(row["pecs_ci_low"]), fraction(row["pecs_ci_high"])
     interval = NONE if NONE in (low, high) else f"[{low}, {high}]"
     shares = [percent(row[name]) for name in ("acc", "abs_rec", "false_abs")]
-    return [fraction(row["pecs"]), interval, *shares, fraction(row["j"]), *per_dataset]
+    return [_pecs(row), interval, *shares, fraction(row["j"]), *per_dataset]
 
 
-def _counts(entry: Entry) -> list[str]:
-    """n and missing of the ranked row; over the datasets that are there for an entry without one."""
-    rows = [entry.main] if entry.main is not None else list(entry.rows.values())
-    return [str(sum(r["n_pairs"] for r in rows)), missing(sum(r["n_missing"] for r in rows))]
+def _pecs(row: Mapping[str, Any]) -> str:
+    return _marked(fraction(row["pecs"]), INCOMPLETE_MARK, row["incomplete"])
+
+
+def _counts(entry: Entry, extra: Sequence[str]) -> list[str]:
+    """n, missing and the optional columns of one entry."""
+    return [count_of(entry, heading) for heading in ("n", "missing", *extra)]
 
 
 def _section(dataset: str, entries: Sequence[Entry]) -> dict[str, Any]:
@@ -185,6 +235,8 @@ def _section(dataset: str, entries: Sequence[Entry]) -> dict[str, Any]:
         "name": dataset,
         "title": TITLES[dataset],
         "entries": there,
+        "extra": optional_columns(there),
+        "marked": any(e.incomplete for e in there),  # an overall row is incomplete if one of its datasets is
         "shared": shared,
         "first": rows[0] if rows else None,
     }
@@ -201,12 +253,31 @@ def _distinct(values: Iterable[Any], separator: str) -> list[str]:
     return sorted({part for value in values for part in str(value).split(separator) if part})
 
 
-def _any_missing(board: pd.DataFrame) -> bool:
-    return bool((board["n_missing"] > 0).any())
+def _legend(board: pd.DataFrame) -> dict[str, str]:
+    """LEGEND without the mark and the columns that nothing on the board calls for."""
+    needed_for = {**OPTIONAL, INCOMPLETE_MARK: "incomplete"}
+    absent = {term for term, name in needed_for.items() if not _any(board, name)}
+    return {term: meaning for term, meaning in LEGEND.items() if term not in absent}
 
 
-def _missing_note() -> str:
-    return "Some items have no answer or no majority of the judges; shares rest on the decided ones."
+def _notes(board: pd.DataFrame) -> dict[str, str]:
+    """What the marks on the board mean, by mark."""
+    notes = {
+        MISSING_MARK: "Some items have no answer or no majority of the judges; shares rest on the decided ones.",
+        INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered.",
+    }
+    called_for_by = {MISSING_MARK: "n_missing", INCOMPLETE_MARK: "incomplete"}
+    return {mark: note for mark, note in notes.items() if _any(board, called_for_by[mark])}
+
+
+def _any(board: pd.DataFrame, column: str) -> bool:
+    return bool((board[column] > 0).any())
+
+
+def _hung(column: Sequence[str]) -> list[str]:
+    """A column's cells with room behind those without a mark, so that figures stay under each other."""
+    marked = [cell.endswith((f" {MISSING_MARK}", f" {INCOMPLETE_MARK}")) for cell in column]
+    return [cell if has or not any(marked) else f"{cell}  " for cell, has in zip(column, marked, strict=True)]
 
 
 def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:

@@ -8,11 +8,16 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.scoring.metrics import FIGURES, decision_counts, joined_epochs
+from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, OUTCOMES, decision_counts, joined_epochs
 from traps_pipeline.tables import LEADERBOARD
 
 ENTRY = ["model", "regime", "dataset"]
+# An entry is incomplete where fewer of its items than this have a text. With 1 % of the items missing, the worst and
+# the best PECS are at most 0.04 apart (if all are controls: 2 % of Acc and 2 % of FalseAbs), half the 95 % interval of
+# a middling model on 500 pairs (0.08); beyond that, which answers were lost may matter as much as which were sampled.
+INCOMPLETE_BELOW = 0.99
 _RUN = ["model", "regime", "run"]
+_SUMMED = ["n_missing", "n_items", *OUTCOMES]
 
 
 def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame) -> pd.DataFrame:
@@ -21,18 +26,21 @@ def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame) -> pd.DataFrame:
     Mean and population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four
     datasets within each run first; a run that lacks a dataset does not enter it, and a model and regime without any
     whole run has no overall row. A figure that is null in one run is null here: no average rests on fewer runs than
-    `n_runs` says.
+    `n_runs` says. Items without a text count in no figure; where they are too many, the entry is `incomplete`.
     """
     cells = metrics.loc[metrics["scope"] == "all"]
+    cells = cells.assign(n_items=2 * cells["n_pairs"])
     runs = pd.concat([cells, _overall_runs(cells)], ignore_index=True)
     groups = runs.groupby(ENTRY, sort=True)
     means, deviations = (groups[FIGURES].agg(f) for f in (_mean, _deviation))
-    board = means.join(deviations.add_suffix("_std"))
+    bounds, sums = groups[BOUNDS].agg(_mean), cast(pd.DataFrame, groups[_SUMMED].sum())
+    board = means.join([deviations.add_suffix("_std"), bounds, sums])
     board["n_runs"] = groups["run"].nunique()
     board["n_pairs"] = groups["n_pairs"].max()
-    board["n_missing"] = groups["n_missing"].sum()
     board["epoch"] = groups["epoch"].agg(joined_epochs)
     board["benchmark_version"] = groups["benchmark_version"].agg(_joined_versions)
+    board["answered"] = board["n_answered"] / board["n_items"]
+    board["incomplete"] = _incomplete(board)
     board = board.reset_index().merge(intervals, on=ENTRY, how="left", validate="one_to_one")
     return board.loc[:, [c.name for c in LEADERBOARD.columns]]
 
@@ -60,11 +68,18 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     """One row a (model, regime, run) that has all four datasets, in the columns of METRICS."""
     groups = cells.groupby(_RUN, sort=True)
     whole = cells[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
-    counts = cast(pd.DataFrame, whole[["n_pairs", "n_missing"]].sum())
-    overall = whole[FIGURES].agg(_mean).join(counts)
+    counts = cast(pd.DataFrame, whole[["n_pairs", *_SUMMED]].sum())
+    overall = whole[[*FIGURES, *BOUNDS]].agg(_mean).join(counts)
     overall["epoch"] = whole["epoch"].agg(joined_epochs)
     overall["benchmark_version"] = whole["benchmark_version"].agg(_joined_versions)
     return overall.reset_index().assign(dataset="overall")
+
+
+def _incomplete(board: pd.DataFrame) -> pd.Series:
+    """Whether too few items of an entry have a text, on `board`'s index ENTRY; overall also where a dataset has."""
+    below = cast(pd.Series, board["answered"] < INCOMPLETE_BELOW)
+    anywhere = cast(pd.Series, below.groupby(level=["model", "regime"]).transform("any")).astype(bool)
+    return below | (anywhere & (board.index.get_level_values("dataset") == "overall"))
 
 
 def _mean(values: pd.Series) -> float:

@@ -8,10 +8,14 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.models.request import JUDGED
 from traps_pipeline.tables import METRICS
 
 CELL = ["dataset", "model", "regime", "run"]
 FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
+BOUNDS = ["pecs_low", "pecs_high"]
+# Which outcomes each number of items counts. Answered means that there is a text, whatever the judges make of it.
+OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), "n_empty": ("empty",), "n_errors": ("error",)}
 # How often something was decided so (numerator) and decided at all (denominator); every figure is made of these six.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
 SCOPED_BY = {"category": "category", "sub_scenario": "sub_scenario", "label": "control_answer"}
@@ -47,18 +51,19 @@ def cell_metrics(verdicts: pd.DataFrame) -> pd.DataFrame:
     One row a cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x` (the control's answer, both sides of
     the pair). Figures are fractions; one whose denominator is 0 is null, and so is what depends on it. `n_missing`
     counts items, of 2 n_pairs, without a needed decision: abstained and correct on a control, abstained on a void.
+    BOUNDS say what the missing decisions could do to PECS; they are never null.
     Raises ValueError when the verdicts are of several datasets, whose versions may differ (benchmark.md section 5).
     """
     datasets = sorted(verdicts["dataset"].unique())
     if len(datasets) > 1:
         raise ValueError(f"verdicts of several datasets {datasets}: score one dataset at a time")
     groups = _scoped(verdicts).groupby([*CELL, "scope"], sort=True)
-    sums = cast(pd.DataFrame, groups[[*COUNTS, "complete", "n_refused", "n_empty"]].sum())
+    sums = cast(pd.DataFrame, groups[[*COUNTS, "complete", *OUTCOMES]].sum())
     sums["n_pairs"] = groups["pair_id"].nunique()
     sums["n_missing"] = 2 * sums["n_pairs"] - sums["complete"]
     sums["epoch"] = groups["epoch"].agg(joined_epochs)
     sums["benchmark_version"] = groups["benchmark_version"].agg(lambda versions: " + ".join(sorted(set(versions))))
-    return sums.assign(**_figures(sums)).reset_index().loc[:, [c.name for c in METRICS.columns]]
+    return sums.assign(**_figures(sums), **_bounds(sums)).reset_index().loc[:, [c.name for c in METRICS.columns]]
 
 
 def joined_epochs(epochs: Iterable[str]) -> str:
@@ -71,11 +76,8 @@ def _scoped(verdicts: pd.DataFrame) -> pd.DataFrame:
     counts = decision_counts(verdicts)
     on_control = verdicts["side"].eq("control")
     complete = np.where(on_control, counts["correct_of"] & counts["false_abs_of"], counts["abs_rec_of"])
-    flags = counts.assign(
-        complete=complete,
-        n_refused=verdicts["outcome"].eq("refused").astype("int64"),
-        n_empty=verdicts["outcome"].eq("empty").astype("int64"),
-    )
+    outcomes = {name: verdicts["outcome"].isin(kinds).astype("int64") for name, kinds in OUTCOMES.items()}
+    flags = counts.assign(complete=complete, **outcomes)
     items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]
     scopes += [prefix + ":" + verdicts[column].astype("str") for prefix, column in SCOPED_BY.items()]
@@ -96,6 +98,23 @@ def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
     }
 
 
+def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
+    """BOUNDS of every cell, (cells,) each: PECS of all pairs with every missing decision at its worst, and at its best.
+
+    Each decision is bounded by itself, since an item may lack only one; PECS rises with Acc and AbsRec and falls with
+    FalseAbs, so that these two are its exact extremes. Where nothing is missing both are PECS, to the last bit.
+    """
+    pairs = sums["n_pairs"].to_numpy(float)
+    taken = {name: sums[name].to_numpy(float) for name in ("correct", "false_abs", "abs_rec")}
+    lacking = {name: pairs - sums[f"{name}_of"].to_numpy(float) for name in taken}
+    least = {name: taken[name] / pairs for name in taken}
+    most = {name: (taken[name] + lacking[name]) / pairs for name in taken}
+    return {
+        "pecs_low": pecs_of(least["correct"], least["abs_rec"] - most["false_abs"]),
+        "pecs_high": pecs_of(most["correct"], most["abs_rec"] - least["false_abs"]),
+    }
+
+
 def _share(sums: pd.DataFrame, name: str) -> np.ndarray:
     """Numerator over denominator, (cells,); NaN where the denominator is 0."""
     of = sums[f"{name}_of"].to_numpy(float)
@@ -103,8 +122,10 @@ def _share(sums: pd.DataFrame, name: str) -> np.ndarray:
 
 
 def wrong_figures(cells: pd.DataFrame) -> int:
-    """How many figures of METRICS rows break their definition: a share outside [0, 1], a PECS that is not
-    Acc x max(0, J). Null figures (nothing decided) are not wrong."""
+    """How many figures of METRICS rows break their definition: a share or bound outside [0, 1], a PECS that is not
+    Acc x max(0, J) or lies outside its bounds. Null figures (nothing decided) are not wrong."""
     acc, abs_rec, false_abs, pecs = (cells[name].to_numpy(float) for name in ("acc", "abs_rec", "false_abs", "pecs"))
-    outside = sum(int(((share < 0) | (share > 1)).sum()) for share in (acc, abs_rec, false_abs))
-    return outside + int((np.abs(pecs - acc * np.maximum(abs_rec - false_abs, 0)) > 1e-12).sum())
+    low, high = (cells[name].to_numpy(float) for name in BOUNDS)
+    outside = sum(int(((share < 0) | (share > 1)).sum()) for share in (acc, abs_rec, false_abs, low, high))
+    unbounded = int(((low > high) | (pecs < low - 1e-12) | (pecs > high + 1e-12)).sum())
+    return outside + unbounded + int((np.abs(pecs - acc * np.maximum(abs_rec - false_abs, 0)) > 1e-12).sum())

@@ -13,6 +13,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
@@ -25,6 +26,9 @@ from traps_pipeline.errors import TrapsError
 
 SYNC_ROWS, SYNC_SECONDS = 100, 0.5
 LOCK_POLL_SECONDS = 0.1
+# Found without parsing the row, which would take ten times as long. Inside a string a quote has a backslash before it.
+_COST = re.compile(rb'(?<!\\)"cost_usd": ([0-9.e+-]+)[,}]')
+_PARTICIPANT = re.compile(rb'(?<!\\)"participant": "([a-z0-9.-]+)"')
 
 
 class LockGivenUp(Exception):
@@ -59,6 +63,23 @@ class Ledger:
                 elif row is not None:
                     known.rows[row["key"]] = row
         return known
+
+    def rows_of(self, participant: str) -> Iterator[dict[str, Any]]:
+        """Rows of one participant, of every evaluation; lines that are not whole are left out."""
+        about = f'"participant": "{participant}"'.encode()
+        for segment in sorted((self.root / self.kind).glob("*/*.jsonl")):
+            yield from (json.loads(line) for line in segment.read_bytes().split(b"\n")[:-1] if about in line)
+
+    def spent(self) -> dict[str, float]:
+        """Dollars by participant, over every row of every evaluation: repeated keys were paid for as well."""
+        spent: dict[str, float] = {}
+        for segment in sorted((self.root / self.kind).glob("*/*.jsonl")):
+            for line in segment.read_bytes().split(b"\n")[:-1]:
+                cost, participant = _COST.search(line), _PARTICIPANT.search(line)
+                if cost and participant:
+                    name = participant[1].decode()
+                    spent[name] = spent.get(name, 0.0) + float(cost[1])
+        return spent
 
     def reasoning(self, evaluation: str) -> dict[str, str]:
         """Reasoning traces by key, kept in sibling segments so that reading answers stays quick."""

@@ -121,7 +121,8 @@ class TableStore:
         return data.sort_by([(name, "ascending") for name in table.key]) if len(data) else data
 
     def state(self, table: Table, partition: Mapping[str, Any]) -> State | None:
-        """What the footer of a partition says; None if it was never written. Raises TrapsError if it is unreadable."""
+        """What the footer of a partition says; None if it was never written, or by a version with other columns (it is
+        then made anew). Raises TrapsError if it is unreadable."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -129,8 +130,9 @@ class TableStore:
         if not path.is_file():
             return None
         try:
-            metadata = pq.ParquetFile(path).schema_arrow.metadata or {}
-            return State(**json.loads(metadata[_FOOTER]))
+            schema = pq.ParquetFile(path).schema_arrow
+            state = State(**json.loads((schema.metadata or {})[_FOOTER]))
+            return state if schema.names == table.arrow_schema().names else None
         except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
             raise _unreadable(path, table, error) from error
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -14,6 +15,9 @@ from traps_pipeline.paths import CHECKOUT, require_checkout
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
+
+if TYPE_CHECKING:
+    from traps_pipeline.models.media import MediaStore
 
 FORMAT = 1
 VARIABLE = "TRAPS_WORKSPACE"
@@ -45,7 +49,11 @@ class Study(BaseModel):
     per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
     panel: str = "rules"
     epoch: str = Field(default="1", pattern=r"^[A-Za-z0-9._-]+$")
-    budget_usd: float = Field(default=0.0, ge=0.0)
+    budget_usd: float = Field(default=0.0, ge=0.0, description="for all calls over the network, ever")
+    model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] = Field(
+        default={}, description="by model or judge, besides"
+    )
+    allow_unknown_prices: bool = Field(default=False, description="ask models without a price: no budget bounds them")
 
     @property
     def is_subset(self) -> bool:
@@ -89,8 +97,18 @@ class Workspace:
             (root / folder).mkdir(parents=True, exist_ok=True)
         workspace = cls(root, study)
         workspace._link_dagster_yaml()
-        write_text(root / "study.yaml", yaml.safe_dump(study.model_dump(exclude_none=True), sort_keys=False))
+        workspace.save_study()
         return workspace
+
+    def save_study(self) -> None:
+        """Write `study.yaml`, which every run in this workspace reads, whoever starts it."""
+        write_text(self.root / "study.yaml", yaml.safe_dump(self.study.model_dump(exclude_none=True), sort_keys=False))
+
+    def allow(self, **money: Any) -> Workspace:
+        """The workspace with other values of budget_usd, model_budgets_usd, allow_unknown_prices in its study."""
+        changed = Workspace(self.root, self.study.model_copy(update=money))
+        changed.save_study()
+        return changed
 
     @classmethod
     def open(cls, root: Path | None = None) -> Workspace:
@@ -139,6 +157,13 @@ class Workspace:
     def tables(self) -> TableStore:
         """The Parquet tables."""
         return TableStore(self.root / "tables")
+
+    @cached_property
+    def media(self) -> MediaStore:
+        """Clips as they are sent to models."""
+        from traps_pipeline.models.media import MediaStore
+
+        return MediaStore(self.root / "media")
 
     @cached_property
     def answers(self) -> Ledger:

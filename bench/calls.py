@@ -1,0 +1,160 @@
+"""Answers a second and CPU an answer, through our backend, ledger and limits against bare `litellm.acompletion` in a
+loop, on the same server (50 ms latency), in one run; with `--inspect PYTHON` also against inspect_ai.
+
+python bench/calls.py [--answers 2000] [--memory] [--inspect /path/to/python]
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
+SYSTEM, QUESTION = "You watch a clip. " * 90, "Does the ball clear the barrier {number}, yes or no?"  # 2 KB in all
+CONNECTIONS = (24, 200)
+KEY = "BENCH_KEY"
+
+
+def ours(url: str, connections: int, answers: int) -> dict[str, float]:
+    """Requests through `ask`: backend, retries, pace, budget and the ledger on disk."""
+    from traps_pipeline.models.api import ApiBackend, load_litellm
+    from traps_pipeline.models.ask import Participants, Work, run_work
+    from traps_pipeline.models.budget import Budget
+    from traps_pipeline.models.registry import Account, Entry, Limits
+    from traps_pipeline.models.request import Request
+    from traps_pipeline.partitions import Cell, Evaluation
+    from traps_pipeline.storage.ledger import Ledger
+    from traps_pipeline.storage.workspace import Study
+
+    account = Account(key=KEY, base_url=f"{url}/v1")
+    fields: dict[str, Any] = {"id": "m", "backend": "api", "account": "a", "provider_id": "openai/m", "params": PARAMS}
+    fields["limits"] = Limits(concurrency=connections)
+    entry = Entry.model_validate(fields, context={"accounts": {"a": account}})
+    requests = [
+        Request("m", "openai/m", PARAMS, SYSTEM, QUESTION.format(number=n), {"item_id": str(n)}) for n in range(answers)
+    ]
+    load_litellm()
+    with tempfile.TemporaryDirectory() as folder:
+        free = Study(allow_unknown_prices=True)
+        participants = Participants({"m": entry}, lambda e: ApiBackend(e, account), free, {"a": account})
+        ledger, cell = Ledger(Path(folder), "answers"), Cell("occlusion", Evaluation("m", "standard", 1))
+        work = Work("responses", ledger, participants, Budget(0, {}, {}), "1", lambda _: requests, lambda *_: None)
+        return _measured(lambda: list(run_work(work, [cell])), answers)
+
+
+def bare(url: str, connections: int, answers: int) -> dict[str, float]:
+    """The least that a script would do: acompletion under a semaphore, answers kept in a list."""
+    from traps_pipeline.models.api import load_litellm
+
+    litellm = load_litellm()
+
+    async def loop() -> None:
+        free = asyncio.Semaphore(connections)
+
+        async def one(number: int) -> str:
+            messages = [{"role": "system", "content": SYSTEM}]
+            messages += [{"role": "user", "content": QUESTION.format(number=number)}]
+            async with free:
+                response = await litellm.acompletion(
+                    model="openai/m", messages=messages, api_base=f"{url}/v1", api_key="k", max_retries=0, **PARAMS
+                )
+            return response.choices[0].message.content
+
+        await asyncio.gather(*(one(number) for number in range(answers)))
+
+    return _measured(lambda: asyncio.run(loop()), answers)
+
+
+INSPECT = """
+import json, resource, sys, time
+from inspect_ai import Task, eval
+from inspect_ai.dataset import MemoryDataset, Sample
+from inspect_ai.model import GenerateConfig, get_model
+from inspect_ai.solver import generate, system_message
+url, connections, answers, system, question = json.loads(sys.argv[1])
+samples = [Sample(input=question.format(number=n), target="yes") for n in range(answers)]
+task = Task(dataset=MemoryDataset(samples), solver=[system_message(system), generate()])
+model = get_model("openai/m", base_url=url + "/v1", api_key="k", responses_api=False,
+    config=GenerateConfig(temperature=0.8, top_p=0.95, max_tokens=8000, max_connections=connections, max_retries=0))
+began, cpu = time.perf_counter(), sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+eval(task, model=model, display="none", max_samples=connections, log_dir=sys.argv[2])
+used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2]) - cpu
+print(json.dumps({"rate": answers / (time.perf_counter() - began), "cpu_ms": 1000 * used / answers}))
+"""
+
+
+def _measured(work: Any, answers: int) -> dict[str, float]:
+    began, cpu = time.perf_counter(), _cpu_s()
+    work()
+    seconds = time.perf_counter() - began
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {"rate": answers / seconds, "cpu_ms": 1000 * (_cpu_s() - cpu) / answers, "peak_mb": peak}
+
+
+def _cpu_s() -> float:
+    return sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+
+
+def _in_a_process(command: Sequence[str]) -> dict[str, float]:
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ | {KEY: "k"}, check=False)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _worker(name: str, url: str, connections: int, answers: int) -> dict[str, float]:
+    return _in_a_process([sys.executable, __file__, "--worker", name, url, str(connections), str(answers)])
+
+
+def _inspect(python: str, url: str, connections: int, answers: int) -> dict[str, float]:
+    with tempfile.TemporaryDirectory() as logs:
+        task = json.dumps([url, connections, answers, SYSTEM, QUESTION])
+        return _in_a_process([python, "-c", INSPECT, task, logs])
+
+
+def main() -> None:
+    from tests.providers.server import Provider
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--answers", type=int, default=2000)
+    parser.add_argument("--memory", action="store_true", help="peak memory after 4,000 and after 20,000 calls")
+    parser.add_argument("--inspect", metavar="PYTHON", help="a Python that has inspect_ai and openai")
+    arguments = parser.parse_args()
+    with Provider.start({"latency_s": 0.05}, keeps_records=False) as provider:
+        print(f"{'connections':>11} {'':<18} {'answers/s':>10} {'CPU ms each':>12}")
+        for connections in CONNECTIONS:
+            found = {name: _worker(name, provider.url, connections, arguments.answers) for name in ("ours", "bare")}
+            if arguments.inspect:
+                few = max(200, arguments.answers // 5)
+                found["inspect_ai"] = _inspect(arguments.inspect, provider.url, connections, few)
+            for name, measured in found.items():
+                print(f"{connections:>11} {name:<18} {measured['rate']:>10.1f} {measured['cpu_ms']:>12.2f}")
+            print(
+                f"{connections:>11} CPU, ours / bare litellm: {found['ours']['cpu_ms'] / found['bare']['cpu_ms']:.2f}"
+            )
+            if arguments.inspect:
+                ratio = found["ours"]["rate"] / found["inspect_ai"]["rate"]
+                print(f"{connections:>11} answers a second, ours / inspect_ai: {ratio:.1f}")
+        if arguments.memory:
+            few, many = (_worker("ours", provider.url, 200, n)["peak_mb"] for n in (4000, 20000))
+            print(f"peak memory after 4,000 calls {few:.0f} MB, after 20,000 {many:.0f} MB: {many / few:.2f}")
+
+
+if __name__ == "__main__":
+    if "--worker" in sys.argv:
+        _, _, worker, server, width, count = sys.argv
+        print(json.dumps({"ours": ours, "bare": bare}[worker](server, int(width), int(count))))
+    else:
+        main()

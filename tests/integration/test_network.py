@@ -1,0 +1,203 @@
+"""Models over the network: real HTTP to a provider that misbehaves, through the commands that people use."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from tests.conftest import Checkout
+from tests.providers.server import Provider
+
+pytestmark = pytest.mark.slow
+KEY, SECRET = "TRAPS_TEST_KEY", "sk-planted-0123456789abcdef"
+SAMPLING = "temperature: 0.8, top_p: 0.95, max_tokens: 8000"
+TRANSIENT = {
+    "rate_limited": 0.03,
+    "rate_limited_bare": 0.03,
+    "server_error": 0.03,
+    "overloaded": 0.02,
+    "hang": 0.005,
+    "cut": 0.025,
+    "wrong_content_type": 0.02,
+    "timeout_status": 0.01,
+    "conflict": 0.01,
+}
+ENDINGS = {"empty": 0.005, "length": 0.005, "content_filter": 0.005, "thinking_exhausted": 0.005}
+
+
+def entry(name: str, profile: str, more: str = "prices: {input: 1.0, output: 10.0, as_of: 2026-11-01}") -> str:
+    return f"""
+  - id: {name}
+    backend: api
+    account: here
+    provider_id: openai/{name}
+    media: {{profile: {profile}, fps: 5, most: 25}}
+    params: {{{SAMPLING}}}
+    limits: {{timeout_s: 4, backoff_s: 0.05}}
+    {more}
+"""
+
+
+def register(study: Checkout, provider: Provider, *entries: str) -> None:
+    """Replace the registry by these models at the provider."""
+    account = f"accounts:\n  here: {{key: {KEY}, base_url: {provider.url}/v1}}\nmodels:\n"
+    (study.root / "assets" / "models.yaml").write_text(account + "".join(entries))
+
+
+def experiment(study: Checkout, models: list[str], **more: Any) -> Path:
+    """An experiment on the demo's scenarios."""
+    demo = (study.root / "assets" / "experiments" / "demo.yaml").read_text()
+    scenarios = demo[demo.index("scenarios:") :]
+    settings = {"models": models, "regimes": ["standard", "json"], "runs": [1], **more}
+    head = "".join(f"{name}: {value!r}\n".replace("'", '"') for name, value in settings.items())
+    path = study.root / "network.yaml"
+    path.write_text(f"name: network\n{head}{scenarios}")
+    return path
+
+
+@pytest.fixture(scope="module")
+def shared_provider() -> Iterator[Provider]:
+    with Provider.start() as provider:
+        yield provider
+
+
+@pytest.fixture
+def provider(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
+    monkeypatch.setenv(KEY, SECRET)
+    return shared_provider.afresh()
+
+
+def responses(study: Checkout) -> list[dict[str, Any]]:
+    files = sorted((study.workspace / "tables" / "responses").rglob("*.parquet"))
+    return [row for file in files for row in pq.read_table(file, partitioning=None).to_pylist()]
+
+
+def settled(study: Checkout) -> list[dict[str, Any]]:
+    return [row for row in study.ledger_rows("answers") if row["outcome"] != "error"]
+
+
+def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly(unasked: Checkout, provider: Provider) -> None:
+    provider.configure(faults=TRANSIENT | ENDINGS, only_first_attempts=3, latency_s=0.02, seed=1)
+    register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
+    path = experiment(unasked, ["video-model", "image-model"], regimes=["standard", "guided", "json"], runs=[1, 2, 3])
+    finished = unasked.traps("run", path, "--budget-usd", "500")
+    assert finished.code == 0, finished.err
+    rows, stats = responses(unasked), provider.stats()
+    assert len(rows) == len({(r["item_id"], r["model"], r["regime"], r["run"]) for r in rows}) == 2 * 128 * 9
+    outcomes = Counter(row["outcome"] for row in rows)
+    assert outcomes.keys() == {"answer", "truncated", "empty", "refused"}
+    assert outcomes["answer"] > 0.95 * len(rows)
+    for row in rows:
+        assert (row["text"] is not None) == (row["outcome"] in ("answer", "truncated"))
+    texts = {row["text"] for row in rows if row["outcome"] == "answer"}
+    assert not [text for text in texts if not text.startswith(("The answer is: ", '{"'))]  # no failure is a text
+    assert max(row["attempts"] for row in rows) <= 6
+    # Every answer that the provider sent in full is in the ledger once, and nothing else is.
+    assert stats["answered_in_full"] == len(settled(unasked)) == len(rows)
+    assert len({row["key"] for row in settled(unasked)}) == len(rows)
+    assert all(row["cost_usd"] > 0 for row in settled(unasked))
+
+
+def test_the_sent_body_is_the_declared_one_and_the_key_is_nowhere(unasked: Checkout, provider: Provider) -> None:
+    register(unasked, provider, entry("image-model", "images"))
+    finished = unasked.traps("run", experiment(unasked, ["image-model"]), "--budget-usd", "10")
+    assert finished.code == 0, finished.err
+    for record in provider.requests(limit=10):
+        body = record["body"]
+        assert (body["temperature"], body["top_p"], body["max_tokens"]) == (0.8, 0.95, 8000)
+        images = [part for part in body["messages"][1]["content"] if part["type"] == "image_url"]
+        assert 1 <= len(images) <= 25
+    written = [file for file in unasked.workspace.rglob("*") if file.is_file() and not file.is_symlink()]
+    assert len(written) > 100
+    assert not [file for file in written if SECRET.encode() in file.read_bytes()]
+    assert SECRET not in finished.out + finished.err
+
+
+def test_the_cap_holds_and_the_next_run_goes_on(unasked: Checkout, provider: Provider) -> None:
+    provider.configure(latency_s=0.05)
+    register(unasked, provider, entry("image-model", "images").replace("limits: {", "limits: {concurrency: 200, "))
+    path = experiment(unasked, ["image-model"])
+    first = unasked.traps("run", path, "--budget-usd", "1.0")
+    assert first.code == 4, first.err
+    assert "the budget of the study is reached" in first.err
+    spent = sum(row["cost_usd"] for row in settled(unasked))
+    assert 0 < spent <= 1.0
+    assert provider.stats()["answered_in_full"] == len(settled(unasked))
+    again = unasked.traps("run", path)  # spend survives restarts
+    assert again.code == 4
+    assert sum(row["cost_usd"] for row in settled(unasked)) <= 1.0
+    more = unasked.traps("run", path, "--budget-usd", "100")
+    assert more.code == 0, more.err
+    assert provider.stats()["answered_in_full"] == len(settled(unasked)) == 2 * 128
+
+
+def test_paid_stages_want_a_budget_and_a_price_whoever_starts_them(unasked: Checkout, provider: Provider) -> None:
+    register(unasked, provider, entry("image-model", "images"), entry("no-price", "images", "runs: 1"))
+    path = experiment(unasked, ["image-model", "no-price"])
+    refused = unasked.traps("run", path)
+    assert refused.code == 1
+    assert "image-model costs money and the study has no budget" in refused.err
+    assert "the price of no-price is unknown" in refused.err
+    partition = "occlusion|image-model__standard__run1"
+    materialize = ("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", "responses", "--partition")
+    clicked = unasked.dagster(*materialize, partition)
+    assert clicked.code != 0
+    assert "has no budget" in clicked.out + clicked.err
+    assert provider.stats()["requests"] == 0
+    planned = unasked.traps("plan", path)
+    assert "price unknown, not in the sum: no-price" in planned.out
+
+
+def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checkout, provider: Provider) -> None:
+    provider.configure(fault_by_model={"locked-out": "unauthorized"})
+    register(unasked, provider, entry("image-model", "images"), entry("locked-out", "images"))
+    finished = unasked.traps("run", experiment(unasked, ["image-model", "locked-out"]), "--budget-usd", "10")
+    assert finished.code == 1
+    assert "locked-out is stopped: 20 refusals in a row (http_401)" in finished.err
+    assert len(responses(unasked)) == 2 * 128
+    assert {row["model"] for row in responses(unasked)} == {"image-model"}
+    assert provider.stats()["by_status"]["401"] < 20 + 24  # those in flight then, and no more
+
+
+def test_only_what_decides_an_answer_is_asked_again(unasked: Checkout, provider: Provider) -> None:
+    register(unasked, provider, entry("image-model", "images"))
+    path = experiment(unasked, ["image-model"])
+    assert unasked.traps("run", path, "--budget-usd", "10").counts()["answers"] == 256
+    quick = entry("image-model", "images").replace("timeout_s: 4", "timeout_s: 9, concurrency: 3")
+    register(unasked, provider, quick.replace("input: 1.0", "input: 2.0"))
+    assert unasked.traps("run", path).counts()["answers"] == 0
+    unasked.correct("plinko-0001", question="In which numbered bucket, 1 to 7, does the ball end?")
+    assert unasked.traps("run", path).counts()["answers"] == 2 * 3  # control and void, and the ill-posed pair's control
+    register(
+        unasked,
+        provider,
+        quick.replace("temperature: 0.8", "temperature: 0.5") + "    waivers: {temperature: a test}\n",
+    )
+    assert unasked.traps("run", path).counts()["answers"] == 256
+
+
+def test_five_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider: Provider) -> None:
+    provider.configure(latency_s=0.1)
+    register(unasked, provider, entry("video-model", "video"))
+    path = experiment(unasked, ["video-model"], regimes=["standard", "guided", "json"], runs=[1, 2, 3])
+    wanted, kills = 128 * 9, 5
+    for kill in range(1, kills + 1):
+        process = unasked.start("python", "-m", "traps_pipeline.cli", "run", str(path), "--budget-usd", "100")
+        while len(unasked.ledger_rows("answers")) < kill * wanted // 8:
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+    finished = unasked.traps("run", path)
+    assert finished.code == 0, finished.err
+    keys = [row["key"] for row in settled(unasked)]
+    assert len(keys) == len(set(keys)) == wanted
+    assert provider.stats()["answered_in_full"] <= wanted + kills * 24

@@ -1,0 +1,117 @@
+"""The cap holds: worst cases are reserved, costs settled, and nothing is sent that could exceed it."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import random
+from pathlib import Path
+
+import pytest
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
+from traps_pipeline.models.registry import Account, Entry, Prices
+from traps_pipeline.models.request import Request
+from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.workspace import Study
+
+
+def entry(prices: Prices | None) -> Entry:
+    fields = {
+        "id": "m",
+        "backend": "api",
+        "account": "a",
+        "provider_id": "openai/m",
+        "params": {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000},
+        "prices": prices,
+    }
+    return Entry.model_validate(fields, context={"accounts": {"a": Account()}})
+
+
+PRICED = entry(Prices(input=2.0, output=10.0, as_of=datetime.date(2026, 11, 1)))
+
+
+def test_the_worst_case_is_every_token_that_may_be_billed() -> None:
+    request = Request("m", "api", {}, "s" * 100, "u" * 100, {})
+    assert most_tokens(PRICED, request).prompt == 100 + 200  # two bytes a token, and the overhead
+    assert worst_case_usd(PRICED, request) == pytest.approx((300 * 2 + 8000 * 10) / 1e6)
+    assert worst_case_usd(entry(None), request) == 0
+
+
+def test_two_hundred_connections_never_spend_a_cent_above_the_cap() -> None:
+    spent = most = 0.0
+    draw = random.Random(1)
+
+    async def call(budget: Budget) -> None:
+        nonlocal spent, most
+        await budget.reserve("m", 0.05)
+        await asyncio.sleep(draw.uniform(0, 0.002))
+        cost = draw.uniform(0, 0.05)
+        spent += cost
+        most = max(most, spent)
+        await budget.settle("m", 0.05, cost)
+
+    async def run() -> int:
+        budget, reached = Budget(10.0, {}, {"m": 1.0}), 0
+        queue = list(range(2000))
+
+        async def worker() -> None:
+            nonlocal reached
+            while queue:
+                queue.pop()
+                try:
+                    await call(budget)
+                except BudgetReached:
+                    reached += 1
+                    return
+
+        await asyncio.gather(*(worker() for _ in range(200)))
+        assert budget.spent_usd == pytest.approx(1.0 + spent)
+        return reached
+
+    assert asyncio.run(run()) == 200
+    assert 9.0 - 0.05 <= most <= 9.0 + 1e-9  # used up to the last call's worst case, never above
+
+
+def test_a_models_own_cap_stops_it_and_not_the_others() -> None:
+    async def run() -> None:
+        budget = Budget(10.0, {"m": 0.10}, {})
+        await budget.reserve("m", 0.06)
+        await budget.settle("m", 0.06, 0.06)
+        with pytest.raises(BudgetReached, match=r"budget of m is reached: \$0\.06 of \$0\.10 spent"):
+            await budget.reserve("m", 0.06)
+        await budget.reserve("other", 0.06)
+
+    asyncio.run(run())
+
+
+def test_an_unknown_cost_counts_as_the_worst() -> None:
+    async def run() -> float:
+        budget = Budget(1.0, {}, {})
+        await budget.reserve("m", 0.4)
+        await budget.settle("m", 0.4, None)
+        return budget.spent_usd
+
+    assert asyncio.run(run()) == pytest.approx(0.4)
+
+
+def test_spend_is_what_the_ledger_holds_repeated_answers_too(tmp_path: Path) -> None:
+    ledger = Ledger(tmp_path, "answers")
+    trap = 'says "cost_usd": 9.5, and "participant": "evil"'
+    for name, cost in (("m__standard__run1", 0.25), ("m__standard__run1", 0.5), ("n__json__run1", 1e-05)):
+        with ledger.writer(name) as writer:
+            about = {"participant": name.split("__")[0]}
+            writer.append({"key": "k", "text": trap, "cost_usd": cost, "components": about})
+            writer.append({"key": "l", "text": None, "cost_usd": None, "components": about})
+    assert ledger.spent() == {"m": 0.75, "n": pytest.approx(1e-05)}
+
+
+def test_paid_calls_want_a_budget_and_unknown_prices_a_word() -> None:
+    with pytest.raises(TrapsError, match="m costs money and the study has no budget"):
+        check_money(Study(), PRICED)
+    check_money(Study(budget_usd=1), PRICED)
+    with pytest.raises(TrapsError, match="the price of m is unknown"):
+        check_money(Study(budget_usd=1), entry(None))
+    check_money(Study(allow_unknown_prices=True), entry(None))
+    check_money(Study(), entry(Prices(input=0, output=0, as_of=datetime.date(2026, 11, 1))))

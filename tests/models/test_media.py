@@ -1,0 +1,515 @@
+"""Frames are picked by time stamp, and what is sent is encoded once, is the same everywhere, and is never damaged."""
+
+from __future__ import annotations
+
+import base64
+import errno
+import hashlib
+import io
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from traps_pipeline.digests import file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models import media
+from traps_pipeline.models.media import (
+    Media,
+    MediaSpec,
+    MediaStore,
+    UriCache,
+    data_uris,
+    payload,
+    pick,
+    profile_digest,
+    sample,
+)
+from traps_pipeline.scenes.encode import DamagedClip, decode, decode_sampled, encode
+
+VIDEO = MediaSpec(profile="video", fps=5)
+IMAGES = MediaSpec(profile="images", fps=5)
+QWEN = MediaSpec(profile="frames", uniform=16)
+GRID = MediaSpec(profile="frames", fps=2, most=32)
+
+
+def drawn(count: int, height: int = 120, width: int = 160) -> list[np.ndarray]:
+    """A bright square that moves over a gradient, 2 px a frame; no two frames alike."""
+    ramp = np.linspace(0, 200, width).astype(np.uint8)
+    frames = []
+    for i in range(count):
+        frame = np.repeat(np.tile(ramp, (height, 1))[..., None], 3, axis=2)
+        frame[40:80, 2 * i : 2 * i + 40] = (230, 40, 30)
+        frames.append(frame)
+    return frames
+
+
+def shown(frame: np.ndarray) -> int:
+    """Which of the drawn frames it is, by where the square is."""
+    red = (frame[60, :, 0] > 160) & (frame[60, :, 1] < 110)
+    return round(int(np.flatnonzero(red).min()) / 2)
+
+
+def write_clip(path: Path, count: int = 50, fps: int = 10) -> tuple[Path, str]:
+    encode(drawn(count), path, fps)
+    return path, file_digest(path)
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> tuple[Path, str]:
+    """A control of full length: 50 frames, 10 a second."""
+    return write_clip(tmp_path / "clips" / "control.mp4")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> MediaStore:
+    return MediaStore(tmp_path / "media")
+
+
+@pytest.fixture
+def encoded(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Grows by one with each video that is encoded."""
+    calls: list[Path] = []
+
+    def counting(frames: list[np.ndarray], path: Path, fps: int) -> None:
+        calls.append(path)
+        encode(frames, path, fps)
+
+    monkeypatch.setattr(media, "encode", counting)
+    return calls
+
+
+def at(count: int, fps: float, spec: MediaSpec) -> list[int]:
+    """Which of a clip's frames are picked."""
+    return pick(np.arange(count) / fps, spec).tolist()
+
+
+# --- specs ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"profile": "video"}, "give fps or uniform, one of them"),
+        ({"profile": "frames", "fps": 2, "uniform": 16}, "give fps or uniform, not both"),
+        ({"profile": "frames", "uniform": 16, "most": 32}, "most goes with fps"),
+        ({"profile": "video", "uniform": 16}, "profile video needs fps"),
+        ({"profile": "video", "fps": 2.5}, "a whole number"),
+        ({"profile": "video", "fps": 5, "size": [335, 336]}, "H.264 needs an even width"),
+        ({"profile": "frames", "fps": 5, "size": [336, 0]}, "a width and a height in pixels"),
+        ({"profile": "frames", "fps": 0}, "greater than 0"),
+        ({"profile": "frames", "fps": float("nan")}, "finite number"),
+        ({"profile": "frames", "fps": 5, "most": 0}, "greater than or equal to 1"),
+        ({"profile": "frames", "uniform": 0}, "greater than or equal to 1"),
+        ({"profile": "film", "fps": 5}, "'video', 'images' or 'frames'"),
+        ({"profile": "frames", "fps": 5, "sise": [336, 336]}, "Extra inputs"),
+    ],
+)
+def test_a_wrong_spec_is_named(fields: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ValidationError, match=complaint):
+        MediaSpec.model_validate(fields)
+
+
+def test_a_spec_is_what_it_says_after_a_round_trip() -> None:
+    for spec in (VIDEO, IMAGES, QWEN, GRID, MediaSpec(profile="frames", fps=2, most=32, size=(336, 336))):
+        again = MediaSpec.model_validate(json.loads(spec.model_dump_json()))
+        assert again == spec and profile_digest(again) == profile_digest(spec)
+    assert VIDEO.most == 25
+
+
+# --- frames -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_clip_of_five_seconds_gives_25_frames_a_fifth_of_a_second_apart() -> None:
+    assert at(50, 10, VIDEO) == list(range(0, 50, 2))  # 0, 0.2, ..., 4.8 s
+    assert at(51, 10, VIDEO) == list(range(0, 50, 2))  # a frame at 5.0 s would be the 26th
+    assert at(49, 10, VIDEO) == list(range(0, 49, 2))  # the last one, 4.8 s, is on the grid
+    assert at(48, 10, VIDEO) == list(range(0, 48, 2))  # ... and here it is not
+
+
+def test_a_short_clip_gives_what_it_has() -> None:
+    assert at(11, 10, VIDEO) == [0, 2, 4, 6, 8, 10]
+    assert at(1, 10, VIDEO) == at(1, 10, QWEN) == at(1, 10, GRID) == [0]
+
+
+def test_sixteen_uniform_frames_include_first_and_last() -> None:
+    # 49 / 15 = 3.267 frames apart: 0, 3.27, 6.53, 9.8, 13.07, 16.33, 19.6, 22.87, 26.13, 29.4, 32.67, 35.93, 39.2, ...
+    assert at(50, 10, QWEN) == [0, 3, 7, 10, 13, 16, 20, 23, 26, 29, 33, 36, 39, 42, 46, 49]
+    assert at(16, 10, QWEN) == list(range(16))
+    assert at(11, 10, QWEN) == list(range(11))
+    assert at(17, 10, QWEN)[::15] == [0, 16] and len(at(17, 10, QWEN)) == 16
+
+
+def test_a_grid_of_two_a_second_has_ten_frames_in_five_seconds() -> None:
+    assert at(50, 10, GRID) == list(range(0, 50, 5))
+    assert at(1000, 10, GRID) == list(range(0, 160, 5))  # at most 32
+
+
+def test_of_two_frames_equally_near_the_earlier_is_shown() -> None:
+    assert at(11, 10, MediaSpec(profile="frames", fps=4)) == [0, 2, 5, 7, 10]  # 0.25 and 0.75 s lie between two
+    assert at(4, 10, MediaSpec(profile="frames", uniform=3)) == [0, 1, 3]
+
+
+def test_a_slower_clip_gives_each_of_its_frames_once() -> None:
+    assert at(5, 1, VIDEO) == [0, 1, 2, 3, 4]
+    assert at(40, 1, VIDEO) == list(range(25))
+
+
+def test_frames_are_picked_by_time_stamp_not_by_number() -> None:
+    times = np.array([0.0, 0.05, 0.19, 0.21, 0.5, 0.61])
+    assert pick(times, VIDEO).tolist() == [0, 2, 4, 5]  # wanted: 0, 0.2 (0.19 and 0.21 equally near), 0.4, 0.6
+
+
+def test_a_sample_is_the_decoded_frames_with_their_times(clip: tuple[Path, str]) -> None:
+    whole, times = decode(clip[0])
+    for spec in (VIDEO, IMAGES):
+        sampled = sample(clip[0], spec)
+        assert sampled.frames.dtype == np.uint8 and sampled.frames.shape == (25, 120, 160, 3)
+        assert np.array_equal(sampled.frames, whole[::2]) and sampled.times_s.tolist() == times[::2].tolist()
+        assert sampled.times_s.dtype == np.float64 and sampled.clip_fps == 10.0
+        assert np.array_equal(sampled.frames, decode_sampled(clip[0]))  # what the observer sees
+    assert [shown(frame) for frame in sample(clip[0], GRID).frames] == list(range(0, 50, 5))
+
+
+def test_a_sample_is_resized_to_width_and_height(clip: tuple[Path, str]) -> None:
+    wide = sample(clip[0], MediaSpec(profile="frames", fps=2, size=(80, 60))).frames
+    assert wide.shape == (10, 60, 80, 3) and wide.dtype == np.uint8
+    averaged = sample(clip[0], GRID).frames.reshape(10, 60, 2, 80, 2, 3).mean(axis=(2, 4))  # half: a mean of 2 x 2
+    assert np.abs(wide - averaged).max() <= 1
+    same = sample(clip[0], MediaSpec(profile="frames", fps=2, size=(160, 120))).frames
+    assert np.array_equal(same, sample(clip[0], MediaSpec(profile="frames", fps=2)).frames)
+
+
+def test_a_broken_clip_is_named(tmp_path: Path, store: MediaStore, clip: tuple[Path, str]) -> None:
+    path, digest = clip
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DamagedClip, match=r"control\.mp4: .*materialize videos again"):
+        sample(path, VIDEO)
+    with pytest.raises(DamagedClip, match=r"control\.mp4: is not the clip that was rendered.*materialize videos again"):
+        store.prepare(path, digest, VIDEO)
+    with pytest.raises(DamagedClip, match=r"none\.mp4: cannot be read .*materialize videos again"):
+        store.prepare(tmp_path / "none.mp4", digest, VIDEO)
+    assert store.known(digest, VIDEO) is None
+
+
+# --- video ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_sent_video_has_the_picked_frames_and_looks_like_the_source(
+    clip: tuple[Path, str], store: MediaStore
+) -> None:
+    made = store.prepare(*clip, VIDEO)
+    assert made.path is not None
+    frames, times = decode(made.path)
+    assert len(frames) == made.n_frames == 25 and made.fps == 5
+    assert times == pytest.approx([i / 5 for i in range(25)], abs=1e-9)
+    assert made.times_s == pytest.approx([i / 5 for i in range(25)], abs=1e-9)
+    assert [shown(frame) for frame in frames] == list(range(0, 50, 2))
+    for source in (sample(clip[0], VIDEO).frames, np.stack(drawn(50)[::2])):
+        error = ((frames.astype(float) - source) ** 2).mean(axis=(1, 2, 3))
+        assert (10 * np.log10(255**2 / error) > 30).all()  # dB
+    assert made.sha256 == file_digest(made.path) and made.size_bytes == made.path.stat().st_size
+    assert payload(made) == [made.path.read_bytes()]
+
+
+def test_a_short_clip_is_a_short_video(tmp_path: Path, store: MediaStore) -> None:
+    made = store.prepare(*write_clip(tmp_path / "void.mp4", 11), VIDEO)
+    assert made.path is not None
+    assert made.n_frames == 6 and decode(made.path)[1] == pytest.approx([0, 0.2, 0.4, 0.6, 0.8, 1.0], abs=1e-9)
+    single = store.prepare(*write_clip(tmp_path / "one.mp4", 1), VIDEO)
+    assert (single.n_frames, single.times_s, single.fps) == (1, (0.0,), 5)
+
+
+def test_a_clip_slower_than_asked_is_not_sped_up(tmp_path: Path, store: MediaStore) -> None:
+    made = store.prepare(*write_clip(tmp_path / "slow.mp4", 4, fps=1), VIDEO)
+    assert made.path is not None
+    assert (made.n_frames, made.fps, made.times_s) == (4, 1, (0, 1, 2, 3))
+    assert decode(made.path)[1].tolist() == [0, 1, 2, 3]
+
+
+def test_a_clip_whose_frame_rate_no_video_can_have_is_named(
+    tmp_path: Path, store: MediaStore, clip: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(media, "decode", lambda _: (np.stack(drawn(4)), np.arange(4) / 2.5))
+    with pytest.raises(TrapsError, match=r"control\.mp4: has 2\.5 frames a second.*use profile images"):
+        store.prepare(*clip, VIDEO)
+    assert store.prepare(*clip, IMAGES).n_frames == 4
+
+
+# --- images and frames ------------------------------------------------------------------------------------------------
+
+
+def test_images_are_jpegs_of_the_same_frames(clip: tuple[Path, str], store: MediaStore) -> None:
+    made = store.prepare(*clip, IMAGES)
+    jpegs = payload(made)
+    assert len(jpegs) == made.n_frames == 25 and made.fps is None
+    assert made.times_s == store.prepare(*clip, VIDEO).times_s
+    assert made.sha256 == hashlib.sha256(b"".join(jpegs)).hexdigest()
+    for jpeg, frame in zip(jpegs, sample(clip[0], IMAGES).frames, strict=True):
+        seen = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        assert seen is not None
+        error = ((seen[..., ::-1].astype(float) - frame) ** 2).mean()  # OpenCV has BGR
+        assert 10 * np.log10(255**2 / error) > 30
+
+
+def test_the_container_is_a_plain_zip_of_the_same_bytes_every_time(clip: tuple[Path, str], tmp_path: Path) -> None:
+    made = [MediaStore(tmp_path / name).prepare(*clip, IMAGES) for name in ("a", "b")]
+    paths = [one.path for one in made if one.path is not None]
+    assert paths[0].read_bytes() == paths[1].read_bytes() and made[0].sha256 == made[1].sha256
+    with zipfile.ZipFile(paths[0]) as archive:
+        entries = archive.infolist()
+        assert [entry.filename for entry in entries] == [f"{i:02d}.jpg" for i in range(25)]
+        assert {(entry.date_time, entry.compress_type) for entry in entries} == {((1980, 1, 1, 0, 0, 0), 0)}
+
+
+def test_frames_have_a_digest_and_no_file(clip: tuple[Path, str], store: MediaStore) -> None:
+    made = store.prepare(*clip, QWEN)
+    assert made.path is None and made.fps is None and made.n_frames == 16 and made.size_bytes == 16 * 120 * 160 * 3
+    assert made.times_s == pytest.approx([i / 10 for i in at(50, 10, QWEN)])
+    assert [path.suffix for path in store.folder.rglob("*") if path.is_file() and path.suffix] == [".json"]
+    assert store.prepare(*clip, QWEN) == MediaStore(store.folder).prepare(*clip, QWEN) == made
+    for ask in (payload, data_uris):
+        with pytest.raises(TrapsError, match=r"media\.profile frames is not sent as bytes"):
+            ask(made)
+
+
+def test_the_digest_of_frames_covers_their_times_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, digest = write_clip(tmp_path / "clip.mp4", 4)
+    made = MediaStore(tmp_path / "a").prepare(path, digest, QWEN)
+    monkeypatch.setattr(media, "decode", lambda clip: (decode(clip)[0], decode(clip)[1] * 2))
+    assert MediaStore(tmp_path / "b").prepare(path, digest, QWEN).sha256 != made.sha256
+
+
+# --- the store --------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_prepared_is_not_encoded_again(clip: tuple[Path, str], store: MediaStore, encoded: list[Path]) -> None:
+    assert store.known(clip[1], VIDEO) is None
+    made = store.prepare(*clip, VIDEO)
+    assert made.path is not None
+    before = made.path.stat().st_mtime_ns
+    assert store.known(clip[1], VIDEO) == store.prepare(*clip, VIDEO) == made
+    later = MediaStore(store.folder)  # as another process has it
+    assert later.known(clip[1], VIDEO) == later.prepare(*clip, VIDEO) == made
+    assert len(encoded) == 1 and made.path.stat().st_mtime_ns == before
+    assert made.path.parent == store.folder / clip[1][:2]
+    assert made.path.name == f"{clip[1]}-{profile_digest(VIDEO)[:16]}.mp4"
+    assert sorted(path.suffix for path in made.path.parent.iterdir() if path.suffix) == [".json", ".mp4"]
+
+
+def test_the_clip_is_not_needed_once_it_is_prepared(clip: tuple[Path, str], store: MediaStore) -> None:
+    made = store.prepare(*clip, VIDEO)
+    clip[0].unlink()
+    assert MediaStore(store.folder).prepare(*clip, VIDEO) == made
+
+
+@pytest.mark.parametrize("spec", [VIDEO, IMAGES, QWEN])
+def test_the_same_clip_elsewhere_has_the_same_digest(clip: tuple[Path, str], tmp_path: Path, spec: MediaSpec) -> None:
+    elsewhere = tmp_path / "elsewhere" / "other-name.mp4"
+    elsewhere.parent.mkdir()
+    elsewhere.write_bytes(clip[0].read_bytes())
+    one = MediaStore(tmp_path / "a").prepare(*clip, spec)
+    other = MediaStore(tmp_path / "b").prepare(elsewhere, clip[1], spec)
+    assert one.sha256 == other.sha256 and one.times_s == other.times_s
+
+
+def test_the_digest_changes_with_frames_size_and_profile(clip: tuple[Path, str], store: MediaStore) -> None:
+    changes: list[dict[str, Any]] = [{}, {"fps": 2}, {"most": 10}, {"size": (80, 60)}]
+    specs = [
+        MediaSpec.model_validate({"profile": profile, "fps": 5} | change)
+        for profile in ("video", "images", "frames")
+        for change in changes
+    ]
+    assert len({store.prepare(*clip, spec).sha256 for spec in specs}) == len(specs)
+    assert len({profile_digest(spec) for spec in specs}) == len(specs)
+
+
+def test_the_profile_covers_the_settings_of_its_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = [profile_digest(spec) for spec in (VIDEO, IMAGES, QWEN)]
+    monkeypatch.setattr(media, "JPEG_QUALITY", 80)
+    monkeypatch.setattr(media, "ENCODER", {"crf": "30"})
+    changed = [profile_digest(spec) != old for spec, old in zip((VIDEO, IMAGES, QWEN), before, strict=True)]
+    assert changed == [True, True, False]
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def overwrite(path: Path) -> None:
+    path.write_bytes(b"\0" * path.stat().st_size)
+
+
+@pytest.mark.parametrize("damage", [truncate, flip, overwrite, Path.unlink])
+@pytest.mark.parametrize("spec", [VIDEO, IMAGES])
+def test_a_damaged_file_is_noticed_and_made_anew(
+    clip: tuple[Path, str], store: MediaStore, spec: MediaSpec, damage: Callable[[Path], None]
+) -> None:
+    made = store.prepare(*clip, spec)
+    assert made.path is not None
+    good = made.path.read_bytes()
+    damage(made.path)
+    with pytest.raises(DamagedClip, match=rf"{made.path.name}: is not what was prepared .*delete it and run again"):
+        payload(made)
+    if damage is not flip and damage is not overwrite:
+        assert MediaStore(store.folder).known(clip[1], spec) is None  # by its size alone
+    assert MediaStore(store.folder).prepare(*clip, spec) == made
+    assert made.path.read_bytes() == good
+
+
+def test_whatever_byte_of_a_container_is_altered_it_is_noticed_or_does_not_matter(
+    tmp_path: Path, store: MediaStore
+) -> None:
+    made = store.prepare(*write_clip(tmp_path / "clip.mp4", 3), IMAGES)
+    assert made.path is not None
+    jpegs, good = payload(made), made.path.read_bytes()
+    inside = {i for jpeg in jpegs for i in range(good.index(jpeg) + 3, good.index(jpeg) + len(jpeg))}
+    for i in sorted(set(range(len(good))) - inside):  # headers, names, directory
+        for bit in range(8):
+            made.path.write_bytes(good[:i] + bytes([good[i] ^ 1 << bit]) + good[i + 1 :])
+            try:
+                assert payload(made) == jpegs
+            except DamagedClip as error:
+                assert made.path.name in str(error)
+
+
+@pytest.mark.parametrize("note", ["", "{", "[]", "3", "{}", '{"sha256": "x", "times_s": 1}', '{"times_s": [0.0]}'])
+def test_a_damaged_note_vouches_for_nothing(clip: tuple[Path, str], store: MediaStore, note: str) -> None:
+    made = store.prepare(*clip, VIDEO)
+    assert made.path is not None
+    made.path.with_suffix(".json").write_text(note)
+    later = MediaStore(store.folder)
+    assert later.known(clip[1], VIDEO) is None
+    assert later.prepare(*clip, VIDEO) == made == MediaStore(store.folder).known(clip[1], VIDEO)
+
+
+def test_a_file_without_a_note_is_prepared_again(
+    clip: tuple[Path, str], store: MediaStore, encoded: list[Path]
+) -> None:
+    made = store.prepare(*clip, VIDEO)
+    assert made.path is not None
+    made.path.with_suffix(".json").unlink()
+    assert MediaStore(store.folder).prepare(*clip, VIDEO) == made
+    assert len(encoded) == 2
+
+
+def test_a_full_disk_is_named_and_leaves_no_part(
+    clip: tuple[Path, str], store: MediaStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    for spec in (VIDEO, IMAGES, QWEN):
+        with monkeypatch.context() as disk:
+            disk.setattr(Path, "replace", full)
+            with pytest.raises(TrapsError, match=r"cannot be written .*No space left.*free some space"):
+                store.prepare(*clip, spec)
+        assert [path.name for path in store.folder.rglob("*") if path.is_file()] == [".lock"]
+
+
+def test_many_threads_prepare_a_clip_once(clip: tuple[Path, str], store: MediaStore, encoded: list[Path]) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        made = set(pool.map(lambda _: store.prepare(*clip, VIDEO), range(16)))
+    assert len(made) == len(encoded) == 1
+
+
+PREPARE = """
+import sys
+from pathlib import Path
+from traps_pipeline.models import media
+encode, count = media.encode, [0]
+def counting(*arguments):
+    count[0] += 1
+    encode(*arguments)
+media.encode = counting
+print("ready", flush=True)
+clip, digest, folder = sys.argv[1:]
+made = media.MediaStore(Path(folder)).prepare(Path(clip), digest, media.MediaSpec(profile="video", fps=5))
+print(count[0], made.sha256)
+"""
+
+
+def test_two_processes_at_once_make_one_good_file(clip: tuple[Path, str], store: MediaStore) -> None:
+    command = [sys.executable, "-c", PREPARE, str(clip[0]), clip[1], str(store.folder)]
+    with media._alone(store.folder / clip[1][:2]):  # so that both find nothing there, and wait for their turn
+        processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+        for process in processes:
+            assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    said = [process.communicate(timeout=60)[0].split() for process in processes]
+    made = store.known(clip[1], VIDEO)
+    assert made is not None and sorted(count for count, _ in said) == ["0", "1"]
+    assert {sha256 for _, sha256 in said} == {made.sha256} and len(payload(made)) == 1
+
+
+# --- as text ----------------------------------------------------------------------------------------------------------
+
+
+def test_data_uris_hold_what_is_sent(clip: tuple[Path, str], store: MediaStore) -> None:
+    for spec, start in ((VIDEO, "data:video/mp4;base64,"), (IMAGES, "data:image/jpeg;base64,")):
+        made = store.prepare(*clip, spec)
+        uris = data_uris(made)
+        assert all(uri.startswith(start) for uri in uris)
+        assert [base64.b64decode(uri.removeprefix(start)) for uri in uris] == payload(made)
+        assert data_uris(made) is uris
+
+
+def raw(folder: Path, size_bytes: int) -> Media:
+    """Media of so many bytes that nothing looks into."""
+    path = folder / f"{size_bytes}.mp4"
+    path.write_bytes(bytes(size_bytes))
+    return Media("video", path, file_digest(path), 1, (0.0,), 5, size_bytes)
+
+
+def test_the_cache_is_bounded_by_bytes_and_forgets_what_was_not_asked_for_longest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[int] = []
+    monkeypatch.setattr(media, "payload", lambda one: read.append(one.size_bytes) or payload(one))
+    # 22 characters before 4 for each 3 bytes: 422, 426, 430
+    a, b, c = (raw(tmp_path, size) for size in (300, 303, 306))
+    cache = UriCache(900)
+    for one in (a, b, a, c, a, b):  # c pushes out b, asked for before a
+        cache.get(one)
+    assert read == [300, 303, 306, 303] and cache.held_bytes == 422 + 426 <= cache.most_bytes
+    assert len(cache.get(raw(tmp_path, 3000))[0]) == 4022  # larger than the cache: given, not kept
+    assert cache.held_bytes == 0
+
+
+def test_many_connections_encode_once(
+    clip: tuple[Path, str], store: MediaStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[Media] = []
+    monkeypatch.setattr(media, "payload", lambda one: read.append(one) or payload(one))
+    made, cache = store.prepare(*clip, IMAGES), UriCache(2**20)
+    read.clear()
+    with ThreadPoolExecutor(8) as pool:
+        uris = list(pool.map(lambda _: cache.get(made), range(50)))
+    assert len(read) == 1 and all(one is uris[0] for one in uris)
+
+
+def test_a_container_of_compressed_entries_is_not_ours(tmp_path: Path, store: MediaStore) -> None:
+    made = store.prepare(*write_clip(tmp_path / "clip.mp4", 3), IMAGES)
+    assert made.path is not None
+    other = io.BytesIO()
+    with zipfile.ZipFile(other, "w", zipfile.ZIP_DEFLATED) as archive:
+        for i, jpeg in enumerate(payload(made)):
+            archive.writestr(f"{i:02d}.jpg", jpeg)
+    made.path.write_bytes(other.getvalue())
+    with pytest.raises(DamagedClip, match="an entry is compressed"):
+        payload(made)

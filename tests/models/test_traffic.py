@@ -1,0 +1,118 @@
+"""Pace and stops: connections that follow 429s, an account's calls a minute, when a participant is given up."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+import pytest
+
+from traps_pipeline.models.request import Outcome
+from traps_pipeline.models.traffic import Breaker, Gate, Meter, Stopped
+
+ANSWER, ERROR = Outcome("answer", "left"), Outcome("error", error="timeout")
+
+
+def test_a_429_halves_the_connections_once_a_second_and_answers_win_them_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    gate = Gate(24)
+    gate.slow_down()
+    gate.slow_down()  # of the same burst
+    assert gate.limit == 12
+    now[0] = 1.0
+    gate.slow_down()
+    assert gate.limit == 6
+    for _ in range(6 + 7):
+        gate.answered()
+    assert gate.limit == 8
+    for _ in range(1000):
+        gate.answered()
+    assert gate.limit == 24
+    for second in range(2, 12):
+        now[0] = second
+        gate.slow_down()
+    assert gate.limit == 1
+
+
+def test_no_more_calls_are_open_than_there_are_connections() -> None:
+    async def run() -> int:
+        gate, most = Gate(3), 0
+
+        async def call() -> None:
+            nonlocal most
+            async with gate.connection():
+                most = max(most, gate.open)
+                await asyncio.sleep(0.001)
+                gate.answered()
+
+        await asyncio.gather(*(call() for _ in range(50)))
+        assert gate.open == 0
+        return most
+
+    assert asyncio.run(run()) == 3
+
+
+def test_a_cancelled_wait_frees_its_place_in_the_queue() -> None:
+    async def run() -> None:
+        gate = Gate(1)
+        async with gate.connection():
+            connections = [gate.connection() for _ in range(2)]
+            waiting = [asyncio.create_task(connection.__aenter__()) for connection in connections]
+            await asyncio.sleep(0)
+            waiting[0].cancel()
+        await asyncio.wait_for(waiting[1], 1)
+        assert gate.open == 1
+
+    asyncio.run(run())
+
+
+def test_an_account_sends_no_more_calls_a_minute_than_it_may() -> None:
+    async def run() -> float:
+        meter = Meter(600, None)  # ten a second, a burst of 20
+        began = time.monotonic()
+        await asyncio.gather(*(meter.admit(1000) for _ in range(25)))
+        return time.monotonic() - began
+
+    assert 0.45 <= asyncio.run(run()) < 2.0  # 20 at once, 5 more at ten a second
+
+
+def test_tokens_a_minute_hold_back_large_calls() -> None:
+    async def run() -> float:
+        meter = Meter(None, 60_000)  # a thousand a second, a burst of 2,000
+        began = time.monotonic()
+        for _ in range(5):
+            await meter.admit(500)
+        return time.monotonic() - began
+
+    assert 0.45 <= asyncio.run(run()) < 2.0  # 2,000 at once, 500 more at 1,000 a second
+
+
+def test_twenty_refusals_of_one_kind_in_a_row_stop_a_model_and_nineteen_do_not() -> None:
+    breaker, refusal = Breaker("m"), Outcome("refused", error="content_policy")
+    for _ in range(19):
+        breaker.watch(refusal)
+    breaker.watch(ANSWER)
+    for _ in range(19):
+        breaker.watch(refusal)
+    breaker.watch(Outcome("refused", finish_reason="content_filter"))  # another kind
+    for _ in range(19):
+        breaker.watch(refusal)
+    with pytest.raises(Stopped, match=r"m is stopped: 20 refusals in a row \(content_policy\).*only what is missing"):
+        breaker.watch(refusal)
+
+
+def test_a_call_that_the_provider_refuses_as_it_is_counts_as_a_refusal() -> None:
+    breaker = Breaker("m")
+    with pytest.raises(Stopped, match=r"20 refusals in a row \(http_401\)"):
+        for _ in range(20):
+            breaker.watch(Outcome("error", error="http_401"))
+
+
+def test_more_than_ten_errors_in_a_hundred_calls_stop_a_model() -> None:
+    breaker = Breaker("m")
+    for n in range(100):
+        breaker.watch(ERROR if n % 10 == 0 else ANSWER)  # ten: at the limit
+    with pytest.raises(Stopped, match=r"11 of its last 100 calls failed \(last: timeout\)"):
+        for n in range(1, 12):
+            breaker.watch(ERROR if n % 2 else ANSWER)

@@ -1,0 +1,735 @@
+"""An LLM provider that misbehaves on demand: OpenAI chat, OpenAI responses and Gemini over real HTTP.
+
+Tests of asking run against it, so that client library, sockets, time-outs and retries are the real ones. It is a
+process of its own (`python -m tests.providers.server`), so that it shares neither event loop nor CPU time with the
+code under test. What it answers and how it fails follow from the request alone: a test can be run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import base64
+import binascii
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+import urllib.request
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from aiohttp import web
+
+Api = Literal["chat", "responses", "gemini"]
+Json = dict[str, Any]
+Turn = tuple[str, list[Json]]  # role and parts
+
+ROOT = Path(__file__).resolve().parents[2]
+REASONING_TOKENS = 16
+_MEDIA_TOKENS = 258  # what Gemini counts for a frame
+_LONG = 256  # strings from here on are looked at for base64: shorter ones are no clip
+_MEDIA_KEYS = ("data", "file_data")  # hold base64 however short it is
+_PARENT_LOOK_S = 0.5
+
+
+# --- what goes wrong --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An error status, as both families of APIs word it."""
+
+    status: int
+    kind: str  # OpenAI's `type`
+    code: str | None  # OpenAI's `code`
+    gemini_status: str
+    message: str
+
+
+_RATE_LIMITED = Failure(429, "requests", "rate_limit_exceeded", "RESOURCE_EXHAUSTED", "Rate limit reached.")
+FAILURES: dict[str, Failure] = {
+    "rate_limited": _RATE_LIMITED,
+    "rate_limited_bare": _RATE_LIMITED,
+    "server_error": Failure(500, "server_error", None, "INTERNAL", "The server had an error."),
+    "overloaded": Failure(503, "server_error", "overloaded", "UNAVAILABLE", "The model is overloaded."),
+    "timeout_status": Failure(408, "timeout", None, "DEADLINE_EXCEEDED", "The request timed out."),
+    "conflict": Failure(409, "conflict", None, "ABORTED", "The request conflicts with another one."),
+    "bad_request": Failure(400, "invalid_request_error", "invalid_value", "INVALID_ARGUMENT", "Invalid value."),
+    "unauthorized": Failure(401, "invalid_request_error", "invalid_api_key", "UNAUTHENTICATED", "Incorrect API key."),
+    "forbidden": Failure(403, "invalid_request_error", "forbidden", "PERMISSION_DENIED", "No access to this model."),
+    "not_found": Failure(404, "invalid_request_error", "model_not_found", "NOT_FOUND", "The model does not exist."),
+    "content_filter_error": Failure(
+        400,
+        "invalid_request_error",
+        "content_policy_violation",
+        "INVALID_ARGUMENT",
+        "Your request was rejected by our safety system (content_policy_violation).",
+    ),
+}
+ENDINGS = ("empty", "length", "thinking_exhausted", "content_filter", "refusal", "invalid_json")  # 200, but no answer
+DISTURBANCES = ("hang", "cut", "slow", "wrong_content_type")
+FAULTS = (*FAILURES, *ENDINGS, *DISTURBANCES)
+_LASTING = {"bad_request", "unauthorized", "forbidden", "not_found", "content_filter_error"}
+TRANSIENT = frozenset(FAULTS) - frozenset(ENDINGS) - _LASTING  # what `only_first_attempts` ends
+
+
+@dataclass(frozen=True)
+class Config:
+    """How the provider behaves. `faults` gives shares of attempts; the rest of them is answered.
+
+    fault_by_model always applies (null: that model never fails). only_first_attempts: transient faults of `faults`
+    spare a body that was seen that often. Latency delays 200s only, error statuses come at once; `slow_s` replaces it.
+    hang_s: when even the server gives up. served_suffix goes behind the model's name, as real ones answer with a date.
+    """
+
+    latency_s: float = 0.0
+    seed: int = 0
+    faults: Mapping[str, float] = field(default_factory=dict)
+    fault_by_model: Mapping[str, str | None] = field(default_factory=dict)
+    only_first_attempts: int | None = None
+    retry_after_s: float = 0.05
+    slow_s: float = 10.0
+    hang_s: float = 300.0
+    served_suffix: str = ""
+
+    def __post_init__(self) -> None:
+        unknown = ({*self.faults} | {*self.fault_by_model.values()}) - {*FAULTS, None}
+        if unknown:
+            raise ValueError(f"no such fault: {', '.join(sorted(map(str, unknown)))}")
+        if any(share < 0 for share in self.faults.values()) or sum(self.faults.values()) > 1 + 1e-9:
+            raise ValueError(f"shares of faults must lie in [0, 1] and add up to at most 1: {dict(self.faults)}")
+
+    def changed(self, changes: Mapping[str, Any]) -> Config:
+        """A copy. Raises ValueError naming what is unknown."""
+        unknown = {*changes} - {each.name for each in fields(self)}
+        if unknown:
+            raise ValueError(f"no such setting: {', '.join(sorted(unknown))}")
+        return replace(self, **changes)
+
+    def fault(self, model: str, body: bytes, seen: int) -> str | None:
+        """What happens to the attempt number `seen` (from 0) of the body with this digest."""
+        if model in self.fault_by_model:
+            return self.fault_by_model[model]
+        drawn = self._drawn(body, seen) if self.faults else None
+        spared = self.only_first_attempts is not None and seen >= self.only_first_attempts and drawn in TRANSIENT
+        return None if spared else drawn
+
+    def _drawn(self, body: bytes, seen: int) -> str | None:
+        number = hashlib.sha256(b"%d:%b:%d" % (self.seed, body, seen)).digest()[:8]
+        left = int.from_bytes(number, "big") / 2**64
+        for name, share in self.faults.items():
+            left -= share
+            if left < 0:
+                return name
+        return None
+
+
+# --- what is asked ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Question:
+    """What of a request decides its answer. Holds no media, so that a waiting request costs no memory."""
+
+    api: Api
+    model: str
+    system: str
+    text: str  # the last text part of the user
+    structured: bool
+    shows_reasoning: bool
+    prompt_tokens: int
+
+
+def api_of(path: str) -> tuple[Api, str] | None:
+    """The API of a path, behind any prefix, and the model where the path names it."""
+    if path.endswith("/chat/completions"):
+        return "chat", ""
+    if path.endswith("/responses"):
+        return "responses", ""
+    found = re.search(r"/models/([^/]+):generateContent$", path)
+    return ("gemini", found[1]) if found else None
+
+
+def read_question(api: Api, model: str, body: Json) -> Question:
+    """Read a body. Raises KeyError, TypeError or AttributeError where it is not of that API, or asks for a stream."""
+    turns = _TURNS[api](body)
+    model = model or body["model"]
+    if not isinstance(model, str) or body.get("stream"):
+        raise TypeError
+    texts = [(role, part["text"]) for role, parts in turns for part in parts if "text" in part]
+    media = sum(len(parts) for _, parts in turns) - len(texts)
+    asked = [text for role, text in texts if role == "user"]
+    return Question(
+        api=api,
+        model=model,
+        system="\n".join(text for role, text in texts if role in ("system", "developer")),
+        text=asked[-1] if asked else "",
+        structured=_is_structured(api, body),
+        shows_reasoning=_shows_reasoning(api, body),
+        prompt_tokens=sum(len(text) for _, text in texts) // 4 + 1 + media * _MEDIA_TOKENS,
+    )
+
+
+def _parts(content: Any) -> list[Json]:
+    """OpenAI's content: a text, parts or nothing."""
+    return [{"text": content}] if isinstance(content, str) else content or []
+
+
+def _messages(messages: Sequence[Json]) -> list[Turn]:
+    return [(message.get("role", ""), _parts(message.get("content"))) for message in messages]
+
+
+def _responses_turns(body: Json) -> list[Turn]:
+    given = body["input"]
+    turns = [("user", _parts(given))] if isinstance(given, str) else _messages(given)
+    return [("system", _parts(body.get("instructions"))), *turns]
+
+
+def _gemini_turns(body: Json) -> list[Turn]:
+    system = _either(body, "systemInstruction") or {}
+    turns = [(content.get("role", "user"), content["parts"]) for content in body["contents"]]
+    return [("system", system.get("parts", [])), *turns]
+
+
+_TURNS: dict[Api, Callable[[Json], list[Turn]]] = {
+    "chat": lambda body: _messages(body["messages"]),
+    "responses": _responses_turns,
+    "gemini": _gemini_turns,
+}
+
+
+def _either(value: Json, name: str) -> Any:
+    """A field of Gemini's JSON, which comes in camel case or in snake case."""
+    return value.get(name, value.get(re.sub(r"[A-Z]", lambda found: "_" + found[0].lower(), name)))
+
+
+def _generation(body: Json) -> Json:
+    return _either(body, "generationConfig") or {}
+
+
+def _is_structured(api: Api, body: Json) -> bool:
+    if api == "gemini":
+        return _either(_generation(body), "responseMimeType") == "application/json"
+    asked = body.get("response_format") if api == "chat" else (body.get("text") or {}).get("format")
+    return bool(asked) and asked["type"] in ("json_object", "json_schema")
+
+
+def _shows_reasoning(api: Api, body: Json) -> bool:
+    """As the real ones: responses and Gemini show it when asked to, what serves `reasoning_content` always does."""
+    if api == "chat":
+        return True
+    if api == "responses":
+        return bool((body.get("reasoning") or {}).get("summary"))
+    return bool(_either(_either(_generation(body), "thinkingConfig") or {}, "includeThoughts"))
+
+
+# --- what is answered -------------------------------------------------------------------------------------------------
+
+ANSWERS = ("left", "right", "red", "blue", "3", "12.5", "I don't know")
+_NUMBER = r"-?\d+(?:\.\d+)?"
+_ABSTAINS = re.compile(r"don't know|cannot|can't|undetermin|insufficient|unanswerable|neither", re.IGNORECASE)
+
+
+def answer_to(question: str) -> str:
+    """The final answer to a question, so that a test can say what it expects."""
+    return ANSWERS[hashlib.sha256(question.encode()).digest()[0] % len(ANSWERS)]
+
+
+def text_for(question: Question) -> str:
+    """The text of a good answer: a judge's JSON, the benchmark's JSON or a sentence."""
+    if '{"abstained"' in question.system:
+        return json.dumps(_abstention(question.text))
+    if '{"correct"' in question.system:
+        return json.dumps(_correctness(question.text))
+    answer = answer_to(question.text)
+    if question.structured:
+        return json.dumps({"reason": f"It looks like {answer}.", "final_answer": answer})
+    return f"The answer is: {answer}."
+
+
+def _judged(text: str) -> str:
+    """The response that a judge is shown (`judging.panel.render`), or all of the text."""
+    found = re.search(r"^(RESPONSE-\w+)\n(.*)\n\1$", text, re.DOTALL | re.MULTILINE)
+    return found[2] if found else text
+
+
+def _abstention(text: str) -> Json:
+    abstained = bool(_ABSTAINS.search(_judged(text)))
+    return {"abstained": abstained, "confidence": "high", "reasoning": "It says so."}
+
+
+def _correctness(text: str) -> Json:
+    found = re.search(r"^Ground truth: (.*)$", text, re.MULTILINE)
+    truth, response = (found[1].strip() if found else ""), _judged(text)
+    if re.fullmatch(_NUMBER, truth):
+        number = re.search(_NUMBER, response)
+        said: str | float = float(number[0]) if number else response[:40]
+        correct = said == float(truth)
+    else:
+        correct = bool(truth) and truth.lower() in response.lower()
+        said = truth if correct else response[:40]
+    return {"correct": correct, "extracted_value": said, "reasoning": "It says so."}
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a 200 ends, whatever the API. text None: there is no message at all."""
+
+    text: str | None
+    finish: Literal["stop", "length", "content_filter"] = "stop"
+    refusal: str | None = None
+
+
+def ending_of(question: Question, fault: str | None) -> Ending:
+    """What the model says, given what goes wrong."""
+    text = text_for(question)
+    endings = {
+        "empty": Ending(""),
+        "length": Ending(text[: max(1, len(text) // 2)], "length"),
+        "thinking_exhausted": Ending(None, "length"),
+        "content_filter": Ending(None, "content_filter"),
+        "refusal": Ending(None, refusal="I'm sorry, but I can't help with that."),
+        "invalid_json": Ending(f"Sure! Here is what I think: {answer_to(question.text)}"),
+    }
+    return endings.get(fault or "", Ending(text))
+
+
+def body_of(question: Question, ending: Ending, served_model: str) -> Json:
+    """The body of a 200."""
+    return _BODIES[question.api](question, ending, served_model)
+
+
+def _reasoning(question: Question) -> str:
+    return f"Looking at the clip for {answer_to(question.text)}."
+
+
+def _usage(question: Question, ending: Ending) -> tuple[int, int]:
+    """Prompt tokens, and those of the visible text."""
+    said = ending.text or ending.refusal or ""
+    return question.prompt_tokens, len(said) // 4 + bool(said)
+
+
+def _chat_body(question: Question, ending: Ending, served_model: str) -> Json:
+    prompt, visible = _usage(question, ending)
+    content = None if ending.refusal else ending.text or ""
+    message = {"role": "assistant", "content": content, "refusal": ending.refusal}
+    choice = {
+        "index": 0,
+        "message": message | {"reasoning_content": _reasoning(question)},
+        "logprobs": None,
+        "finish_reason": ending.finish,
+    }
+    return {
+        "id": "chatcmpl-test",
+        "object": "chat.completion",
+        "created": int(time.time()),
+        "model": served_model,
+        "choices": [choice],
+        "usage": {
+            "prompt_tokens": prompt,
+            "completion_tokens": visible + REASONING_TOKENS,
+            "total_tokens": prompt + visible + REASONING_TOKENS,
+            "prompt_tokens_details": {"cached_tokens": 0},
+            "completion_tokens_details": {"reasoning_tokens": REASONING_TOKENS},
+        },
+    }
+
+
+def _responses_output(question: Question, ending: Ending) -> list[Json]:
+    summary = [{"type": "summary_text", "text": _reasoning(question)}] if question.shows_reasoning else []
+    thought = {"id": "rs_test", "type": "reasoning", "summary": summary}
+    if ending.refusal:
+        part: Json = {"type": "refusal", "refusal": ending.refusal}
+    elif ending.text is not None:
+        part = {"type": "output_text", "text": ending.text, "annotations": [], "logprobs": []}
+    else:
+        return [thought]
+    status = "completed" if ending.finish == "stop" else "incomplete"
+    return [thought, {"id": "msg_test", "type": "message", "status": status, "role": "assistant", "content": [part]}]
+
+
+def _responses_body(question: Question, ending: Ending, served_model: str) -> Json:
+    prompt, visible = _usage(question, ending)
+    reasons = {"length": "max_output_tokens", "content_filter": "content_filter"}
+    reason = reasons.get(ending.finish)
+    return {
+        "id": "resp_test",
+        "object": "response",
+        "created_at": int(time.time()),
+        "status": "incomplete" if reason else "completed",
+        "error": None,
+        "incomplete_details": {"reason": reason} if reason else None,
+        "instructions": None,
+        "metadata": {},
+        "model": served_model,
+        "output": _responses_output(question, ending),
+        "parallel_tool_calls": True,
+        "temperature": 1.0,
+        "tool_choice": "auto",
+        "tools": [],
+        "top_p": 1.0,
+        "usage": {
+            "input_tokens": prompt,
+            "input_tokens_details": {"cached_tokens": 0},
+            "output_tokens": visible + REASONING_TOKENS,
+            "output_tokens_details": {"reasoning_tokens": REASONING_TOKENS},
+            "total_tokens": prompt + visible + REASONING_TOKENS,
+        },
+    }
+
+
+def _gemini_candidate(question: Question, ending: Ending) -> Json:
+    finish = {"stop": "STOP", "length": "MAX_TOKENS", "content_filter": "SAFETY"}[ending.finish]
+    if ending.finish == "content_filter":
+        rating = {"category": "HARM_CATEGORY_DANGEROUS_CONTENT", "probability": "HIGH", "blocked": True}
+        return {"finishReason": finish, "index": 0, "safetyRatings": [rating]}
+    thoughts = [{"text": _reasoning(question), "thought": True}] if question.shows_reasoning else []
+    parts = thoughts + ([{"text": ending.text}] if ending.text is not None else [])
+    content = {"parts": parts, "role": "model"} if parts else {"role": "model"}
+    return {"content": content, "finishReason": finish, "index": 0}
+
+
+def _gemini_body(question: Question, ending: Ending, served_model: str) -> Json:
+    """Gemini has no refusal of its own: it blocks the prompt, and there is no candidate."""
+    prompt, visible = _usage(question, ending)
+    usage = {"promptTokenCount": prompt, "candidatesTokenCount": visible, "thoughtsTokenCount": REASONING_TOKENS}
+    said: Json = {"candidates": [_gemini_candidate(question, ending)]}
+    if ending.refusal:
+        said = {"promptFeedback": {"blockReason": "PROHIBITED_CONTENT"}}
+        usage = {"promptTokenCount": prompt}
+    usage["totalTokenCount"] = sum(usage.values())
+    return {**said, "usageMetadata": usage, "modelVersion": served_model, "responseId": "test"}
+
+
+_BODIES: dict[Api, Callable[[Question, Ending, str], Json]] = {
+    "chat": _chat_body,
+    "responses": _responses_body,
+    "gemini": _gemini_body,
+}
+
+
+def error_body(api: Api, failure: Failure) -> Json:
+    """The body of an error status."""
+    if api == "gemini":
+        return {"error": {"code": failure.status, "message": failure.message, "status": failure.gemini_status}}
+    error = {"message": failure.message, "type": failure.kind, "param": None, "code": failure.code}
+    return {"error": error}
+
+
+# --- what is kept -----------------------------------------------------------------------------------------------------
+
+_SECRET_NAME = re.compile(r"authorization|api-?_?key|token|secret|^key$", re.IGNORECASE)
+
+
+def fingerprint(secret: str) -> str:
+    """What stands for a key in a record: a test can tell which key came without any being kept."""
+    return "sha256:" + hashlib.sha256(secret.encode()).hexdigest()[:16]
+
+
+def redacted(pairs: Mapping[str, str]) -> dict[str, str]:
+    """Headers or a query with every key reduced to its fingerprint; names in lower case."""
+    return {name.lower(): _without_key(value) if _SECRET_NAME.search(name) else value for name, value in pairs.items()}
+
+
+def _without_key(value: str) -> str:
+    scheme, space, key = value.rpartition(" ")
+    return f"{scheme}{space}{fingerprint(key)}"
+
+
+def without_media(value: Any, key: str = "") -> Any:
+    """A body in which digest and size of the decoded bytes stand for base64."""
+    if isinstance(value, dict):
+        return {name: without_media(each, name) for name, each in value.items()}
+    if isinstance(value, list):
+        return [without_media(each) for each in value]
+    if not isinstance(value, str):
+        return value
+    return _media(value, key) or value
+
+
+def _media(text: str, key: str) -> Json | None:
+    is_uri = text.startswith("data:")
+    if not is_uri and len(text) < _LONG and key not in _MEDIA_KEYS:
+        return None
+    head, _, coded = text.partition(",") if is_uri else ("", "", text)
+    try:
+        content = base64.b64decode(coded, validate=True)
+    except (binascii.Error, ValueError):
+        return None
+    kept: Json = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    return kept | ({"mime": head.removeprefix("data:").removesuffix(";base64")} if is_uri else {})
+
+
+@dataclass
+class Tallies:
+    """What was seen since the start or the last reset. Counts only, unless records are kept."""
+
+    requests: int = 0
+    max_in_flight: int = 0
+    by_status: Counter[str] = field(default_factory=Counter)
+    by_fault: Counter[str] = field(default_factory=Counter)
+    answered_by_fault: Counter[str] = field(default_factory=Counter)
+    attempts: Counter[bytes] = field(default_factory=Counter)  # by digest of path and body
+    records: list[Json] = field(default_factory=list)
+
+    def seen(self, body: bytes) -> int:
+        """How often this very body came before."""
+        before = self.attempts[body]
+        self.attempts[body] = before + 1
+        return before
+
+    def report(self) -> Json:
+        """The answer of `/_stats`."""
+        return {
+            "requests": self.requests,
+            "distinct_bodies": len(self.attempts),
+            "answered_in_full": self.answered_by_fault.total(),
+            "by_status": dict(self.by_status),
+            "by_fault": dict(self.by_fault),
+            "answered_by_fault": dict(self.answered_by_fault),
+            "max_in_flight": self.max_in_flight,
+        }
+
+
+# --- the server -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What is sent for a request, and how."""
+
+    status: int
+    content: bytes
+    content_type: str = "application/json"
+    headers: Mapping[str, str] = field(default_factory=dict)
+    delay_s: float = 0.0
+    cut: bool = False
+
+
+def json_reply(value: Any, status: int = 200, **how: Any) -> Reply:
+    """A reply of JSON."""
+    return Reply(status, json.dumps(value).encode(), **how)
+
+
+_PAGE = b"<!doctype html><title>Bad gateway</title><h1>It works, but it is not an API.</h1>"
+_MALFORMED = Failure(400, "invalid_request_error", None, "INVALID_ARGUMENT", "Not a request of this API, or a stream.")
+_UNKNOWN_PATH = Failure(404, "invalid_request_error", "unknown_url", "NOT_FOUND", "Unknown request URL.")
+
+
+def reply_to(question: Question, fault: str | None, config: Config) -> Reply:
+    """What one attempt gets."""
+    if fault in FAILURES:
+        failure = FAILURES[fault]
+        headers = {"Retry-After": f"{config.retry_after_s:g}"} if fault == "rate_limited" else {}
+        return json_reply(error_body(question.api, failure), failure.status, headers=headers)
+    if fault == "wrong_content_type":
+        return Reply(200, _PAGE, "text/html", delay_s=config.latency_s)
+    body = body_of(question, ending_of(question, fault), question.model + config.served_suffix)
+    waits = {"slow": config.slow_s, "hang": config.hang_s}
+    return json_reply(body, delay_s=waits.get(fault or "", config.latency_s), cut=fault in ("cut", "hang"))
+
+
+class Server:
+    """Answers requests, counts them and, unless told otherwise, keeps a record of each."""
+
+    def __init__(self, config: Config, keeps_records: bool = True) -> None:
+        self._config, self._keeps_records = config, keeps_records
+        self._tallies, self._in_flight = Tallies(), 0
+
+    async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        """Any request: a control path, or one to be answered as a provider."""
+        if request.path.startswith("/_"):
+            return await _sent(request, await self._control(request))
+        tallies = self._tallies  # a reset meanwhile starts others
+        self._in_flight += 1
+        tallies.requests += 1
+        tallies.max_in_flight = max(tallies.max_in_flight, self._in_flight)
+        try:
+            return await self._provide(request, tallies)
+        finally:
+            self._in_flight -= 1
+
+    async def _provide(self, request: web.BaseRequest, tallies: Tallies) -> web.StreamResponse:
+        record: Json = {"fault": None, "status": None, "answered_in_full": False}
+        reply = await self._decide(request, tallies, record)
+        await asyncio.sleep(reply.delay_s)
+        tallies.by_status[str(reply.status)] += 1
+        record["status"] = reply.status
+        response = await _sent(request, reply)
+        whole = not reply.cut and request.transport is not None and not request.transport.is_closing()
+        record["answered_in_full"] = whole and reply.status == 200 and reply.content_type == "application/json"
+        if record["answered_in_full"]:
+            tallies.answered_by_fault[record["fault"] or "none"] += 1
+        return response
+
+    async def _decide(self, request: web.BaseRequest, tallies: Tallies, record: Json) -> Reply:
+        """Read a request and choose its reply; the body, which may be large, is not kept while the reply waits."""
+        content = await request.content.read()
+        if self._keeps_records:
+            tallies.records.append(record)
+            record |= {"method": request.method, "path": request.path}
+            record |= {"query": redacted(request.query), "headers": redacted(request.headers), "body": None}
+        known = api_of(request.path) if request.method == "POST" else None
+        if known is None:
+            return json_reply(error_body("chat", _UNKNOWN_PATH), 404)
+        try:
+            body = json.loads(content)
+            question = read_question(*known, body)
+        except (ValueError, KeyError, TypeError, AttributeError):
+            return json_reply(error_body(known[0], _MALFORMED), 400)
+        if self._keeps_records:
+            record["body"] = without_media(body)
+        digest = hashlib.sha256(request.path.encode() + b"\n" + content).digest()[:8]
+        record["fault"] = fault = self._config.fault(question.model, digest, tallies.seen(digest))
+        tallies.by_fault[fault or "none"] += 1
+        return reply_to(question, fault, self._config)
+
+    async def _control(self, request: web.BaseRequest) -> Reply:
+        match request.method, request.path:
+            case "GET", "/_requests":
+                limit = int(request.query.get("limit", 0))
+                return json_reply(self._tallies.records[-limit:])
+            case "GET", "/_stats":
+                return json_reply(self._tallies.report() | {"in_flight": self._in_flight})
+            case "POST", "/_reset":
+                self._tallies = Tallies(max_in_flight=self._in_flight)
+                return json_reply({})
+            case "POST", "/_config":
+                return self._configure(await request.content.read())
+        return json_reply({"error": f"no {request.method} {request.path}"}, 404)
+
+    def _configure(self, content: bytes) -> Reply:
+        try:
+            self._config = self._config.changed(json.loads(content))
+        except (ValueError, TypeError) as error:
+            return json_reply({"error": str(error)}, 400)
+        return json_reply(asdict(self._config))
+
+
+async def _sent(request: web.BaseRequest, reply: Reply) -> web.StreamResponse:
+    """Send a reply to its last byte, or half of it and close."""
+    headers = {"Content-Type": reply.content_type, "Content-Length": str(len(reply.content)), **reply.headers}
+    if not reply.cut:
+        response: web.StreamResponse = web.Response(status=reply.status, headers=headers, body=reply.content)
+        await response.prepare(request)
+        await response.write_eof()
+        return response
+    response = web.StreamResponse(status=reply.status, headers=headers)
+    await response.prepare(request)
+    await response.write(reply.content[: len(reply.content) // 2])
+    if request.transport:
+        request.transport.close()
+    return response
+
+
+async def _end_with(parent: int) -> None:
+    """Return when the parent is gone: a killed test run leaves no server behind."""
+    while os.getppid() == parent:
+        await asyncio.sleep(_PARENT_LOOK_S)
+
+
+async def _serve(server: Server, port: int, parent: int) -> None:
+    handler = web.Server(server.handle, handler_cancellation=True, access_log=None)  # a closed client ends its wait
+    runner = web.ServerRunner(handler, shutdown_timeout=0.1)
+    await runner.setup()
+    site = web.TCPSite(runner, "127.0.0.1", port, backlog=4096)
+    await site.start()
+    print(f"listening on http://127.0.0.1:{runner.addresses[0][1]}", flush=True)
+    await _end_with(parent)
+    os._exit(0)  # nobody is left to be answered
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--port", type=int, default=0, help="0: any free one")
+    parser.add_argument("--config", type=json.loads, default={}, help="JSON, see Config")
+    parser.add_argument("--no-bodies", action="store_true", help="keep counts only, for load")
+    parser.add_argument("--parent", type=int, default=os.getppid(), help="the process whose end ends this one")
+    arguments = parser.parse_args()
+    server = Server(Config().changed(arguments.config), not arguments.no_bodies)
+    with suppress(KeyboardInterrupt):
+        asyncio.run(_serve(server, arguments.port, arguments.parent))
+
+
+# --- for tests --------------------------------------------------------------------------------------------------------
+
+_OPENER = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+
+
+@dataclass(frozen=True)
+class Provider:
+    """A running server, from a test's side. Use it as a context manager, or call `stop`."""
+
+    url: str
+    process: subprocess.Popen[str]
+
+    @classmethod
+    def start(cls, config: Mapping[str, Any] | None = None, keeps_records: bool = True, port: int = 0) -> Self:
+        """Start a server. Returns when it listens."""
+        command = [sys.executable, "-m", "tests.providers.server", "--port", str(port), "--parent", str(os.getpid())]
+        command += ["--config", json.dumps(dict(config or {}))] + ([] if keeps_records else ["--no-bodies"])
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, start_new_session=True)
+        assert process.stdout
+        line = process.stdout.readline()
+        if not line.startswith("listening on "):
+            process.kill()
+            raise RuntimeError(f"the provider did not start (exit code {process.wait()}): {line}")
+        return cls(line.split()[-1], process)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def configure(self, **config: Any) -> Json:
+        """Change some settings; the others stay. Returns all of them."""
+        return self._call("POST", "/_config", config)
+
+    def stats(self) -> Json:
+        """Counts since the start or the last reset."""
+        return self._call("GET", "/_stats")
+
+    def requests(self, limit: int = 0) -> list[Json]:
+        """Records of requests, newest last; with a limit, the newest ones."""
+        return self._call("GET", f"/_requests?limit={limit}")
+
+    def reset(self) -> None:
+        """Forget all requests; the settings stay."""
+        self._call("POST", "/_reset", {})
+
+    def afresh(self, **config: Any) -> Self:
+        """As if just started with this config: what a test of a shared server begins with."""
+        self.reset()
+        self.configure(**asdict(Config()) | config)
+        return self
+
+    def stop(self) -> None:
+        """End the process."""
+        self.process.terminate()
+        try:
+            self.process.wait(10)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        if self.process.stdout:
+            self.process.stdout.close()
+
+    def _call(self, method: str, path: str, body: Json | None = None) -> Any:
+        content = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.url + path, content, method=method)
+        with _OPENER.open(request, timeout=60) as response:
+            return json.load(response)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""Models over the network, through litellm: one attempt a call, exactly the declared parameters, typed outcomes.
+
+Retries, pace and money are not here (`ask`). litellm is imported when first asked: it takes seconds and would fetch a
+price list from the network.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+from traps_pipeline import progress
+from traps_pipeline.models.media import Media, data_uris
+from traps_pipeline.models.registry import Account, Entry, load_accounts
+from traps_pipeline.models.request import RATE_LIMITED, Outcome, Request, TransientError
+
+UNREADABLE = 422  # what litellm makes of a page that is no JSON; no provider here sends it
+TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
+
+
+@cache
+def load_litellm() -> Any:
+    """The library, told to send and to fetch nothing of its own."""
+    os.environ["LITELLM_LOCAL_MODEL_COST_MAP"] = "True"
+    os.environ["LITELLM_LOCAL_ANTHROPIC_BETA_HEADERS"] = "True"
+    litellm: Any = import_module("litellm")
+    _close_tool_gateway()
+    logging.getLogger("LiteLLM").setLevel(logging.ERROR)  # it warns at every call of Gemini 3 that has a temperature
+    litellm.telemetry = False
+    litellm.suppress_debug_info = True
+    litellm.drop_params = False  # a parameter that a provider refuses is an error, never left out in silence
+    return litellm
+
+
+def _close_tool_gateway() -> None:
+    """Put a closed gate where litellm's Responses API looks for a gateway to tools. It does so at calls without tools
+    too, as ours are, and the real one needs a dozen packages more (`litellm[mcp]`)."""
+
+    class Closed:
+        @staticmethod
+        def should_use_litellm_mcp_gateway(tools: Any) -> bool:
+            return False
+
+    name = "litellm.responses.mcp.litellm_proxy_mcp_handler"
+    gateway: Any = ModuleType(name)
+    gateway.LiteLLM_Proxy_MCP_Handler = Closed
+    sys.modules[name] = gateway
+
+
+def media_parts(media: Media, route: str) -> list[dict[str, Any]]:
+    """The message parts that carry a clip. Gemini drops a `video_url` without a word, and samples a video without
+    metadata at 1 FPS: it gets a file part that says its rate."""
+    uris = data_uris(media)
+    if media.profile == "images":
+        return [{"type": "image_url", "image_url": {"url": uri}} for uri in uris]
+    if route in ("gemini", "vertex_ai"):
+        file = {"file_data": uris[0], "format": "video/mp4", "video_metadata": {"fps": media.fps}}
+        return [{"type": "file", "file": file}]
+    return [{"type": "video_url", "video_url": {"url": uris[0]}, "fps": media.fps}]
+
+
+def messages(entry: Entry, request: Request) -> list[dict[str, Any]]:
+    """System prompt, then the clip and the question, nothing else (`benchmark.md` section 3)."""
+    user: str | list[dict[str, Any]] = request.user
+    if request.sent is not None:
+        route = str(entry.provider_id).split("/")[0]
+        user = [*media_parts(request.sent, route), {"type": "text", "text": request.user}]
+    return [{"role": "system", "content": request.system}, {"role": "user", "content": user}]
+
+
+class ApiBackend:
+    """Asks one entry of the registry through litellm."""
+
+    def __init__(self, entry: Entry, account: Account | None = None) -> None:
+        account = account or load_accounts()[str(entry.account)]
+        self._entry, self._secret = entry, account.secret()
+        self._fixed: dict[str, Any] = {
+            "model": entry.provider_id,
+            "api_key": self._secret or "none",  # a client without a key would look for one in the environment
+            "timeout": entry.limits.timeout_s,
+            "num_retries": 0,
+            "max_retries": 0,
+            **({"api_base": account.base_url} if account.base_url else {}),
+        }
+        self._told: set[str] = set()
+
+    async def ask(self, request: Request) -> Outcome:
+        """One attempt; see `Backend`."""
+        litellm = load_litellm()
+        try:
+            response = await litellm.acompletion(
+                messages=messages(self._entry, request), **request.params, **self._fixed
+            )
+        except Exception as error:  # noqa: BLE001 - litellm raises its own, the SDKs' and httpx's errors
+            return self._failure(error, litellm)
+        return read_response(response, self._entry)
+
+    def _failure(self, error: Exception, litellm: Any) -> Outcome:
+        """A failure as TransientError or as an outcome. Its text goes to a person, never into the ledger."""
+        if isinstance(error, litellm.ContentPolicyViolationError):
+            return Outcome("refused", error="content_policy", cost_usd=0.0)
+        kind = failure_kind(error, litellm)
+        self._tell(kind, error)
+        if kind.startswith("http_4"):
+            return Outcome("error", error=kind)
+        raise TransientError(kind, retry_after_s(error)) from None
+
+    def _tell(self, kind: str, error: Exception) -> None:
+        """Say once for each kind what the provider said, without the key."""
+        if kind in self._told:
+            return
+        self._told.add(kind)
+        text = " ".join(str(error).split())[:300]
+        progress.current().note(
+            f"{self._entry.id}: {kind}: {text.replace(self._secret, '***') if self._secret else text}"
+        )
+
+
+def failure_kind(error: Exception, litellm: Any) -> str:
+    """What went wrong in a word: http_<status> is final, anything else is worth another try."""
+    if isinstance(error, litellm.Timeout):
+        return "timeout"
+    if isinstance(error, litellm.APIConnectionError):
+        return "connection"
+    status = getattr(error, "status_code", None)
+    if not isinstance(status, int) or status < 400 or status == UNREADABLE:
+        return "bad_response"
+    if status in TRANSIENT_STATUSES:
+        return TRANSIENT_STATUSES[status]
+    return f"http_{status}" if 400 <= status < 500 else "server_error"
+
+
+def retry_after_s(error: Exception) -> float | None:
+    """Seconds that the provider asks to wait; None if it does not say so in seconds."""
+    headers: Mapping[str, str] = getattr(error, "litellm_response_headers", None) or {}
+    try:
+        return max(0.0, float(headers.get("retry-after", "")))
+    except ValueError:
+        return None
+
+
+def read_response(response: Any, entry: Entry) -> Outcome:
+    """The outcome in a response: what is seen, what was thought, what it took."""
+    choice = response.choices[0]
+    message, finish = choice.message, choice.finish_reason
+    text = (message.content or "").strip()
+    usage = getattr(response, "usage", None)
+    prompt, completion = (getattr(usage, f"{kind}_tokens", None) for kind in ("prompt", "completion"))
+    details = getattr(usage, "completion_tokens_details", None)
+    fields: Mapping[str, Any] = getattr(message, "provider_specific_fields", None) or {}
+    return Outcome(
+        _kind(text, finish, fields.get("refusal") or getattr(message, "refusal", None)),
+        text=text or None,
+        reasoning=getattr(message, "reasoning_content", None) or None,
+        finish_reason=finish,
+        served_model=getattr(response, "model", None),
+        prompt_tokens=prompt,
+        completion_tokens=completion,
+        reasoning_tokens=getattr(details, "reasoning_tokens", None),
+        cost_usd=_cost(entry, prompt, completion),
+    )
+
+
+def _cost(entry: Entry, prompt_tokens: int | None, completion_tokens: int | None) -> float | None:
+    """Dollars; None where the price or what was used is unknown."""
+    if entry.prices is None or prompt_tokens is None or completion_tokens is None:
+        return None
+    return entry.prices.cost(prompt_tokens, completion_tokens)
+
+
+def _kind(text: str, finish: str | None, refusal: str | None) -> Any:
+    if refusal or finish in ("content_filter", "refusal"):
+        return "refused"
+    if not text:
+        return "empty"
+    return "truncated" if finish == "length" else "answer"

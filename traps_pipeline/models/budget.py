@@ -1,0 +1,125 @@
+"""A cap that holds: the worst case of a call is reserved before it is sent and settled when its cost is known.
+
+What was spent is the sum of the costs in the ledger, so it survives restarts without a second book.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry
+from traps_pipeline.models.request import Request
+from traps_pipeline.storage.workspace import Study, Workspace
+
+OVERHEAD_TOKENS = 200  # roles, separators, JSON around the text
+BYTES_A_TOKEN = 2  # no tokenizer makes more of text than a token for two bytes, but for rare scripts
+
+
+class BudgetReached(TrapsError):
+    """No room is left for another call."""
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """Tokens of a call at most."""
+
+    prompt: int
+    completion: int
+
+
+def most_tokens(entry: Entry, request: Request) -> Tokens:
+    """An upper bound of what a call takes."""
+    frames = request.sent.n_frames if request.sent else 0
+    each = entry.tokens_per_frame if isinstance(entry, ModelEntry) else 0
+    text = -(-len((request.system + request.user).encode()) // BYTES_A_TOKEN)
+    return Tokens(frames * each + text + OVERHEAD_TOKENS, entry.max_tokens)
+
+
+def worst_case_usd(entry: Entry, request: Request) -> float:
+    """Dollars that a call may cost at most; 0 where the price is unknown (a study must allow that)."""
+    if entry.prices is None:
+        return 0.0
+    tokens = most_tokens(entry, request)
+    return entry.prices.cost(tokens.prompt, tokens.completion)
+
+
+def check_money(study: Study, entry: Entry) -> None:
+    """Raises TrapsError unless the study allows what asking this participant may cost."""
+    if entry.backend != NETWORK:
+        return
+    if entry.prices is None:
+        if not study.allow_unknown_prices:
+            raise TrapsError(
+                f"the price of {entry.id} is unknown: give it prices in the registry, or accept that nothing bounds it "
+                "(--allow-unknown-prices, or allow_unknown_prices: true in study.yaml)"
+            )
+    elif (entry.prices.input or entry.prices.output) and study.budget_usd <= 0:
+        raise TrapsError(
+            f"{entry.id} costs money and the study has no budget: set one (--budget-usd, or budget_usd in study.yaml); "
+            "`traps plan` says how much is needed"
+        )
+
+
+class Budget:
+    """What may still be spent, in all and by each participant that has a cap of its own."""
+
+    def __init__(self, cap_usd: float, caps_usd: Mapping[str, float], spent_usd: Mapping[str, float]) -> None:
+        self._caps = {None: cap_usd, **caps_usd}
+        self._spent = defaultdict(float, spent_usd) | {None: sum(spent_usd.values())}
+        self._reserved: defaultdict[str | None, float] = defaultdict(float)
+        self._changed = asyncio.Condition()
+
+    @property
+    def spent_usd(self) -> float:
+        """Dollars settled, those of earlier runs included."""
+        return self._spent[None]
+
+    def _room(self, slot: str | None) -> float:
+        return self._caps[slot] - self._spent[slot] - self._reserved[slot]
+
+    def _slots(self, participant: str) -> tuple[str | None, ...]:
+        return (None, participant) if participant in self._caps else (None,)
+
+    async def reserve(self, participant: str, worst_usd: float) -> None:
+        """Reserve a call's worst case; while calls in flight hold the room, wait for what they really cost.
+
+        Raises BudgetReached when there is no room and nothing in flight that could make some.
+        """
+        if worst_usd <= 0:
+            return
+        async with self._changed:
+            while full := [slot for slot in self._slots(participant) if self._room(slot) < worst_usd - 1e-9]:
+                if hopeless := [slot for slot in full if self._reserved[slot] <= 1e-9]:
+                    raise BudgetReached(self._explain(hopeless[0], worst_usd))
+                await self._changed.wait()
+            for slot in (None, participant):
+                self._reserved[slot] += worst_usd
+
+    async def settle(self, participant: str, worst_usd: float, cost_usd: float | None) -> None:
+        """Put a call's cost in the place of its worst case; an unknown cost counts as the worst."""
+        cost = worst_usd if cost_usd is None else cost_usd
+        async with self._changed:
+            for slot in (None, participant):
+                self._reserved[slot] = max(0.0, self._reserved[slot] - worst_usd)
+                self._spent[slot] = self._spent[slot] + cost
+            self._changed.notify_all()
+
+    def _explain(self, slot: str | None, worst_usd: float) -> str:
+        whose = "the study" if slot is None else slot
+        return (
+            f"the budget of {whose} is reached: ${self._spent[slot]:.2f} of ${self._caps[slot]:.2f} spent, the next "
+            f"call may cost ${worst_usd:.4f}. Raise it (--budget-usd, or study.yaml) and run the same command to go on"
+        )
+
+
+def open_budget(workspace: Workspace) -> Budget:
+    """The study's budget, less what its ledgers say was spent."""
+    study, spent = workspace.study, defaultdict(float)
+    for ledger in (workspace.answers, workspace.votes):
+        for participant, dollars in ledger.spent().items():
+            spent[participant] += dollars
+    return Budget(study.budget_usd, study.model_budgets_usd, spent)

@@ -1,0 +1,179 @@
+"""Answers from elsewhere: a cluster, or a provider's batch mode, does the asking.
+
+`export_requests` writes what is missing as JSON lines with its media by digest; `import_answers` takes answers back
+under the same keys, after the same checks. What is written is data: nothing in it is run or believed unchecked.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from traps_pipeline import progress
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.experiment import Experiment
+from traps_pipeline.models.answers import prepare_media, wanted_requests
+from traps_pipeline.models.ask import ledger_row
+from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.models.request import JUDGED, Outcome, OutcomeKind, Request
+from traps_pipeline.partitions import Evaluation
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.yamlfile import explain, read_lines
+
+REQUESTS, MEDIA = "requests.jsonl", "media"
+SHOWN = 5  # bad lines named in an error
+
+
+class Answer(BaseModel):
+    """One line of a file of answers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    key: str
+    outcome: OutcomeKind = "answer"
+    text: str | None = None
+    reasoning: str | None = None
+    finish_reason: str | None = None
+    served_model: str | None = None
+    prompt_tokens: int | None = Field(default=None, ge=0)
+    completion_tokens: int | None = Field(default=None, ge=0)
+    reasoning_tokens: int | None = Field(default=None, ge=0)
+    latency_s: float = Field(default=0.0, ge=0.0)
+
+    @model_validator(mode="after")
+    def _text_goes_with_outcome(self) -> Answer:
+        if self.outcome == "error":
+            raise ValueError("outcome: an error is no answer; leave the line out, the item stays missing")
+        if (self.outcome in JUDGED) != bool((self.text or "").strip()):
+            raise ValueError(f"text: outcome {self.outcome!r} {'needs one' if self.outcome in JUDGED else 'has none'}")
+        return self
+
+    def as_outcome(self, entry: ModelEntry) -> Outcome:
+        """What came of the request, priced by the registry."""
+        fields = self.model_dump(exclude={"key", "outcome", "latency_s"})
+        cost = None
+        if entry.prices and self.prompt_tokens is not None and self.completion_tokens is not None:
+            cost = entry.prices.cost(self.prompt_tokens, self.completion_tokens)
+        return Outcome(self.outcome, **fields, cost_usd=cost)
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What became of a file's lines: new answers, and answers that the ledger held already."""
+
+    new: int
+    known: int
+
+
+def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> int:
+    """Write the experiment's missing requests to `out`: requests.jsonl, and media/<sha256>.<suffix>; how many.
+
+    A line holds key, model, provider_id, params, system, user, about (item, model, regime, run) and media: profile,
+    file, sha256, n_frames, times_s (s), fps. A local model's media is the clip itself: decode the frames at times_s.
+    Raises TrapsError when items are missing or `out` holds an export already.
+    """
+    if (out / REQUESTS).exists():
+        raise TrapsError(f"{out / REQUESTS} is there already; give another folder, or delete it")
+    (out / MEDIA).mkdir(parents=True, exist_ok=True)
+    prepare_media(workspace, experiment.cells())
+    part, count = out / f".{REQUESTS}.part", 0
+    with part.open("w", encoding="utf-8") as stream:
+        for request in _missing(workspace, experiment):
+            stream.write(json.dumps(_line(request, out), ensure_ascii=False) + "\n")
+            count += 1
+    part.replace(out / REQUESTS)
+    return count
+
+
+def _missing(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
+    known: dict[Evaluation, set[str]] = {}
+    for cell in experiment.cells():
+        evaluation = cell.evaluation
+        if evaluation not in known:
+            rows = workspace.answers.read(evaluation.key).rows
+            known[evaluation] = {key for key, row in rows.items() if row["outcome"] != "error"}
+        wanted = wanted_requests(workspace, cell)
+        yield from (request for request in wanted if request.key not in known[evaluation])
+
+
+def _line(request: Request, out: Path) -> dict[str, Any]:
+    media: dict[str, Any] | None = None
+    if request.sent is not None and request.media is not None:
+        source = request.sent.path or request.media
+        file = out / MEDIA / f"{request.sent.sha256}{source.suffix}"
+        if not file.exists():
+            shutil.copyfile(source, file)
+        sent = request.sent
+        media = {"profile": sent.profile, "file": f"{MEDIA}/{file.name}", "sha256": sent.sha256}
+        media |= {"n_frames": sent.n_frames, "times_s": list(sent.times_s), "fps": sent.fps}
+    return {
+        "key": request.key,
+        "model": request.participant,
+        "provider_id": request.endpoint,
+        "params": dict(request.params),
+        "system": request.system,
+        "user": request.user,
+        "about": dict(request.about),
+        "media": media,
+    }
+
+
+def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> Imported:
+    """Take answers (JSON lines, see `Answer`) into the ledger; `traps run` then makes tables of them.
+
+    All lines are checked before any is written. Raises TrapsError naming lines that are not answers, whose key the
+    experiment does not want (another question, clip, parameter or run), or that give one key two different answers.
+    """
+    prepare_media(workspace, experiment.cells())
+    wanted = {request.key: request for cell in experiment.cells() for request in wanted_requests(workspace, cell)}
+    answers = _checked(path, wanted)
+    by_evaluation: defaultdict[Evaluation, list[Answer]] = defaultdict(list)
+    for key, answer in answers.items():
+        about = wanted[key].about
+        by_evaluation[Evaluation(str(about["model"]), str(about["regime"]), int(about["run"]))].append(answer)
+    new = sum(asyncio.run(_append(workspace, evaluation, mine, wanted)) for evaluation, mine in by_evaluation.items())
+    return Imported(new, len(answers) - new)
+
+
+def _checked(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answer]:
+    answers: dict[str, Answer] = {}
+    wrong: list[str] = []
+    for number, line in read_lines(path):
+        try:
+            answer = Answer.model_validate(json.loads(line))
+        except ValidationError as error:
+            wrong.append(f"{path}:{number}: {explain(error)}")
+            continue
+        except ValueError as error:
+            wrong.append(f"{path}:{number}: not JSON ({error})")
+            continue
+        if answer.key not in wanted:
+            wrong.append(f"{path}:{number}: key {answer.key[:16]} is not wanted: question, clip or setting changed")
+        elif answers.setdefault(answer.key, answer) != answer:
+            wrong.append(f"{path}:{number}: another answer to the key of an earlier line")
+    if wrong:
+        more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+        raise TrapsError("\n".join(wrong[:SHOWN]) + more + "\nnothing was imported")
+    return answers
+
+
+async def _append(
+    workspace: Workspace, evaluation: Evaluation, answers: list[Answer], wanted: Mapping[str, Request]
+) -> int:
+    """Append what one evaluation's ledger does not hold; how many."""
+    ledger, entry = workspace.answers, get_model(evaluation.model)
+    async with ledger.lock(evaluation.key, progress.current().note):
+        rows = ledger.read(evaluation.key).rows
+        new = [a for a in answers if a.key not in rows or rows[a.key]["outcome"] == "error"]
+        with ledger.writer(evaluation.key) as writer:
+            for answer in new:
+                outcome = answer.as_outcome(entry)
+                writer.append(*ledger_row(wanted[answer.key], outcome, 1, answer.latency_s, workspace.study.epoch))
+    return len(new)

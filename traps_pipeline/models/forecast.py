@@ -1,0 +1,83 @@
+"""What new calls will take: tokens, dollars and minutes of each participant that is asked over the network.
+
+Experience comes first: means over what the ledger holds of a participant. Without any, the registry's estimates stand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from traps_pipeline.models.budget import BYTES_A_TOKEN, OVERHEAD_TOKENS
+from traps_pipeline.models.registry import Entry, ModelEntry, load_accounts
+
+TYPICAL_TEXT_BYTES = 1500  # system prompt, question and, for a judge, the answer
+TYPICAL_LATENCY_S = 10.0
+TYPICAL_BYTES_A_TOKEN = 4
+LOW_SHARE = 0.4  # of the expected completion: what a terse model takes
+
+
+@dataclass(frozen=True)
+class Experience:
+    """Means over answered calls: tokens of prompt and completion, seconds. None where nothing is known."""
+
+    prompt_tokens: float | None = None
+    completion_tokens: float | None = None
+    latency_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What calls take. Tokens are expected ones; dollars are low, expected, high, or None: unknown, never 0."""
+
+    participant: str
+    calls: int
+    prompt_tokens: int
+    completion_tokens: int
+    dollars: tuple[float, float, float] | None
+    minutes: float
+
+
+def experience(rows: Iterable[Mapping[str, Any]]) -> Experience:
+    """What ledger rows of one participant tell."""
+    answered = [row for row in rows if row["outcome"] != "error"]
+
+    def mean(column: str) -> float | None:
+        known = [row[column] for row in answered if row.get(column) is not None]
+        return sum(known) / len(known) if known else None
+
+    return Experience(mean("prompt_tokens"), mean("completion_tokens"), mean("latency_s"))
+
+
+def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
+    """What so many new calls to an entry take. The high end is each call's worst case, which a budget reserves."""
+    media = _media_tokens(entry)
+    prompt = seen.prompt_tokens or media + TYPICAL_TEXT_BYTES / TYPICAL_BYTES_A_TOKEN
+    completion = seen.completion_tokens or entry.expected_completion_tokens
+    most_prompt = max(prompt, media + TYPICAL_TEXT_BYTES / BYTES_A_TOKEN + OVERHEAD_TOKENS)
+    dollars = None
+    if entry.prices is not None:
+        cost = entry.prices.cost
+        low, expected = cost(prompt, LOW_SHARE * completion), cost(prompt, completion)
+        dollars = (calls * low, calls * expected, calls * max(expected, cost(most_prompt, entry.max_tokens)))
+    return Forecast(
+        entry.id, calls, round(calls * prompt), round(calls * completion), dollars, _minutes(entry, calls, seen, prompt)
+    )
+
+
+def _media_tokens(entry: Entry) -> int:
+    if not isinstance(entry, ModelEntry) or entry.media is None:
+        return 0
+    return entry.tokens_per_frame * (entry.media.uniform or entry.media.most)
+
+
+def _minutes(entry: Entry, calls: int, seen: Experience, prompt_tokens: float) -> float:
+    """Minutes at the entry's concurrency and its account's pace, whichever is slower."""
+    minutes = [calls * (seen.latency_s or TYPICAL_LATENCY_S) / entry.limits.concurrency / 60]
+    account = load_accounts()[str(entry.account)]
+    if account.requests_per_minute:
+        minutes.append(calls / account.requests_per_minute)
+    if account.tokens_per_minute:
+        minutes.append(calls * (prompt_tokens + entry.max_tokens) / account.tokens_per_minute)
+    return max(minutes)

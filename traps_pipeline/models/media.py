@@ -1,0 +1,384 @@
+"""What a model is shown of a clip: frames picked by time stamp, and the video or images that carry them.
+
+The same decoded frames go to every backend. They are encoded once per clip and profile and shared over regimes and
+runs; the digest of what is sent goes into the ledger key.
+"""
+
+from __future__ import annotations
+
+import base64
+import fcntl
+import hashlib
+import io
+import json
+import os
+import struct
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from threading import Lock
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from traps_pipeline.digests import digest, file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.scenes.encode import ENCODER, DamagedClip, decode, encode
+
+Profile = Literal["video", "images", "frames"]
+MOST = 25  # frames an API model sees, `benchmark.md` section 3
+JPEG_QUALITY = 92
+CACHE_BYTES = 256 * 2**20
+_REVISION = 1  # raise it when picking, resizing or the container changes: everything is then prepared anew
+_SUFFIX: dict[Profile, str] = {"video": ".mp4", "images": ".zip"}
+_MIME: dict[Profile, str] = {"video": "video/mp4", "images": "image/jpeg"}
+# What zipfile raises on an archive with altered bytes.
+_NO_ZIP = (zipfile.BadZipFile, ValueError, RuntimeError, EOFError, OverflowError, struct.error)
+
+
+class MediaSpec(BaseModel):
+    """How a model is shown a clip: `media` of an entry of `assets/models.yaml`.
+
+    profile: an mp4, separate JPEGs, or raw frames for a local model. Frames are a grid of fps a second, at most `most`,
+    or `uniform` evenly spaced ones. size: (width, height) in pixels to resize to.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    profile: Profile
+    fps: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    most: int = Field(default=MOST, ge=1)
+    uniform: int | None = Field(default=None, ge=1)
+    size: tuple[int, int] | None = None
+
+    @model_validator(mode="after")
+    def _one_frame_policy(self) -> MediaSpec:
+        if (self.fps is None) == (self.uniform is None):
+            raise ValueError(f"give fps or uniform, {'one of them' if self.fps is None else 'not both'}")
+        if self.uniform is not None and self.most != MOST:
+            raise ValueError("most goes with fps; uniform says itself how many frames there are")
+        if self.size is not None and min(self.size) < 1:
+            raise ValueError(f"size is {self.size}; it is a width and a height in pixels")
+        if self.profile == "video":
+            self._check_video()
+        return self
+
+    def _check_video(self) -> None:
+        if self.fps is None or self.fps != int(self.fps):
+            raise ValueError("profile video needs fps, a whole number: the frames a second at which it plays")
+        if self.size is not None and (self.size[0] % 2 or self.size[1] % 2):
+            raise ValueError(f"size is {self.size}; H.264 needs an even width and height")
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frames picked from a clip. frames: (N, H, W, 3) uint8 RGB. times_s: (N,) float64, seconds into the clip.
+
+    clip_fps: frames a second of the whole clip; None if it has one frame.
+    """
+
+    frames: np.ndarray
+    times_s: np.ndarray
+    clip_fps: float | None
+
+
+@dataclass(frozen=True)
+class Media:
+    """What is sent of a clip. path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` gives.
+
+    sha256: of what is sent (the mp4; the JPEGs one after another; pixels and times), the same wherever the clip lies.
+    times_s: seconds into the clip. fps: at which the sent video plays; None but for profile video. size_bytes: of the
+    file; for frames of the pixels.
+    """
+
+    profile: Profile
+    path: Path | None
+    sha256: str
+    n_frames: int
+    times_s: tuple[float, ...]
+    fps: float | None
+    size_bytes: int
+
+
+# --- frames -----------------------------------------------------------------------------------------------------------
+
+
+def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
+    """Indices of the frames nearest to the wanted times, none twice; of two that are equally near the earlier one.
+
+    times: (F,) seconds, ascending. A grid starts at 0 and ends with the last frame; uniform includes first and last.
+    """
+    if spec.uniform is not None and len(times) <= spec.uniform:
+        return np.arange(len(times))
+    away = np.abs(times[:, None] - _wanted(times, spec)).round(9)  # s; rounded, or noise would decide between equals
+    return np.unique(away.argmin(axis=0))[: spec.uniform or spec.most]
+
+
+def _wanted(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
+    if spec.fps is None:
+        return np.linspace(times[0], times[-1], spec.uniform or 1)
+    return np.arange(int(times[-1] * spec.fps + 1e-6) + 1) / spec.fps
+
+
+def sample(clip: Path, spec: MediaSpec) -> Frames:
+    """The frames of a clip that a model sees. Raises DamagedClip."""
+    shown, times = decode(clip)
+    chosen = pick(times, spec)
+    clip_fps = round((len(times) - 1) / float(times[-1] - times[0]), 3) if len(times) > 1 else None
+    return Frames(_resized(shown[chosen], spec.size), times[chosen], clip_fps)
+
+
+def _resized(frames: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
+    import cv2
+
+    if size is None or size == (frames.shape[2], frames.shape[1]):
+        return frames
+    # Bit-exact, since the pixels are in the ledger key: other filters may differ between CPUs.
+    return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_LINEAR_EXACT) for frame in frames])
+
+
+# --- what is sent -----------------------------------------------------------------------------------------------------
+
+
+class MediaStore:
+    """Prepared media under one folder, by clip and profile. Threads and processes may share it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._sound: dict[Path, Media] = {}  # by note: what this process has prepared, or has checked byte by byte
+
+    def prepare(self, clip: Path, clip_digest: str, spec: MediaSpec) -> Media:
+        """What is sent of a clip, made once; a damaged or missing file is made anew. Blocks: call it in a thread.
+
+        clip_digest: SHA-256 of the clip's file. Raises DamagedClip when the clip is not that or cannot be read,
+        TrapsError when nothing can be written, or when a video cannot play at the clip's own frame rate.
+        """
+        note = self._note(clip_digest, spec)
+        if note not in self._sound:
+            with _alone(note.parent):
+                media = self.known(clip_digest, spec)
+                if media is None or not _whole(media):
+                    media = _make(clip, clip_digest, spec, note)
+                self._sound[note] = media
+        return self._sound[note]
+
+    def known(self, clip_digest: str, spec: MediaSpec) -> Media | None:
+        """What is sent of a clip if it is prepared, else None: a quick look at note and size, for planning."""
+        note = self._note(clip_digest, spec)
+        if note in self._sound:
+            return self._sound[note]
+        path = _file(note, spec.profile)
+        try:
+            record = json.loads(note.read_text(encoding="utf-8"))
+            media = Media(profile=spec.profile, path=path, **record | {"times_s": tuple(record["times_s"])})
+            return media if path is None or path.stat().st_size == media.size_bytes else None
+        except (OSError, ValueError, TypeError, KeyError):
+            return None
+
+    def _note(self, clip_digest: str, spec: MediaSpec) -> Path:
+        """The small JSON that says what is prepared; written after it, so that it vouches for it."""
+        return self.folder / clip_digest[:2] / f"{clip_digest}-{profile_digest(spec)[:16]}.json"
+
+
+def profile_digest(spec: MediaSpec) -> str:
+    """Digest of all that decides the bytes of a profile, the clip aside."""
+    made: dict[str, Any] = {"revision": _REVISION, "spec": spec.model_dump(mode="json")}
+    if spec.profile == "video":
+        made["encoder"] = ENCODER
+    if spec.profile == "images":
+        made["jpeg_quality"] = JPEG_QUALITY
+    return digest(made)
+
+
+def payload(media: Media) -> list[bytes]:
+    """The bytes to send: of the mp4, or of each JPEG in order.
+
+    Raises DamagedClip when the file is not what was prepared, TrapsError for profile frames.
+    """
+    if media.path is None:
+        raise TrapsError("media.profile frames is not sent as bytes; use video or images for a model behind an API")
+    try:
+        data = media.path.read_bytes()
+        parts = _unzipped(data) if media.profile == "images" else [data]
+    except OSError as error:
+        raise _damaged(media.path, error.strerror or str(error)) from error
+    except _NO_ZIP as error:
+        raise _damaged(media.path, str(error)) from error
+    if len(data) != media.size_bytes or _sha256(parts) != media.sha256:
+        raise _damaged(media.path, f"{len(data)} of {media.size_bytes} bytes; truncated or altered")
+    return parts
+
+
+def _damaged(path: Path, why: str) -> DamagedClip:
+    return DamagedClip(f"{path}: is not what was prepared ({why}); delete it and run again: it is prepared anew")
+
+
+def _whole(media: Media) -> bool:
+    try:
+        return media.path is None or bool(payload(media))
+    except DamagedClip:
+        return False
+
+
+def _file(note: Path, profile: Profile) -> Path | None:
+    return note.with_suffix(_SUFFIX[profile]) if profile in _SUFFIX else None
+
+
+def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
+    """Pick, encode, write the file, and last the note. The digest is of the bytes that were written."""
+    _require(clip, clip_digest)
+    sampled = sample(clip, spec)
+    path, rate = _file(note, spec.profile), None
+    if path is None:
+        header = str((sampled.frames.shape, sampled.times_s.tolist())).encode()
+        sha256, size = _sha256([header, sampled.frames.tobytes()]), sampled.frames.nbytes
+    elif spec.profile == "video":
+        rate = _rate(clip, sampled, spec)
+        data = _written(path, lambda part: encode(list(sampled.frames), part, rate))
+        sha256, size = _sha256([data]), len(data)
+    else:
+        jpegs = [_jpeg(frame) for frame in sampled.frames]
+        sha256, size = _sha256(jpegs), len(_written(path, lambda part: part.write_bytes(_zipped(jpegs))))
+    times = tuple(sampled.times_s.tolist())
+    media = Media(spec.profile, path, sha256, len(times), times, rate, size)
+    record = {name: value for name, value in asdict(media).items() if name not in ("profile", "path")}
+    _written(note, lambda part: part.write_text(json.dumps(record), encoding="utf-8"))
+    return media
+
+
+def _require(clip: Path, clip_digest: str) -> None:
+    """Raises DamagedClip unless the clip is the one that the prepared file will be filed under."""
+    try:
+        found = file_digest(clip)
+    except OSError as error:
+        raise DamagedClip(f"{clip}: cannot be read ({error.strerror}); materialize videos again") from error
+    if found != clip_digest:
+        raise DamagedClip(
+            f"{clip}: is not the clip that was rendered (digest {found[:16]}, not {clip_digest[:16]}); "
+            "delete the file and materialize videos again"
+        )
+
+
+def _rate(clip: Path, sampled: Frames, spec: MediaSpec) -> int:
+    """Frames a second at which the picked frames play: fps, or those of a slower clip, which would else be sped up."""
+    rate = min(spec.fps or 1, sampled.clip_fps or np.inf)
+    if rate != int(rate):
+        raise TrapsError(
+            f"{clip}: has {rate:g} frames a second; a video can be sent at a whole number only: use profile images"
+        )
+    return int(rate)
+
+
+def _sha256(parts: Sequence[bytes]) -> str:
+    """SHA-256 of all parts, one after another."""
+    made = hashlib.sha256()
+    for part in parts:
+        made.update(part)
+    return made.hexdigest()
+
+
+def _jpeg(frame: np.ndarray) -> bytes:
+    import cv2
+
+    return cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+
+
+def _zipped(jpegs: Sequence[bytes]) -> bytes:
+    """A zip of 00.jpg, 01.jpg, ..., uncompressed; the same images give the same bytes on every day and system."""
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive:
+        for i, jpeg in enumerate(jpegs):
+            entry = zipfile.ZipInfo(f"{i:02d}.jpg", date_time=(1980, 1, 1, 0, 0, 0))
+            entry.create_system = 3
+            archive.writestr(entry, jpeg, zipfile.ZIP_STORED)
+    return made.getvalue()
+
+
+def _unzipped(data: bytes) -> list[bytes]:
+    """The entries of a zip in order. Raises one of `_NO_ZIP`."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+            raise zipfile.BadZipFile("an entry is compressed")
+        return [archive.read(entry) for entry in archive.infolist()]
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise TrapsError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space and run again"
+        ) from error
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold a folder's lock, so that of several threads and processes one prepares and the others find it done.
+
+    The system frees it when its holder dies. Raises TrapsError.
+    """
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _written(path: Path, write: Callable[[Path], object]) -> bytes:
+    """Write a file whole or not at all; returns its bytes. Raises TrapsError."""
+    part = path.with_name(f".{os.getpid()}-{path.name}")  # encode wants the ending; the lock keeps other threads out
+    try:
+        with _writing(path):
+            write(part)
+            data = part.read_bytes()
+            part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return data
+
+
+# --- as text ----------------------------------------------------------------------------------------------------------
+
+
+class UriCache:
+    """Data URIs of what was sent last, by digest, bounded by their total length in bytes.
+
+    One thread encodes at a time: of many that want the same clip one encodes, the others find it.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self.most_bytes, self.held_bytes = most_bytes, 0
+        self._lock = Lock()
+        self._kept: OrderedDict[tuple[Profile, str], tuple[str, ...]] = OrderedDict()
+
+    def get(self, media: Media) -> tuple[str, ...]:
+        """The data URIs of `payload`, in order; raises what that raises."""
+        key = (media.profile, media.sha256)
+        with self._lock:
+            found = self._kept.get(key)
+            if found is None:
+                found = self._kept[key] = tuple(_data_uri(media.profile, part) for part in payload(media))
+                self.held_bytes += sum(map(len, found))
+            self._kept.move_to_end(key)
+            while self.held_bytes > self.most_bytes:
+                self.held_bytes -= sum(map(len, self._kept.popitem(last=False)[1]))
+        return found
+
+
+def _data_uri(profile: Profile, data: bytes) -> str:
+    return f"data:{_MIME[profile]};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+_URIS = UriCache(CACHE_BYTES)
+
+
+def data_uris(media: Media) -> tuple[str, ...]:
+    """What `payload` gives as data URIs, from a cache that this process's calls share. Raises what `payload` raises."""
+    return _URIS.get(media)

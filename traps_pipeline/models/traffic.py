@@ -1,0 +1,133 @@
+"""How fast a participant may be asked: connections that shrink on a 429, calls and tokens a minute of its account, and
+when a participant that only fails is stopped. None of it decides an answer."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.request import Outcome
+
+SAME_REFUSALS = 20
+ERROR_WINDOW, ERROR_SHARE = 100, 0.10
+BURST_S = 2.0  # so many seconds' worth of calls and tokens may go out at once
+
+
+class Gate:
+    """Connections of one participant: halved on a 429 (once a second at most), one more for every round of answers."""
+
+    def __init__(self, most: int) -> None:
+        self.most, self.limit, self.open = most, most, 0
+        self._answers, self._slowed_at = 0, float("-inf")
+        self._waiting: deque[asyncio.Future[None]] = deque()
+
+    @asynccontextmanager
+    async def connection(self) -> AsyncIterator[None]:
+        """Wait for a free connection and hold it."""
+        while self.open >= self.limit:
+            free = asyncio.get_running_loop().create_future()
+            self._waiting.append(free)
+            try:
+                await free
+            finally:
+                if free in self._waiting:
+                    self._waiting.remove(free)
+        self.open += 1
+        try:
+            yield
+        finally:
+            self.open -= 1
+            self._wake()
+
+    def slow_down(self) -> None:
+        """The provider said 429."""
+        now = time.monotonic()
+        if now - self._slowed_at >= 1.0:
+            self.limit, self._slowed_at, self._answers = max(1, self.limit // 2), now, 0
+
+    def answered(self) -> None:
+        """The provider answered."""
+        self._answers += 1
+        if self.limit < self.most and self._answers >= self.limit:
+            self.limit, self._answers = self.limit + 1, 0
+            self._wake()
+
+    def _wake(self) -> None:
+        for _ in range(self.limit - self.open):
+            while self._waiting:
+                free = self._waiting.popleft()
+                if not free.done():
+                    free.set_result(None)
+                    break
+
+
+class Meter:
+    """Calls and tokens a minute of one account, whoever asks through it: two buckets that fill evenly."""
+
+    def __init__(self, requests_per_minute: int | None, tokens_per_minute: int | None) -> None:
+        self._rates = [None if rate is None else rate / 60 for rate in (requests_per_minute, tokens_per_minute)]
+        self._levels = [self._capacity(rate, 1.0) for rate in self._rates]
+        self._at = time.monotonic()
+
+    @staticmethod
+    def _capacity(rate: float | None, least: float) -> float:
+        return float("inf") if rate is None else max(rate * BURST_S, least)
+
+    async def admit(self, tokens: int) -> None:
+        """Wait until one call of so many tokens may go out. The bucket may go below zero: later calls wait longer."""
+        wait = self._take((1.0, float(tokens)))
+        if wait > 0:
+            await asyncio.sleep(wait)
+
+    def _take(self, amounts: tuple[float, float]) -> float:
+        """Take from the buckets; the seconds until they are at zero again."""
+        now, wait = time.monotonic(), 0.0
+        for k, (rate, amount) in enumerate(zip(self._rates, amounts, strict=True)):
+            if rate is None:
+                continue
+            self._levels[k] = min(self._capacity(rate, 1.0), self._levels[k] + (now - self._at) * rate) - amount
+            wait = max(wait, -self._levels[k] / rate)
+        self._at = now
+        return wait
+
+
+class Stopped(TrapsError):
+    """A participant that is asked no more; the others go on."""
+
+
+class Breaker:
+    """Watches what comes back from one participant."""
+
+    def __init__(self, participant: str) -> None:
+        self._participant = participant
+        self._refusal, self._in_a_row = "", 0
+        self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
+
+    def watch(self, outcome: Outcome) -> None:
+        """Raises Stopped after 20 refusals of the same kind in a row, or when over 10 of the last 100 calls failed."""
+        refusal = _refusal(outcome)
+        self._in_a_row = self._in_a_row + 1 if refusal and refusal == self._refusal else int(bool(refusal))
+        self._refusal = refusal
+        self._window.append(outcome.kind == "error")
+        errors = sum(self._window)
+        if self._in_a_row >= SAME_REFUSALS:
+            why = f"{self._in_a_row} refusals in a row ({refusal})"
+        elif len(self._window) == ERROR_WINDOW and errors > ERROR_SHARE * ERROR_WINDOW:
+            why = f"{errors} of its last {ERROR_WINDOW} calls failed (last: {outcome.error or 'an answer'})"
+        else:
+            return
+        raise Stopped(
+            f"{self._participant} is stopped: {why}; its answers so far are kept. Mend the cause and run the same "
+            "command again: only what is missing is asked"
+        )
+
+
+def _refusal(outcome: Outcome) -> str:
+    """The kind of a refusal by the provider (of the content, or of the call as it is); empty if it is none."""
+    if outcome.kind == "refused":
+        return outcome.error or outcome.finish_reason or "refused"
+    return (outcome.error or "") if outcome.kind == "error" and (outcome.error or "").startswith("http_4") else ""
