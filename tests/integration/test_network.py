@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -201,3 +202,56 @@ def test_five_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, prov
     keys = [row["key"] for row in settled(unasked)]
     assert len(keys) == len(set(keys)) == wanted
     assert provider.stats()["answered_in_full"] <= wanted + kills * 24
+
+
+def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Provider, tmp_path: Path) -> None:
+    register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
+    path = experiment(unasked, ["video-model", "image-model"], regimes=["standard"])
+    exported = unasked.traps("requests", "export", path, "--out", tmp_path / "batch")
+    assert exported.code == 0, exported.err
+    lines = [json.loads(line) for line in (tmp_path / "batch" / "requests.jsonl").read_text().splitlines()]
+    assert len(lines) == len({line["key"] for line in lines}) == 256
+    for line in lines:
+        file = tmp_path / "batch" / line["media"]["file"]
+        assert file.stem == line["media"]["sha256"] and file.is_file()
+        assert line["params"] == {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
+    answers = [{"key": line["key"], "text": "The answer is: left.", "prompt_tokens": 9} for line in lines]
+    answers[0] = {"key": lines[0]["key"], "outcome": "refused", "finish_reason": "content_filter"}
+    given = tmp_path / "answers.jsonl"
+
+    given.write_text("\n".join(json.dumps(answer) for answer in [*answers[:200], {"key": "0" * 64, "text": "x"}]))
+    refused = unasked.traps("answers", "import", path, given)
+    assert refused.code == 1
+    assert "answers.jsonl:201: key 0000000000000000 is not wanted" in refused.err
+    assert "nothing was imported" in refused.err
+    assert settled(unasked) == []
+
+    given.write_text("\n".join(json.dumps(answer) for answer in answers[:200]))
+    assert "200 answers imported, 0 were there already" in unasked.traps("answers", "import", path, given).out
+    given.write_text("\n".join(json.dumps(answer) for answer in answers))
+    assert "56 answers imported, 200 were there already" in unasked.traps("answers", "import", path, given).out
+    finished = unasked.traps("run", path)
+    assert finished.code == 0, finished.err
+    assert finished.counts()["answers"] == 0
+    assert provider.stats()["requests"] == 0
+    assert Counter(row["outcome"] for row in responses(unasked)) == {"answer": 255, "refused": 1}
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("not json", "not JSON"),
+        ('{"key": "k", "text": "x", "mood": 1}', "mood: Extra inputs"),
+        ('{"key": "k", "outcome": "error"}', "an error is no answer"),
+        ('{"key": "k", "outcome": "answer", "text": " "}', "outcome 'answer' needs one"),
+        ('{"key": "k", "outcome": "refused", "text": "no"}', "outcome 'refused' has none"),
+    ],
+)
+def test_a_line_that_is_no_answer_is_named(tmp_path: Path, line: str, complaint: str) -> None:
+    from traps_pipeline.errors import TrapsError
+    from traps_pipeline.models.exchange import checked_answers
+
+    given = tmp_path / "answers.jsonl"
+    given.write_text(line + "\n")
+    with pytest.raises(TrapsError, match=rf"answers\.jsonl:1: .*{complaint}"):
+        checked_answers(given, {})

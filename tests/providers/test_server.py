@@ -492,8 +492,6 @@ def through_litellm(model: str, api_base: str, monkeypatch: pytest.MonkeyPatch, 
 @pytest.mark.slow  # the import of litellm takes long on a busy machine
 @pytest.mark.parametrize("api", APIS)
 def test_litellm_reads_the_answers(provider: Provider, api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
-    if api == "responses":
-        pytest.importorskip("mcp", reason="litellm's bridge to the responses API imports mcp")
     thinking = {"chat": {}, "gemini": {"reasoning_effort": "low"}}
     model, base = {
         "chat": ("openai/x", "/v1"),

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
-from types import ModuleType
 from typing import Any
 
 from traps_pipeline import progress
@@ -30,27 +28,11 @@ def load_litellm() -> Any:
     os.environ["LITELLM_LOCAL_MODEL_COST_MAP"] = "True"
     os.environ["LITELLM_LOCAL_ANTHROPIC_BETA_HEADERS"] = "True"
     litellm: Any = import_module("litellm")
-    _close_tool_gateway()
     logging.getLogger("LiteLLM").setLevel(logging.ERROR)  # it warns at every call of Gemini 3 that has a temperature
     litellm.telemetry = False
     litellm.suppress_debug_info = True
     litellm.drop_params = False  # a parameter that a provider refuses is an error, never left out in silence
     return litellm
-
-
-def _close_tool_gateway() -> None:
-    """Put a closed gate where litellm's Responses API looks for a gateway to tools. It does so at calls without tools
-    too, as ours are, and the real one needs a dozen packages more (`litellm[mcp]`)."""
-
-    class Closed:
-        @staticmethod
-        def should_use_litellm_mcp_gateway(tools: Any) -> bool:
-            return False
-
-    name = "litellm.responses.mcp.litellm_proxy_mcp_handler"
-    gateway: Any = ModuleType(name)
-    gateway.LiteLLM_Proxy_MCP_Handler = Closed
-    sys.modules[name] = gateway
 
 
 def media_parts(media: Media, route: str) -> list[dict[str, Any]]:

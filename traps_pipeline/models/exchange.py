@@ -133,7 +133,7 @@ def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> 
     """
     prepare_media(workspace, experiment.cells())
     wanted = {request.key: request for cell in experiment.cells() for request in wanted_requests(workspace, cell)}
-    answers = _checked(path, wanted)
+    answers = checked_answers(path, wanted)
     by_evaluation: defaultdict[Evaluation, list[Answer]] = defaultdict(list)
     for key, answer in answers.items():
         about = wanted[key].about
@@ -142,7 +142,8 @@ def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> 
     return Imported(new, len(answers) - new)
 
 
-def _checked(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answer]:
+def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answer]:
+    """The answers of a file by key. Raises TrapsError naming every line (up to five) that is not one that is wanted."""
     answers: dict[str, Answer] = {}
     wrong: list[str] = []
     for number, line in read_lines(path):

@@ -31,6 +31,7 @@ JUDGE_PROTOCOL: Protocol = {
     "temperature": (("temperature",), 0.8),
     "max_tokens": (("max_tokens", "max_completion_tokens"), 512),
 }
+OTHER_WAIVERS = ("media", "reasoning", "json_schema")  # what the protocol sets besides parameters
 NETWORK = "api"  # the backend that asks over the network
 
 
@@ -154,8 +155,9 @@ class Entry(BaseModel):
                 raise ValueError(
                     f"params.{parameter} {found}, the protocol has {value!r}: send that, or say why under waivers"
                 )
-        for parameter in self.waivers.keys() - protocol.keys() - {"media"}:
-            raise ValueError(f"waivers.{parameter}: not a parameter of the protocol ({', '.join(protocol)}, media)")
+        known = (*protocol, *OTHER_WAIVERS)
+        for parameter in self.waivers.keys() - set(known):
+            raise ValueError(f"waivers.{parameter}: nothing that the protocol sets ({', '.join(known)})")
 
 
 class ModelEntry(Entry):
@@ -179,6 +181,10 @@ class ModelEntry(Entry):
             raise ValueError(f"media: backend {self.backend} {'needs it' if self.media is None else 'has none'}")
         if self.media is not None:
             self._check_media(self.media)
+        if self.backend == NETWORK and self.json_schema == ("json_schema" in self.waivers):
+            raise ValueError(
+                "json_schema: the JSON regime asks for structured output; where it is off, a waiver says why"
+            )
         return self
 
     def _check_media(self, media: MediaSpec) -> None:
