@@ -5,15 +5,24 @@ from __future__ import annotations
 import re
 import shutil
 import sys
+from collections.abc import Iterator
 
 import pytest
 
 from tests.conftest import ROOT, Checkout
+from tests.providers.server import Provider
 
 pytestmark = pytest.mark.slow
 README = (ROOT / "README.md").read_text()
 # Run by other means: CI is `make test`; the command of `make ui` is started by tests/integration/test_ui.py.
 ELSEWHERE = ("make test", "make ui")
+
+
+@pytest.fixture
+def provider() -> Iterator[Provider]:
+    """What answers on the port of the README's own model."""
+    with Provider.start() as provider:
+        yield provider
 
 
 def blocks(language: str) -> list[str]:
@@ -37,14 +46,14 @@ def in_this_study(study: Checkout, command: str) -> str:
     return f"{command} -C {ROOT} DEMO={study.workspace}" if command.startswith("make") else command
 
 
-def test_every_command_of_the_readme_runs(demo_study: Checkout) -> None:
+def test_every_command_of_the_readme_runs(demo_study: Checkout, provider: Provider) -> None:
     study = demo_study
     package = study.root / "traps_pipeline" / "scenes" / "families"
     text = (package / "hidden_race.py").read_text()
     (package / "my_race.py").write_text(text.replace('"hidden_race"', '"my_race"'))
     entry, experiment = blocks("yaml")
-    with (study.root / "assets" / "models.yaml").open("a") as stream:
-        stream.write(entry)
+    registry = study.root / "assets" / "models.yaml"
+    registry.write_text(registry.read_text().replace("http://127.0.0.1:8000", provider.url) + entry)
     (study.root / "mine.yaml").write_text(experiment)
     (correction,) = blocks("json")
     # The demo's clips serve here too: a clip's name is its content.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from tests.conftest import Checkout
+from tests.conftest import ROOT, Checkout
 from tests.providers.server import Provider
 
 pytestmark = pytest.mark.slow
@@ -48,9 +49,11 @@ def entry(name: str, profile: str, more: str = "prices: {input: 1.0, output: 10.
 
 
 def register(study: Checkout, provider: Provider, *entries: str) -> None:
-    """Replace the registry by these models at the provider."""
-    account = f"accounts:\n  here: {{key: {KEY}, base_url: {provider.url}/v1}}\nmodels:\n"
-    (study.root / "assets" / "models.yaml").write_text(account + "".join(entries))
+    """Put these models at the provider into the registry, in the place of what a test has put there before."""
+    registry = study.root / "assets" / "models.yaml"
+    shipped = (ROOT / "assets" / "models.yaml").read_text()
+    account = f"accounts:\n  here: {{key: {KEY}, base_url: {provider.url}/v1}}\n"
+    registry.write_text(shipped.replace("accounts:\n", account, 1) + "".join(entries))
 
 
 def experiment(study: Checkout, models: list[str], **more: Any) -> Path:
@@ -191,7 +194,7 @@ def test_five_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, prov
     path = experiment(unasked, ["video-model"], regimes=["standard", "guided", "json"], runs=[1, 2, 3])
     wanted, kills = 128 * 9, 5
     for kill in range(1, kills + 1):
-        process = unasked.start("python", "-m", "traps_pipeline.cli", "run", str(path), "--budget-usd", "100")
+        process = unasked.start(sys.executable, "-m", "traps_pipeline.cli", "run", str(path), "--budget-usd", "100")
         while len(unasked.ledger_rows("answers")) < kill * wanted // 8:
             assert process.poll() is None, process.communicate()
             time.sleep(0.05)
