@@ -168,7 +168,8 @@ def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checko
     assert "locked-out is stopped: 20 refusals in a row (http_401)" in finished.err
     assert len(responses(unasked)) == 2 * 128
     assert {row["model"] for row in responses(unasked)} == {"image-model"}
-    assert provider.stats()["by_status"]["401"] < 20 + 24  # those in flight then, and no more
+    # In each regime (a run of its own): 20 in a row, those in flight then, and no more.
+    assert provider.stats()["by_status"]["401"] < 2 * (20 + 24)
 
 
 def test_only_what_decides_an_answer_is_asked_again(unasked: Checkout, provider: Provider) -> None:
@@ -189,10 +190,11 @@ def test_only_what_decides_an_answer_is_asked_again(unasked: Checkout, provider:
 
 
 def test_five_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider: Provider) -> None:
-    provider.configure(latency_s=0.1)
-    register(unasked, provider, entry("video-model", "video"))
-    path = experiment(unasked, ["video-model"], regimes=["standard", "guided", "json"], runs=[1, 2, 3])
-    wanted, kills = 128 * 9, 5
+    provider.configure(latency_s=0.05)
+    models = ["video-model", "image-model"]
+    register(unasked, provider, *map(entry, models, ("video", "images")))
+    path = experiment(unasked, models, regimes=["standard", "guided", "json"], runs=[1, 2, 3])
+    wanted, kills = 2 * 128 * 9, 5
     for kill in range(1, kills + 1):
         process = unasked.start(sys.executable, "-m", "traps_pipeline.cli", "run", str(path), "--budget-usd", "100")
         while len(unasked.ledger_rows("answers")) < kill * wanted // 8:
@@ -204,7 +206,7 @@ def test_five_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, prov
     assert finished.code == 0, finished.err
     keys = [row["key"] for row in settled(unasked)]
     assert len(keys) == len(set(keys)) == wanted
-    assert provider.stats()["answered_in_full"] <= wanted + kills * 24
+    assert provider.stats()["answered_in_full"] <= wanted + kills * 2 * 24
 
 
 def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Provider, tmp_path: Path) -> None:
