@@ -1,0 +1,96 @@
+"""Sixteen models at 24 connections each, 8 s latency, 25 real frames a call: the share of the throughput that latency
+and concurrency allow, in one process.
+
+python bench/throughput.py [--answers 96]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+MODELS, CONNECTIONS, LATENCY_S = 16, 24, 8.0
+PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
+
+
+def _clip(folder: Path) -> Path:
+    """A real clip: the control of a released scenario."""
+    from bench.render import _model, _qpos
+    from traps_pipeline.benchmark.records import load_released
+    from traps_pipeline.scenes.camera import Camera
+    from traps_pipeline.scenes.encode import encode
+    from traps_pipeline.scenes.render import Renderer
+
+    spec = load_released()["plinko-0001"]
+    with Renderer(_model(spec), Camera.from_record(spec.camera)) as renderer:
+        encode(list(renderer.frames(_qpos(spec))), folder / "clip.mp4", 10)
+    return folder / "clip.mp4"
+
+
+def main() -> None:
+    from tests.providers.server import Provider
+    from traps_pipeline.digests import file_digest
+    from traps_pipeline.models.api import ApiBackend, load_litellm
+    from traps_pipeline.models.ask import Participants, Work, run_work
+    from traps_pipeline.models.budget import Budget
+    from traps_pipeline.models.media import MediaSpec, MediaStore
+    from traps_pipeline.models.registry import Account, ModelEntry
+    from traps_pipeline.models.request import Request
+    from traps_pipeline.partitions import Cell, Evaluation
+    from traps_pipeline.storage.ledger import Ledger
+    from traps_pipeline.storage.workspace import Study
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--answers", type=int, default=4 * CONNECTIONS, help="of each model")
+    arguments = parser.parse_args()
+    os.environ["BENCH_KEY"] = "k"
+    spec = MediaSpec(profile="images", fps=5, most=25)
+    with (
+        tempfile.TemporaryDirectory() as name,
+        Provider.start({"latency_s": LATENCY_S}, keeps_records=False) as provider,
+    ):
+        folder = Path(name)
+        clip = _clip(folder)
+        sent = MediaStore(folder / "media").prepare(clip, file_digest(clip), spec)
+        account = Account(key="BENCH_KEY", base_url=f"{provider.url}/v1")
+        names = [f"m{n}" for n in range(MODELS)]
+        fields: dict[str, Any] = {"backend": "api", "account": "a", "params": PARAMS, "media": spec}
+        context = {"accounts": {"a": account}}
+        entries = {
+            n: ModelEntry.model_validate(fields | {"id": n, "provider_id": f"openai/{n}"}, context=context)
+            for n in names
+        }
+
+        def requests(cell: Cell) -> list[Request]:
+            model = cell.evaluation.model
+            about = [{"item_id": str(n), "model": model} for n in range(arguments.answers)]
+            question = "In which numbered bucket does the ball come to rest?"
+            return [
+                Request(model, f"openai/{model}", PARAMS, "You watch a clip.", question, a, sent=sent) for a in about
+            ]
+
+        study = Study(allow_unknown_prices=True)
+        participants = Participants(entries, lambda entry: ApiBackend(entry, account), study, {"a": account})
+        ledger, budget = Ledger(folder, "answers"), Budget(0, {}, {})
+        work = Work("responses", ledger, participants, budget, "1", requests, lambda *_: None)
+        load_litellm()
+        began, cpu = time.perf_counter(), sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+        list(run_work(work, [Cell("occlusion", Evaluation(n, "standard", 1)) for n in names]))
+        seconds = time.perf_counter() - began
+        cpu = sum(resource.getrusage(resource.RUSAGE_SELF)[:2]) - cpu
+    answers, allowed = MODELS * arguments.answers, MODELS * CONNECTIONS / LATENCY_S
+    print(f"{answers} answers of {MODELS} models, {sent.size_bytes / 1024:.0f} KB of frames each, in {seconds:.1f} s")
+    print(f"{answers / seconds:.1f} a second of the {allowed:.1f} that latency and concurrency allow: ", end="")
+    print(f"{answers / seconds / allowed:.2f}; {1000 * cpu / answers:.1f} ms CPU each")
+
+
+if __name__ == "__main__":
+    main()
