@@ -22,6 +22,8 @@ ui: setup ## Dagster's web server and daemon on 127.0.0.1:3000
 bench: setup ## ratios against what one would otherwise use
 	$(BIN)/python bench/render.py
 	$(BIN)/python bench/ledger.py
+	$(BIN)/python bench/calls.py
+	$(BIN)/python bench/throughput.py
 
 lint: setup
 	$(BIN)/ruff check .

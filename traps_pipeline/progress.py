@@ -44,7 +44,7 @@ class Traffic:
     done: int = 0
     errors: int = 0
     dollars: float = 0.0
-    began: float = field(default_factory=time.monotonic)
+    began: float = field(default_factory=lambda: time.monotonic())
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=500))
 
     def called(self, failed: bool, latency_s: float, dollars: float) -> None:
@@ -66,6 +66,11 @@ class Traffic:
     def left_s(self) -> float:
         """Seconds until what is wanted so far is done."""
         return (self.wanted - self.done) / self.per_second if self.done else 0.0
+
+    def line(self) -> str:
+        """The same in words, for where there is no table."""
+        done, cached, errors, pace, p50, p95, dollars, left = self.cells()
+        return f"{done}, {cached} cached, {errors} errors, {pace}, p50 {p50}, p95 {p95}, {dollars}, {left}"
 
     def cells(self) -> list[str]:
         """done, cached, errors, calls a second, p50 and p95 latency, dollars, time left."""
@@ -154,7 +159,7 @@ class TerminalProgress(Progress):
         elif time.monotonic() - self._spoke >= LIVE_SECONDS:
             for (of, name), traffic in self.traffic.items():
                 if of == stage and traffic.done < traffic.wanted:
-                    self._say(f"  {stage:<12} {name}: {', '.join(traffic.cells())}")
+                    self._say(f"  {stage:<12} {name}: {traffic.line()}")
 
     def close(self) -> None:
         """Take the live table off the terminal."""

@@ -32,7 +32,7 @@ TRANSIENT = {
     "timeout_status": 0.01,
     "conflict": 0.01,
 }
-ENDINGS = {"empty": 0.005, "length": 0.005, "content_filter": 0.005, "thinking_exhausted": 0.005}
+ENDINGS = {"empty": 0.005, "length": 0.005, "content_filter": 0.005, "thinking_exhausted": 0.005, "invalid_json": 0.005}
 
 
 def entry(name: str, profile: str, more: str = "prices: {input: 1.0, output: 10.0, as_of: 2026-11-01}") -> str:
@@ -102,7 +102,8 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly(unasked: Checkou
     for row in rows:
         assert (row["text"] is not None) == (row["outcome"] in ("answer", "truncated"))
     texts = {row["text"] for row in rows if row["outcome"] == "answer"}
-    assert not [text for text in texts if not text.startswith(("The answer is: ", '{"'))]  # no failure is a text
+    said = ("The answer is: ", '{"', "Sure! Here is what I think: ")  # the last is no JSON, though the regime wants it
+    assert not [text for text in texts if not text.startswith(said)]  # no failure is a text
     assert max(row["attempts"] for row in rows) <= 6
     # Every answer that the provider sent in full is in the ledger once, and nothing else is.
     assert stats["answered_in_full"] == len(settled(unasked)) == len(rows)
@@ -166,6 +167,7 @@ def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checko
     finished = unasked.traps("run", experiment(unasked, ["image-model", "locked-out"]), "--budget-usd", "10")
     assert finished.code == 1
     assert "locked-out is stopped: 20 refusals in a row (http_401)" in finished.err
+    assert SECRET not in finished.out + finished.err
     assert len(responses(unasked)) == 2 * 128
     assert {row["model"] for row in responses(unasked)} == {"image-model"}
     # In each regime (a run of its own): 20 in a row, those in flight then, and no more.

@@ -1,0 +1,132 @@
+"""One attempt over the network, by three APIs: what each failure becomes, and what is read of an answer."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.providers.server import Provider, answer_to
+from traps_pipeline import progress
+from traps_pipeline.models.api import ApiBackend
+from traps_pipeline.models.registry import Account, Entry, Limits, Prices
+from traps_pipeline.models.request import Outcome, Request, TransientError
+
+KEY, SECRET = "TRAPS_TEST_KEY", "sk-planted-0123456789abcdef"
+ROUTES = {"openai/m": "/v1", "gemini/gemini-2.5-pro": "/v1beta", "openai/responses/m": "/v1"}
+QUESTION = "Does the ball clear the barrier?"
+
+
+@pytest.fixture(scope="module")
+def shared_provider() -> Iterator[Provider]:
+    with Provider.start() as provider:
+        yield provider
+
+
+@pytest.fixture
+def provider(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
+    monkeypatch.setenv(KEY, SECRET)
+    return shared_provider.afresh()
+
+
+def backend(provider: Provider, route: str, **params: Any) -> ApiBackend:
+    account = Account(key=KEY, base_url=provider.url + ROUTES[route])
+    fields = {
+        "id": "m",
+        "backend": "api",
+        "account": "a",
+        "provider_id": route,
+        "params": {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000} | params,
+        "limits": Limits(timeout_s=1.0),
+        "prices": Prices(input=1.0, output=10.0, as_of=datetime.date(2026, 11, 1)),
+    }
+    return ApiBackend(Entry.model_validate(fields, context={"accounts": {"a": account}}), account)
+
+
+def ask(provider: Provider, route: str, **params: Any) -> Outcome:
+    asking = backend(provider, route, **params)
+    sent = asking._entry.params  # the request of a real run holds the same
+    return asyncio.run(asking.ask(Request("m", route, sent, "You watch a clip.", QUESTION, {"item_id": "x"})))
+
+
+@pytest.mark.parametrize("route", ROUTES)
+def test_an_answer_is_read_with_what_it_took(provider: Provider, route: str) -> None:
+    thinking: dict[str, dict[str, Any]] = {
+        "openai/m": {},
+        "gemini/gemini-2.5-pro": {"thinkingConfig": {"includeThoughts": True, "thinkingBudget": -1}},
+        "openai/responses/m": {"reasoning": {"effort": "high", "summary": "auto"}},
+    }
+    outcome = ask(provider, route, **thinking[route])
+    assert (outcome.kind, outcome.text) == ("answer", f"The answer is: {answer_to(QUESTION)}.")
+    assert outcome.reasoning == f"Looking at the clip for {answer_to(QUESTION)}."
+    assert outcome.finish_reason == "stop"
+    assert outcome.served_model == route.split("/")[-1]
+    assert outcome.prompt_tokens and outcome.completion_tokens and outcome.reasoning_tokens
+    assert outcome.cost_usd == pytest.approx((outcome.prompt_tokens + 10 * outcome.completion_tokens) / 1e6)
+    (record,) = provider.requests()
+    assert SECRET not in str(record)
+
+
+@pytest.mark.parametrize("route", ROUTES)
+@pytest.mark.parametrize(
+    ("fault", "kind"),
+    [
+        ("rate_limited", "rate_limited"),
+        ("rate_limited_bare", "rate_limited"),
+        ("server_error", "server_error"),
+        ("overloaded", "server_error"),
+        ("timeout_status", "timeout"),
+        ("conflict", "conflict"),
+        ("hang", "timeout"),
+        ("cut", None),
+        ("wrong_content_type", None),
+    ],
+)
+def test_what_may_pass_is_worth_another_try(provider: Provider, route: str, fault: str, kind: str | None) -> None:
+    provider.configure(faults={fault: 1.0}, retry_after_s=7)
+    with pytest.raises(TransientError) as raised:
+        ask(provider, route)
+    assert kind in (None, raised.value.kind)
+    assert raised.value.retry_after_s == (7.0 if fault == "rate_limited" else None)
+    assert provider.stats()["requests"] == 1  # no layer below retries
+
+
+@pytest.mark.parametrize("route", ROUTES)
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [("bad_request", "http_400"), ("unauthorized", "http_401"), ("forbidden", "http_403"), ("not_found", "http_404")],
+)
+def test_what_will_not_pass_is_final_and_told_once_without_the_key(
+    provider: Provider, route: str, fault: str, error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    provider.configure(faults={fault: 1.0})
+    with progress.reporting(progress.Progress()):
+        outcome = ask(provider, route)
+    assert (outcome.kind, outcome.error, outcome.text) == ("error", error, None)
+    told = capsys.readouterr().err
+    assert f"m: {error}: " in told and SECRET not in told
+
+
+@pytest.mark.parametrize("route", ROUTES)
+@pytest.mark.parametrize(
+    ("fault", "kind"),
+    [("empty", "empty"), ("thinking_exhausted", "empty"), ("length", "truncated"), ("content_filter", "refused")],
+)
+def test_an_answer_without_its_end_has_a_kind_of_its_own(provider: Provider, route: str, fault: str, kind: str) -> None:
+    provider.configure(faults={fault: 1.0})
+    outcome = ask(provider, route)
+    assert outcome.kind == kind
+    assert (outcome.text is not None) == (kind == "truncated")
+    assert outcome.cost_usd is not None and outcome.cost_usd > 0  # it was paid for
+
+
+def test_a_refusal_in_words_is_no_answer(provider: Provider) -> None:
+    provider.configure(faults={"refusal": 1.0})
+    for route in ("openai/m", "gemini/gemini-2.5-pro"):
+        outcome = ask(provider, route)
+        assert (outcome.kind, outcome.text) == ("refused", None)
+    provider.configure(faults={"content_filter_error": 1.0})
+    assert ask(provider, "openai/m").kind == "refused"

@@ -1,0 +1,47 @@
+"""What calls take, worked out by hand."""
+
+from __future__ import annotations
+
+import datetime
+from typing import Any
+
+import pytest
+
+from traps_pipeline.models.forecast import Experience, experience, forecast
+from traps_pipeline.models.registry import ModelEntry, get_model
+
+
+def model(**changes: Any) -> ModelEntry:
+    """gemini-2.5-pro at $1 and $10 a million tokens, 100 tokens a frame."""
+    prices = {"input": 1.0, "output": 10.0, "as_of": datetime.date(2026, 11, 1)}
+    record = get_model("gemini-2.5-pro").model_dump() | {"prices": prices, "tokens_per_frame": 100} | changes
+    return ModelEntry.model_validate(record, context={"accounts": {"gemini": None}})
+
+
+def test_without_experience_the_registrys_estimates_stand() -> None:
+    seen = forecast(model(expected_completion_tokens=1000), 240, Experience())
+    # 25 frames x 100 and 1,500 bytes at 4 a token: 2,875 in; low takes 0.4 of 1,000 out, high 8,000
+    assert (seen.prompt_tokens, seen.completion_tokens) == (240 * 2875, 240 * 1000)
+    assert seen.dollars is not None
+    low, expected, high = (dollars / 240 for dollars in seen.dollars)
+    assert low == pytest.approx((2875 + 4000) / 1e6)
+    assert expected == pytest.approx((2875 + 10_000) / 1e6)
+    assert high == pytest.approx((2500 + 750 + 200 + 80_000) / 1e6)
+    assert seen.minutes == pytest.approx(240 * 10 / 24 / 60)
+
+
+def test_experience_comes_before_estimates() -> None:
+    rows = [
+        {"outcome": "answer", "prompt_tokens": 1000, "completion_tokens": 100, "latency_s": 2.0},
+        {"outcome": "empty", "prompt_tokens": 3000, "completion_tokens": 300, "latency_s": 4.0},
+        {"outcome": "answer", "prompt_tokens": None, "completion_tokens": None, "latency_s": 6.0},
+        {"outcome": "error", "prompt_tokens": None, "completion_tokens": None, "latency_s": 600.0},
+    ]
+    assert experience(rows) == Experience(2000, 200, 4.0)
+    seen = forecast(model(), 60, experience(rows))
+    assert (seen.prompt_tokens, seen.completion_tokens) == (60 * 2000, 60 * 200)
+    assert seen.minutes == pytest.approx(60 * 4 / 24 / 60)
+
+
+def test_an_unknown_price_stays_unknown() -> None:
+    assert forecast(model(prices=None), 10, Experience()).dollars is None
