@@ -220,6 +220,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
         return OVER_BUDGET if outcome.over_budget else FAILED
     _print_results(workspace)
+    print(f"next: open {workspace.reports / 'leaderboard.html'}, or traps why ITEM for what stands behind a figure")
     return OK
 
 
