@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from traps_pipeline.models.forecast import Forecast
     from traps_pipeline.storage.workspace import Workspace
 
+MONEY = ("budget_usd", "model_budgets_usd", "allow_unknown_prices")  # fields of an experiment and of a study
 OK, FAILED, BAD_USAGE, OVER_BUDGET, INTERRUPTED = 0, 1, 2, 4, 130
 
 
@@ -201,7 +202,7 @@ def run(arguments: argparse.Namespace) -> int:
     from traps_pipeline.progress import Tally, TerminalProgress, clock, reporting
 
     experiment = _experiment(arguments)
-    workspace = _allow(_create(arguments, experiment), arguments)
+    workspace = _allow(_create(arguments, experiment), experiment, arguments)
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
     with reporting(TerminalProgress()) as progress:
         outcome = run_experiment(workspace, experiment)
@@ -224,9 +225,13 @@ def run(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _allow(workspace: Workspace, arguments: argparse.Namespace) -> Workspace:
-    """The workspace with what the command line says about money in its study. Raises TrapsError for a wrong amount."""
-    money: dict[str, Any] = {} if arguments.allow_unknown_prices is None else {"allow_unknown_prices": True}
+def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:
+    """The workspace with what the experiment, and above it the command line, says about money in its study. Raises
+    TrapsError for a wrong amount or name."""
+    stated = {name: getattr(experiment, name) for name in MONEY}
+    money: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+    if arguments.allow_unknown_prices:
+        money["allow_unknown_prices"] = True
     for text in arguments.budget_usd:
         name, _, amount = text.rpartition("=")
         try:
@@ -239,9 +244,11 @@ def _allow(workspace: Workspace, arguments: argparse.Namespace) -> Workspace:
             )
         if name:
             caps = money.setdefault("model_budgets_usd", dict(workspace.study.model_budgets_usd))
-            caps[_known_participant(name)] = dollars
+            caps[name] = dollars
         else:
             money["budget_usd"] = dollars
+    for name in money.get("model_budgets_usd", {}):
+        _known_participant(name)
     return workspace.allow(**money) if money else workspace
 
 

@@ -20,9 +20,10 @@ from traps_pipeline.benchmark.specs import released_in_study
 from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import load_judges, load_panel
+from traps_pipeline.judging.panel import SCHEMAS, load_judges, load_panel
+from traps_pipeline.models.media import profile_digest
 from traps_pipeline.models.prompts import prompt, system_prompt
-from traps_pipeline.models.registry import all_evaluations, get_model, load_accounts, load_models
+from traps_pipeline.models.registry import all_evaluations, effective_params, get_model, load_accounts, load_models
 from traps_pipeline.partitions import CATEGORIES, DATASETS, Cell, Evaluation
 from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace, write_text
@@ -166,13 +167,14 @@ class Lineage:
                 return digest([[s.scenario_id, s.version] for s in scenarios if s.category == key])[:16]
             case "models":
                 entry = get_model(Evaluation.parse(str(key)).model)
-                media = entry.media.model_dump(mode="json") if entry.media else None
-                return digest([entry.id, entry.backend, entry.provider_id, entry.params, entry.json_schema, media])[:16]
+                sent = [effective_params(entry, Evaluation.parse(str(key)).regime)]
+                sent += [profile_digest(entry.media)] if entry.media else []
+                return digest([entry.id, entry.provider_id or entry.backend, *sent])[:16]
             case "prompts":
                 return digest(system_prompt(Evaluation.parse(str(key)).regime))[:16]
             case "judges":
                 panel = [
-                    [judge.id, judge.backend, judge.provider_id, judge.params]
+                    [judge.id, judge.provider_id or judge.backend, judge.params, SCHEMAS]
                     for judge in load_panel(self._workspace.study.panel)
                 ]
                 return digest([panel, prompt("judge_abstention"), prompt("judge_correctness")])[:16]

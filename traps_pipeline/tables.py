@@ -192,7 +192,7 @@ RESPONSES = Table(
     prompt_tokens int? tokens
     completion_tokens int? tokens
     reasoning_tokens int? tokens
-    cost_usd float? dollars; null where the price is unknown
+    cost_usd float? dollars, with the worst case of attempts that may be billed; null where the price is unknown
     latency_s float seconds of the last attempt
     attempts int calls made for this row
     request_key str ledger key

@@ -88,7 +88,9 @@ def settled(study: Checkout) -> list[dict[str, Any]]:
     return [row for row in study.ledger_rows("answers") if row["outcome"] != "error"]
 
 
-def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly(unasked: Checkout, provider: Provider) -> None:
+def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_of_the_key(
+    unasked: Checkout, provider: Provider
+) -> None:
     provider.configure(faults=TRANSIENT | ENDINGS, only_first_attempts=3, latency_s=0.02, seed=1)
     register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
     path = experiment(unasked, ["video-model", "image-model"], regimes=["standard", "guided", "json"], runs=[1, 2, 3])
@@ -109,17 +111,11 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly(unasked: Checkou
     assert stats["answered_in_full"] == len(settled(unasked)) == len(rows)
     assert len({row["key"] for row in settled(unasked)}) == len(rows)
     assert all(row["cost_usd"] > 0 for row in settled(unasked))
-
-
-def test_the_sent_body_is_the_declared_one_and_the_key_is_nowhere(unasked: Checkout, provider: Provider) -> None:
-    register(unasked, provider, entry("image-model", "images"))
-    finished = unasked.traps("run", experiment(unasked, ["image-model"]), "--budget-usd", "10")
-    assert finished.code == 0, finished.err
     for record in provider.requests(limit=10):
         body = record["body"]
         assert (body["temperature"], body["top_p"], body["max_tokens"]) == (0.8, 0.95, 8000)
         images = [part for part in body["messages"][1]["content"] if part["type"] == "image_url"]
-        assert 1 <= len(images) <= 25
+        assert len(images) <= 25
     written = [file for file in unasked.workspace.rglob("*") if file.is_file() and not file.is_symlink()]
     assert len(written) > 100
     assert not [file for file in written if SECRET.encode() in file.read_bytes()]
@@ -164,11 +160,12 @@ def test_paid_stages_want_a_budget_and_a_price_whoever_starts_them(unasked: Chec
 def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checkout, provider: Provider) -> None:
     provider.configure(fault_by_model={"locked-out": "unauthorized"})
     register(unasked, provider, entry("image-model", "images"), entry("locked-out", "images"))
-    finished = unasked.traps("run", experiment(unasked, ["image-model", "locked-out"]), "--budget-usd", "10")
+    path = experiment(unasked, ["image-model", "locked-out"], datasets=["occlusion"])
+    finished = unasked.traps("run", path, "--budget-usd", "10")
     assert finished.code == 1
     assert "locked-out is stopped: 20 refusals in a row (http_401)" in finished.err
     assert SECRET not in finished.out + finished.err
-    assert len(responses(unasked)) == 2 * 128
+    assert len(responses(unasked)) == 2 * 32
     assert {row["model"] for row in responses(unasked)} == {"image-model"}
     # In each regime (a run of its own): 20 in a row, those in flight then, and no more.
     assert provider.stats()["by_status"]["401"] < 2 * (20 + 24)
@@ -176,27 +173,26 @@ def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checko
 
 def test_only_what_decides_an_answer_is_asked_again(unasked: Checkout, provider: Provider) -> None:
     register(unasked, provider, entry("image-model", "images"))
-    path = experiment(unasked, ["image-model"])
-    assert unasked.traps("run", path, "--budget-usd", "10").counts()["answers"] == 256
+    path = experiment(unasked, ["image-model"], regimes=["standard"], datasets=["chaotic", "chaotic_ill_posed"])
+    assert unasked.traps("run", path, "--budget-usd", "10").counts()["answers"] == 64
     quick = entry("image-model", "images").replace("timeout_s: 4", "timeout_s: 9, concurrency: 3")
     register(unasked, provider, quick.replace("input: 1.0", "input: 2.0"))
     assert unasked.traps("run", path).counts()["answers"] == 0
     unasked.correct("plinko-0001", question="In which numbered bucket, 1 to 7, does the ball end?")
-    assert unasked.traps("run", path).counts()["answers"] == 2 * 3  # control and void, and the ill-posed pair's control
+    assert unasked.traps("run", path).counts()["answers"] == 3  # control and void, and the ill-posed pair's control
     register(
         unasked,
         provider,
         quick.replace("temperature: 0.8", "temperature: 0.5") + "    waivers: {temperature: a test}\n",
     )
-    assert unasked.traps("run", path).counts()["answers"] == 256
+    assert unasked.traps("run", path).counts()["answers"] == 64
 
 
 def test_five_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider: Provider) -> None:
-    provider.configure(latency_s=0.05)
-    models = ["video-model", "image-model"]
-    register(unasked, provider, *map(entry, models, ("video", "images")))
-    path = experiment(unasked, models, regimes=["standard", "guided", "json"], runs=[1, 2, 3])
-    wanted, kills = 2 * 128 * 9, 5
+    provider.configure(latency_s=0.1)
+    register(unasked, provider, entry("video-model", "video"))
+    path = experiment(unasked, ["video-model"], regimes=["standard", "guided", "json"], runs=[1, 2, 3])
+    wanted, kills = 128 * 9, 5
     for kill in range(1, kills + 1):
         process = unasked.start(sys.executable, "-m", "traps_pipeline.cli", "run", str(path), "--budget-usd", "100")
         while len(unasked.ledger_rows("answers")) < kill * wanted // 8:
@@ -208,16 +204,16 @@ def test_five_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, prov
     assert finished.code == 0, finished.err
     keys = [row["key"] for row in settled(unasked)]
     assert len(keys) == len(set(keys)) == wanted
-    assert provider.stats()["answered_in_full"] <= wanted + kills * 2 * 24
+    assert provider.stats()["answered_in_full"] <= wanted + kills * 24
 
 
 def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Provider, tmp_path: Path) -> None:
     register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
-    path = experiment(unasked, ["video-model", "image-model"], regimes=["standard"])
+    path = experiment(unasked, ["video-model", "image-model"], regimes=["standard"], datasets=["occlusion"])
     exported = unasked.traps("requests", "export", path, "--out", tmp_path / "batch")
     assert exported.code == 0, exported.err
     lines = [json.loads(line) for line in (tmp_path / "batch" / "requests.jsonl").read_text().splitlines()]
-    assert len(lines) == len({line["key"] for line in lines}) == 256
+    assert len(lines) == len({line["key"] for line in lines}) == 64
     for line in lines:
         file = tmp_path / "batch" / line["media"]["file"]
         assert file.stem == line["media"]["sha256"] and file.is_file()
@@ -226,22 +222,22 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
     answers[0] = {"key": lines[0]["key"], "outcome": "refused", "finish_reason": "content_filter"}
     given = tmp_path / "answers.jsonl"
 
-    given.write_text("\n".join(json.dumps(answer) for answer in [*answers[:200], {"key": "0" * 64, "text": "x"}]))
+    given.write_text("\n".join(json.dumps(answer) for answer in [*answers[:50], {"key": "0" * 64, "text": "x"}]))
     refused = unasked.traps("answers", "import", path, given)
     assert refused.code == 1
-    assert "answers.jsonl:201: key 0000000000000000 is not wanted" in refused.err
+    assert "answers.jsonl:51: key 0000000000000000 is not wanted" in refused.err
     assert "nothing was imported" in refused.err
     assert settled(unasked) == []
 
-    given.write_text("\n".join(json.dumps(answer) for answer in answers[:200]))
-    assert "200 answers imported, 0 were there already" in unasked.traps("answers", "import", path, given).out
+    given.write_text("\n".join(json.dumps(answer) for answer in answers[:50]))
+    assert "50 answers imported, 0 were there already" in unasked.traps("answers", "import", path, given).out
     given.write_text("\n".join(json.dumps(answer) for answer in answers))
-    assert "56 answers imported, 200 were there already" in unasked.traps("answers", "import", path, given).out
+    assert "14 answers imported, 50 were there already" in unasked.traps("answers", "import", path, given).out
     finished = unasked.traps("run", path)
     assert finished.code == 0, finished.err
     assert finished.counts()["answers"] == 0
     assert provider.stats()["requests"] == 0
-    assert Counter(row["outcome"] for row in responses(unasked)) == {"answer": 255, "refused": 1}
+    assert Counter(row["outcome"] for row in responses(unasked)) == {"answer": 63, "refused": 1}
 
 
 @pytest.mark.parametrize(

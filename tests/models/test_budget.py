@@ -5,16 +5,22 @@ from __future__ import annotations
 import asyncio
 import datetime
 import random
+import threading
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
-from traps_pipeline.models.registry import Account, Entry, Prices
-from traps_pipeline.models.request import Request
+from traps_pipeline.models.ask import Participants, Work, run_work
+from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, spending, worst_case_usd
+from traps_pipeline.models.registry import Account, Entry, Limits, Prices
+from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.ledger import Ledger
-from traps_pipeline.storage.workspace import Study
+from traps_pipeline.storage.workspace import Study, Workspace
 
 
 def entry(prices: Prices | None) -> Entry:
@@ -34,8 +40,8 @@ PRICED = entry(Prices(input=2.0, output=10.0, as_of=datetime.date(2026, 11, 1)))
 
 def test_the_worst_case_is_every_token_that_may_be_billed() -> None:
     request = Request("m", "api", {}, "s" * 100, "u" * 100, {})
-    assert most_tokens(PRICED, request).prompt == 100 + 200  # two bytes a token, and the overhead
-    assert worst_case_usd(PRICED, request) == pytest.approx((300 * 2 + 8000 * 10) / 1e6)
+    assert most_tokens(PRICED, request).prompt == 200 + 2 + 200  # a byte a token, no schema (""), the overhead
+    assert worst_case_usd(PRICED, request) == pytest.approx((402 * 2 + 8000 * 10) / 1e6)
     assert worst_case_usd(entry(None), request) == 0
 
 
@@ -115,3 +121,78 @@ def test_paid_calls_want_a_budget_and_unknown_prices_a_word() -> None:
         check_money(Study(budget_usd=1), entry(None))
     check_money(Study(allow_unknown_prices=True), entry(None))
     check_money(Study(), entry(Prices(input=0, output=0, as_of=datetime.date(2026, 11, 1))))
+
+
+class Failing:
+    """A provider that fails in one way so many times, then answers."""
+
+    def __init__(self, kind: str, times: int) -> None:
+        self.kind, self.left = kind, times
+
+    async def ask(self, request: Request) -> Outcome:
+        await asyncio.sleep(0)
+        self.left -= 1
+        if self.left >= 0:
+            raise TransientError(self.kind)
+        return Outcome("answer", "left", cost_usd=0.001)
+
+
+def row_after(kind: str, times: int, cap_usd: float, folder: Path) -> dict[str, Any] | None:
+    """The ledger's row of one call with two retries under a cap; None if there is none."""
+    asked = PRICED.model_copy(update={"limits": Limits(concurrency=1, retries=2, backoff_s=0.001)})
+    participants = Participants(
+        {"m": asked}, lambda _: Failing(kind, times), Study(budget_usd=cap_usd), {"a": Account()}
+    )
+    ledger, cell = Ledger(folder, "answers"), Cell("occlusion", Evaluation("m", "standard", 1))
+    requests = [Request("m", "api", {}, "s", "u", {"item_id": "x"})]
+    work = Work("responses", ledger, participants, Budget(cap_usd, {}, {}), "1", lambda _: requests, lambda *_: None)
+    with suppress(BudgetReached):
+        list(run_work(work, [cell]))
+    return next(iter(ledger.read(cell.evaluation.key).rows.values()), None)
+
+
+WORST = (1 + 1 + 2 + 200) * 2 / 1e6 + 8000 * 10 / 1e6
+
+
+@pytest.mark.parametrize(
+    ("kind", "times", "cap_usd", "outcome", "cost_usd"),
+    [
+        ("rate_limited", 2, 1.0, "answer", 0.001),  # nothing was generated
+        ("timeout", 2, 1.0, "answer", 2 * WORST + 0.001),  # each may be billed
+        ("timeout", 9, 1.0, "error", 3 * WORST),
+        ("timeout", 9, 2.5 * WORST, "error", 2 * WORST),  # the third would have been above the cap
+        ("timeout", 9, 0.5 * WORST, None, None),
+    ],
+)
+def test_a_call_that_may_be_billed_counts_as_its_worst_case(
+    tmp_path: Path, kind: str, times: int, cap_usd: float, outcome: str | None, cost_usd: float | None
+) -> None:
+    row = row_after(kind, times, cap_usd, tmp_path)
+    assert (row and row["outcome"]) == outcome
+    assert (row and row["cost_usd"]) == (None if cost_usd is None else pytest.approx(cost_usd))
+    assert sum(Ledger(tmp_path, "answers").spent().values()) <= cap_usd
+
+
+def test_two_runs_never_spend_from_one_budget_at_once(tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path, Study(budget_usd=5))
+    events: list[str] = []
+
+    def second() -> None:
+        with spending(workspace, [PRICED]):
+            events.append("second")
+
+    with spending(workspace, [PRICED]):
+        thread = threading.Thread(target=second)
+        thread.start()
+        thread.join(0.5)
+        with spending(workspace, [entry(None)]):  # who costs nothing need not wait
+            events.append("free")
+        events.append("first ends")
+    thread.join(5)
+    assert events == ["free", "first ends", "second"]
+
+
+def test_a_price_wants_a_bound() -> None:
+    with pytest.raises(ValidationError, match="without it no budget can bound"):
+        fields = PRICED.model_dump() | {"params": {"temperature": 0.8, "top_p": 0.95}}
+        Entry.model_validate(fields | {"waivers": {"max_tokens": "a test"}}, context={"accounts": {"a": Account()}})

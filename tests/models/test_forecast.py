@@ -26,7 +26,7 @@ def test_without_experience_the_registrys_estimates_stand() -> None:
     low, expected, high = (dollars / 240 for dollars in seen.dollars)
     assert low == pytest.approx((2875 + 4000) / 1e6)
     assert expected == pytest.approx((2875 + 10_000) / 1e6)
-    assert high == pytest.approx((2500 + 750 + 200 + 80_000) / 1e6)
+    assert high == pytest.approx((2500 + 1500 + 200 + 80_000) / 1e6)
     assert seen.minutes == pytest.approx(240 * 10 / 24 / 60)
 
 

@@ -22,7 +22,7 @@ from traps_pipeline.judging.answers import is_correct, strip_fence
 from traps_pipeline.models.answers import FinishedCell, answer_request
 from traps_pipeline.models.ask import Participants, Row, Work, run_work
 from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.budget import open_budget
+from traps_pipeline.models.budget import spending
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import (
     JUDGE_PROTOCOL,
@@ -209,8 +209,9 @@ def collect_votes(
         return FinishedCell(cell, version, len(table), tally)
 
     participants = Participants({judge.id: judge for judge in panel}, make_judge, workspace.study)
-    budget, epoch = open_budget(workspace), workspace.study.epoch
-    yield from run_work(Work("votes", workspace.votes, participants, budget, epoch, requests, finish), cells)
+    epoch = workspace.study.epoch
+    with spending(workspace, panel) as budget:
+        yield from run_work(Work("votes", workspace.votes, participants, budget, epoch, requests, finish), cells)
 
 
 def make_judge(entry: Entry) -> Backend:

@@ -14,7 +14,7 @@ from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.ask import Participants, Row, Work, run_work
 from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.budget import open_budget
+from traps_pipeline.models.budget import spending
 from traps_pipeline.models.media import MediaSpec
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model, load_models
@@ -64,11 +64,10 @@ def is_prepared(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any]
 def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
     """Make what is sent of every clip of the cells, on all cores, first: encoding would hold calls up."""
     jobs: dict[tuple[str, str], tuple[Path, str, MediaSpec]] = {}
-    for cell in cells:
-        spec = get_model(cell.evaluation.model).media
+    for dataset, spec in {(cell.dataset, get_model(cell.evaluation.model).media) for cell in cells}:
         if spec is None:
             continue
-        for item in _items(workspace, cell.dataset):
+        for item in _items(workspace, dataset):
             jobs[item["media_digest"], repr(spec)] = (workspace.resolve(item["clip"]), item["media_digest"], spec)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         for done, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
@@ -130,6 +129,6 @@ def collect_answers(
     def requests(cell: Cell) -> list[Request]:
         return wanted_requests(workspace, cell)
 
-    participants = Participants(load_models(), make_backend, workspace.study)
-    budget, epoch = open_budget(workspace), workspace.study.epoch
-    yield from run_work(Work("responses", workspace.answers, participants, budget, epoch, requests, finish), cells)
+    participants, epoch = Participants(load_models(), make_backend, workspace.study), workspace.study.epoch
+    with spending(workspace, [get_model(cell.evaluation.model) for cell in cells]) as budget:
+        yield from run_work(Work("responses", workspace.answers, participants, budget, epoch, requests, finish), cells)

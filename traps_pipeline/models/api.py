@@ -16,7 +16,7 @@ from typing import Any
 from traps_pipeline import progress
 from traps_pipeline.models.media import Media, data_uris
 from traps_pipeline.models.registry import Account, Entry, load_accounts
-from traps_pipeline.models.request import RATE_LIMITED, Outcome, Request, TransientError
+from traps_pipeline.models.request import JUDGED, RATE_LIMITED, Outcome, OutcomeKind, Request, TransientError
 
 UNREADABLE = 422  # what litellm makes of a page that is no JSON; no provider here sends it
 TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
@@ -74,11 +74,9 @@ class ApiBackend:
 
     async def ask(self, request: Request) -> Outcome:
         """One attempt; see `Backend`."""
-        litellm = load_litellm()
+        litellm, asked = load_litellm(), messages(self._entry, request)
         try:
-            response = await litellm.acompletion(
-                messages=messages(self._entry, request), **request.params, **self._fixed
-            )
+            response = await litellm.acompletion(messages=asked, **request.params, **self._fixed)
         except Exception as error:  # noqa: BLE001 - litellm raises its own, the SDKs' and httpx's errors
             return self._failure(error, litellm)
         return read_response(response, self._entry)
@@ -98,17 +96,16 @@ class ApiBackend:
         if kind in self._told:
             return
         self._told.add(kind)
-        text = " ".join(str(error).split())[:300]
-        progress.current().note(
-            f"{self._entry.id}: {kind}: {text.replace(self._secret, '***') if self._secret else text}"
-        )
+        text = " ".join(str(error).split())
+        text = text.replace(self._secret, "***") if self._secret else text  # before it is cut: a cut key is a key
+        progress.current().note(f"{self._entry.id}: {kind}: {text[:300]}")
 
 
 def failure_kind(error: Exception, litellm: Any) -> str:
     """What went wrong in a word: http_<status> is final, anything else is worth another try."""
     if isinstance(error, litellm.Timeout):
         return "timeout"
-    if isinstance(error, litellm.APIConnectionError):
+    if isinstance(error, litellm.APIConnectionError) or _broke_off(error):
         return "connection"
     status = getattr(error, "status_code", None)
     if not isinstance(status, int) or status < 400 or status == UNREADABLE:
@@ -116,6 +113,18 @@ def failure_kind(error: Exception, litellm: Any) -> str:
     if status in TRANSIENT_STATUSES:
         return TRANSIENT_STATUSES[status]
     return f"http_{status}" if 400 <= status < 500 else "server_error"
+
+
+def _broke_off(error: BaseException | None) -> bool:
+    """Whether the connection failed below what litellm calls a server error: the answer may have been on its way."""
+    while error is not None:
+        if (
+            type(error).__module__.split(".")[0] in ("httpx", "httpcore", "aiohttp")
+            and "Status" not in type(error).__name__
+        ):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def retry_after_s(error: Exception) -> float | None:
@@ -129,17 +138,22 @@ def retry_after_s(error: Exception) -> float | None:
 
 def read_response(response: Any, entry: Entry) -> Outcome:
     """The outcome in a response: what is seen, what was thought, what it took."""
+    if not response.choices:
+        raise TransientError("bad_response")
     choice = response.choices[0]
     message, finish = choice.message, choice.finish_reason
-    text = (message.content or "").strip()
+    text = _storable((message.content or "").strip())
     usage = getattr(response, "usage", None)
     prompt, completion = (getattr(usage, f"{kind}_tokens", None) for kind in ("prompt", "completion"))
+    if not prompt:  # litellm makes zeros of a usage that is not there; no prompt is empty
+        prompt = completion = None
     details = getattr(usage, "completion_tokens_details", None)
     fields: Mapping[str, Any] = getattr(message, "provider_specific_fields", None) or {}
+    kind = _kind(text, finish, fields.get("refusal") or getattr(message, "refusal", None))
     return Outcome(
-        _kind(text, finish, fields.get("refusal") or getattr(message, "refusal", None)),
-        text=text or None,
-        reasoning=getattr(message, "reasoning_content", None) or None,
+        kind,
+        text=text if kind in JUDGED else None,
+        reasoning=_storable(getattr(message, "reasoning_content", None) or "") or None,
         finish_reason=finish,
         served_model=getattr(response, "model", None),
         prompt_tokens=prompt,
@@ -149,6 +163,11 @@ def read_response(response: Any, entry: Entry) -> Outcome:
     )
 
 
+def _storable(text: str) -> str:
+    """Text without halves of surrogate pairs, which a cut in the middle of an emoji leaves and no file takes."""
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
 def _cost(entry: Entry, prompt_tokens: int | None, completion_tokens: int | None) -> float | None:
     """Dollars; None where the price or what was used is unknown."""
     if entry.prices is None or prompt_tokens is None or completion_tokens is None:
@@ -156,7 +175,7 @@ def _cost(entry: Entry, prompt_tokens: int | None, completion_tokens: int | None
     return entry.prices.cost(prompt_tokens, completion_tokens)
 
 
-def _kind(text: str, finish: str | None, refusal: str | None) -> Any:
+def _kind(text: str, finish: str | None, refusal: str | None) -> OutcomeKind:
     if refusal or finish in ("content_filter", "refusal"):
         return "refused"
     if not text:

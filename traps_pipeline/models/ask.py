@@ -14,7 +14,7 @@ import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import groupby
 from typing import Any, Generic, TypeVar
@@ -23,7 +23,7 @@ from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
 from traps_pipeline.models.registry import Account, Entry, load_accounts
-from traps_pipeline.models.request import RATE_LIMITED, Backend, Outcome, Request, TransientError
+from traps_pipeline.models.request import RATE_LIMITED, UNBILLED, Backend, Outcome, Request, TransientError
 from traps_pipeline.models.traffic import Breaker, Gate, Meter
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
@@ -99,39 +99,82 @@ class Settled:
     tally: Tally
 
 
-async def attempt(participant: Participant, request: Request, stop: asyncio.Event) -> tuple[Outcome, int, float] | None:
-    """An outcome, the calls it took, the seconds of the last one; None when stopped before another try.
+async def attempt(
+    participant: Participant, request: Request, budget: Budget, stop: asyncio.Event, halted: Callable[[], bool]
+) -> tuple[Outcome, int, float] | None:
+    """An outcome, the calls it took, the seconds of the last one; None when halted before anything was spent.
 
-    The one retry layer: exponential with full jitter, and never sooner than the provider asks.
+    The one retry layer: exponential with full jitter, and never sooner than the provider asks. The outcome's cost holds
+    what attempts before it may have cost.
     """
-    limits = participant.entry.limits
+    limits, tokens = participant.entry.limits, most_tokens(participant.entry, request)
+    lost_usd, seconds = 0.0, 0.0
     for number in range(1, limits.retries + 2):
-        tokens = most_tokens(participant.entry, request)
-        await participant.meter.admit(tokens.prompt + tokens.completion)
         async with participant.gate.connection():
-            if stop.is_set():
-                return None
+            await participant.meter.admit(tokens.prompt + tokens.completion, halted)
+            if halted():
+                return _given_up("interrupted", number - 1, seconds, lost_usd)
             began = time.monotonic()
             try:
-                async with asyncio.timeout(limits.timeout_s):
-                    outcome = await participant.backend.ask(request)
+                outcome = await _send(participant, request, budget)
             except TransientError as error:
-                failure = error
-            except TimeoutError:
-                failure = TransientError("timeout")
+                failure, seconds = error, time.monotonic() - began
+            except BudgetReached:
+                if lost_usd:  # first what was lost goes into the ledger; the next call meets the cap again
+                    return _given_up("budget", number - 1, seconds, lost_usd)
+                raise
             else:
                 participant.gate.answered()
+                if lost_usd:
+                    outcome = replace(outcome, cost_usd=(outcome.cost_usd or 0.0) + lost_usd)
                 return outcome, number, time.monotonic() - began
-            seconds = time.monotonic() - began
         if failure.kind == RATE_LIMITED:
             participant.gate.slow_down()
+        if failure.kind not in UNBILLED:
+            lost_usd += worst_case_usd(participant.entry, request)
         if number > limits.retries:
-            return Outcome("error", error=failure.kind), number, seconds
+            return _given_up(failure.kind, number, seconds, lost_usd)
         longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
         wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
         if await _stopped_within(stop, wait):
-            return None
+            return _given_up("interrupted", number, seconds, lost_usd)
     raise AssertionError("unreachable: the last attempt returns")
+
+
+def _given_up(kind: str, attempts: int, seconds: float, lost_usd: float) -> tuple[Outcome, int, float] | None:
+    """A failure for the ledger; None for a call that was never sent, or that cost nothing and will be made again."""
+    if kind in ("interrupted", "budget") and not lost_usd:
+        return None
+    return Outcome("error", error=kind, cost_usd=lost_usd or None), attempts, seconds
+
+
+async def _send(participant: Participant, request: Request, budget: Budget) -> Outcome:
+    """One attempt under a reservation. Raises TransientError and BudgetReached.
+
+    A call that was sent costs its worst case until the provider says otherwise: one that timed out may be billed.
+    """
+    entry = participant.entry
+    worst_usd = worst_case_usd(entry, request)
+    await budget.reserve(entry.id, worst_usd)
+    cost_usd = worst_usd
+    try:
+        async with asyncio.timeout(entry.limits.timeout_s):
+            outcome = await participant.backend.ask(request)
+        if outcome.kind == "error":
+            cost_usd = 0.0  # refused as it is: nothing was generated
+        elif outcome.cost_usd is not None:
+            cost_usd = outcome.cost_usd
+        elif entry.prices is not None:
+            outcome = replace(outcome, cost_usd=worst_usd)
+        return outcome
+    except TimeoutError:
+        raise TransientError("timeout") from None
+    except TransientError as failure:
+        if failure.kind in UNBILLED:
+            cost_usd = 0.0
+        raise
+    finally:
+        await budget.settle(entry.id, worst_usd, cost_usd)
 
 
 async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
@@ -177,27 +220,23 @@ class _Asking:
 
     async def one(self, participant: Participant, queue: deque[Request]) -> bool:
         """Ask and record one request of the queue; False when there is nothing more to do."""
-        if not queue or self.stop.is_set() or self.problems:
+        if not queue or self.halted():
             return False
-        request, budget, name = queue.popleft(), self.work.budget, participant.entry.id
-        worst_usd = worst_case_usd(participant.entry, request)
-        await budget.reserve(name, worst_usd)
-        cost_usd: float | None = 0.0
-        try:
-            if self.stop.is_set() or self.problems:
-                return False
-            attempted = await attempt(participant, request, self.stop)
-            if attempted is None:
-                return False
-            row, reasoning = ledger_row(request, *attempted, self.work.epoch)
-            cost_usd = 0.0 if row["outcome"] == "error" else row["cost_usd"]
-            self.writer.append(row, reasoning)
-        finally:
-            await budget.settle(name, worst_usd, cost_usd)
+        request, name = queue.popleft(), participant.entry.id
+        attempted = await attempt(participant, request, self.work.budget, self.stop, self.halted)
+        if attempted is None:
+            return False
+        row, reasoning = ledger_row(request, *attempted, self.work.epoch)
+        self.writer.append(row, reasoning)
         self.rows[request.key] = row
-        progress.current().called(self.work.stage, name, row["outcome"] == "error", row["latency_s"], cost_usd or 0.0)
+        failed, dollars = row["outcome"] == "error", row["cost_usd"] or 0.0
+        progress.current().called(self.work.stage, name, failed, row["latency_s"], dollars)
         participant.breaker.watch(attempted[0])
         return True
+
+    def halted(self) -> bool:
+        """Whether no more calls are to be sent."""
+        return self.stop.is_set() or bool(self.problems)
 
     async def sync(self) -> None:
         while True:
@@ -252,6 +291,7 @@ async def settle_evaluation(
                 complete = {key: row for key, row in rows.items() if row is not None}
                 tally.errors = sum(row["outcome"] == "error" for row in complete.values())
                 yield Settled(cell, complete, tally)
+                await asyncio.sleep(0)  # a cell that was all known must not keep the loop from those that are asked
 
 
 async def settle(work: Work[Any], cells: Sequence[Cell], stop: asyncio.Event) -> AsyncIterator[Settled | Exception]:

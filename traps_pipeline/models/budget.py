@@ -6,17 +6,22 @@ What was spent is the sum of the costs in the ledger, so it survives restarts wi
 from __future__ import annotations
 
 import asyncio
+import fcntl
+import json
+import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 
+from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Request
 from traps_pipeline.storage.workspace import Study, Workspace
 
 OVERHEAD_TOKENS = 200  # roles, separators, JSON around the text
-BYTES_A_TOKEN = 2  # no tokenizer makes more of text than a token for two bytes, but for rare scripts
+BYTES_A_TOKEN = 1  # some tokenizers make a token of every digit, and judges are shown arbitrary text
 
 
 class BudgetReached(TrapsError):
@@ -35,7 +40,8 @@ def most_tokens(entry: Entry, request: Request) -> Tokens:
     """An upper bound of what a call takes."""
     frames = request.sent.n_frames if request.sent else 0
     each = entry.tokens_per_frame if isinstance(entry, ModelEntry) else 0
-    text = -(-len((request.system + request.user).encode()) // BYTES_A_TOKEN)
+    schema = json.dumps(request.params.get("response_format", ""))
+    text = len((request.system + request.user + schema).encode()) // BYTES_A_TOKEN
     return Tokens(frames * each + text + OVERHEAD_TOKENS, entry.max_tokens)
 
 
@@ -116,8 +122,29 @@ class Budget:
         )
 
 
-def open_budget(workspace: Workspace) -> Budget:
-    """The study's budget, less what its ledgers say was spent."""
+@contextmanager
+def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Budget]:
+    """The study's budget, less what its ledgers say was spent. Where anyone asked has a price, no other process spends
+    from it meanwhile: two that do not see each other's calls would both use the remainder. Raises TrapsError."""
+    if not any(entry.prices for entry in participants):
+        yield Budget(workspace.study.budget_usd, workspace.study.model_budgets_usd, {})
+        return
+    workspace.locks.mkdir(parents=True, exist_ok=True)
+    with (workspace.locks / "budget.lock").open("w") as lock:
+        told = False
+        while True:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if not told:
+                    progress.current().note("another run spends from this study's budget; waiting for it to finish")
+                    told = True
+                time.sleep(0.2)
+        yield _open_budget(workspace)
+
+
+def _open_budget(workspace: Workspace) -> Budget:
     study, spent = workspace.study, defaultdict(float)
     for ledger in (workspace.answers, workspace.votes):
         for participant, dollars in ledger.spent().items():

@@ -24,8 +24,9 @@ from traps_pipeline.models.answers import prepare_media, wanted_requests
 from traps_pipeline.models.ask import ledger_row
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.models.request import JUDGED, Outcome, OutcomeKind, Request
-from traps_pipeline.partitions import Evaluation
+from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS
 from traps_pipeline.yamlfile import explain, read_lines
 
 REQUESTS, MEDIA = "requests.jsonl", "media"
@@ -82,7 +83,7 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
     if (out / REQUESTS).exists():
         raise TrapsError(f"{out / REQUESTS} is there already; give another folder, or delete it")
     (out / MEDIA).mkdir(parents=True, exist_ok=True)
-    prepare_media(workspace, experiment.cells())
+    prepare_media(workspace, _cells(workspace, experiment))
     part, count = out / f".{REQUESTS}.part", 0
     with part.open("w", encoding="utf-8") as stream:
         for request in _missing(workspace, experiment):
@@ -92,9 +93,17 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
     return count
 
 
+def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
+    """Cells of the datasets that the study has: of one taxonomy it has two of four. Raises TrapsError for none."""
+    cells = [cell for cell in experiment.cells() if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
+    if not cells:
+        raise TrapsError(f"{workspace.root}: no items yet; materialize scene_specs, videos and items first")
+    return cells
+
+
 def _missing(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
     known: dict[Evaluation, set[str]] = {}
-    for cell in experiment.cells():
+    for cell in _cells(workspace, experiment):
         evaluation = cell.evaluation
         if evaluation not in known:
             rows = workspace.answers.read(evaluation.key).rows
@@ -131,8 +140,9 @@ def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> 
     All lines are checked before any is written. Raises TrapsError naming lines that are not answers, whose key the
     experiment does not want (another question, clip, parameter or run), or that give one key two different answers.
     """
-    prepare_media(workspace, experiment.cells())
-    wanted = {request.key: request for cell in experiment.cells() for request in wanted_requests(workspace, cell)}
+    cells = _cells(workspace, experiment)
+    prepare_media(workspace, cells)
+    wanted = {request.key: request for cell in cells for request in wanted_requests(workspace, cell)}
     answers = checked_answers(path, wanted)
     by_evaluation: defaultdict[Evaluation, list[Answer]] = defaultdict(list)
     for key, answer in answers.items():

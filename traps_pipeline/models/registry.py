@@ -133,6 +133,8 @@ class Entry(BaseModel):
         if self.provider_id is None or "/" not in self.provider_id:
             raise ValueError(f"provider_id is {self.provider_id!r}; it is route/model, e.g. openai/gpt-5")
         self._check_waivers(self.protocol())
+        if self.prices and (self.prices.input or self.prices.output) and not self.max_tokens:
+            raise ValueError("params.max_tokens is not sent: without it no budget can bound what a call costs")
         return self
 
     @property

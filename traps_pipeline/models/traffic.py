@@ -6,7 +6,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 from traps_pipeline.errors import TrapsError
@@ -14,6 +14,7 @@ from traps_pipeline.models.request import Outcome
 
 SAME_REFUSALS = 20
 ERROR_WINDOW, ERROR_SHARE = 100, 0.10
+LOOK_S = 0.2  # how often a waiting call looks whether it is still wanted
 BURST_S = 2.0  # so many seconds' worth of calls and tokens may go out at once
 
 
@@ -77,11 +78,12 @@ class Meter:
     def _capacity(rate: float | None, least: float) -> float:
         return float("inf") if rate is None else max(rate * BURST_S, least)
 
-    async def admit(self, tokens: int) -> None:
-        """Wait until one call of so many tokens may go out. The bucket may go below zero: later calls wait longer."""
-        wait = self._take((1.0, float(tokens)))
-        if wait > 0:
-            await asyncio.sleep(wait)
+    async def admit(self, tokens: int, halted: Callable[[], bool] = lambda: False) -> None:
+        """Wait until one call of so many tokens may go out, or until nothing is to be sent any more. The bucket may go
+        below zero: later calls wait longer."""
+        until = time.monotonic() + self._take((1.0, float(tokens)))
+        while (left := until - time.monotonic()) > 0 and not halted():
+            await asyncio.sleep(min(left, LOOK_S))
 
     def _take(self, amounts: tuple[float, float]) -> float:
         """Take from the buckets; the seconds until they are at zero again."""
