@@ -16,9 +16,12 @@ from typing import Any
 
 import pytest
 
+from tests.providers.server import Provider
+
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = "tests/experiments/small.yaml"  # of the small study, relative to a checkout
 SMALL = ROOT / EXPERIMENT
+KEY, SECRET = "TRAPS_TEST_KEY", "sk-planted-0123456789abcdef"  # of the test provider
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return 2 if item.path.name in longest else 3
 
     items.sort(key=turn)
+
+
+@pytest.fixture(scope="session")
+def shared_provider() -> Iterator[Provider]:
+    """A server that speaks like providers do and misbehaves as it is told."""
+    with Provider.start() as provider:
+        yield provider
+
+
+@pytest.fixture
+def provider(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
+    """The server as just started, and its key in the environment."""
+    monkeypatch.setenv(KEY, SECRET)
+    return shared_provider.afresh()
 
 
 def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], str]) -> Path:

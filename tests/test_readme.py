@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 import sys
-from collections.abc import Iterator
 
 import pytest
 
@@ -16,13 +15,6 @@ pytestmark = pytest.mark.slow
 README = (ROOT / "README.md").read_text()
 # Run by other means: CI is `make test`; the command of `make ui` is started by tests/integration/test_ui.py.
 ELSEWHERE = ("make test", "make ui")
-
-
-@pytest.fixture
-def provider() -> Iterator[Provider]:
-    """What answers on the port of the README's own model."""
-    with Provider.start() as provider:
-        yield provider
 
 
 def blocks(language: str) -> list[str]:

@@ -8,18 +8,16 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
 
-from tests.conftest import ROOT, Checkout
+from tests.conftest import KEY, ROOT, SECRET, Checkout
 from tests.providers.server import Provider
 
 pytestmark = pytest.mark.slow
-KEY, SECRET = "TRAPS_TEST_KEY", "sk-planted-0123456789abcdef"
 SAMPLING = "temperature: 0.8, top_p: 0.95, max_tokens: 8000"
 TRANSIENT = {
     "rate_limited": 0.03,
@@ -65,18 +63,6 @@ def experiment(study: Checkout, models: list[str], **more: Any) -> Path:
     path = study.root / "network.yaml"
     path.write_text(f"name: network\n{head}{scenarios}")
     return path
-
-
-@pytest.fixture(scope="module")
-def shared_provider() -> Iterator[Provider]:
-    with Provider.start() as provider:
-        yield provider
-
-
-@pytest.fixture
-def provider(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
-    monkeypatch.setenv(KEY, SECRET)
-    return shared_provider.afresh()
 
 
 def responses(study: Checkout) -> list[dict[str, Any]]:

@@ -4,33 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import datetime
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from tests.conftest import KEY, SECRET
 from tests.providers.server import Provider, answer_to
 from traps_pipeline import progress
 from traps_pipeline.models.api import ApiBackend, read_response
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 
-KEY, SECRET = "TRAPS_TEST_KEY", "sk-planted-0123456789abcdef"
 ROUTES = {"openai/m": "/v1", "gemini/gemini-2.5-pro": "/v1beta", "openai/responses/m": "/v1"}
 QUESTION = "Does the ball clear the barrier?"
-
-
-@pytest.fixture(scope="module")
-def shared_provider() -> Iterator[Provider]:
-    with Provider.start() as provider:
-        yield provider
-
-
-@pytest.fixture
-def provider(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
-    monkeypatch.setenv(KEY, SECRET)
-    return shared_provider.afresh()
 
 
 def backend(provider: Provider, route: str, **params: Any) -> ApiBackend:
