@@ -280,8 +280,9 @@ async def settle_evaluation(
                 wanted = {request.key: request for request in work.requests(cell)}
                 missing = [request for key, request in wanted.items() if key not in answered]
                 asking = _Asking(work, writer, missing, stop)
-                for name, count in Counter(request.participant for request in missing).items():
-                    report.asking(work.stage, name, count, len(wanted) - len(missing))
+                new = Counter(request.participant for request in missing)
+                for name, count in Counter(request.participant for request in wanted.values()).items():
+                    report.asking(work.stage, name, new[name], count - new[name])
                 tally = Tally(asked=len(missing), cached=len(wanted) - len(missing))
                 await asking.run()
                 rows = {key: answered.get(key) or asking.rows.get(key) for key in wanted}
