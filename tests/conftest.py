@@ -121,7 +121,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """One worker starts with the demo, which others wait for; the other takes what needs no study meanwhile. Of those
     files that need one the longest go first: a file is one worker's, and the last must not leave the other idle."""
     needs_study = {"demo", "small", "study", "demo_study", "unasked", "one_regime"}
-    longest = ("test_corrections.py", "test_network.py", "test_crashes.py")
+    longest = ("test_corrections.py", "test_network.py", "test_crashes.py", "test_ui.py")
 
     def turn(item: pytest.Item) -> int:
         if "test_demo.py" in item.nodeid:

@@ -177,8 +177,8 @@ def test_only_what_decides_an_answer_is_asked_again(unasked: Checkout, provider:
 def test_five_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider: Provider) -> None:
     provider.configure(latency_s=0.1)
     register(unasked, provider, entry("video-model", "video"))
-    path = experiment(unasked, ["video-model"], regimes=["standard", "guided", "json"], runs=[1, 2, 3])
-    wanted, kills = 128 * 9, 5
+    path = experiment(unasked, ["video-model"], runs=[1, 2])
+    wanted, kills = 128 * 4, 5
     for kill in range(1, kills + 1):
         process = unasked.start(sys.executable, "-m", "traps_pipeline.cli", "run", str(path), "--budget-usd", "100")
         while len(unasked.ledger_rows("answers")) < kill * wanted // 8:
