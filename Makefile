@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 DEMO := $(CURDIR)/.workspaces/demo
 RENDER_PACKAGES := libosmesa6 python3-venv
 TEST_PACKAGES := $(RENDER_PACKAGES) chromium
+# Outside the lock, so that a machine may bring the build that suits it; a CPU build is enough: make TORCH="torch==2.13.0 --index-url ..."
+TORCH ?= torch==2.13.0
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
 .PHONY: demo test ui bench lint setup render-packages test-packages clean
@@ -35,7 +37,8 @@ setup: render-packages $(VENV)/.installed
 $(VENV)/.installed: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or later is needed: make PYTHON=/path/to/python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	touch $@
 
