@@ -1,0 +1,301 @@
+"""The paper's analyses: from a tidy frame of cells to a tidy frame (benchmark.md section 5, paper sections on results).
+
+`cells` has one row a (model, dataset, regime), averaged over runs, with the columns model, dataset, regime, acc,
+abs_rec, false_abs, pecs (fractions) and epoch; `study_cells` makes it of a study, `published.published_cells` of the
+paper. The input may hold further columns and is never changed. A ratio or gap whose two sides are of different epochs
+raises `epochs.EpochMismatch`; a mean over datasets takes every dataset's own epoch, alike on both sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.models.registry import load_models
+from traps_pipeline.partitions import DATASETS
+from traps_pipeline.scoring import Frame
+from traps_pipeline.scoring.epochs import require_one_epoch
+
+SHARES = ["acc", "abs_rec", "false_abs", "pecs"]
+TAXONOMIES = ("occlusion", "chaotic")
+# The thinking member first (benchmark.md section 5).
+REASONING_PAIRS = (
+    ("gemini-2.5-flash", "gemini-2.5-flash-nt"),
+    ("gemini-3.1-pro", "gemini-3.1-pro-r-low"),
+    ("qwen3-vl-think", "qwen3-vl-instruct"),
+)
+REASONING_LADDER = ("gpt-5-nr", "gpt-5-medium", "gpt-5-high", "gpt-5-pro")
+HIDDEN = ("hidden_collision", "hidden_drop", "hidden_race")
+_ENTRY = ["model", "dataset", "regime"]
+_EQUAL = 12  # decimals at which two means count as equal: below any printed digit, above rounding noise
+
+
+# --- cells ------------------------------------------------------------------------------------------------------------
+
+
+def study_cells(leaderboard: Frame) -> Frame:
+    """Cells of a study from its LEADERBOARD rows, with `_std` over runs, n_pairs, n_runs, n_missing and incomplete."""
+    rows = leaderboard.loc[leaderboard["dataset"] != "overall"]
+    spread = [f"{share}_std" for share in SHARES]
+    return rows[[*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]].reset_index(
+        drop=True
+    )
+
+
+def scoped_cells(metrics: Frame, scope: str) -> Frame:
+    """Cells of the parts of datasets from METRICS rows, averaged over runs; the column `scope` names the part.
+
+    scope is `category`, `sub_scenario` or `label` (the control's answer). Columns as in `study_cells`, with scope.
+    """
+    parts = metrics["scope"].str.partition(":")
+    rows = metrics.assign(scope=parts[2]).loc[parts[0] == scope]
+    groups = rows.groupby([*_ENTRY, "scope"], sort=True)
+    cells = groups[SHARES].agg(lambda values: float(np.mean(values.to_numpy(float))))
+    cells["n_pairs"], cells["n_missing"] = groups["n_pairs"].max(), groups["n_missing"].sum()
+    cells["n_runs"], cells["epoch"] = groups["run"].nunique(), groups["epoch"].agg(lambda e: "+".join(sorted(set(e))))
+    return cells.reset_index()
+
+
+def models_of(group: str | None = None, family: str | None = None, media: str | None = None) -> list[str]:
+    """Ids of the registry's models in a group (main, replication, ..), of a family, or with an input (video, image)."""
+    wanted = {"group": group, "family": family, "input": media}
+    return [
+        entry.id
+        for entry in load_models().values()
+        if all(value is None or getattr(entry.groups, name) == value for name, value in wanted.items())
+    ]
+
+
+# --- means ------------------------------------------------------------------------------------------------------------
+
+
+def overall(cells: Frame) -> Frame:
+    """Equal-weight means over datasets: columns model, regime, acc, abs_rec, false_abs, pecs; PECS is averaged too.
+
+    A (model, regime) that lacks one of the datasets in `cells` has no row: no two rows are means of different datasets.
+    """
+    cells = _checked(cells)
+    groups = cells.groupby(["model", "regime"], sort=False)
+    whole = cells[groups["dataset"].transform("nunique") == cells["dataset"].nunique()]
+    return whole.groupby(["model", "regime"], sort=False)[SHARES].mean().reset_index()
+
+
+def uplift(cells: Frame) -> Frame:
+    """Guided over standard AbsRec, each averaged over datasets: columns model, ratio.
+
+    Infinite where standard is 0 and guided is not. A model needs both regimes on every dataset of `cells`.
+    """
+    cells = _checked(cells)
+    cells = cells[cells["regime"].isin(["standard", "guided"])]
+    require_one_epoch(cells.pivot(index=["model", "dataset"], columns="regime", values="epoch"), "uplift")
+    means = overall(cells).pivot(index="model", columns="regime", values="abs_rec")
+    means = means.reindex(columns=["standard", "guided"], index=cells["model"].unique()).dropna()
+    return pd.DataFrame({"model": means.index, "ratio": ratio(means["guided"], means["standard"])})
+
+
+def spread(cells: Frame, column: str = "pecs_std") -> Frame:
+    """Quartiles of the standard deviations over runs, over all cells: one row with q25, median, q75, n.
+
+    Cells of a single run have none and are left out. The paper does not say of which metric its quartiles are; the
+    default takes PECS.
+    """
+    values = cells[column].dropna().to_numpy(float)
+    q25, median, q75 = np.quantile(values, [0.25, 0.5, 0.75]) if len(values) else (np.nan,) * 3
+    return pd.DataFrame({"q25": [q25], "median": [median], "q75": [q75], "n": [len(values)]})
+
+
+# --- PECS and what it is not ------------------------------------------------------------------------------------------
+
+
+def pareto_frontier(cells: Frame) -> Frame:
+    """The models that no other model of the same regime beats in both Acc and J, after averaging over datasets.
+
+    Rows of `overall` with the column j, by falling Acc; a model equal to another in one and better in the other beats
+    it, equal models are both on the frontier. It orders models and makes no ratio or gap, so epochs may differ.
+    """
+    means = overall(cells)
+    means["j"] = means["abs_rec"] - means["false_abs"]
+    frontier = [group[~_dominated(group)] for _, group in means.groupby("regime", sort=False)]
+    return pd.concat(frontier or [means]).sort_values(["regime", "acc"], ascending=[True, False], ignore_index=True)
+
+
+def _dominated(points: Frame) -> np.ndarray:
+    """Which rows are beaten by another in (acc, j): (rows,) bool."""
+    at = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
+    no_worse = (at[None] >= at[:, None]).all(-1)  # [i, k]: k is no worse than i in both
+    better = (at[None] > at[:, None]).any(-1)
+    return (no_worse & better).any(1)
+
+
+def naive_gap(cells: Frame, threshold: float = 0.03) -> Frame:
+    """The cells whose Acc x AbsRec exceeds PECS by more than `threshold`, with columns naive and gap added."""
+    cells = _checked(cells)
+    cells["naive"] = cells["acc"] * cells["abs_rec"]
+    cells["gap"] = cells["naive"] - cells["pecs"]
+    return cells[cells["gap"].round(_EQUAL) > threshold].reset_index(drop=True)
+
+
+def zero_boundary(cells: Frame) -> Frame:
+    """The cells with PECS 0: no more abstention on voids than on controls in any run, or no correct answer."""
+    cells = _checked(cells)
+    return cells[cells["pecs"] == 0].reset_index(drop=True)
+
+
+def degenerate_strategies() -> Frame:
+    """What strategies without any discrimination score in expectation: strategy, acc, false_abs, abs_rec, j, pecs,
+    naive.
+
+    acc is null where the strategy does not fix it; PECS is 0 all the same, since J is not above 0.
+    """
+    some = 0.2  # any share will do: it is the same on either side
+    rows = [
+        ("always-abstain", 0.0, 1.0, 1.0),
+        ("never-abstain", np.nan, 0.0, 0.0),
+        ("random-50", np.nan, 0.5, 0.5),
+        ("perfect-answerer", 1.0, 0.0, 0.0),
+        ("inverse-oracle", 0.0, 1.0, 0.0),
+        ("confidence-noise", np.nan, some, some),
+    ]
+    table = pd.DataFrame(rows, columns=pd.Index(["strategy", "acc", "false_abs", "abs_rec"]))
+    table["j"] = table["abs_rec"] - table["false_abs"]
+    # An Acc of at most 1 bounds PECS by max(0, J), which is 0 for all of them.
+    table["pecs"] = np.maximum(table["j"], 0.0) * table["acc"].fillna(1.0)
+    return table.assign(naive=np.where(table["abs_rec"] == 0, 0.0, table["acc"] * table["abs_rec"]))
+
+
+# --- comparisons within a model or a pair -----------------------------------------------------------------------------
+
+
+def visual_textual_gap(cells: Frame, taxonomies: Sequence[str] = TAXONOMIES) -> Frame:
+    """Textual over visual AbsRec: columns model, regime, taxonomy (occlusion, chaotic, pooled), visual, textual, gap.
+
+    Visual is the taxonomy's own dataset, textual its ill-posed one. `pooled` is the mean of the two textual over the
+    mean of the two visual, where both taxonomies are there. The gap is infinite where visual is 0 and textual is not,
+    null where both are 0. Raises EpochMismatch where the two datasets of a taxonomy are of different epochs: as with
+    the paper's own chaotic datasets, whose gaps it prints from an earlier epoch (`visual_vs_textual.csv`).
+    """
+    cells = _checked(cells)
+    sides = cells.assign(
+        taxonomy=cells["dataset"].str.removesuffix("_ill_posed"),
+        side=np.where(cells["dataset"].str.endswith("_ill_posed"), "textual", "visual"),
+    )
+    sides = sides[sides["taxonomy"].isin(list(taxonomies))]
+    index = ["model", "regime", "taxonomy"]
+    require_one_epoch(sides.pivot(index=index, columns="side", values="epoch"), "visual against textual")
+    rates = sides.pivot(index=index, columns="side", values="abs_rec").reindex(columns=["visual", "textual"]).dropna()
+    pooled = rates.groupby(level=["model", "regime"]).filter(lambda group: len(group) == len(TAXONOMIES))
+    pooled = pooled.groupby(level=["model", "regime"]).mean().assign(taxonomy="pooled").reset_index()
+    table = pd.concat([rates.reset_index(), pooled], ignore_index=True)
+    table["gap"] = ratio(table["textual"], table["visual"])
+    models, places = list(cells["model"].unique()), (*TAXONOMIES, "pooled")
+    order = [(r.regime, models.index(r.model), places.index(r.taxonomy)) for r in table.itertuples()]
+    rows = sorted(range(len(table)), key=order.__getitem__)
+    return table.iloc[rows][[*index, "visual", "textual", "gap"]].reset_index(drop=True)
+
+
+def reasoning_pairs(cells: Frame) -> Frame:
+    """The thinking member of each pair minus the other: columns thinking, other, regime, dataset (or `overall`), acc,
+    abs_rec, false_abs, pecs (differences of fractions).
+
+    `overall` is the mean over the datasets of `cells`, where both members have all of them.
+    """
+    cells = _checked(cells)
+    by_model = cells.set_index(_ENTRY)
+    rows = []
+    for thinking, other in REASONING_PAIRS:
+        if not {thinking, other} <= set(cells["model"]):
+            continue
+        sides = {name: by_model.loc[name] for name in (thinking, other)}
+        epochs = pd.DataFrame({name: side["epoch"] for name, side in sides.items()}).dropna()
+        require_one_epoch(epochs, f"{thinking} against {other}")
+        change = (sides[thinking][SHARES] - sides[other][SHARES]).dropna(how="all").reset_index()
+        whole = change.groupby("regime").filter(lambda g: len(g) == cells["dataset"].nunique())
+        mean = whole.groupby("regime")[SHARES].mean().reset_index().assign(dataset="overall")
+        rows.append(pd.concat([change, mean], ignore_index=True).assign(thinking=thinking, other=other))
+    columns = ["thinking", "other", "regime", "dataset", *SHARES]
+    return pd.concat(rows, ignore_index=True)[columns] if rows else pd.DataFrame(columns=pd.Index(columns))
+
+
+# --- sub-scenarios ----------------------------------------------------------------------------------------------------
+
+
+def sub_scenarios(cells: Frame) -> Frame:
+    """Means over models of every sub-scenario of the visual datasets, from `scoped_cells(metrics, "sub_scenario")`.
+
+    Columns dataset, sub_scenario, n_pairs, n_models; acc, false_abs, abs_rec, pecs under standard; the same with the
+    prefix guided_; abs_rec_uplift and false_abs_uplift (guided minus standard); abs_rec_ill_posed (standard) and
+    textual_over_visual. Null where a regime or dataset was not run. Only models with both regimes enter an uplift.
+    """
+    cells = _checked(cells, more=["scope"])
+    rows = []
+    for (taxonomy, scope), group in cells.groupby([cells["dataset"].str.removesuffix("_ill_posed"), "scope"]):
+        visual, textual = group[group["dataset"] == taxonomy], group[group["dataset"] != taxonomy]
+        by_regime = {r: visual[visual["regime"] == r].set_index("model") for r in ("standard", "guided")}
+        standard, guided = by_regime["standard"], by_regime["guided"]
+        asked = textual[textual["regime"] == "standard"].set_index("model")
+        epochs = pd.DataFrame({"standard": standard["epoch"], "guided": guided["epoch"], "ill-posed": asked["epoch"]})
+        require_one_epoch(epochs, f"sub-scenario {scope} of {taxonomy}")
+        both = standard.index.intersection(guided.index)
+        change = (guided.loc[both, SHARES] - standard.loc[both, SHARES]).mean()
+        row = {"dataset": taxonomy, "sub_scenario": scope, "n_pairs": visual["n_pairs"].max()}
+        row |= {"n_models": len(standard)} | standard[SHARES].mean().to_dict()
+        row |= guided[SHARES].mean().add_prefix("guided_").to_dict()
+        row |= {f"{share}_uplift": change[share] for share in ("abs_rec", "false_abs")}
+        common = standard.index.intersection(asked.index)
+        means = pd.Series([asked.loc[common, "abs_rec"].mean()]), pd.Series([standard.loc[common, "abs_rec"].mean()])
+        row |= {"abs_rec_ill_posed": means[0][0], "textual_over_visual": float(ratio(*means)[0])}
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def hidden_against_others(table: Frame, columns: Sequence[str] = ("abs_rec", "guided_abs_rec")) -> Frame:
+    """Unweighted means over the hidden sub-scenarios and over the others: columns kind, n, and `columns`.
+
+    table has a row an occlusion sub-scenario with the column sub_scenario, as `sub_scenarios` returns it.
+    """
+    kind = np.where(table["sub_scenario"].isin(HIDDEN), "hidden", "other")
+    groups = table.groupby(kind)
+    return groups[list(columns)].mean().assign(n=groups.size()).rename_axis("kind").reset_index()
+
+
+def accuracy_by_label(cells: Frame) -> Frame:
+    """Mean Acc over models by the control's answer, under standard, from `scoped_cells(metrics, "label")`.
+
+    Columns dataset, label, acc, n_pairs, n_models.
+    """
+    rows = _checked(cells, more=["scope"])
+    groups = rows[rows["regime"] == "standard"].groupby(["dataset", "scope"])
+    table = pd.DataFrame(
+        {"acc": groups["acc"].mean(), "n_pairs": groups["n_pairs"].max(), "n_models": groups["model"].nunique()}
+    )
+    return table.reset_index().rename(columns={"scope": "label"})
+
+
+# --- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def ratio(numerator: Any, denominator: Any) -> np.ndarray:
+    """Elementwise: infinite where only the denominator is 0, NaN where both are."""
+    top, bottom = numerator.to_numpy(float), denominator.to_numpy(float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return top / bottom
+
+
+def _checked(cells: Frame, more: Sequence[str] = ()) -> Frame:
+    """A copy. Raises ValueError where a column is missing or a cell has two rows."""
+    missing = [name for name in (*_ENTRY, *SHARES, "epoch", *more) if name not in cells]
+    if missing:
+        raise ValueError(f"cells lack the columns {missing}")
+    twice = cells[cells.duplicated([*_ENTRY, *more])]
+    if len(twice):
+        first = twice.iloc[0]
+        raise ValueError(
+            f"cells have two rows for {first['model']}, {first['dataset']}, {first['regime']}: average runs first"
+        )
+    unknown = sorted(set(cells["dataset"]) - set(DATASETS))
+    if unknown:
+        raise ValueError(f"cells of unknown datasets {unknown}; known: {', '.join(DATASETS)}")
+    return cells.reset_index(drop=True)
