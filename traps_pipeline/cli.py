@@ -85,6 +85,9 @@ def build_parser() -> argparse.ArgumentParser:
     add("why", why, "why an item's answers stand or will be asked again").add_argument(
         "item", help="dataset:scenario:side"
     )
+    auditing = add("audit", audit_published, "recompute what the published tables allow, and compare", workspace=False)
+    auditing.add_argument("--all", action="store_true", help="show what agrees, too")
+    auditing.add_argument("--csv", type=Path, metavar="FILE", help="write every finding to a file")
     requests = commands.add_parser("requests", help="calls for others to make").add_subparsers(required=True)
     export = requests.add_parser("export", help="write an experiment's missing calls and their media to a folder")
     export.set_defaults(command=export_calls)
@@ -130,6 +133,18 @@ def doctor(arguments: argparse.Namespace) -> int:
         problems += not finding.ok
     print("everything that the demo needs is here" if not problems else f"{problems} problem(s); the demo will not run")
     return FAILED if problems else OK
+
+
+def audit_published(arguments: argparse.Namespace) -> int:
+    """See `traps audit --help`. Discrepancies of the published tables are findings, not failures."""
+    from traps_pipeline.scoring.audit import audit, audit_text
+
+    findings = audit()
+    print(audit_text(findings, arguments.all))
+    if arguments.csv:
+        findings.to_csv(arguments.csv, index=False)
+        print(f"every finding: {arguments.csv}")
+    return OK
 
 
 def init(arguments: argparse.Namespace) -> int:

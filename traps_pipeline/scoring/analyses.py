@@ -191,7 +191,8 @@ def visual_textual_gap(cells: Frame, taxonomies: Sequence[str] = TAXONOMIES) -> 
     table = pd.concat([rates.reset_index(), pooled], ignore_index=True)
     table["gap"] = ratio(table["textual"], table["visual"])
     models, places = list(cells["model"].unique()), (*TAXONOMIES, "pooled")
-    order = [(r.regime, models.index(r.model), places.index(r.taxonomy)) for r in table.itertuples()]
+    keys = zip(table["regime"], table["model"], table["taxonomy"], strict=True)
+    order = [(regime, models.index(model), places.index(taxonomy)) for regime, model, taxonomy in keys]
     rows = sorted(range(len(table)), key=order.__getitem__)
     return table.iloc[rows][[*index, "visual", "textual", "gap"]].reset_index(drop=True)
 

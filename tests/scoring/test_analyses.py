@@ -1,0 +1,178 @@
+"""The analyses on hand-worked cells, and on the paper's published ones."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from traps_pipeline.partitions import DATASETS
+from traps_pipeline.scoring.analyses import (
+    accuracy_by_label,
+    degenerate_strategies,
+    hidden_against_others,
+    models_of,
+    naive_gap,
+    overall,
+    pareto_frontier,
+    reasoning_pairs,
+    scoped_cells,
+    spread,
+    sub_scenarios,
+    uplift,
+    visual_textual_gap,
+    zero_boundary,
+)
+from traps_pipeline.scoring.epochs import EpochMismatch, epoch_note
+from traps_pipeline.scoring.published import published, published_cells
+
+
+def cell(model="m", dataset="occlusion", regime="standard", acc=0.5, abs_rec=0.4, false_abs=0.1, pecs=0.15, epoch="e1"):
+    return {
+        "model": model, "dataset": dataset, "regime": regime, "acc": acc, "abs_rec": abs_rec, "false_abs": false_abs,
+        "pecs": pecs, "epoch": epoch,
+    }  # fmt: skip
+
+
+def cells(*rows):
+    return pd.DataFrame(list(rows))
+
+
+def test_overall_is_the_equal_weight_mean_and_averages_pecs_itself():
+    frame = cells(
+        *(cell(dataset=d, acc=a, pecs=p) for d, a, p in zip(DATASETS, (1, 0, 0.5, 0.5), (0.4, 0, 0, 0), strict=True))
+    )
+    row = overall(frame).iloc[0]
+    assert (row["acc"], row["pecs"]) == (0.5, 0.1)
+
+
+def test_a_model_that_lacks_a_dataset_has_no_overall_row():
+    frame = cells(*(cell(dataset=d) for d in DATASETS), cell(model="partial"))
+    assert list(overall(frame)["model"]) == ["m"]
+
+
+def test_uplift_is_the_ratio_of_means_not_the_mean_of_ratios():
+    frame = cells(
+        cell(abs_rec=0.1), cell(dataset="chaotic", abs_rec=0.3),
+        cell(regime="guided", abs_rec=0.5), cell(dataset="chaotic", regime="guided", abs_rec=0.3),
+    )  # fmt: skip
+    assert uplift(frame)["ratio"].tolist() == pytest.approx([0.4 / 0.2])
+
+
+def test_uplift_from_nothing_is_infinite():
+    frame = cells(cell(abs_rec=0.0), cell(regime="guided", abs_rec=0.5))
+    assert uplift(frame)["ratio"].tolist() == [np.inf]
+
+
+def test_a_ratio_across_epochs_is_refused_and_names_model_dataset_and_epochs():
+    frame = cells(cell(), cell(regime="guided", epoch="e2"))
+    with pytest.raises(
+        EpochMismatch, match=r"uplift: m/occlusion has guided from epoch 'e2', standard from epoch 'e1'"
+    ):
+        uplift(frame)
+
+
+def test_a_mean_may_mix_epochs_where_both_sides_mix_them_alike():
+    frame = cells(*(cell(dataset=d, regime=r, epoch=f"e-{d}") for d in DATASETS for r in ("standard", "guided")))
+    assert uplift(frame)["ratio"].tolist() == [1.0]
+    assert epoch_note(frame).startswith("epochs: occlusion e-occlusion, occlusion_ill_posed e-occlusion_ill_posed")
+
+
+def test_the_papers_own_chaotic_gap_is_refused_and_its_occlusion_gap_is_not():
+    frame = published_cells()
+    with pytest.raises(EpochMismatch, match="chaotic has textual from epoch 'original', visual from epoch 'corrected'"):
+        visual_textual_gap(frame)
+    gaps = visual_textual_gap(frame, ["occlusion"]).set_index(["model", "regime"])
+    rows = published("behavioral_per_dataset").set_index(["model", "regime", "dataset"])["abs_rec_pct"]
+    expected = rows["gpt-5-pro", "standard", "occlusion_ill_posed"] / rows["gpt-5-pro", "standard", "occlusion"]
+    assert gaps.loc[("gpt-5-pro", "standard"), "gap"] == pytest.approx(expected)
+
+
+def test_the_pooled_gap_is_a_ratio_of_means_and_a_gap_over_zero_is_infinite():
+    rates = dict(zip(DATASETS, (0.1, 0.2, 0.0, 0.5), strict=True))
+    gaps = visual_textual_gap(cells(*(cell(dataset=d, abs_rec=r) for d, r in rates.items()))).set_index("taxonomy")
+    assert gaps["gap"].to_dict() == pytest.approx({"occlusion": 2.0, "chaotic": np.inf, "pooled": 0.35 / 0.05})
+
+
+def test_a_gap_of_nothing_over_nothing_is_null():
+    frame = cells(cell(abs_rec=0.0), cell(dataset="occlusion_ill_posed", abs_rec=0.0))
+    assert visual_textual_gap(frame)["gap"].isna().all()
+
+
+def test_the_frontier_keeps_equals_and_drops_whoever_is_beaten_in_one_and_not_better_in_the_other():
+    frame = cells(
+        cell("a", acc=0.9, abs_rec=0.5), cell("b", acc=0.9, abs_rec=0.4), cell("c", acc=0.5, abs_rec=0.9),
+        cell("twin", acc=0.5, abs_rec=0.9), cell("d", acc=0.4, abs_rec=0.8),
+    )  # fmt: skip
+    assert list(pareto_frontier(frame)["model"]) == ["a", "c", "twin"]
+
+
+def test_the_naive_gap_counts_cells_strictly_above_the_threshold():
+    frame = cells(cell("at", acc=0.5, abs_rec=0.4, pecs=0.17), cell("above", acc=0.5, abs_rec=0.4, pecs=0.169))
+    assert list(naive_gap(frame, 0.03)["model"]) == ["above"]
+
+
+def test_zero_boundary_lists_the_cells_with_pecs_0():
+    assert list(zero_boundary(cells(cell("none", pecs=0.0), cell("some")))["model"]) == ["none"]
+
+
+def test_published_analyses_give_the_papers_figures():
+    frame = published_cells()
+    ratios = uplift(frame).set_index("model")["ratio"]
+    main = ratios[models_of("main")]
+    assert (main.median().round(1), main.max().round(), ratios["gemma-4-e4b"].round(1)) == (2.6, 11, 1.8)
+    guided = frame[frame["regime"] == "guided"]
+    assert sorted(pareto_frontier(guided)["model"]) == ["gemini-3.1-pro", "gemini-3.1-pro-r-low"]
+    assert len(naive_gap(guided[guided["model"].isin(models_of("main"))], 0.03)) == 16
+    assert spread(frame)["n"].iloc[0] == 183  # 16 x 4 x 3 cells, nine of a single run
+
+
+def test_reasoning_pairs_subtract_the_other_from_the_thinking_member():
+    frame = cells(
+        *(cell("qwen3-vl-think", d, abs_rec=0.6) for d in DATASETS),
+        *(cell("qwen3-vl-instruct", d, abs_rec=r) for d, r in zip(DATASETS, (0.5, 0.6, 0.7, 0.8), strict=True)),
+    )
+    change = reasoning_pairs(frame).set_index("dataset")["abs_rec"]
+    assert change.to_dict() == pytest.approx(
+        {"occlusion": 0.1, "occlusion_ill_posed": 0.0, "chaotic": -0.1, "chaotic_ill_posed": -0.2, "overall": -0.05}
+    )
+
+
+def test_every_degenerate_strategy_scores_zero():
+    table = degenerate_strategies()
+    assert len(table) == 6
+    assert (table["pecs"] == 0).all()
+
+
+def scoped(scope, regime, dataset, abs_rec, run=1):
+    return {
+        **cell(dataset=dataset, regime=regime, abs_rec=abs_rec), "run": run, "scope": scope,
+        "n_pairs": 10, "n_missing": 0,
+    }  # fmt: skip
+
+
+def test_sub_scenarios_average_runs_and_compare_regimes_and_datasets():
+    metrics = pd.DataFrame(
+        [
+            scoped("sub_scenario:dice", "standard", "chaotic", 0.1),
+            scoped("sub_scenario:dice", "standard", "chaotic", 0.3, run=2),
+            scoped("sub_scenario:dice", "guided", "chaotic", 0.5),
+            scoped("sub_scenario:dice", "standard", "chaotic_ill_posed", 0.8),
+            scoped("label:red", "standard", "chaotic", 0.4),
+            scoped("all", "standard", "chaotic", 0.4),
+        ]
+    )
+    row = sub_scenarios(scoped_cells(metrics, "sub_scenario")).iloc[0]
+    assert row[["abs_rec", "guided_abs_rec", "abs_rec_uplift", "textual_over_visual"]].tolist() == pytest.approx(
+        [0.2, 0.5, 0.3, 4.0]
+    )
+    assert accuracy_by_label(scoped_cells(metrics, "label"))[["label", "acc"]].values.tolist() == [["red", 0.5]]
+
+
+def test_hidden_sub_scenarios_against_the_others_as_published():
+    means = hidden_against_others(published("occlusion_subscenarios"), ["abs_rec_pct"]).set_index("kind")
+    assert means["n"].to_dict() == {"hidden": 3, "other": 12}
+    assert means["abs_rec_pct"].round(1).to_dict() == {"hidden": 27.0, "other": 4.9}
+
+
+def test_a_cell_given_twice_is_an_error():
+    with pytest.raises(ValueError, match="two rows for m, occlusion, standard"):
+        overall(cells(cell(), cell()))

@@ -1,0 +1,56 @@
+"""The audit of the published tables: what agrees, and the arithmetic of what does not."""
+
+import pytest
+
+from traps_pipeline.cli import main
+from traps_pipeline.scoring.audit import audit, transfer_type
+from traps_pipeline.scoring.claims import CLAIMS
+from traps_pipeline.scoring.published import published
+
+
+@pytest.fixture(scope="module")
+def findings():
+    return audit()
+
+
+def test_every_published_claim_is_decided(findings):
+    claims = findings[findings["group"] == "claims"]
+    assert set(published("claims")["id"]) == set(CLAIMS)
+    assert len(claims) == 33
+    differing = claims.loc[claims["verdict"] == "differs", "statement"].str.partition(":")[0]
+    assert set(differing) == {"spread-video-native", "spread-gpt5", "steer-control", "steer-void", "steer-family"}
+
+
+def test_the_overall_table_follows_from_the_cells_but_for_one(findings):
+    overall = findings[findings["group"] == "overall"]
+    assert len(overall) == 16 * 3 * 4
+    [one] = overall[overall["verdict"] != "agrees"].to_dict("records")
+    assert one["statement"] == "overall pecs of llava-next-video-7b, json"
+    assert one["reason"] == "(0.013 + 0.013 + 0.010 + 0.056) / 4 = 0.023, off by -0.002"
+
+
+def test_the_cell_behind_it_is_the_only_one_whose_factors_do_not_give_its_pecs(findings):
+    factors = findings[(findings["group"] == "pecs factors") & (findings["verdict"] == "differs")]
+    assert list(factors["statement"]) == ["PECS of llava-next-video-7b, chaotic, json"]
+    # With Acc x J of its factors in its place the overall figure is the printed one.
+    assert round((0.013 + 0.013 + 0.244 * (0.098 - 0.021) + 0.056) / 4, 3) == 0.025
+
+
+def test_two_printed_transfer_types_contradict_the_definitions(findings):
+    types = findings[(findings["group"] == "transfer types") & (findings["verdict"] == "differs")]
+    assert [s.rsplit("of ")[-1] for s in types["statement"]] == ["oc_ip to oc", "ch_ip to ch"]
+
+
+def test_transfer_types_follow_the_definitions():
+    assert transfer_type("oc", "oc_ip") == "Cross-modality"
+    assert transfer_type("oc_ip", "ch_ip") == "Cross-domain"
+    assert transfer_type("oc", "ch_ip") == "Cross-both"
+
+
+def test_the_command_prints_claims_and_discrepancies_and_writes_all_findings(tmp_path, capsys):
+    assert main(["audit", "--csv", str(tmp_path / "audit.csv")]) == 0
+    printed = capsys.readouterr().out
+    assert "differs         steer-family" in printed
+    assert "1 differs" in printed
+    assert "overall acc of gemini-2.5-pro" not in printed
+    assert "overall acc of gemini-2.5-pro" in (tmp_path / "audit.csv").read_text()

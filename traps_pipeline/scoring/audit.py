@@ -1,0 +1,300 @@
+"""What of the published tables can be recomputed from each other, and whether it agrees (`traps audit`).
+
+Every statement gets a verdict: `agrees` (equal at the printed digits), `within rounding` (the printed inputs, each
+anywhere in its last digit, admit the printed result) or `differs`, with the arithmetic. Nothing here is tuned to agree.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.scoring import Frame
+from traps_pipeline.scoring.analyses import SHARES, overall
+from traps_pipeline.scoring.claims import CLAIMS, DOSE_AGAINST_REGIME
+from traps_pipeline.scoring.published import published, published_cells, published_overall
+
+AGREES, ROUNDING, DIFFERS = "agrees", "within rounding", "differs"
+Verdict = Literal["agrees", "within rounding", "differs"]
+_NUMBER = re.compile(r"(?<![\w.-])\d+(?:\.\d+)?(?![\w-]*[a-z])")
+_SLACK = 1e-9
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One published statement beside what its own tables give."""
+
+    group: str
+    statement: str
+    published: str
+    recomputed: str
+    verdict: Verdict
+    reason: str = ""
+
+
+def audit() -> Frame:
+    """Every finding: columns group, statement, published, recomputed, verdict, reason."""
+    groups: Sequence[Callable[[], Iterator[Finding]]] = (
+        claims,
+        overall_means,
+        pecs_factors,
+        gaps,
+        probe_means,
+        transfer_types,
+        steering_means,
+        steering_families,
+        validation_scores,
+        composition_sums,
+    )
+    return pd.DataFrame([asdict(finding) for check in groups for finding in check()])
+
+
+def audit_text(findings: Frame, everything: bool = False) -> str:
+    """The findings for a terminal: every claim, whatever differs, counts of the rest; or all of it."""
+    lines = []
+    for group, rows in findings.groupby("group", sort=False):
+        counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
+        lines.append(f"{group}: {len(rows)} statements: {counts}")
+        shown = rows if everything or group == "claims" else rows[rows["verdict"] == DIFFERS]
+        for row in shown.itertuples():
+            lines.append(f"  {row.verdict:<15} {row.statement}")
+            lines.append(f"  {'':<15} published {row.published}; recomputed {row.recomputed}")
+            lines += [f"  {'':<15} {row.reason}"] if row.reason else []
+    differing = int((findings["verdict"] == DIFFERS).sum())
+    lines.append(f"{len(findings)} statements, {differing} differ from what the published tables give")
+    return "\n".join(lines)
+
+
+# --- claims.csv -------------------------------------------------------------------------------------------------------
+
+
+def claims() -> Iterator[Finding]:
+    """Every statement of `claims.csv`. Raises KeyError for one that nobody has written the arithmetic of."""
+    for claim in published("claims").itertuples():
+        found = CLAIMS[str(claim.id)]()
+        verdict = AGREES if _same_words(str(claim.published), found.words) else DIFFERS
+        reason = found.reason if verdict == DIFFERS else ""
+        if verdict == DIFFERS:
+            reason = f"{_differences(str(claim.published), found.words)}{'; ' + reason if reason else ''}"
+        yield Finding(
+            "claims", f"{claim.id}: {claim.statement}", str(claim.published), _shown(found.words), verdict, reason
+        )
+
+
+def _same_words(printed: str, recomputed: str) -> bool:
+    """Whether the numbers agree at the printed digits and all else that the printed words name is there too."""
+    ours, theirs = _numbers(recomputed), _numbers(printed)
+    if len(ours) != len(theirs):
+        return False
+    close = all(abs(float(a) - float(b)) <= _half_unit(b) + _SLACK for a, b in zip(ours, theirs, strict=True))
+    names = set(re.findall(r"[a-z][\w.-]*\w", _NUMBER.sub(" ", printed))) - {"to", "and", "of"}
+    return close and all(name in recomputed for name in names)
+
+
+def _numbers(words: str) -> list[str]:
+    return _NUMBER.findall(words)
+
+
+def _half_unit(number: str) -> float:
+    """Half of the last printed digit of a number."""
+    return 0.5 * 10.0 ** -len(number.partition(".")[2])
+
+
+def _differences(printed: str, recomputed: str) -> str:
+    ours, theirs = _numbers(recomputed), _numbers(printed)
+    if len(ours) != len(theirs) or not ours:
+        return "not what the tables give"
+    return "differs by " + " and ".join(f"{float(a) - float(b):+.3g}" for a, b in zip(ours, theirs, strict=True))
+
+
+def _shown(words: str) -> str:
+    """Without trailing zeros of four-decimal numbers."""
+    return re.sub(r"(\d\.\d*?[1-9])0+(?!\d)|(\d+)\.0+(?!\d)", r"\1\2", words) if re.search(r"\.\d{4}", words) else words
+
+
+# --- tables against each other ----------------------------------------------------------------------------------------
+
+
+def overall_means() -> Iterator[Finding]:
+    """The overall leaderboard against the equal-weight means of the per-dataset table, cell by cell."""
+    printed = published_overall().set_index(["model", "regime"])
+    ours = overall(published_cells()).set_index(["model", "regime"])
+    for key, row in printed.iterrows():
+        for share in SHARES:
+            scale, digits, unit = (1, 3, 0.001) if share == "pecs" else (100, int(share == "false_abs"), 0.1)
+            value, theirs = float(ours.loc[key, share]) * scale, float(row[share]) * scale
+            off, half = abs(value - theirs), 0.5 * 10.0**-digits
+            verdict: Verdict = (
+                AGREES if off <= half + _SLACK else ROUNDING if off <= half + unit / 2 + _SLACK else DIFFERS
+            )
+            parts = published_cells().query("model == @key[0] and regime == @key[1]")[share] * scale
+            sums = " + ".join(f"{part:.{3 if share == 'pecs' else 1}f}" for part in parts)
+            reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - theirs:+.2g}"
+            name = f"overall {share} of {key[0]}, {key[1]}"
+            yield Finding("overall", name, f"{theirs:.{digits}f}", f"{value:.{digits + 2}f}", verdict, reason)
+
+
+def pecs_factors() -> Iterator[Finding]:
+    """PECS of every cell against its printed factors, within what averaging over runs and rounding allow.
+
+    PECS is averaged over runs, Acc x max(0, J) of the averages is not the same: with the printed deviations the mean of
+    max(0, J) lies between max(0, J) and (J + sqrt(J^2 + s_J^2)) / 2, s_J is at most the sum of the deviations of AbsRec
+    and FalseAbs, and Acc adds a covariance of at most s_Acc s_J.
+    """
+    for cell in published_cells().fillna(0.0).itertuples():
+        shares = {name: float(getattr(cell, name)) for name in ("acc", "abs_rec", "false_abs", "pecs")}
+        low, high = _pecs_range(cell, shares)
+        naive = shares["acc"] * max(0.0, shares["abs_rec"] - shares["false_abs"])
+        inside = low - 0.0005 - _SLACK <= shares["pecs"] <= high + 0.0005 + _SLACK
+        verdict: Verdict = AGREES if abs(naive - shares["pecs"]) <= 0.0005 else ROUNDING if inside else DIFFERS
+        reason = (
+            f"{shares['acc']:.3f} x ({shares['abs_rec']:.3f} - {shares['false_abs']:.3f}) = {naive:.4f}; runs and "
+            f"rounding allow {low:.4f} to {high:.4f}"
+        )
+        name = f"PECS of {cell.model}, {cell.dataset}, {cell.regime}"
+        shown = f"{shares['pecs']:.3f}", f"{naive:.4f}"
+        yield Finding("pecs factors", name, *shown, verdict, "" if verdict == AGREES else reason)
+
+
+def _pecs_range(cell: Any, shares: dict[str, float]) -> tuple[float, float]:
+    half = 0.0005  # of a printed 0.1 %
+    deviation = {name: float(getattr(cell, f"{name}_std")) + half for name in ("acc", "abs_rec", "false_abs")}
+    if not (cell.acc_std or cell.abs_rec_std or cell.false_abs_std):  # a single run has no deviation
+        deviation = dict.fromkeys(deviation, 0.0)
+    s_j = deviation["abs_rec"] + deviation["false_abs"]
+    j_low, j_high = (shares["abs_rec"] - shares["false_abs"] + sign * 2 * half for sign in (-1, 1))
+    most = (j_high + float(np.hypot(j_high, s_j))) / 2
+    covariance = deviation["acc"] * s_j
+    low = max(0.0, (shares["acc"] - half) * max(0.0, j_low) - covariance)
+    return low, (shares["acc"] + half) * most + covariance
+
+
+def gaps() -> Iterator[Finding]:
+    """The printed gaps against the printed rates, each of which may lie anywhere in its last digit."""
+    for row in published("visual_vs_textual").to_dict("records"):
+        for taxonomy in ("occlusion", "chaotic"):
+            visual, textual = float(row[f"{taxonomy}_visual_pct"]), float(row[f"{taxonomy}_textual_pct"])
+            printed = float(row[f"{taxonomy}_gap"])
+            ours = textual / visual if visual else np.inf
+            half = 0.05 if printed < 10 and printed != round(printed) else 0.5
+            lowest, highest = (
+                (textual - 0.05) / (visual + 0.05),
+                (textual + 0.05) / (visual - 0.05) if visual > 0.05 else np.inf,
+            )
+            agrees = ours == printed or abs(ours - printed) <= half + _SLACK
+            reachable = lowest - half <= printed <= highest + half
+            verdict: Verdict = AGREES if agrees else ROUNDING if reachable else DIFFERS
+            reason = (
+                "" if agrees else f"{textual:g} / {visual:g} = {ours:.2f}; rounding allows {lowest:.2f}-{highest:.2f}"
+            )
+            name = f"textual over visual, {taxonomy}, {row['model']}"
+            yield Finding("gaps", name, f"{printed:g}", f"{ours:.2f}", verdict, reason)
+
+
+def probe_means() -> Iterator[Finding]:
+    """Every shift that confabulated items alone make, by transfer type, against the largest that the paper states."""
+    stated = float(published("claims").set_index("id").loc["probe-cf-shift", "published"])
+    rows = published("probe_transfer")
+    means = rows.groupby(["model", "transfer_type"])[["auroc", "auroc_confabulated"]].mean()
+    for (model, kind), row in means.iterrows():
+        shift = float(row["auroc"] - row["auroc_confabulated"])
+        small = shift <= stated + 0.005 + _SLACK
+        reason = "" if small else "the statement is made of qwen3-vl-8b; it does not hold for this model"
+        name = f"four-path mean AUROC, all minus confabulated only, {model}, {kind}"
+        verdict: Verdict = AGREES if small else DIFFERS
+        yield Finding("probe means", name, f"at most {stated:g}", f"{shift:.3f}", verdict, reason)
+
+
+def transfer_type(source: str, target: str) -> str:
+    """What a transfer crosses, by the definitions (benchmark.md section 7): Cross-modality, -domain or -both."""
+    domain = source.removesuffix("_ip") != target.removesuffix("_ip")
+    modality = source.endswith("_ip") != target.endswith("_ip")
+    return {(True, True): "Cross-both", (True, False): "Cross-domain", (False, True): "Cross-modality"}.get(
+        (domain, modality), "Same"
+    )
+
+
+def transfer_types() -> Iterator[Finding]:
+    """Printed transfer types against the definitions."""
+    for name in ("probe_transfer", "steering_alpha10_qwen"):
+        for row in published(name).to_dict("records"):
+            ours, printed = transfer_type(row["source"], row["target"]), str(row["transfer_type"])
+            where = f"{name}: type of {row['source']} to {row['target']}" + (
+                f", {row['model']}" if "model" in row else ""
+            )
+            reason = "" if ours == printed else f"{row['source']} and {row['target']} share the taxonomy"
+            yield Finding("transfer types", where, printed, ours, AGREES if ours == printed else DIFFERS, reason)
+
+
+def steering_means() -> Iterator[Finding]:
+    """The regime table against the means of the dose tables of the same model, direction and inference regime."""
+    regimes = published("steering_regime")
+    # The dose tables do not name their direction regime; the claims take standard directions, guided inference.
+    for name, model in (("steering_dose_qwen", "qwen3-vl-8b"), ("steering_dose_gemma", "gemma-4-e4b")):
+        printed = regimes.query(
+            "model == @model and direction_family == 'all' and direction_regime == 'standard' "
+            "and inference_regime == 'guided'"
+        ).iloc[0]
+        dose = published(name).groupby("alpha")[["control_abstention_pct", "void_abstention_pct"]].mean()
+        for side in ("control", "void"):
+            for alpha in (0, 10):
+                ours, theirs = float(dose.loc[alpha, f"{side}_abstention_pct"]), float(printed[f"{side}_alpha{alpha}"])
+                verdict: Verdict = AGREES if abs(ours - theirs) <= 0.5 + _SLACK else DIFFERS
+                reason = "" if verdict == AGREES else f"differs by {ours - theirs:+.3g} points: {_DOSE_REASONS[name]}"
+                statement = f"{model}: mean {side} abstention at alpha {alpha} over the eight paths"
+                yield Finding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason)
+
+
+_DOSE_REASONS = {
+    "steering_dose_qwen": DOSE_AGAINST_REGIME,
+    "steering_dose_gemma": "the dose table is a verification run with a reduced generation budget; the regime table is "
+    "authoritative",
+}
+
+
+def steering_families() -> Iterator[Finding]:
+    """The regime table's figures over all paths against the means of its two source families, of four paths each."""
+    rows = published("steering_regime").query("direction_regime == 'guided' and inference_regime == 'guided'")
+    for model, group in rows.groupby("model", sort=False):
+        by_family = group.set_index("direction_family")
+        for side in ("control", "void"):
+            column = f"{side}_alpha10"
+            stated = float(by_family.loc["all", column])
+            families = [float(by_family.loc[family, column]) for family in ("oc", "ch")]
+            ours = sum(families) / 2
+            verdict: Verdict = AGREES if abs(ours - stated) <= 1 + _SLACK else DIFFERS  # three roundings to a whole
+            sums = f"({families[0]:g} + {families[1]:g}) / 2 = {ours:g}"
+            reason = "" if verdict == AGREES else f"{sums}: the families are not halves of the paths averaged in `all`"
+            statement = f"{model}: {side} abstention at alpha 10, all paths, guided directions and inference"
+            yield Finding("steering", statement, f"{stated:g}", f"{ours:g}", verdict, reason)
+
+
+def validation_scores() -> Iterator[Finding]:
+    """F1 of the confabulation judge against printed precision and recall, each anywhere in its last digit."""
+    for row in published("judge_validation").to_dict("records"):
+        precision, recall, printed = float(row["precision"]), float(row["recall"]), float(row["f1"])
+        ours = _f1(precision, recall)
+        lowest, highest = _f1(precision - 0.005, recall - 0.005), _f1(min(1.0, precision + 0.005), recall + 0.005)
+        agrees = abs(ours - printed) <= 0.005 + _SLACK
+        reachable = lowest - 0.005 <= printed <= highest + 0.005
+        verdict: Verdict = AGREES if agrees else ROUNDING if reachable else DIFFERS
+        reason = "" if agrees else f"rounding of precision and recall allows {lowest:.3f} to {highest:.3f}"
+        yield Finding("validation", f"F1, {row['category']}", f"{printed:.2f}", f"{ours:.3f}", verdict, reason)
+
+
+def _f1(precision: float, recall: float) -> float:
+    return 2 * precision * recall / (precision + recall)
+
+
+def composition_sums() -> Iterator[Finding]:
+    """Category counts against the totals that the paper states: 202 occlusion and 500 chaotic pairs."""
+    counts = published("composition").groupby("taxonomy")["n"].sum()
+    for taxonomy, row in (("occlusion", "ill-posed-occlusion"), ("chaotic", "ill-posed-chaotic")):
+        stated, ours = int(float(published("other").set_index("id").loc[row, "value"])), int(counts[taxonomy])
+        verdict: Verdict = AGREES if ours == stated else DIFFERS
+        yield Finding("composition", f"pairs of {taxonomy}", str(stated), str(ours), verdict)
