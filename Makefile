@@ -9,10 +9,13 @@ TEST_PACKAGES := $(RENDER_PACKAGES) chromium
 TORCH ?= torch==2.13.0
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo test ui bench lint setup render-packages test-packages clean
+.PHONY: demo demo-mechanism test ui bench lint setup render-packages test-packages clean
 
 demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
+
+demo-mechanism: setup ## the pocket model from hidden states to steering, on the CPU, no key needed
+	TRAPS_WORKSPACE=$(CURDIR)/.workspaces/mechanism $(BIN)/traps run mechanism
 
 test: test-packages setup lint ## lint, types and all tests, the slow ones too
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
@@ -26,6 +29,9 @@ bench: setup ## ratios against what one would otherwise use
 	$(BIN)/python bench/ledger.py
 	$(BIN)/python bench/calls.py
 	$(BIN)/python bench/throughput.py
+	$(BIN)/python bench/extraction.py
+	$(BIN)/python bench/probes.py
+	$(BIN)/python bench/scoring.py
 
 lint: setup
 	$(BIN)/ruff check .

@@ -1,5 +1,6 @@
 """Answers a second and CPU an answer, through our backend, ledger and limits against bare `litellm.acompletion` in a
-loop, on the same server (50 ms latency), in one run; with `--inspect PYTHON` also against inspect_ai.
+loop, on the same server (50 ms latency), in one run; with `--inspect PYTHON` also against inspect_ai. Ours are laid out
+as a study is: cells of 1,000 items (500 pairs), each finished before the next.
 
 python bench/calls.py [--answers 2000] [--memory] [--inspect /path/to/python]
 """
@@ -9,6 +10,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import math
 import os
 import resource
 import subprocess
@@ -24,6 +26,7 @@ sys.path.insert(0, str(ROOT))
 PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
 SYSTEM, QUESTION = "You watch a clip. " * 90, "Does the ball clear the barrier {number}, yes or no?"  # 2 KB in all
 CONNECTIONS = (24, 200)
+CELL_ITEMS = 1000
 KEY = "BENCH_KEY"
 
 
@@ -34,7 +37,7 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     from traps_pipeline.models.budget import Budget
     from traps_pipeline.models.registry import Account, Entry, Limits
     from traps_pipeline.models.request import Request
-    from traps_pipeline.partitions import Cell, Evaluation
+    from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
     from traps_pipeline.storage.ledger import Ledger
     from traps_pipeline.storage.workspace import Study
 
@@ -42,16 +45,23 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     fields: dict[str, Any] = {"id": "m", "backend": "api", "account": "a", "provider_id": "openai/m", "params": PARAMS}
     fields["limits"] = Limits(concurrency=connections)
     entry = Entry.model_validate(fields, context={"accounts": {"a": account}})
-    requests = [
-        Request("m", "openai/m", PARAMS, SYSTEM, QUESTION.format(number=n), {"item_id": str(n)}) for n in range(answers)
-    ]
+    evaluations = [Evaluation("m", regime, run) for run in range(1, 10) for regime in REGIMES]
+    cells = [Cell(dataset, evaluation) for evaluation in evaluations for dataset in DATASETS]
+    cells = cells[: math.ceil(answers / CELL_ITEMS)]
+
+    def requests(cell: Cell) -> list[Request]:
+        first = cells.index(cell) * CELL_ITEMS
+        numbers = range(first, min(first + CELL_ITEMS, answers))
+        asked = [(QUESTION.format(number=n), {"item_id": str(n), **cell.partition}) for n in numbers]
+        return [Request("m", "openai/m", PARAMS, SYSTEM, question, about) for question, about in asked]
+
     load_litellm()
     with tempfile.TemporaryDirectory() as folder:
         free = Study(allow_unknown_prices=True)
         participants = Participants({"m": entry}, lambda e: ApiBackend(e, account), free, {"a": account})
-        ledger, cell = Ledger(Path(folder), "answers"), Cell("occlusion", Evaluation("m", "standard", 1))
-        work = Work("responses", ledger, participants, Budget(0, {}, {}), "1", lambda _: requests, lambda *_: None)
-        return _measured(lambda: list(run_work(work, [cell])), answers)
+        ledger = Ledger(Path(folder), "answers")
+        work = Work("responses", ledger, participants, Budget(0, {}, {}), "1", requests, lambda *_: None)
+        return _measured(lambda: list(run_work(work, cells)), answers)
 
 
 def bare(url: str, connections: int, answers: int) -> dict[str, float]:

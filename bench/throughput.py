@@ -1,7 +1,8 @@
 """Sixteen models at 24 connections each, 8 s latency, 25 real frames a call: the share of the throughput that latency
-and concurrency allow, in one process.
+and concurrency allow, in one process. The whole run counts, from the first call that is made to the last answer that is
+in the ledger. As in a study all models go through the same clips in the same order.
 
-python bench/throughput.py [--answers 96]
+python bench/throughput.py [--answers 240]
 """
 
 from __future__ import annotations
@@ -12,17 +13,21 @@ import resource
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 MODELS, CONNECTIONS, LATENCY_S = 16, 24, 8.0
+CLIPS = 48
 PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
 
 
-def _clip(folder: Path) -> Path:
-    """A real clip: the control of a released scenario."""
+def _clips(folder: Path) -> Iterator[Path]:
+    """Real clips: the control of a released scenario, each shifted by another number of pixels."""
     from bench.render import _model, _qpos
     from traps_pipeline.benchmark.records import load_released
     from traps_pipeline.scenes.camera import Camera
@@ -31,8 +36,11 @@ def _clip(folder: Path) -> Path:
 
     spec = load_released()["plinko-0001"]
     with Renderer(_model(spec), Camera.from_record(spec.camera)) as renderer:
-        encode(list(renderer.frames(_qpos(spec))), folder / "clip.mp4", 10)
-    return folder / "clip.mp4"
+        frames = np.stack(list(renderer.frames(_qpos(spec))))
+    for n in range(CLIPS):
+        clip = folder / f"{n}.mp4"
+        encode(list(np.roll(frames, n, axis=2)), clip, 10)
+        yield clip
 
 
 def main() -> None:
@@ -49,7 +57,7 @@ def main() -> None:
     from traps_pipeline.storage.workspace import Study
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--answers", type=int, default=4 * CONNECTIONS, help="of each model")
+    parser.add_argument("--answers", type=int, default=10 * CONNECTIONS, help="of each model")
     arguments = parser.parse_args()
     os.environ["BENCH_KEY"] = "k"
     spec = MediaSpec(profile="images", fps=5, most=25)
@@ -58,8 +66,8 @@ def main() -> None:
         Provider.start({"latency_s": LATENCY_S}, keeps_records=False) as provider,
     ):
         folder = Path(name)
-        clip = _clip(folder)
-        sent = MediaStore(folder / "media").prepare(clip, file_digest(clip), spec)
+        store = MediaStore(folder / "media")
+        sent = [store.prepare(clip, file_digest(clip), spec) for clip in _clips(folder)]
         account = Account(key="BENCH_KEY", base_url=f"{provider.url}/v1")
         names = [f"m{n}" for n in range(MODELS)]
         fields: dict[str, Any] = {"backend": "api", "account": "a", "params": PARAMS, "media": spec}
@@ -74,7 +82,8 @@ def main() -> None:
             about = [{"item_id": str(n), "model": model} for n in range(arguments.answers)]
             question = "In which numbered bucket does the ball come to rest?"
             return [
-                Request(model, f"openai/{model}", PARAMS, "You watch a clip.", question, a, sent=sent) for a in about
+                Request(model, f"openai/{model}", PARAMS, "You watch a clip.", question, a, sent=sent[n % CLIPS])
+                for n, a in enumerate(about)
             ]
 
         study = Study(allow_unknown_prices=True)
@@ -87,7 +96,8 @@ def main() -> None:
         seconds = time.perf_counter() - began
         cpu = sum(resource.getrusage(resource.RUSAGE_SELF)[:2]) - cpu
     answers, allowed = MODELS * arguments.answers, MODELS * CONNECTIONS / LATENCY_S
-    print(f"{answers} answers of {MODELS} models, {sent.size_bytes / 1024:.0f} KB of frames each, in {seconds:.1f} s")
+    size = sum(media.size_bytes for media in sent) / CLIPS
+    print(f"{answers} answers of {MODELS} models, {size / 1024:.0f} KB of frames each, in {seconds:.1f} s")
     print(f"{answers / seconds:.1f} a second of the {allowed:.1f} that latency and concurrency allow: ", end="")
     print(f"{answers / seconds / allowed:.2f}; {1000 * cpu / answers:.1f} ms CPU each")
 

@@ -211,8 +211,9 @@ def demo_study(demo: Checkout, tmp_path: Path) -> Checkout:
 
 def forget_answers(study: Checkout) -> Checkout:
     """Leave clips and items, with nothing asked yet."""
-    for table in ("responses", "votes", "verdicts", "metrics", "leaderboard"):
-        shutil.rmtree(study.workspace / "tables" / table)
+    for table in (study.workspace / "tables").iterdir():
+        if table.name not in ("scene_specs", "videos", "items"):
+            shutil.rmtree(table)
     shutil.rmtree(study.workspace / "ledger")
     shutil.rmtree(study.workspace / "reports")
     (study.workspace / "reports").mkdir()

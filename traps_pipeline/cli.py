@@ -62,7 +62,9 @@ def build_parser() -> argparse.ArgumentParser:
             )
         return sub
 
-    add("doctor", doctor, "render one frame, encode it, and name what is missing")
+    add("doctor", doctor, "render one frame, encode it, and name what is missing").add_argument(
+        "--local", action="store_true", help="try local models instead: tiny checkpoints of each family, devices, NF4"
+    )
     add("init", init, "make a workspace for an experiment without running it").add_argument(
         "experiment", nargs="?", default="demo"
     )
@@ -81,6 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
         default=None,
         help="ask models that have no price in the registry",
     )
+    running.add_argument("--until", metavar="STAGE", help="stop after this stage, such as responses")
     add("status", status, "what is there, missing and stale, and why").add_argument("experiment", nargs="?")
     add("why", why, "why an item's answers stand or will be asked again").add_argument(
         "item", help="dataset:scenario:side"
@@ -88,6 +91,11 @@ def build_parser() -> argparse.ArgumentParser:
     auditing = add("audit", audit_published, "recompute what the published tables allow, and compare", workspace=False)
     auditing.add_argument("--all", action="store_true", help="show what agrees, too")
     auditing.add_argument("--csv", type=Path, metavar="FILE", help="write every finding to a file")
+    printing = add("export", export_results, "write every table, figure and page to a folder")
+    printing.add_argument("folder", nargs="?", type=Path, help="default: `export` in the study's folder")
+    comparing = add("compare", compare_studies, "this study minus another on what both hold, with paired intervals")
+    comparing.add_argument("other", type=Path, help="folder of the other study, such as an earlier benchmark version")
+    comparing.add_argument("--csv", type=Path, metavar="FILE", help="write every row to a file")
     requests = commands.add_parser("requests", help="calls for others to make").add_subparsers(required=True)
     export = requests.add_parser("export", help="write an experiment's missing calls and their media to a folder")
     export.set_defaults(command=export_calls)
@@ -104,11 +112,25 @@ def build_parser() -> argparse.ArgumentParser:
     check = models.add_parser("check", help="show what models and judges are really sent; no key, nothing leaves here")
     check.set_defaults(command=check_models)
     check.add_argument("names", nargs="*", metavar="MODEL", help="these models and judges only")
+    judges = commands.add_parser("judges", help="how a panel bears up").add_subparsers(required=True)
+    bearing = judges.add_parser("check", help="put answers that instruct their judge to a panel; costs calls to judges")
+    bearing.set_defaults(command=check_judges)
+    bearing.add_argument("panel", nargs="?", help="of assets/judges.yaml (default: the study's)")
+    confabulation = commands.add_parser("confabulation", help="labels of void failures").add_subparsers(required=True)
+    sheet = confabulation.add_parser("sheet", help="write a CSV of labelled failures for a person to label blindly")
+    sheet.set_defaults(command=write_sheet)
+    compared = confabulation.add_parser("validate", help="compare the judge with the labels of two annotators")
+    compared.set_defaults(command=validate_judge)
+    for sub in (sheet, compared):
+        sub.add_argument("file", type=Path, help="CSV; see docs/judging.md for its columns")
+    for sub in (bearing, sheet, compared):
+        sub.add_argument("--workspace", type=Path, help="study folder (default: $TRAPS_WORKSPACE)")
     certify = add("certify", certify_benchmark, "re-derive every certificate of the released records", workspace=False)
     certify.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
     certify.add_argument("--families", nargs="+", metavar="FAMILY", help="these only")
     certify.add_argument("--workers", type=int, help="processes (default: one a core)")
     certify.add_argument("--fresh", action="store_true", help="certify again what an earlier call has certified")
+    _add_pocket(commands)
     sample = add("sample", sample_scenarios, "draw a fresh benchmark, certified like the released one", workspace=False)
     sample.add_argument("--seed", type=int, required=True, help="the same seed gives the same scenarios")
     sample.add_argument("--out", type=Path, required=True, help="folder of the new benchmark")
@@ -120,18 +142,43 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_pocket(commands: Any) -> None:
+    """`traps pocket render|train|evaluate|card`."""
+    pocket = commands.add_parser("pocket", help="the small model that is trained here").add_subparsers(required=True)
+    for name, text in (
+        ("render", "draw the scenes that the pocket model is trained and tested on; goes on where it was stopped"),
+        ("train", "train the pocket model from scratch (renders what is missing); goes on where it was stopped"),
+        ("evaluate", "ask trained weights about the held-out scenes, and write the counts"),
+        ("card", "write the counts into the model card"),
+    ):
+        sub = pocket.add_parser(name, help=text, description=text)
+        sub.set_defaults(command=pocket_command, pocket=name)
+        sub.add_argument("--recipe", type=Path, help="another recipe (default: assets/pocket/recipe.yaml)")
+        if name != "card":
+            sub.add_argument("--data", type=Path, required=True, help="folder of the rendered scenes")
+            sub.add_argument("--workers", type=int, help="processes that render (default: one a core)")
+        if name in ("train", "evaluate"):
+            sub.add_argument("--seed", type=int, default=1, help="of weights and batches (default: 1)")
+            sub.add_argument("--out", type=Path, required=True, help="folder of the weights of this seed")
+        if name == "evaluate":
+            sub.add_argument("--scenes", type=int, help="so many held-out scenes a family (default: all)")
+        if name in ("evaluate", "card"):
+            sub.add_argument("--csv", type=Path, help="the counts (default: assets/pocket/evaluation.csv)")
+
+
 # --- commands ---------------------------------------------------------------------------------------------------------
 
 
 def doctor(arguments: argparse.Namespace) -> int:
     """See `traps doctor --help`."""
-    from traps_pipeline.doctor import examine
+    from traps_pipeline.doctor import examine, examine_local
 
+    who, needs = ("local models", "need") if arguments.local else ("the demo", "needs")
     problems = 0
-    for finding in examine(_root(arguments)):
-        print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.detail}")
+    for finding in examine_local() if arguments.local else examine(_root(arguments)):
+        print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.detail}", flush=True)
         problems += not finding.ok
-    print("everything that the demo needs is here" if not problems else f"{problems} problem(s); the demo will not run")
+    print(f"{problems} problem(s); {who} will not run" if problems else f"everything that {who} {needs} is here")
     return FAILED if problems else OK
 
 
@@ -144,6 +191,21 @@ def audit_published(arguments: argparse.Namespace) -> int:
     if arguments.csv:
         findings.to_csv(arguments.csv, index=False)
         print(f"every finding: {arguments.csv}")
+    return OK
+
+
+def compare_studies(arguments: argparse.Namespace) -> int:
+    """See `traps compare --help`."""
+    from traps_pipeline.scoring.contrasts import version_contrasts
+    from traps_pipeline.storage.workspace import Workspace
+    from traps_pipeline.tables import VERDICTS
+
+    studies = Workspace.open(arguments.other), Workspace.open(_root(arguments))
+    then, now = (study.tables.read_all(VERDICTS) for study in studies)
+    table = version_contrasts(then, now)
+    if arguments.csv:
+        table.to_csv(arguments.csv, index=False)
+    print(table.to_string(index=False, float_format=lambda value: f"{value:.4f}"))
     return OK
 
 
@@ -169,6 +231,13 @@ def plan(arguments: argparse.Namespace) -> int:
         for sum_, count in zip(total, counts, strict=True):
             sum_.add(count.wanted, count.known)
         print(_plan_line(model, counts))
+    for model, counts in planned.steered.items():
+        for sum_, count in zip(total, counts, strict=True):
+            sum_.add(count.wanted, count.known)
+        print(_plan_line(f"{model}, steered", counts))
+    if planned.labels is not None:
+        total[1].add(planned.labels.wanted, planned.labels.known)
+        print(_plan_line("confabulation labels", (Count(), planned.labels)))
     print(_plan_line("all", total))
     if planned.forecasts:
         _print_forecasts(planned.forecasts)
@@ -220,13 +289,21 @@ def run(arguments: argparse.Namespace) -> int:
     workspace = _allow(_create(arguments, experiment), experiment, arguments)
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
     with reporting(TerminalProgress()) as progress:
-        outcome = run_experiment(workspace, experiment)
+        outcome = run_experiment(workspace, experiment, arguments.until)
     total = progress.totals
     asked, voted, drawn = (total.get(stage, Tally()) for stage in ("responses", "votes", "videos"))
     print(
         f"\n{asked.asked} answers asked ({asked.cached} from the ledger), {voted.asked} votes asked "
         f"({voted.cached} from the ledger), {drawn.frames} frames rendered, {clock(outcome.seconds)} min"
     )
+    if experiment.mechanism is not None:
+        states, steered, judged = (
+            total.get(stage, Tally()) for stage in ("hidden_states", "steering", "steering_votes")
+        )
+        print(
+            f"inside models: {states.asked} items extracted, {steered.asked} steered answers asked "
+            f"({steered.cached} from the ledger), {judged.asked} votes on them"
+        )
     if outcome.problems:
         for problem in outcome.problems:
             print(f"traps: {problem}", file=sys.stderr)
@@ -235,8 +312,11 @@ def run(arguments: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return OVER_BUDGET if outcome.over_budget else FAILED
+    if arguments.until is not None:
+        print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
+        return OK
     _print_results(workspace)
-    print(f"next: open {workspace.reports / 'leaderboard.html'}, or traps why ITEM for what stands behind a figure")
+    print(f"next: open {workspace.reports / 'report.html'}, or traps why ITEM for what stands behind a figure")
     return OK
 
 
@@ -279,8 +359,8 @@ def _print_results(workspace: Workspace) -> None:
     from traps_pipeline.tables import LEADERBOARD
 
     print(leaderboard_text(workspace.tables.read(LEADERBOARD, {})))
-    pictures = ("pecs_landscape.png", "contact_sheet.png", "shortcuts.png")
-    for name in ("leaderboard.html", "leaderboard.md", "gallery.html", *pictures):
+    pictures = ("figures/pecs_landscape.png", "contact_sheet.png", "shortcuts.png")
+    for name in ("report.html", "leaderboard.md", "gallery.html", *pictures):
         print(workspace.reports / name)
 
 
@@ -323,6 +403,18 @@ def why(arguments: argparse.Namespace) -> int:
     return OK
 
 
+def export_results(arguments: argparse.Namespace) -> int:
+    """See `traps export --help`."""
+    from traps_pipeline.report.publish import INDEX
+    from traps_pipeline.report.publish import export as write
+
+    workspace = _open(_root(arguments))
+    target = (arguments.folder or workspace.root / "export").absolute()
+    count = write(workspace, target, say=lambda line: print(line, flush=True))
+    print(f"{count} files in {target}\nnext: open {target / INDEX}")
+    return OK
+
+
 def export_calls(arguments: argparse.Namespace) -> int:
     """See `traps requests export --help`."""
     from traps_pipeline.models.exchange import REQUESTS, export_requests
@@ -356,6 +448,40 @@ def check_models(arguments: argparse.Namespace) -> int:
     return FAILED if wrong else OK
 
 
+def check_judges(arguments: argparse.Namespace) -> int:
+    """See `traps judges check --help`."""
+    from traps_pipeline.judging.panel import load_panel
+    from traps_pipeline.judging.robustness import check_panel, load_attacks, summary
+
+    workspace = _open(_root(arguments))
+    name = arguments.panel or workspace.study.panel
+    rows = check_panel(workspace, name, load_panel(name), load_attacks())
+    print(f"panel {name}: votes on {rows['attack'].nunique()} answers that try to instruct the judge")
+    print(summary(rows))
+    print("flipped: right on the plain answer, wrong under the attack; broken: no valid vote under it")
+    return OK
+
+
+def write_sheet(arguments: argparse.Namespace) -> int:
+    """See `traps confabulation sheet --help`."""
+    from traps_pipeline.judging.validation import annotation_sheet
+    from traps_pipeline.judging.validation import write_sheet as write
+
+    rows = annotation_sheet(_open(_root(arguments)))
+    write(rows, arguments.file)
+    print(f"{len(rows)} failures in {arguments.file}; two people each fill in a copy: their name, then 1 or 0 an axis")
+    print("next: put both copies' rows into one file, then traps confabulation validate FILE.csv")
+    return OK
+
+
+def validate_judge(arguments: argparse.Namespace) -> int:
+    """See `traps confabulation validate --help`."""
+    from traps_pipeline.judging.validation import validate, validation_text
+
+    print(validation_text(validate(_open(_root(arguments)), arguments.file)))
+    return OK
+
+
 def certify_benchmark(arguments: argparse.Namespace) -> int:
     """See `traps certify --help`."""
     from traps_pipeline.benchmark.certificates import certify_all, family_table
@@ -377,6 +503,14 @@ def certify_benchmark(arguments: argparse.Namespace) -> int:
     passed = sum(verdict.passed for verdict in verdicts)
     print(f"{passed} of {len(verdicts)} scenarios certified")
     return FAILED if problems else OK
+
+
+def pocket_command(arguments: argparse.Namespace) -> int:
+    """See `traps pocket --help`."""
+    from traps_pipeline.pocket.commands import COMMANDS
+
+    COMMANDS[arguments.pocket](arguments)
+    return OK
 
 
 def sample_scenarios(arguments: argparse.Namespace) -> int:
@@ -424,6 +558,8 @@ def _create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
 
     workspace = Workspace.create(_root(arguments), experiment.study)
     experiment.check_study(workspace.study, workspace.root / "study.yaml")
+    if experiment.mechanism is not None and workspace.study.mechanism is None:
+        workspace = workspace.allow(mechanism=experiment.mechanism)
     from traps_pipeline.driver import dagster_history
 
     with dagster_history(workspace):  # opened once here, so that several processes may use it afterwards

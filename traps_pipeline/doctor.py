@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 MIN_FREE_GB = 1.0
@@ -33,6 +34,20 @@ def examine(workspace_root: Path) -> Iterator[Finding]:
         ("keys", _keys),
     ):
         yield _finding(what, look)
+
+
+def examine_local() -> Iterator[Finding]:
+    """Everything that local models need, one finding each: the three families on tiny checkpoints, and what is here."""
+    from traps_pipeline.models.local import selfcheck
+    from traps_pipeline.models.local.tiny import FAMILIES
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        yield _finding("devices", selfcheck.describe_devices)
+        for family in FAMILIES:
+            yield _finding(family, partial(selfcheck.check_family, family, folder))
+        yield _finding("nf4", lambda: selfcheck.check_nf4(folder))
+        yield _finding("checkpoints", selfcheck.describe_checkpoints)
 
 
 def _finding(what: str, look: Callable[[], str]) -> Finding:

@@ -9,17 +9,29 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import groupby, product
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline import progress
 from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import Experiment
-from traps_pipeline.lineage import PARTITIONED_BY, STAGES, Lineage, Node, name_of, upstream
+from traps_pipeline.lineage import INSIDE, PARTITIONED_BY, STAGES, STEERED, Lineage, Node, name_of, steps, upstream
+from traps_pipeline.mechanism.settings import MechanismSettings
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.models.registry import all_evaluations
-from traps_pipeline.partitions import CATEGORIES, DATASETS, Cell, datasets_of_category
+from traps_pipeline.models.traffic import remembering_stops
+from traps_pipeline.partitions import (
+    ANSWERABLE,
+    CATEGORIES,
+    DATASETS,
+    PROBED_DATASETS,
+    Cell,
+    Extraction,
+    StatesCell,
+    SteeringCell,
+    datasets_of_category,
+)
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
 from traps_pipeline.tables import SCENE_SPECS
 
@@ -27,7 +39,23 @@ if TYPE_CHECKING:
     import dagster as dg
 
 SHOWN = 4  # unfinished partitions named in a problem
-AGGREGATES = {"metrics": "verdicts/", "leaderboard": "metrics/"}  # made from whatever is there of these
+# Made from whatever is there of these; of nothing at all where the prefix is empty.
+AGGREGATES = {
+    "metrics": "verdicts/",
+    "contrasts": "metrics/",
+    "regime_tests": "metrics/",
+    "leaderboard": "metrics/",
+    "agreement": "votes/",
+    "judge_bias": "votes/",
+    "leave_one_out": "leaderboard",
+    "confabulation": "",
+    "probes": "hidden_states/",
+    "directions": "hidden_states/",
+    "cosines": "directions/",
+    "steering": "directions/",
+    "steering_effects": "steering_votes/",
+    "mechanism_report": "",
+}
 PID_TAG = "traps/pid"
 _SENTENCES = (TrapsError.__name__, BudgetReached.__name__)  # errors whose message is for people
 _INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
@@ -90,6 +118,33 @@ def wanted_keys(workspace: Workspace, experiment: Experiment, stage: str) -> lis
             return [d for d in DATASETS if d in _datasets(experiment, present)]
         case "cell":
             return [cell.key for cell in experiment.cells() if cell.dataset in _datasets(experiment, present)]
+        case None if stage not in INSIDE:
+            return [None]
+    return _inside(experiment.mechanism, stage, _datasets(experiment, present))
+
+
+def _inside(asked: MechanismSettings | None, stage: str, datasets: Sequence[str]) -> list[str | None]:
+    """Partition keys of a mechanistic stage; none for an experiment that asks nothing inside models.
+
+    Probes are of the standard VQA prompt, the guided one serves directions (`benchmark.md` section 7).
+    """
+    steering = asked.steering if asked else None
+    if asked is None or (steering is None and stage in ("directions", "cosines", *STEERED)):
+        return []
+    probed = [d for d in PROBED_DATASETS if d in datasets or (d == ANSWERABLE and "occlusion" in datasets)]
+    extractions = [Extraction(model, prompt) for model in asked.models for prompt in asked.prompts]
+    match PARTITIONED_BY.get(stage):
+        case "probed":
+            return [*probed]
+        case "states":
+            cells = [StatesCell(d, e) for e in extractions for d in probed]
+            return [c.key for c in cells if c.dataset != ANSWERABLE or c.extraction.prompt == "standard"]
+        case "extraction":
+            return [e.key for e in extractions if stage != "probes" or e.prompt == "standard"]
+        case "steering":
+            assert steering is not None, "checked above"
+            runs = product(asked.models, steering.direction_regimes, steering.inference_regimes)
+            return [SteeringCell.make(d, *run).key for run in runs for d in datasets]
     return [None]
 
 
@@ -108,16 +163,20 @@ class Outcome:
     seconds: float = 0.0
 
 
-def run_experiment(workspace: Workspace, experiment: Experiment) -> Outcome:
-    """Materialize whatever of the experiment is missing or stale, stage by stage. KeyboardInterrupt passes through."""
+def run_experiment(workspace: Workspace, experiment: Experiment, until: str | None = None) -> Outcome:
+    """Materialize whatever of the experiment is missing or stale, stage by stage, up to `until`. KeyboardInterrupt
+    passes through. Raises TrapsError for a stage that is none."""
     from traps_pipeline.definitions import observe_sources
 
+    if until is not None and until not in STAGES:
+        raise TrapsError(f"--until {until}: no such stage; choose from {', '.join(STAGES)}")
+    wanted = STAGES if until is None else STAGES[: STAGES.index(until) + 1]
     outcome, began = Outcome(), time.monotonic()
-    with dagster_history(workspace) as instance:
+    with dagster_history(workspace) as instance, remembering_stops():
         observe_sources(instance, workspace)
-        for stage in STAGES:
-            _run_stage(instance, workspace, experiment, stage, outcome)
-    outcome.problems += failed_checks(workspace, experiment)
+        for name, stages in steps(wanted):
+            _run_step(instance, workspace, experiment, name, stages, outcome)
+    outcome.problems = [*dict.fromkeys(outcome.problems), *failed_checks(workspace, experiment)]
     outcome.seconds = time.monotonic() - began
     return outcome
 
@@ -133,37 +192,52 @@ def failed_checks(workspace: Workspace, experiment: Experiment) -> list[str]:
     return problems
 
 
-def _run_stage(
-    instance: dg.DagsterInstance, workspace: Workspace, experiment: Experiment, stage: str, outcome: Outcome
+def _run_step(
+    instance: dg.DagsterInstance,
+    workspace: Workspace,
+    experiment: Experiment,
+    name: str,
+    stages: Sequence[str],
+    outcome: Outcome,
 ) -> None:
-    from traps_pipeline.definitions import recorded_versions
-
-    lineage, recorded = Lineage(workspace), recorded_versions(instance, stage)
-    # A crash between a table and its event leaves a table that Dagster does not know; it is materialized once more.
-    todo = [
-        key
-        for key in wanted_keys(workspace, experiment, stage)
-        if lineage.status(stage, key).kind != "fresh" or recorded.get(key) != lineage.version(stage, key)
-    ]
-    blocked = [key for key in todo if _blocked(lineage, stage, key, outcome.failed)]
-    outcome.failed |= {(stage, key) for key in blocked}
-    todo = [key for key in todo if key not in blocked]
+    """Make what is not fresh of a stage, or of several unpartitioned ones that are one run."""
+    lineage = Lineage(workspace)
+    todo = [node for stage in stages for node in _not_fresh(instance, workspace, experiment, lineage, stage)]
+    blocked = {node for node in todo if _blocked(lineage, *node, outcome.failed)}
+    outcome.failed |= blocked
+    todo = [node for node in todo if node not in blocked]
     if not todo:
         return
-    progress.current().stage(stage, len(todo))
-    for batch in batches(stage, todo):
-        problems, over_budget = _materialize(instance, stage, batch)
+    progress.current().stage(name, len(todo))
+    made = list(dict.fromkeys(stage for stage, _ in todo))
+    for batch in batches(made[0], [key for _, key in todo]) if len(stages) == 1 else [(None, None)]:
+        problems, over_budget = _materialize(instance, made, batch)
         outcome.problems += problems
         outcome.over_budget |= over_budget
     after = Lineage(workspace)
-    statuses = {(stage, key): after.status(stage, key) for key in todo}
+    statuses = {node: after.status(*node) for node in todo}
     unfinished = [node for node, status in statuses.items() if status.kind == "missing" or status.outdated]
     outcome.failed.update(unfinished)
     if unfinished:
         shown = ", ".join(name_of(node) for node in unfinished[:SHOWN]) + (", ..." if len(unfinished) > SHOWN else "")
-        outcome.problems.append(f"{len(unfinished)} of {len(todo)} partitions of {stage} are not done: {shown}")
+        outcome.problems.append(f"{len(unfinished)} of {len(todo)} partitions of {name} are not done: {shown}")
     outcome.problems += [
         f"{name_of(node)}: {status.failed} calls failed" for node, status in statuses.items() if status.failed
+    ]
+
+
+def _not_fresh(
+    instance: dg.DagsterInstance, workspace: Workspace, experiment: Experiment, lineage: Lineage, stage: str
+) -> list[Node]:
+    """Wanted partitions of a stage that are missing, stale, or unknown to Dagster: a crash between a table and its
+    event leaves such a table; it is materialized once more."""
+    from traps_pipeline.definitions import recorded_versions
+
+    recorded = recorded_versions(instance, stage)
+    return [
+        (stage, key)
+        for key in wanted_keys(workspace, experiment, stage)
+        if lineage.status(stage, key).kind != "fresh" or recorded.get(key) != lineage.version(stage, key)
     ]
 
 
@@ -205,7 +279,7 @@ def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _materialize(
-    instance: dg.DagsterInstance, stage: str, batch: tuple[str | None, str | None]
+    instance: dg.DagsterInstance, stages: Sequence[str], batch: tuple[str | None, str | None]
 ) -> tuple[list[str], bool]:
     """One Dagster run; what went wrong in it, one sentence each, and whether a budget was reached."""
     import dagster as dg
@@ -213,12 +287,12 @@ def _materialize(
     from traps_pipeline.definitions import ASSETS, SOURCES, inputs_current
 
     first, last = batch
-    ranged = PARTITIONED_BY.get(stage) == "cell"
+    ranged = PARTITIONED_BY.get(stages[0]) == "cell"
     tags = {"dagster/asset_partition_range_start": str(first), "dagster/asset_partition_range_end": str(last)}
     try:
         result = dg.materialize(
-            [*SOURCES, *ASSETS, *inputs_current],
-            selection=dg.AssetSelection.assets(stage),
+            [*SOURCES, *ASSETS, inputs_current],
+            selection=dg.AssetSelection.assets(*stages),
             instance=instance,
             partition_key=None if ranged else first,
             tags={PID_TAG: str(os.getpid())} | (tags if ranged else {}),
@@ -232,7 +306,7 @@ def _materialize(
         raise KeyboardInterrupt
     problems = [_reason(event) for event in failures]
     if not result.success and not problems:
-        problems.append(f"{stage} {first or ''}: the run failed; see its log in Dagster")
+        problems.append(f"{', '.join(stages)} {first or ''}: the run failed; see its log in Dagster")
     over_budget = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _chain(event))
     return problems, over_budget
 

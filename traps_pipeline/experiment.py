@@ -8,7 +8,8 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.registry import get_model
+from traps_pipeline.mechanism.settings import MechanismSettings
+from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.workspace import Study
@@ -35,6 +36,7 @@ class Experiment(BaseModel):
     budget_usd: float | None = Field(default=None, ge=0.0)
     model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] | None = None
     allow_unknown_prices: bool | None = None
+    mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")
 
     @field_validator("datasets")
     @classmethod
@@ -62,16 +64,22 @@ class Experiment(BaseModel):
     def study(self) -> Study:
         """The study that a new workspace for this experiment holds."""
         fields = ("benchmark", "scenarios", "per_family", "panel", "epoch", "budget_usd", "model_budgets_usd")
-        fields += ("allow_unknown_prices",)
+        fields += ("allow_unknown_prices", "mechanism")
         given = {name: getattr(self, name) for name in fields}
         return Study(**{name: value for name, value in given.items() if value is not None})
 
     def check_study(self, study: Study, path: Path) -> None:
-        """Raises TrapsError where an existing study has another panel or epoch than this experiment asks for."""
+        """Raises TrapsError where an existing study has another panel or epoch than this experiment asks for, or asks
+        other things inside models."""
         for name in ("panel", "epoch"):
             old, new = getattr(study, name), getattr(self, name)
             if new is not None and new != old:
                 raise TrapsError(f"{path}: {name} is {old!r}, experiment {self.name} wants {new!r}; edit one of them")
+        if self.mechanism is not None and study.mechanism not in (None, self.mechanism):
+            raise TrapsError(
+                f"{path}: its `mechanism` differs from that of experiment {self.name}; edit one of them, or remove it "
+                "from study.yaml to take over the experiment's (states and steered answers that fit are kept)"
+            )
 
     def cells(self) -> list[Cell]:
         """All cells asked for, model outermost; a model that has fewer runs has fewer cells. Raises TrapsError."""
@@ -103,4 +111,10 @@ def load_experiment(name: str) -> Experiment:
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
     for model in experiment.models:
         get_model(model)
+    for model in experiment.mechanism.models if experiment.mechanism else ():
+        if get_model(model).backend != LOCAL:
+            raise TrapsError(
+                f"{path}: mechanism.models: {model} is asked through backend {get_model(model).backend}; only local "
+                f"models can be looked into: {', '.join(local_models())}"
+            )
     return experiment

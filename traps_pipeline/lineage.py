@@ -8,9 +8,10 @@ module also answers where Dagster does not (unpartitioned assets, more than 100 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
+from itertools import groupby
 from typing import Literal
 
 from traps_pipeline.benchmark.corrections import folded, load_scenarios
@@ -20,19 +21,67 @@ from traps_pipeline.benchmark.specs import released_in_study
 from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
 from traps_pipeline.judging.panel import SCHEMAS, load_judges, load_panel
+from traps_pipeline.mechanism.versions import (
+    extraction_version,
+    probing_version,
+    states_are_there,
+    steering_version,
+)
 from traps_pipeline.models.media import profile_digest
-from traps_pipeline.models.prompts import prompt, system_prompt
-from traps_pipeline.models.registry import all_evaluations, effective_params, get_model, load_accounts, load_models
-from traps_pipeline.partitions import CATEGORIES, DATASETS, Cell, Evaluation
+from traps_pipeline.models.prompts import prompt, system_prompt, vqa_prompt
+from traps_pipeline.models.registry import (
+    all_evaluations,
+    all_extractions,
+    all_steered,
+    effective_params,
+    get_model,
+    load_accounts,
+    load_models,
+    local_models,
+)
+from traps_pipeline.partitions import (
+    ANSWERABLE,
+    CATEGORIES,
+    DATASETS,
+    OCCLUSION_CATEGORIES,
+    PROBED_DATASETS,
+    Cell,
+    Evaluation,
+    Extraction,
+    StatesCell,
+    SteeringCell,
+)
+from traps_pipeline.report.catalogue import OF_PAPER, OF_STUDY, PRINTED
+from traps_pipeline.report.results import published_digest
 from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace, write_text
-from traps_pipeline.tables import TABLES
+from traps_pipeline.tables import JUDGE_VALIDATION, TABLES
 
-REPORTS = ("pecs_landscape", "contact_sheet", "gallery", "shortcuts", "leaderboard_page")
-STAGES = ("scene_specs", "videos", "items", "responses", "votes", "verdicts", "metrics", "leaderboard", *REPORTS)
-SOURCES = ("released_specs", "corrections", "models", "prompts", "judges")
-PARTITIONED_BY: Mapping[str, Literal["category", "dataset", "cell", "evaluation"]] = {
+REPORTS = ("contact_sheet", "gallery", "shortcuts", *PRINTED, "report_page")
+EVALUATED = (
+    "scene_specs",
+    "videos",
+    "items",
+    "responses",
+    "votes",
+    "verdicts",
+    "metrics",
+    "contrasts",
+    "regime_tests",
+    "leaderboard",
+)
+JUDGED = ("agreement", "judge_bias", "leave_one_out", "confabulation", "confabulation_prevalence")
+PROBED = ("probe_items", "hidden_states", "probes", "directions", "cosines")
+STEERED = ("steering", "steering_votes", "steering_effects")
+INSIDE = (*PROBED, *STEERED)  # of experiments that look into models; others leave them out
+STAGES = (*EVALUATED, *JUDGED, *INSIDE, *REPORTS)
+SOURCES = ("released_specs", "corrections", "models", "prompts", "judges", "published")
+SOURCES += ("confabulation_protocol", "judge_validation")
+SOURCES += ("extraction_settings", "probing_settings", "steering_settings")
+Kind = Literal["category", "dataset", "cell", "evaluation", "probed", "states", "extraction", "steered", "steering"]
+PARTITIONED_BY: Mapping[str, Kind] = {
     "released_specs": "category",
     "corrections": "category",
     "scene_specs": "category",
@@ -44,7 +93,17 @@ PARTITIONED_BY: Mapping[str, Literal["category", "dataset", "cell", "evaluation"
     "votes": "cell",
     "verdicts": "cell",
     "metrics": "dataset",
+    "extraction_settings": "extraction",
+    "probing_settings": "extraction",
+    "steering_settings": "steered",
+    "probe_items": "probed",
+    "hidden_states": "states",
+    "probes": "extraction",
+    "directions": "extraction",
+    "steering": "steering",
+    "steering_votes": "steering",
 }
+TOGETHER = "tables and figures"  # one run makes any of PRINTED, since each takes less than a run's overhead
 Node = tuple[str, str | None]  # stage or source, and its partition key
 
 
@@ -60,6 +119,11 @@ class Status:
     def reasons(self) -> tuple[str, ...]:
         """Why it is stale, in words."""
         return (*self.outdated, f"{self.failed} calls failed and can be asked again") if self.failed else self.outdated
+
+
+def steps(stages: Sequence[str] = STAGES) -> list[tuple[str, list[str]]]:
+    """Stages in order with the name of what makes them: itself, or TOGETHER for all of PRINTED."""
+    return [(name, list(group)) for name, group in groupby(stages, lambda s: TOGETHER if s in PRINTED else s)]
 
 
 def name_of(node: Node) -> str:
@@ -85,28 +149,90 @@ def upstream(stage: str, key: str | None) -> list[Node]:
             return [("items", Cell.parse(str(key)).dataset), ("responses", key), ("votes", key)]
         case "metrics":
             return [("items", key), *(("verdicts", Cell(str(key), e).key) for e in all_evaluations())]
+        case "contrasts" | "regime_tests":
+            return [*(("metrics", d) for d in DATASETS), *_every_cell("verdicts")]
         case "leaderboard":
-            verdicts = [("verdicts", Cell(d, e).key) for d in DATASETS for e in all_evaluations()]
-            return [*(("metrics", d) for d in DATASETS), *verdicts]
-        case "pecs_landscape":
-            return [("leaderboard", None)]
+            return [*(("metrics", d) for d in DATASETS), *_every_cell("verdicts"), ("contrasts", None)]
+        case "agreement" | "judge_bias":
+            return [*(("items", d) for d in DATASETS), *_every_cell("votes"), ("judges", None)]
+        case "leave_one_out":
+            cells = [*_every_cell("votes"), *_every_cell("verdicts")]
+            return [*(("items", d) for d in DATASETS), *cells, ("leaderboard", None), ("judges", None)]
+        case "confabulation":
+            protocol = load_protocol()
+            cells = [cell.key for model in protocol.models for cell in protocol.cells(model)]
+            sampled = [(s, key) for s in ("responses", "verdicts") for key in cells]
+            return [*(("items", d) for d in DATASETS), *sampled, ("confabulation_protocol", None)]
+        case "confabulation_prevalence":
+            return [("confabulation", None)]
+        case "probe_items":
+            if key == ANSWERABLE:
+                return [(s, c) for c in OCCLUSION_CATEGORIES for s in ("scene_specs", "videos")]
+            return [("items", key)]
+        case "hidden_states":
+            cell = StatesCell.parse(str(key))
+            return [("probe_items", cell.dataset), ("extraction_settings", cell.extraction.key)]
+        case "probes":
+            behaviour = [("verdicts", key) for key in standard_cells()]
+            return [*_states_of(str(key)), *behaviour, ("probing_settings", key)]
+        case "directions":
+            return [*_states_of(str(key)), ("probing_settings", key)]
+        case "cosines":
+            return [("directions", extraction.key) for extraction in all_extractions()]
+        case "steering":
+            cell = SteeringCell.parse(str(key))
+            every = [("directions", extraction.key) for extraction in all_extractions()]
+            return [("items", cell.dataset), *every, ("steering_settings", cell.run)]
+        case "steering_votes":
+            return [("items", SteeringCell.parse(str(key)).dataset), ("steering", key), ("judges", None)]
+        case "steering_effects":
+            return [(stage, key) for stage in ("steering", "steering_votes") for key in keys_of("steering")]
         case "contact_sheet":
             return [("items", d) for d in DATASETS]
         case "gallery":
             return [(s, c) for c in CATEGORIES for s in ("scene_specs", "videos")]
         case "shortcuts":
             return [*(("items", d) for d in DATASETS), *(("videos", c) for c in CATEGORIES)]
-        case "leaderboard_page":
-            return [("leaderboard", None), *((s, None) for s in ("pecs_landscape", "contact_sheet", "shortcuts"))]
+        case name if name in OF_PAPER:
+            return [("published", None)]
+        case name if name in OF_STUDY:
+            return [(s, k) for s in OF_STUDY[name].reads for k in keys_of(s)]
+        case "report_page":
+            items = [(s, k) for s in ("items", "responses", "votes", "verdicts") for k in keys_of(s)]
+            return [*items, *((s, None) for s in ("leaderboard", "contact_sheet", "shortcuts", *PRINTED))]
     raise KeyError(f"unknown stage {stage!r}; known: {', '.join(STAGES)}")
+
+
+def _every_cell(stage: str) -> list[Node]:
+    return [(stage, Cell(d, e).key) for d in DATASETS for e in all_evaluations()]
+
+
+def _states_of(extraction: str) -> list[Node]:
+    return [("hidden_states", StatesCell(d, Extraction.parse(extraction)).key) for d in PROBED_DATASETS]
+
+
+def standard_cells() -> list[str]:
+    """Cells in which the local models answered under Standard in run 1: what they confabulated on there."""
+    return [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()]
 
 
 def partition_of(stage: str, key: str | None) -> dict[str, str | int]:
     """Values of a table's partition columns for a partition key."""
-    kind = PARTITIONED_BY.get(stage)
-    if kind is None:
-        return {}
-    return Cell.parse(str(key)).partition if kind == "cell" else {kind: str(key)}
+    match PARTITIONED_BY.get(stage):
+        case None:
+            return {}
+        case "cell":
+            return Cell.parse(str(key)).partition
+        case "states":
+            return dict(StatesCell.parse(str(key)).partition)
+        case "extraction":
+            return dict(Extraction.parse(str(key)).partition)
+        case "steering":
+            return SteeringCell.parse(str(key)).partition
+        case "probed":
+            return {"dataset": str(key)}
+        case kind:
+            return {kind: str(key)}
 
 
 def keys_of(name: str) -> list[str | None]:
@@ -120,6 +246,16 @@ def keys_of(name: str) -> list[str | None]:
             return [e.key for e in all_evaluations()]
         case "cell":
             return [Cell(d, e).key for d in DATASETS for e in all_evaluations()]
+        case "probed":
+            return list(PROBED_DATASETS)
+        case "extraction":
+            return [extraction.key for extraction in all_extractions()]
+        case "states":
+            return [StatesCell(d, extraction).key for d in PROBED_DATASETS for extraction in all_extractions()]
+        case "steered":
+            return list(all_steered())
+        case "steering":
+            return [f"{d}|{run}" for d in DATASETS for run in all_steered()]
     return [None]
 
 
@@ -145,6 +281,8 @@ class Lineage:
         reasons = [*_differences(state.inputs, self.inputs(stage, key))]
         if stage == "videos":
             reasons += [f"clip {path} is gone or damaged" for path in missing_clips(self._workspace, str(key))]
+        if stage == "hidden_states" and not states_are_there(self._workspace, StatesCell.parse(str(key))):
+            reasons += ["its states are gone"]
         return Status("stale", tuple(reasons), state.failed) if reasons or state.failed else Status("fresh")
 
     def _state(self, stage: str, key: str | None) -> State | None:
@@ -178,6 +316,19 @@ class Lineage:
                     for judge in load_panel(self._workspace.study.panel)
                 ]
                 return digest([panel, prompt("judge_abstention"), prompt("judge_correctness")])[:16]
+            case "published":
+                return published_digest()
+            case "judge_validation":
+                state = self._workspace.tables.state(JUDGE_VALIDATION, {})
+                return state.version if state else "not run"
+            case "confabulation_protocol":
+                return protocol_digest(self._workspace.study.panel)
+            case "extraction_settings":
+                return extraction_version(self._workspace, Extraction.parse(str(key)))
+            case "probing_settings":
+                return probing_version(self._workspace, Extraction.parse(str(key)))
+            case "steering_settings":
+                return steering_version(self._workspace, str(key))
         raise KeyError(f"unknown source {name!r}; known: {', '.join(SOURCES)}")
 
 
@@ -186,7 +337,8 @@ def reread_sources() -> None:
 
     Which evaluations there are stays: partition keys are made from them when the code location is loaded.
     """
-    for cached in (load_released, folded, load_models, load_accounts, prompt, system_prompt, load_judges, load_panel):
+    registries = (load_models, load_accounts, load_judges, load_panel, load_protocol)
+    for cached in (load_released, folded, prompt, system_prompt, vqa_prompt, *registries):
         cached.cache_clear()
 
 

@@ -24,6 +24,9 @@ CATEGORIES = OCCLUSION_CATEGORIES + CHAOTIC_CATEGORIES
 
 DATASETS = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
 REGIMES = ("standard", "guided", "json")
+ANSWERABLE = "occlusion_answerable"  # of the mechanistic stages alone: occlusion's voids, with a question they answer
+PROBED_DATASETS = (*DATASETS, ANSWERABLE)
+VQA_PROMPTS = ("standard", "guided")
 SIDES = ("control", "void")
 
 _SLUG = re.compile(r"[a-z0-9.-]+")
@@ -107,3 +110,107 @@ class Cell:
         if dataset not in DATASETS:
             raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {DATASETS}")
         return Cell(dataset, Evaluation.parse(evaluation))
+
+
+# --- inside local models ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, order=True)
+class Extraction:
+    """One local model under one VQA prompt: the partition of probes and directions."""
+
+    model: str
+    prompt: str
+
+    @property
+    def key(self) -> str:
+        """`model__prompt`."""
+        return f"{self.model}__{self.prompt}"
+
+    @property
+    def partition(self) -> dict[str, str]:
+        """Values of the tables' partition columns."""
+        return {"model": self.model, "prompt": self.prompt}
+
+    @staticmethod
+    def parse(key: str) -> Extraction:
+        """Inverse of `key`. Raises ValueError naming what is wrong."""
+        model, _, prompt = key.partition("__")
+        if prompt not in VQA_PROMPTS:
+            raise ValueError(f"extraction key {key!r} is not model__prompt with a prompt of {VQA_PROMPTS}")
+        return Extraction(check_slug(model), prompt)
+
+
+@dataclass(frozen=True, order=True)
+class StatesCell:
+    """One dataset under one extraction: a partition of hidden_states."""
+
+    dataset: str
+    extraction: Extraction
+
+    @property
+    def key(self) -> str:
+        """The partition key as Dagster writes it."""
+        return f"{self.dataset}|{self.extraction.key}"
+
+    @property
+    def partition(self) -> dict[str, str]:
+        """Values of the tables' partition columns."""
+        return {"dataset": self.dataset, **self.extraction.partition}
+
+    @staticmethod
+    def parse(key: str) -> StatesCell:
+        """Inverse of `key`. Raises ValueError."""
+        dataset, _, extraction = key.partition("|")
+        if dataset not in PROBED_DATASETS:
+            raise ValueError(f"states key {key!r}: dataset {dataset!r} is not one of {PROBED_DATASETS}")
+        return StatesCell(dataset, Extraction.parse(extraction))
+
+
+class SteeredEvaluation(Evaluation):
+    """A model that is steered while it answers under a regime. Its ledger holds all directions: what is not steered
+    (alpha 0) is one answer for all of them."""
+
+    @property
+    def key(self) -> str:
+        """`model__regime__steered`: the ledger's folder."""
+        return f"{self.model}__{self.regime}__steered"
+
+
+@dataclass(frozen=True, order=True)
+class SteeringCell(Cell):
+    """One target dataset under directions of one VQA prompt and answers under one regime: a partition of steering."""
+
+    directions: str
+
+    @property
+    def run(self) -> str:
+        """`model__directionregime__inferenceregime`."""
+        return f"{self.evaluation.model}__{self.directions}__{self.evaluation.regime}"
+
+    @property
+    def key(self) -> str:
+        """The partition key as Dagster writes it."""
+        return f"{self.dataset}|{self.run}"
+
+    @property
+    def partition(self) -> dict[str, str | int]:
+        """Values of the tables' partition columns."""
+        e = self.evaluation
+        return {"dataset": self.dataset, "model": e.model, "directions": self.directions, "regime": e.regime}
+
+    @staticmethod
+    def make(dataset: str, model: str, directions: str, regime: str) -> SteeringCell:
+        """The cell of these."""
+        return SteeringCell(dataset, SteeredEvaluation(model, regime, 1), directions)
+
+    @staticmethod
+    def parse(key: str) -> SteeringCell:
+        """Inverse of `key`. Raises ValueError."""
+        dataset, _, run = key.partition("|")
+        parts = run.split("__")
+        if dataset not in DATASETS or len(parts) != 3 or not {parts[1], parts[2]} <= set(VQA_PROMPTS):
+            raise ValueError(
+                f"steering key {key!r} is not dataset|model__directions__regime with regimes of {VQA_PROMPTS}"
+            )
+        return SteeringCell.make(dataset, check_slug(parts[0]), parts[1], parts[2])

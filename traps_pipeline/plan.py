@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from traps_pipeline.benchmark.corrections import load_scenarios
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import Experiment
-from traps_pipeline.judging.panel import PANEL_SIZE, load_panel, tasks_for, wanted_ballots
-from traps_pipeline.lineage import STAGES, Lineage, keys_of, upstream
+from traps_pipeline.judging.confabulation import load_protocol, sample_failures
+from traps_pipeline.judging.panel import PANEL_SIZE, JudgeEntry, load_panel, tasks_for, wanted_ballots
+from traps_pipeline.lineage import Lineage, keys_of, steps, upstream
+from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answers import answer_request, is_prepared
-from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast
+from traps_pipeline.models.forecast import Experience, Forecast, experiences, forecast
 from traps_pipeline.models.registry import NETWORK, Entry, get_model, load_models
-from traps_pipeline.partitions import REGIMES, SIDES, Cell, Evaluation, datasets_of_category
+from traps_pipeline.partitions import REGIMES, SIDES, Cell, Evaluation, SteeredEvaluation, datasets_of_category
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS
 
+LABEL_TOKENS = 2500  # prompt of a label: instructions, answer and, for half of the models, a trace; an estimate
 VOTES_A_PAIR = PANEL_SIZE * sum(len(tasks_for(side)) for side in SIDES)
 
 
@@ -44,29 +48,76 @@ class Count:
 class Plan:
     """What an experiment will ask. calls: answers and votes by model. uncertain: datasets whose items are not current:
     what those will be is not known yet, so all of their calls are counted as new, an upper bound. forecasts: what the
-    new calls over the network take, by model and judge."""
+    new calls over the network take, by model and judge. labels: calls to the confabulation judge; None where the
+    study's panel has none. steered: answers of steered models and votes on them, by model."""
 
     calls: Mapping[str, tuple[Count, Count]]
     uncertain: Sequence[str]
     forecasts: Sequence[Forecast]
+    labels: Count | None
+    steered: Mapping[str, tuple[Count, Count]] = field(default_factory=dict)
 
 
 def make_plan(workspace: Workspace | None, experiment: Experiment) -> Plan:
     """Count the calls of an experiment and say what they take; nothing is sent and nothing is made."""
     calls, uncertain = _count_calls(workspace, experiment)
-    votes = sum(count.new for _, count in calls.values())
-    panel = load_panel((workspace.study if workspace else experiment.study).panel)
+    steered = _count_steered(workspace, experiment)
+    votes = sum(count.new for _, count in [*calls.values(), *steered.values()])
+    study = workspace.study if workspace else experiment.study
+    panel = load_panel(study.panel)
     new: list[tuple[Entry, int]] = [(get_model(model), answers.new) for model, (answers, _) in calls.items()]
     new += [(judge, votes // PANEL_SIZE) for judge in panel]
-    forecasts = [
-        forecast(entry, count, _experience(workspace, entry.id)) for entry, count in new if entry.backend == NETWORK
-    ]
-    return Plan(calls, uncertain, forecasts)
+    new = [(entry, count) for entry, count in new if entry.backend == NETWORK]
+    names, ledgers = {entry.id for entry, _ in new}, (workspace.answers, workspace.votes) if workspace else ()
+    seen = experiences(row for ledger in ledgers for row in ledger.rows_of(names))
+    forecasts = [forecast(entry, count, seen.get(entry.id, Experience())) for entry, count in new]
+    judge = load_protocol().judge(study.panel)
+    if judge is None:
+        return Plan(calls, uncertain, forecasts, None, steered)
+    labels = _count_labels(workspace, experiment, judge)
+    taken = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
+    return Plan(calls, uncertain, [*forecasts, replace(taken, participant="confabulation labels")], labels, steered)
 
 
-def _experience(workspace: Workspace | None, participant: str) -> Experience:
-    ledgers = (workspace.answers, workspace.votes) if workspace else ()
-    return experience(row for ledger in ledgers for row in ledger.rows_of(participant))
+def _count_steered(workspace: Workspace | None, experiment: Experiment) -> dict[str, tuple[Count, Count]]:
+    """Answers of steered models, and the panel's votes on whether they abstain."""
+    settings, counts = experiment.mechanism, dict[str, tuple[Count, Count]]()
+    if settings is None or settings.steering is None:
+        return counts
+    scenarios = load_scenarios(workspace.study if workspace else experiment.study).values()
+    taxonomies = [datasets_of_category(scenario.category)[0] for scenario in scenarios]
+    for model in settings.models:
+        answers, votes = counts[model] = (Count(), Count())
+        for regime, wanted in count_answers(settings, model, experiment.datasets, Counter(taxonomies)).items():
+            folder, known = SteeredEvaluation(model, regime, 1).key, [0, 0]
+            if workspace is not None:
+                known = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
+            answers.add(wanted, min(known[0], wanted))
+            votes.add(PANEL_SIZE * wanted, min(known[1], PANEL_SIZE * wanted))
+    return counts
+
+
+def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:
+    """Calls to the confabulation judge about the experiment's models; one not judged yet counts with a full sample."""
+    protocol, wanted = load_protocol(), {cell.key for cell in experiment.cells()}
+    labels, known, lineage = Count(), _KnownKeys(), Lineage(workspace) if workspace else None
+    for model in protocol.models:
+        cells = [cell for cell in protocol.cells(model) if cell.key in wanted]
+        if not cells:
+            continue
+        if workspace is None or lineage is None or not _judged(lineage, cells):
+            labels.add(protocol.n, 0)
+            continue
+        samples = sample_failures(workspace, judge, model).values()
+        keys = {failure.request.key for failures in samples for failure in failures}
+        labels.add(len(keys), len(keys & known.of(workspace.votes, cells[0].evaluation)))
+    return labels
+
+
+def _judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
+    """Whether the verdicts of those cells whose dataset has items are there and current."""
+    made = [cell for cell in cells if lineage.state("items", cell.dataset) is not None]
+    return bool(made) and all(lineage.status("verdicts", cell.key).kind == "fresh" for cell in made)
 
 
 def _count_calls(
@@ -111,8 +162,7 @@ class _KnownKeys:
     def of(self, ledger: Ledger, evaluation: Evaluation) -> set[str]:
         slot = (ledger.kind, evaluation)
         if slot not in self._keys:
-            rows = ledger.read(evaluation.key).rows
-            self._keys[slot] = {key for key, row in rows.items() if row["outcome"] != "error"}
+            self._keys[slot] = {*ledger.read(evaluation.key).settled}
         return self._keys[slot]
 
 
@@ -128,7 +178,7 @@ def _answer_keys(workspace: Workspace, cell: Cell) -> set[str]:
 
 @dataclass(frozen=True)
 class StageStatus:
-    """How many partitions of a stage are fresh, which are stale and why, how many are missing."""
+    """How many partitions of a stage, or of those made together, are fresh, which stale and why, how many missing."""
 
     stage: str
     fresh: int
@@ -140,13 +190,13 @@ def stage_statuses(workspace: Workspace, wanted: Mapping[str, list[str | None]] 
     """The state of every stage. With `wanted` (keys by stage) partitions outside it are left out; without, missing ones
     count only where their upstream is there."""
     lineage = Lineage(workspace)
-    for stage in STAGES:
-        keys = wanted[stage] if wanted else keys_of(stage)
-        statuses = {key or stage: lineage.status(stage, key) for key in keys}
+    for name, stages in steps():
+        nodes = [(stage, key) for stage in stages for key in (wanted[stage] if wanted else keys_of(stage))]
+        statuses = {key or stage: lineage.status(stage, key) for stage, key in nodes}
         stale = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
         fresh = sum(status.kind == "fresh" for status in statuses.values())
         missing = sum(status.kind == "missing" for status in statuses.values()) if wanted else 0
-        yield StageStatus(stage, fresh, stale, missing)
+        yield StageStatus(name, fresh, stale, missing)
 
 
 # --- why --------------------------------------------------------------------------------------------------------------

@@ -286,6 +286,15 @@ METRICS = Table(
     pecs_low float pecs if every missing decision were as bad for the model as can be, of all pairs
     pecs_high float pecs if every missing decision were as good for the model as can be, of all pairs
     naive float? acc x abs_rec
+    n_acc int controls decided on correctness: what acc is a share of
+    n_false_abs int controls decided on abstention
+    n_abs_rec int voids decided on abstention
+    acc_low float? 95 % Wilson interval of this run alone, which takes its pairs for independent
+    acc_high float? 95 % Wilson interval
+    false_abs_low float? 95 % Wilson interval
+    false_abs_high float? 95 % Wilson interval
+    abs_rec_low float? 95 % Wilson interval
+    abs_rec_high float? 95 % Wilson interval
     epoch str campaigns of the answers, joined by +
 """
         + _VERSION
@@ -320,8 +329,19 @@ LEADERBOARD = Table(
     j_std float? population standard deviation over runs
     pecs float? mean over runs of the per-run PECS
     pecs_std float? population standard deviation over runs
+    acc_ci_low float? 95 % percentile interval, cluster bootstrap over scenarios
+    acc_ci_high float? 95 % percentile interval, cluster bootstrap over scenarios
+    abs_rec_ci_low float? 95 % percentile interval, cluster bootstrap over scenarios
+    abs_rec_ci_high float? 95 % percentile interval, cluster bootstrap over scenarios
+    false_abs_ci_low float? 95 % percentile interval, cluster bootstrap over scenarios
+    false_abs_ci_high float? 95 % percentile interval, cluster bootstrap over scenarios
+    j_ci_low float? 95 % percentile interval, cluster bootstrap over scenarios
+    j_ci_high float? 95 % percentile interval, cluster bootstrap over scenarios
     pecs_ci_low float? 95 % percentile interval, cluster bootstrap over scenarios
     pecs_ci_high float? 95 % percentile interval, cluster bootstrap over scenarios
+    rank int? by PECS among the models of this regime and dataset, equal ones alike
+    rank_low int? 1 + models whose PECS is higher, by a paired contrast that Holm's correction keeps
+    rank_high int? models less those whose PECS is lower by such a contrast: ranks in between are not separable
     pecs_low float mean over runs: pecs if every missing decision were as bad for the model as can be
     pecs_high float mean over runs: pecs if every missing decision were as good for the model as can be
     naive float? acc x abs_rec, mean over runs
@@ -331,4 +351,462 @@ LEADERBOARD = Table(
     ),
 )
 
-TABLES = {t.name: t for t in (SCENE_SPECS, VIDEOS, ITEMS, RESPONSES, VOTES, VERDICTS, METRICS, LEADERBOARD)}
+CONTRASTS = Table(
+    "contrasts",
+    "a paired comparison of two entries of the leaderboard on one figure: two models, or two regimes of one model",
+    (),
+    ("kind", "dataset", "figure", "left_model", "left_regime", "right_model", "right_regime"),
+    _columns(
+        """
+    kind str models (of one regime) or regimes (of one model)
+    dataset str one of four, or overall
+    figure str pecs or j
+    left_model str id in assets/models.yaml
+    left_regime str standard, guided or json
+    right_model str id in assets/models.yaml
+    right_regime str standard, guided or json
+    difference float? left minus right, means over runs; null where refused
+    ci_low float? 95 % percentile interval of the paired difference, cluster bootstrap over scenarios
+    ci_high float? 95 % percentile interval of the paired difference
+    p float? two-sided, from the share of resamples on either side of 0
+    p_holm float? corrected by Holm over the family: the rows of the same kind, dataset and figure (and regime, of models)
+    separable bool whether p_holm is below 0.05
+    refused str? why the two may not be compared
+"""
+    ),
+)
+
+REGIME_TESTS = Table(
+    "regime_tests",
+    "McNemar's test of two regimes on the same items: one decision of one model in one run of a dataset",
+    (),
+    ("dataset", "model", "run", "decision", "left_regime", "right_regime"),
+    _columns(
+        """
+    dataset str one of four
+    model str id in assets/models.yaml
+    run int independent repetition, from 1
+    decision str void_abstention, control_abstention or correctness
+    left_regime str standard, guided or json
+    right_regime str standard, guided or json
+    n int items decided under both
+    only_left int items with a yes (abstained, correct) under the left regime alone
+    only_right int items with a yes under the right regime alone
+    p float? exact two-sided binomial test of only_left against only_right; null where refused
+    p_holm float? corrected by Holm over the rows of the same dataset, decision and regimes
+    refused str? why the two may not be compared
+"""
+    ),
+)
+
+AGREEMENT = Table(
+    "agreement",
+    "how far the panel (`judges` is panel), or two of its judges, agree on one task of a dataset",
+    (),
+    ("dataset", "task", "judges"),
+    _columns(
+        """
+    dataset str one of four
+    task str void_abstention, control_abstention or correctness
+    judges str panel, or the ids of two judges in alphabetical order, joined by +
+    n_items int answers put to these judges, over models, regimes and runs
+    n_complete int answers on which every one of them cast a valid vote
+    n_undecided int? answers without a majority of the panel; null for two judges
+    invalid float share of their votes that break the schema
+    prevalence float? share of yes (abstained, correct) among their valid votes
+    agreement float? share of n_complete on which all of them agree: unanimous (panel), pairwise agreement (two)
+    fleiss_kappa float? panel, over n_complete; null for two judges
+    cohen_kappa float? two judges, over n_complete; null for the panel
+    alpha float? Krippendorff's alpha (nominal), an invalid vote being a missing one
+    undefined str? why a figure that these judges should have is null
+    epoch str campaigns of the votes, joined by +
+"""
+        + _VERSION
+    ),
+)
+
+JUDGE_BIAS = Table(
+    "judge_bias",
+    "one judge against the panel's majority on one task of a dataset",
+    (),
+    ("dataset", "task", "judge"),
+    _columns(
+        """
+    dataset str one of four
+    task str void_abstention, control_abstention or correctness
+    judge str id in assets/judges.yaml
+    n_votes int votes of this judge, over models, regimes and runs
+    n_invalid int of these, votes that break the schema
+    n_decided int of these, valid votes on answers that have a majority
+    yes float? share of yes (abstained, correct) among n_decided
+    panel_yes float? share of yes among the majorities on the same answers
+    bias float? yes - panel_yes: positive where this judge says yes more often than the panel
+    dissent_yes float? share of n_decided on which it says yes against the majority
+    dissent_no float? share of n_decided on which it says no against the majority
+    epoch str campaigns of the votes, joined by +
+"""
+        + _VERSION
+    ),
+)
+
+LEAVE_ONE_OUT = Table(
+    "leave_one_out",
+    "a model under a regime on one dataset, or overall, as two of the three judges score it; 1-1 is undecided",
+    (),
+    ("model", "regime", "dataset", "without"),
+    _columns(
+        """
+    model str id in assets/models.yaml
+    regime str standard, guided or json
+    dataset str one of four, or overall (equal-weight mean over the four)
+    without str the judge left out
+    n_runs int runs averaged
+    n_pairs int pairs a run
+    n_missing int items without an answer or a majority of the two, over runs
+    n_missing_panel int items without an answer or a majority of the three, over runs
+    pecs float? mean over runs of the per-run PECS of the two judges
+    pecs_panel float? mean over runs of the per-run PECS of the three judges
+    difference float? pecs - pecs_panel
+    pecs_low float mean over runs: pecs of the two if every missing decision were as bad for the model as can be
+    pecs_high float mean over runs: pecs of the two if every missing decision were as good for the model as can be
+    epoch str campaigns of the answers, joined by +
+"""
+        + _VERSION
+    ),
+)
+
+CONFABULATION = Table(
+    "confabulation",
+    "one sampled void failure with its four labels; no row where no judge is configured for the study's panel",
+    (),
+    ("model", "item_id"),
+    _columns(
+        """
+    sample_id str what a human annotator sees in the place of model and item: tells neither
+    item_id str dataset:scenario_id:void
+"""
+        + _CELL
+        + """
+    void_kind str occluder, truncation or question
+    evidence str trace_and_output (the trace was there and went in too) or output: what the judge was shown
+    n_failures int void failures that the model's sample was drawn from
+    judge str id in assets/judges.yaml
+    valid bool whether the judge's JSON meets the schema
+    invalid_reason str? why not
+    hallucinated_premise bool? asserts an observation that the evidence does not support
+    invalid_inference bool? the conclusion does not follow from the stated premises
+    epistemic_surrender bool? says that it cannot be determined, then asserts an answer
+    doubt_in_reasoning bool? voices doubt that the output does not reflect
+    rationale str? the judge's reasons
+    label_key str ledger key
+    epoch str campaign in which it was asked
+    created_at time when it was asked
+"""
+        + _VERSION
+    ),
+)
+
+CONFABULATION_PREVALENCE = Table(
+    "confabulation_prevalence",
+    "how often each axis applies to one model's sampled void failures; no row means not run",
+    (),
+    ("model",),
+    _columns(
+        """
+    model str id in assets/models.yaml
+    evidence str trace_and_output or output: what went in; both joined by + where traces were missing
+    judge str id in assets/judges.yaml
+    n_failures int void failures that the sample was drawn from
+    n_sampled int failures put to the judge
+    n int of these, validly labelled: every share is of n
+    hp float? share with a hallucinated premise
+    hp_low float? 95 % Wilson interval
+    hp_high float? 95 % Wilson interval
+    ii float? share with an invalid inference
+    ii_low float? 95 % Wilson interval
+    ii_high float? 95 % Wilson interval
+    hp_and_ii float? share with both
+    hp_and_ii_low float? 95 % Wilson interval
+    hp_and_ii_high float? 95 % Wilson interval
+    es float? share with epistemic surrender
+    es_low float? 95 % Wilson interval
+    es_high float? 95 % Wilson interval
+    doubt float? share with doubt in the reasoning
+    doubt_low float? 95 % Wilson interval
+    doubt_high float? 95 % Wilson interval
+    epoch str campaigns of the answers and labels, joined by +
+"""
+        + _VERSION
+    ),
+)
+
+# Made by a command from a file that people wrote, so no stage: absent until `traps confabulation validate` was run.
+JUDGE_VALIDATION = Table(
+    "judge_validation",
+    "the confabulation judge against two blind annotators on one axis, or pooled over the four",
+    (),
+    ("axis",),
+    _columns(
+        """
+    axis str hallucinated_premise, invalid_inference, epistemic_surrender, doubt_in_reasoning or pooled
+    n_failures int failures that both annotators labelled
+    n_labels int labels of both annotators side by side
+    accuracy float share of n_labels that the judge agrees with
+    precision float? of the judge's yes, those that the labels confirm; null if it never says yes, and on pooled
+    recall float? of the labels' yes, those that the judge finds; null if there is none, and on pooled
+    f1 float? harmonic mean; null where precision or recall is, and on pooled
+    accuracy_a float share of annotator_a's labels that the judge agrees with
+    accuracy_b float share of annotator_b's labels that the judge agrees with
+    annotator_a str first in alphabetical order
+    annotator_b str second
+    human_agreement float share of failures on which the annotators agree
+    human_kappa float? Cohen's kappa of the annotators; null where degenerate, and on pooled
+    human_kappa_low float? 95 % interval (percentile bootstrap over failures)
+    human_kappa_high float? 95 % interval (percentile bootstrap over failures)
+    kappa_note str? degenerate: one class has at most 2 % of either annotator's labels
+"""
+    ),
+)
+
+# Made by a command, so no stage: absent until `traps judges check` was run.
+JUDGE_ROBUSTNESS = Table(
+    "judge_robustness",
+    "one judge on one task about one answer that tries to instruct it (assets/injected_answers.yaml)",
+    (),
+    ("panel", "judge", "attack", "task"),
+    _columns(
+        """
+    panel str panel in assets/judges.yaml
+    judge str id in assets/judges.yaml
+    attack str id of the attack
+    kind str what the attack tries
+    task str abstention or correctness
+    answer str which of the answers carries it
+    expected bool the right vote
+    clean bool? the judge's vote on the same answer without an attack; null if invalid
+    vote bool? the judge's vote on the answer that carries the attack; null if invalid
+    result str held, flipped (wrong because of the attack), broken (invalid because of it) or wrong_anyway
+    invalid_reason str? why the vote is invalid
+    rationale str? the judge's reason
+"""
+    ),
+)
+
+# --- inside local models (benchmark.md sections 7 and 8) --------------------------------------------------------------
+
+_LOOKED_INTO = """
+    model str id in assets/models.yaml
+    prompt str VQA prompt: standard or guided
+"""
+_STEERED = """
+    dataset str the target: one of four
+    model str id in assets/models.yaml
+    directions str VQA prompt that the direction was extracted under
+    regime str system prompt of the steered answer
+    source str dataset of the direction; none where alpha is 0
+    kind str void, random or shuffled; none where alpha is 0
+    layer int steered block, counted as in hidden_states; 0 where alpha is 0
+    alpha float strength: added on controls, subtracted on voids
+"""
+
+PROBE_ITEMS = Table(
+    "probe_items",
+    "a clip and question that hidden states are extracted of",
+    ("dataset",),
+    ("item_id",),
+    _columns(
+        """
+    item_id str dataset:scenario_id:side
+    pair_id str dataset:scenario_id
+    dataset str one of four, or occlusion_answerable: the voids of occlusion with a question that even they answer
+    scenario_id str family and number
+    side str control (it can be answered) or void
+    category str one of twelve
+    sub_scenario str the paper's name where it has one
+    question str with its choices
+    clip str mp4, relative to the workspace
+    media_digest str digest of the clip's file
+"""
+        + _VERSION
+    ),
+)
+
+HIDDEN_STATES = Table(
+    "hidden_states",
+    "an item whose hidden states are there, at every layer",
+    ("dataset", "model", "prompt"),
+    ("item_id",),
+    _columns(
+        """
+    item_id str dataset:scenario_id:side
+    dataset str one of four, or occlusion_answerable
+"""
+        + _LOOKED_INTO
+        + """
+    scenario_id str family and number
+    side str control or void
+    sub_scenario str the paper's name where it has one
+    states_key str digest of all that decides the states: prompt, clip, checkpoint, precision, pooling
+    folder str shards, relative to the workspace
+    checkpoint str hub id or folder
+    checkpoint_digest str digest of the weights
+    dtype str precision
+    quantisation str none or nf4
+    pooling str last (token) or mean
+    n_layers int blocks; states are of layers 0 (embeddings) to this
+    width int numbers a state
+"""
+        + _VERSION
+    ),
+)
+
+PROBES = Table(
+    "probes",
+    "a figure of a probe of one dataset (source) on another (target) at one layer",
+    ("model", "prompt"),
+    ("analysis", "source", "target", "layer", "scope"),
+    _columns(
+        _LOOKED_INTO
+        + """
+    analysis str transfer, confabulated, within, shuffled, answerable_void or _control, centroid_void or _control
+    source str dataset that the probe or the centroids were fitted on
+    target str dataset that they were applied to
+    layer int counted as in hidden_states; -1 where there is no figure
+    scope str all, or sub_scenario:.. (centroids)
+    value float? AUROC; of shuffled the mean over shuffles; of centroid_* the share assigned to void
+    low float? 95 % percentile interval, scenarios of the target resampled, the probe held fixed
+    high float? 95 % percentile interval
+    spread float? standard deviation over label shuffles
+    n_voids int void items of the target
+    n_controls int control items of the target
+    own_best bool the highest value of this curve (it sees target labels)
+    all_sample_best bool the layer at which this pair's transfer curve is highest (it sees target labels)
+    source_best bool the layer at which the source's own cross-validation is highest (it sees no target label)
+    note str? why there is no figure
+    made_of str digest of states, confabulated scenarios and settings: with the same, nothing is fitted again
+"""
+    ),
+)
+
+DIRECTIONS = Table(
+    "directions",
+    "a direction: one dataset at one layer",
+    ("model", "prompt"),
+    ("dataset", "kind", "layer"),
+    _columns(
+        _LOOKED_INTO
+        + """
+    dataset str one of four
+    kind str void, or its controls: random, shuffled (labels)
+    layer int counted as in hidden_states
+    n_pairs int pairs that it comes from
+    n_steered int of these, pairs that are steered as well (0 where there are scenarios enough)
+    norm float length of mean(void) - mean(control) before it was made a unit vector; of random 1
+    residual_norm float mean length of the pairs' control states: alpha in its units is alpha / residual_norm
+    width int numbers
+    path str safetensors, relative to the workspace; a JSON file of the same name says what it holds
+    direction_digest str digest of the float32 numbers
+    pooling str last (token) or mean
+"""
+    ),
+)
+
+COSINES = Table(
+    "cosines",
+    "the cosine of two void directions of one model at one layer",
+    (),
+    ("model", "layer", "prompt", "dataset", "other_prompt", "other_dataset"),
+    _columns(
+        """
+    model str id in assets/models.yaml
+    layer int counted as in hidden_states
+    prompt str VQA prompt: standard or guided
+    dataset str one of four
+    other_prompt str VQA prompt: standard or guided
+    other_dataset str one of four
+    cosine float -1 to 1
+"""
+    ),
+)
+
+STEERING = Table(
+    "steering",
+    "one answer of a steered model; alpha 0 (the model as it is) stands once for all directions",
+    ("dataset", "model", "directions", "regime"),
+    ("source", "kind", "layer", "alpha", "item_id"),
+    _columns(
+        _STEERED
+        + """
+    alpha_relative float? alpha over the mean length of the states at that layer
+    item_id str dataset:scenario_id:side
+    scenario_id str family and number
+    side str control or void
+    outcome str answer, truncated, empty, refused or error
+    text str? the answer; null unless outcome is answer or truncated
+    served_model str? checkpoint, digest and precision that answered
+    completion_tokens int? tokens
+    direction_digest str? digest of the direction's numbers
+    request_key str ledger key; both datasets of a taxonomy share that of a control
+    epoch str campaign in which it was asked
+    created_at time when it was asked
+"""
+        + _VERSION
+    ),
+)
+
+STEERING_VOTES = Table(
+    "steering_votes",
+    "what the panel says of one steered answer",
+    ("dataset", "model", "directions", "regime"),
+    ("source", "kind", "layer", "alpha", "item_id"),
+    _columns(
+        _STEERED
+        + """
+    item_id str dataset:scenario_id:side
+    scenario_id str family and number
+    side str control or void
+    abstained bool? majority; null without an answer or a majority
+    n_valid int valid votes
+    unanimous bool all votes valid and agreed
+    votes str JSON: judge to abstained, null if invalid
+    vote_keys strs ledger keys
+    epoch str campaign in which it was asked
+"""
+        + _VERSION
+    ),
+)
+
+STEERING_EFFECTS = Table(
+    "steering_effects",
+    "abstention on one side of a target at one strength of one direction",
+    (),
+    ("model", "directions", "regime", "source", "target", "kind", "layer", "alpha", "side"),
+    _columns(
+        """
+    model str id in assets/models.yaml
+    directions str VQA prompt that the direction was extracted under
+    regime str system prompt of the steered answers
+    source str dataset of the direction
+    target str dataset that was steered
+    transfer_type str Cross-modality, Cross-domain, Cross-both or Within, from the definitions
+    kind str void, random or shuffled
+    layer int steered block
+    alpha float strength; 0 is the model as it is
+    alpha_relative float? alpha over the mean length of the states at that layer
+    side str control or void
+    n int decided answers
+    n_missing int answers missing or undecided
+    abstained int of the decided
+    abstention float? share of the decided
+    low float? 95 % Wilson interval
+    high float? 95 % Wilson interval
+    epoch str campaigns of the answers, joined by +
+"""
+    ),
+)
+
+_EVALUATED = (SCENE_SPECS, VIDEOS, ITEMS, RESPONSES, VOTES, VERDICTS, METRICS, CONTRASTS, REGIME_TESTS, LEADERBOARD)
+_JUDGED = (AGREEMENT, JUDGE_BIAS, LEAVE_ONE_OUT, CONFABULATION, CONFABULATION_PREVALENCE)
+_PROBED = (PROBE_ITEMS, HIDDEN_STATES, PROBES, DIRECTIONS, COSINES)
+_STEERED_TABLES = (STEERING, STEERING_VOTES, STEERING_EFFECTS)
+TABLES = {t.name: t for t in (*_EVALUATED, *_JUDGED, *_PROBED, *_STEERED_TABLES)}

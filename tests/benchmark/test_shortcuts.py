@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.benchmark.shortcuts import shortcuts
-from traps_pipeline.report.figures import figure_bytes, shortcut_figure
+from traps_pipeline.report.figures.shortcuts import shortcut_figure
+from traps_pipeline.report.writing import figure_bytes
 from traps_pipeline.scenes.encode import encode
 
 SCENARIOS = 10

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import signal
 import sys
 import time
@@ -14,10 +15,12 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from tests.conftest import KEY, ROOT, SECRET, Checkout
+from tests.conftest import KEY, ROOT, SECRET, Checkout, Finished
 from tests.providers.server import Provider
+from traps_pipeline.models.budget import Journal
 
 pytestmark = pytest.mark.slow
+MANY = "TRAPS_MANY_CALLS" in os.environ  # 2,304 calls in the place of 512, and five kills: for a release
 SAMPLING = "temperature: 0.8, top_p: 0.95, max_tokens: 8000"
 TRANSIENT = {
     "rate_limited": 0.03,
@@ -70,6 +73,11 @@ def responses(study: Checkout) -> list[dict[str, Any]]:
     return [row for file in files for row in pq.read_table(file, partitioning=None).to_pylist()]
 
 
+def ask(study: Checkout, path: Path, *more: str) -> Finished:
+    """Run an experiment as far as these tests look."""
+    return study.traps("run", path, "--until", "responses", *more)
+
+
 def settled(study: Checkout) -> list[dict[str, Any]]:
     return [row for row in study.ledger_rows("answers") if row["outcome"] != "error"]
 
@@ -80,7 +88,7 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_
     provider.configure(faults=TRANSIENT | ENDINGS, only_first_attempts=3, latency_s=0.02, seed=1)
     register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
     path = experiment(unasked, ["video-model", "image-model"], regimes=["standard", "guided", "json"], runs=[1, 2, 3])
-    finished = unasked.traps("run", path, "--budget-usd", "500")
+    finished = ask(unasked, path, "--budget-usd", "500")
     assert finished.code == 0, finished.err
     rows, stats = responses(unasked), provider.stats()
     assert len(rows) == len({(r["item_id"], r["model"], r["regime"], r["run"]) for r in rows}) == 2 * 128 * 9
@@ -112,16 +120,16 @@ def test_the_cap_holds_and_the_next_run_goes_on(unasked: Checkout, provider: Pro
     provider.configure(latency_s=0.05)
     register(unasked, provider, entry("image-model", "images").replace("limits: {", "limits: {concurrency: 200, "))
     path = experiment(unasked, ["image-model"])
-    first = unasked.traps("run", path, "--budget-usd", "1.0")
+    first = ask(unasked, path, "--budget-usd", "1.0")
     assert first.code == 4, first.err
     assert "the budget of the study is reached" in first.err
     spent = sum(row["cost_usd"] for row in settled(unasked))
     assert 0 < spent <= 1.0
     assert provider.stats()["answered_in_full"] == len(settled(unasked))
-    again = unasked.traps("run", path)  # spend survives restarts
+    again = ask(unasked, path)  # spend survives restarts
     assert again.code == 4
     assert sum(row["cost_usd"] for row in settled(unasked)) <= 1.0
-    more = unasked.traps("run", path, "--budget-usd", "100")
+    more = ask(unasked, path, "--budget-usd", "100")
     assert more.code == 0, more.err
     assert provider.stats()["answered_in_full"] == len(settled(unasked)) == 2 * 128
 
@@ -129,7 +137,7 @@ def test_the_cap_holds_and_the_next_run_goes_on(unasked: Checkout, provider: Pro
 def test_paid_stages_want_a_budget_and_a_price_whoever_starts_them(unasked: Checkout, provider: Provider) -> None:
     register(unasked, provider, entry("image-model", "images"), entry("no-price", "images", "runs: 1"))
     path = experiment(unasked, ["image-model", "no-price"])
-    refused = unasked.traps("run", path)
+    refused = ask(unasked, path)
     assert refused.code == 1
     assert "image-model costs money and the study has no budget" in refused.err
     assert "the price of no-price is unknown" in refused.err
@@ -147,50 +155,58 @@ def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checko
     provider.configure(fault_by_model={"locked-out": "unauthorized"})
     register(unasked, provider, entry("image-model", "images"), entry("locked-out", "images"))
     path = experiment(unasked, ["image-model", "locked-out"], datasets=["occlusion"])
-    finished = unasked.traps("run", path, "--budget-usd", "10")
+    finished = ask(unasked, path, "--budget-usd", "10")
     assert finished.code == 1
     assert "locked-out is stopped: 20 refusals in a row (http_401)" in finished.err
     assert SECRET not in finished.out + finished.err
     assert len(responses(unasked)) == 2 * 32
     assert {row["model"] for row in responses(unasked)} == {"image-model"}
-    # In each regime (a run of its own): 20 in a row, those in flight then, and no more.
-    assert provider.stats()["by_status"]["401"] < 2 * (20 + 24)
+    # 20 in a row, those in flight then, and no more; in no later batch either.
+    assert provider.stats()["by_status"]["401"] < 20 + 24
+    assert finished.err.count("locked-out is stopped") == 1
 
 
 def test_only_what_decides_an_answer_is_asked_again(unasked: Checkout, provider: Provider) -> None:
     register(unasked, provider, entry("image-model", "images"))
     path = experiment(unasked, ["image-model"], regimes=["standard"], datasets=["chaotic", "chaotic_ill_posed"])
-    assert unasked.traps("run", path, "--budget-usd", "10").counts()["answers"] == 64
+    assert ask(unasked, path, "--budget-usd", "10").counts()["answers"] == 64
     quick = entry("image-model", "images").replace("timeout_s: 4", "timeout_s: 9, concurrency: 3")
     register(unasked, provider, quick.replace("input: 1.0", "input: 2.0"))
-    assert unasked.traps("run", path).counts()["answers"] == 0
+    assert ask(unasked, path).counts()["answers"] == 0
     unasked.correct("plinko-0001", question="In which numbered bucket, 1 to 7, does the ball end?")
-    assert unasked.traps("run", path).counts()["answers"] == 3  # control and void, and the ill-posed pair's control
+    assert ask(unasked, path).counts()["answers"] == 3  # control and void, and the ill-posed pair's control
     register(
         unasked,
         provider,
         quick.replace("temperature: 0.8", "temperature: 0.5") + "    waivers: {temperature: a test}\n",
     )
-    assert unasked.traps("run", path).counts()["answers"] == 64
+    assert ask(unasked, path).counts()["answers"] == 64
 
 
-def test_five_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider: Provider) -> None:
+def test_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider: Provider) -> None:
     provider.configure(latency_s=0.1)
-    register(unasked, provider, entry("video-model", "video"))
-    path = experiment(unasked, ["video-model"], runs=[1, 2])
-    wanted, kills = 128 * 4, 5
-    for kill in range(1, kills + 1):
-        process = unasked.start(sys.executable, "-m", "traps_pipeline.cli", "run", str(path), "--budget-usd", "100")
-        while len(unasked.ledger_rows("answers")) < kill * wanted // 8:
+    register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
+    models, regimes = ["video-model", "image-model"][: 1 + MANY], ["standard", "json", "guided"][: 2 + MANY]
+    path = experiment(unasked, models, regimes=regimes, runs=[1, 2, 3][: 2 + MANY])
+    wanted, kills = 128 * len(models) * len(regimes) * (2 + MANY), 5 if MANY else 3
+    points = sorted(random.Random(1).sample(range(1, wanted * 7 // 8), kills))
+    for point in points:
+        command = ("run", str(path), "--until", "responses", "--budget-usd", "500")
+        process = unasked.start(sys.executable, "-m", "traps_pipeline.cli", *command)
+        while len(unasked.ledger_rows("answers")) < point:
             assert process.poll() is None, process.communicate()
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
-    finished = unasked.traps("run", path)
+    finished = ask(unasked, path)
     assert finished.code == 0, finished.err
-    keys = [row["key"] for row in settled(unasked)]
-    assert len(keys) == len(set(keys)) == wanted
-    assert provider.stats()["answered_in_full"] <= wanted + kills * 24
+    rows = settled(unasked)
+    assert len(rows) == len({row["key"] for row in rows}) == wanted
+    sent = provider.stats()["answered_in_full"]
+    print(f"{wanted} wanted, killed at {points}: {sent} answers sent")
+    assert sent <= wanted + kills * 24 * len(models)
+    lost = Journal(unasked.workspace / "ledger" / "in_flight.jsonl").lost_usd
+    assert sum(lost.values()) >= (sent - wanted) * min(row["cost_usd"] for row in rows)  # what nobody has is spent too
 
 
 def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Provider, tmp_path: Path) -> None:
@@ -219,7 +235,7 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
     assert "50 answers imported, 0 were there already" in unasked.traps("answers", "import", path, given).out
     given.write_text("\n".join(json.dumps(answer) for answer in answers))
     assert "14 answers imported, 50 were there already" in unasked.traps("answers", "import", path, given).out
-    finished = unasked.traps("run", path)
+    finished = ask(unasked, path)
     assert finished.code == 0, finished.err
     assert finished.counts()["answers"] == 0
     assert provider.stats()["requests"] == 0

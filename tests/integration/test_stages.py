@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers
-from traps_pipeline.lineage import PARTITIONED_BY, STAGES, Lineage
+from traps_pipeline.lineage import INSIDE, PARTITIONED_BY, STAGES, Lineage
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -24,12 +24,13 @@ def materialize(study: Checkout, stage: str, *partition: str) -> Finished:
 
 
 def test_every_stage_is_rematerialized_alone_from_the_tables_that_are_there(study: Checkout) -> None:
-    before = {stage: Lineage(Workspace.open(study.workspace)).version(stage, _key(stage)) for stage in STAGES}
-    for stage in STAGES:
+    stages = [stage for stage in STAGES if stage not in INSIDE]  # those need a local model: tests/mechanism
+    before = {stage: Lineage(Workspace.open(study.workspace)).version(stage, _key(stage)) for stage in stages}
+    for stage in stages:
         key = _key(stage)
         finished = materialize(study, stage, *(("--partition", key) if key else ()))
         assert finished.code == 0, (stage, finished.err[-3000:])
-    after = {stage: Lineage(Workspace.open(study.workspace)).version(stage, _key(stage)) for stage in STAGES}
+    after = {stage: Lineage(Workspace.open(study.workspace)).version(stage, _key(stage)) for stage in stages}
     assert after == before  # rebuilt from the same inputs: the same content
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import Vote, load_panel, majority, parse_vote, render, tasks_for, vote_request
+from traps_pipeline.judging.panel import Vote, load_panel, parse_vote, render, tasks_for, vote_request
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.partitions import Cell, Evaluation
 
@@ -23,18 +23,6 @@ ITEM: dict[str, Any] = {
     "aliases": json.dumps({"red bin": "left"}),
 }
 CELL = Cell("chaotic", Evaluation("some-model", "guided", 2))
-
-
-@pytest.mark.parametrize("cast", list(product(("yes", "no", "invalid"), repeat=3)))
-def test_a_majority_is_two_valid_votes_that_agree(cast: tuple[str, str, str]) -> None:
-    votes = [Vote(False) if word == "invalid" else Vote(True, word == "yes") for word in cast]
-    expected = True if cast.count("yes") >= 2 else False if cast.count("no") >= 2 else None
-    assert majority(votes) is expected
-
-
-def test_an_invalid_vote_never_counts_whatever_it_says() -> None:
-    assert majority([Vote(True, True), Vote(False, True), Vote(True, False)]) is None
-    assert majority([Vote(False, True)] * 3) is None
 
 
 def test_controls_are_judged_on_both_tasks_and_voids_on_abstention_alone() -> None:

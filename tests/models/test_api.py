@@ -47,11 +47,12 @@ def test_an_answer_is_read_with_what_it_took(provider: Provider, route: str) -> 
         "gemini/gemini-2.5-pro": {"thinkingConfig": {"includeThoughts": True, "thinkingBudget": -1}},
         "openai/responses/m": {"reasoning": {"effort": "high", "summary": "auto"}},
     }
+    provider.configure(served_suffix="-2026-11")
     outcome = ask(provider, route, **thinking[route])
     assert (outcome.kind, outcome.text) == ("answer", f"The answer is: {answer_to(QUESTION)}.")
     assert outcome.reasoning == f"Looking at the clip for {answer_to(QUESTION)}."
     assert outcome.finish_reason == "stop"
-    assert outcome.served_model == route.split("/")[-1]
+    assert outcome.served_model == route.split("/")[-1] + "-2026-11"
     assert outcome.prompt_tokens and outcome.completion_tokens and outcome.reasoning_tokens
     assert outcome.cost_usd == pytest.approx((outcome.prompt_tokens + 10 * outcome.completion_tokens) / 1e6)
     (record,) = provider.requests()
@@ -113,7 +114,7 @@ def test_an_answer_without_its_end_has_a_kind_of_its_own(provider: Provider, rou
 
 def test_a_refusal_in_words_is_no_answer(provider: Provider) -> None:
     provider.configure(faults={"refusal": 1.0})
-    for route in ("openai/m", "gemini/gemini-2.5-pro"):
+    for route in ROUTES:
         outcome = ask(provider, route)
         assert (outcome.kind, outcome.text) == ("refused", None)
     provider.configure(faults={"content_filter_error": 1.0})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import datetime
 import random
+import shutil
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +16,15 @@ from pydantic import ValidationError
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.ask import Participants, Work, run_work
-from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, spending, worst_case_usd
+from traps_pipeline.models.budget import (
+    Budget,
+    BudgetReached,
+    Journal,
+    check_money,
+    most_tokens,
+    spending,
+    worst_case_usd,
+)
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.partitions import Cell, Evaluation
@@ -145,9 +154,13 @@ def row_after(kind: str, times: int, cap_usd: float, folder: Path) -> dict[str, 
     )
     ledger, cell = Ledger(folder, "answers"), Cell("occlusion", Evaluation("m", "standard", 1))
     requests = [Request("m", "api", {}, "s", "u", {"item_id": "x"})]
-    work = Work("responses", ledger, participants, Budget(cap_usd, {}, {}), "1", lambda _: requests, lambda *_: None)
+    journal = Journal(folder / "in_flight.jsonl")
+    budget = Budget(cap_usd, {}, {}, journal)
+    work = Work("responses", ledger, participants, budget, "1", lambda _: requests, lambda *_: None)
     with suppress(BudgetReached):
         list(run_work(work, [cell]))
+    journal.close()
+    assert Journal(journal.path).lost_usd == {}  # all of it stands in the ledger
     return next(iter(ledger.read(cell.evaluation.key).rows.values()), None)
 
 
@@ -190,6 +203,31 @@ def test_two_runs_never_spend_from_one_budget_at_once(tmp_path: Path) -> None:
         events.append("first ends")
     thread.join(5)
     assert events == ["free", "first ends", "second"]
+
+
+def test_calls_in_flight_at_a_kill_are_spent_for_good(tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study(budget_usd=5))
+
+    async def three_calls(budget: Budget) -> None:
+        for _ in range(3):
+            await budget.reserve("m", 0.5)
+        await budget.settle("m", 0.5, 0.25)
+        await budget.settle("m", 0.5, 0.125)
+        budget.booked("m", 0.25)
+
+    with spending(workspace, [PRICED]) as budget:
+        asyncio.run(three_calls(budget))
+        shutil.copytree(workspace.root, tmp_path / "killed")  # in flight: $0.50; answered and not in the ledger: $0.125
+    for _ in range(2):
+        with spending(Workspace.open(tmp_path / "killed"), [PRICED]) as after:
+            assert after.spent_usd == pytest.approx(0.625)
+
+
+def test_a_cap_for_nobody_is_refused(tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path, Study(budget_usd=5, model_budgets_usd={"gpt-5-mini": 1, "gpt-6": 1}))
+    complaint = r"study\.yaml: model_budgets_usd names gpt-6, neither a model"
+    with pytest.raises(TrapsError, match=complaint), spending(workspace, [PRICED]):
+        pass
 
 
 def test_a_price_wants_a_bound() -> None:

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from traps_pipeline.models.request import Outcome
-from traps_pipeline.models.traffic import Breaker, Gate, Meter, Stopped
+from traps_pipeline.models.traffic import Breaker, Gate, Meter, Stopped, remembering_stops
 
 ANSWER, ERROR = Outcome("answer", "left"), Outcome("error", error="timeout")
 
@@ -107,6 +107,23 @@ def test_a_call_that_the_provider_refuses_as_it_is_counts_as_a_refusal() -> None
     with pytest.raises(Stopped, match=r"20 refusals in a row \(http_401\)"):
         for _ in range(20):
             breaker.watch(Outcome("error", error="http_401"))
+
+
+def test_a_stop_lasts_for_the_whole_run_and_no_longer() -> None:
+    def stop(name: str) -> None:
+        for _ in range(20):
+            Breaker(name).check()
+            breaker.watch(Outcome("refused"))
+
+    with remembering_stops():
+        breaker = Breaker("m")
+        with pytest.raises(Stopped) as first:
+            stop("m")
+        with pytest.raises(Stopped) as again:
+            Breaker("m").check()  # as the next batch of the run makes it
+        assert str(again.value) == str(first.value)
+        Breaker("n").check()
+    Breaker("m").check()
 
 
 def test_more_than_ten_errors_in_a_hundred_calls_stop_a_model() -> None:

@@ -86,7 +86,9 @@ class Config:
     """How the provider behaves. `faults` gives shares of attempts; the rest of them is answered.
 
     fault_by_model always applies (null: that model never fails). only_first_attempts: transient faults of `faults`
-    spare a body that was seen that often. Latency delays 200s only, error statuses come at once; `slow_s` replaces it.
+    spare a body that was seen that often. scripts: by model, what it says to a request whose text holds a phrase (the
+    first that fits), in the place of a good answer. Latency delays 200s only, error statuses come at once; `slow_s`
+    replaces it.
     hang_s: when even the server gives up. served_suffix goes behind the model's name, as real ones answer with a date.
     """
 
@@ -95,6 +97,7 @@ class Config:
     faults: Mapping[str, float] = field(default_factory=dict)
     fault_by_model: Mapping[str, str | None] = field(default_factory=dict)
     only_first_attempts: int | None = None
+    scripts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     retry_after_s: float = 0.05
     slow_s: float = 10.0
     hang_s: float = 300.0
@@ -288,9 +291,10 @@ class Ending:
     refusal: str | None = None
 
 
-def ending_of(question: Question, fault: str | None) -> Ending:
+def ending_of(question: Question, fault: str | None, script: Mapping[str, str]) -> Ending:
     """What the model says, given what goes wrong."""
-    text = text_for(question)
+    scripted = (said for phrase, said in script.items() if phrase in question.text)
+    text = next(scripted, None) or text_for(question)
     endings = {
         "empty": Ending(""),
         "length": Ending(text[: max(1, len(text) // 2)], "length"),
@@ -532,7 +536,8 @@ def reply_to(question: Question, fault: str | None, config: Config) -> Reply:
         return json_reply(error_body(question.api, failure), failure.status, headers=headers)
     if fault == "wrong_content_type":
         return Reply(200, _PAGE, "text/html", delay_s=config.latency_s)
-    body = body_of(question, ending_of(question, fault), question.model + config.served_suffix)
+    served = question.model + config.served_suffix
+    body = body_of(question, ending_of(question, fault, config.scripts.get(question.model, {})), served)
     waits = {"slow": config.slow_s, "hang": config.hang_s}
     return json_reply(body, delay_s=waits.get(fault or "", config.latency_s), cut=fault in ("cut", "hang"))
 

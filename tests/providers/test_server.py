@@ -194,6 +194,13 @@ def test_an_answer_follows_from_the_question_and_counts_its_tokens(provider: Pro
     assert len({said(provider, api, question=f"{QUESTION} {n}").text for n in range(20)}) > 3
 
 
+def test_a_script_says_what_a_model_answers_to_a_phrase(provider: Provider) -> None:
+    provider.configure(scripts={"m": {"seesaw": "It tips.", "ball": "It rolls."}})
+    first = said(provider, "chat", question="A ball on a seesaw?").text  # the first phrase of the script that fits
+    assert (first, said(provider, "gemini", question="A ball?").text) == ("It tips.", "It rolls.")
+    assert said(provider, "chat", question="A die?").text == f"The answer is: {answer_to('A die?')}."
+
+
 def test_reasoning_is_shown_to_whoever_asks_for_it(provider: Provider) -> None:
     assert said(provider, "chat").reasoning
     asks: dict[Api, dict[str, Any]] = {

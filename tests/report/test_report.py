@@ -12,15 +12,15 @@ import pytest
 
 from traps_pipeline.partitions import DATASETS, REGIMES
 from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet
-from traps_pipeline.report.figures import Label, figure_bytes, landscape_figure, merged_labels
+from traps_pipeline.report.figures.labels import Label, merged_labels
+from traps_pipeline.report.figures.landscape import landscape_figure
 from traps_pipeline.report.page import (
     entries_of,
-    fraction,
-    leaderboard_html,
     leaderboard_markdown,
     leaderboard_text,
-    percent,
+    report_html,
 )
+from traps_pipeline.report.writing import figure_bytes, fraction, percent
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.tables import LEADERBOARD
@@ -49,11 +49,13 @@ def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6
         **{name: float(value) for name, value in figures.items()},
         **{f"{name}_std": 0.01 for name in figures},
         **{"n_refused": 0, "n_empty": 0, "n_errors": 0, "answered": 1.0, "incomplete": False},
+        **{f"{name}_ci_{end}": float(value) for name, value in figures.items() for end in ("low", "high")},
         **{
+            "rank": 1,
+            "rank_low": 1,
+            "rank_high": 2,
             "pecs_low": pecs,
             "pecs_high": pecs,
-            "pecs_ci_low": pecs,
-            "pecs_ci_high": pecs,
             "naive": acc * abs_rec,
             "epoch": "e1",
             "benchmark_version": "v1",
@@ -75,9 +77,14 @@ def board():
     )
 
 
+def points(board):
+    """What the landscape shows of a board."""
+    return board[board["dataset"] == "overall"]
+
+
 @pytest.fixture(scope="module")
 def png(board):
-    return figure_bytes(landscape_figure(board))
+    return figure_bytes(landscape_figure(points(board), "Overall"))
 
 
 def test_the_boards_of_these_tests_fit_the_schema(board, tmp_path):
@@ -107,7 +114,7 @@ def test_missing_items_are_marked_wherever_the_model_stands():
     board = board_of(
         board_row("whole"), board_row("gaps", n_missing=7), board_row("gaps", dataset="occlusion", n_missing=7)
     )
-    for text in (leaderboard_text(board), leaderboard_markdown(board), leaderboard_html(board)):
+    for text in (leaderboard_text(board), leaderboard_markdown(board), report_html(board)):
         assert "7 †" in text
         assert "0 †" not in text
     assert "†" not in leaderboard_text(board_of(board_row("whole")))
@@ -143,7 +150,7 @@ def tables(board):
     text = [text[0], *text[2:]]
     lines = [line for line in leaderboard_markdown(board).splitlines() if line.startswith("|")]
     markdown = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in [lines[0], *lines[2:]]]
-    html = [[cell.strip() for cell in row] for row in Rows(leaderboard_html(board)).rows[: len(text)]]
+    html = [[cell.strip() for cell in row] for row in Rows(report_html(board)).rows[: len(text)]]
     return (
         [[row[0], *row[8:]] for row in text],
         [[row[0], *row[8:]] for row in markdown],
@@ -179,7 +186,7 @@ def test_an_incomplete_cell_is_marked_at_every_pecs_and_n():
         # PECS overall, PECS chaotic, n; then the note or the legend.
         assert table.count("‡") == 4
         assert "incomplete: fewer than 99 % of items answered" in table
-    page = leaderboard_html(board)
+    page = report_html(board)
     assert page.count('<span class="mark">‡</span>') == 5  # PECS and n of the dataset's own table too
     own = page.split("<h2>Chaotic</h2>")[1].split("</section>")[0]
     assert own.count("‡") == 2
@@ -189,10 +196,10 @@ def test_an_incomplete_cell_is_marked_at_every_pecs_and_n():
 
 def test_marks_and_columns_are_away_where_nothing_calls_for_them():
     for board in (board_of(board_row("m")), board_of(board_row("m", n_errors=1, n_missing=0))):
-        for shown in (leaderboard_text(board), leaderboard_markdown(board), leaderboard_html(board)):
+        for shown in (leaderboard_text(board), leaderboard_markdown(board), report_html(board)):
             assert not re.search("‡|refused|Refused|empty|Empty|worst|incomplete:", shown)
     undecided = board_of(board_row("m", n_missing=1))
-    for shown in (leaderboard_text(undecided), leaderboard_markdown(undecided), leaderboard_html(undecided)):
+    for shown in (leaderboard_text(undecided), leaderboard_markdown(undecided), report_html(undecided)):
         assert "[0.250, 0.250]" in shown
         assert not re.search("‡|refused|Refused|Empty", shown)
 
@@ -211,7 +218,7 @@ def test_an_incomplete_dataset_marks_a_model_without_an_overall_row():
     board = board_of(board_row("whole"), board_row("part", dataset="chaotic", n_missing=50, incomplete=True))
     text, markdown, _ = tables(board)
     assert text[2] == markdown[2] == ["part", "–", "–", "0.250 ‡", "–", "1404 ‡", "50 †", "–"]
-    page = Rows(leaderboard_html(board)).rows[2]  # its seven figures are one cell, its dataset is the only one
+    page = Rows(report_html(board)).rows[2]  # its seven figures are one cell, its dataset is the only one
     assert page[3:] == ["0.250 ‡", "1404 ‡", "–", "50 †", "–"]
 
 
@@ -227,7 +234,7 @@ def test_a_hostile_model_id_stays_escaped_beside_marks_and_optional_columns():
     board = board_of(*cells_with_gaps(HOSTILE))
     rows = [line for line in leaderboard_markdown(board).splitlines() if line.startswith("|")]
     assert {len(re.findall(r"(?<!\\)\|", line)) for line in rows} == {18}
-    assert "<script" not in leaderboard_markdown(board) + leaderboard_html(board)
+    assert "<script" not in leaderboard_markdown(board) + report_html(board)
     assert "\x1b" not in leaderboard_text(board)
 
 
@@ -237,7 +244,7 @@ def test_a_model_without_an_overall_row_is_listed_last_with_what_it_has():
     )
     last = leaderboard_text(board).splitlines()[5]
     assert last.split() == ["partial", "standard", *["–"] * 8, "1.000", "–", "500", "3", "†", "–"]
-    assert "not all four datasets evaluated" in leaderboard_html(board)
+    assert "not all four datasets evaluated" in report_html(board)
 
 
 def test_a_board_of_one_dataset_is_ranked_by_that_dataset():
@@ -252,11 +259,11 @@ def test_null_figures_are_dashes_and_negative_ones_have_a_true_minus():
     assert (percent(0.1234), percent(np.nan)) == ("12.3", "–")
     null = dict.fromkeys(("acc", "j", "pecs", "pecs_std", "pecs_ci_low", "pecs_ci_high"), np.nan)
     board = board_of(board_row("m", **null))
-    assert "nan" not in leaderboard_text(board) + leaderboard_markdown(board) + leaderboard_html(board)
+    assert "nan" not in leaderboard_text(board) + leaderboard_markdown(board) + report_html(board)
 
 
 def test_html_escapes_a_hostile_model_id(board):
-    page = leaderboard_html(board)
+    page = report_html(board)
     assert "<script" not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
 
@@ -274,7 +281,7 @@ def test_text_lets_no_model_id_steer_the_terminal(board):
 
 
 def test_html_asks_the_network_for_nothing(board, png):
-    page = leaderboard_html(board, {"PECS landscape": png})
+    page = report_html(board, {"PECS landscape": png})
     targets = re.findall(r"""(?:src|href|action|data|poster|srcset)\s*=\s*["']?([^"'\s>]*)""", page)
     assert len(targets) == 1
     assert targets[0].startswith("data:image/png;base64,")
@@ -283,7 +290,7 @@ def test_html_asks_the_network_for_nothing(board, png):
 
 
 def test_html_shows_every_dataset_version_epoch_n_and_the_legend(board):
-    page = leaderboard_html(board)
+    page = report_html(board)
     for title in ("Overall", "Occlusion", "Occlusion, ill-posed", "Chaotic", "Chaotic, ill-posed"):
         assert f"<h2>{title}</h2>" in page
     for term in ("Acc", "AbsRec", "FalseAbs", "J", "PECS", "n", "missing", "epoch"):
@@ -292,27 +299,29 @@ def test_html_shows_every_dataset_version_epoch_n_and_the_legend(board):
 
 
 def test_html_names_the_epoch_in_each_row_where_rows_differ():
-    page = leaderboard_html(board_of(board_row("a"), board_row("b", epoch="e2")))
+    page = report_html(board_of(board_row("a"), board_row("b", epoch="e2")))
     assert '<th class="word">Epoch</th>' in page
     assert '<td class="word">e2</td>' in page
 
 
 def test_an_empty_board_still_gives_a_page_a_table_and_a_figure():
     board = pd.DataFrame(columns=pd.Index([c.name for c in LEADERBOARD.columns]))
-    assert "Overall" in leaderboard_html(board)
+    assert "Overall" in report_html(board)
     assert leaderboard_text(board).startswith("PECS, overall.")
-    assert figure_bytes(landscape_figure(board)).startswith(b"\x89PNG")
+    assert figure_bytes(landscape_figure(points(board), "Overall")).startswith(b"\x89PNG")
 
 
 def test_figures_are_byte_identical_on_a_second_build(board, png):
-    again, first, second = (figure_bytes(landscape_figure(board), kind) for kind in ("png", "svg", "svg"))
+    again, first, second = (
+        figure_bytes(landscape_figure(points(board), "Overall"), kind) for kind in ("png", "svg", "svg")
+    )
     assert again == png
     assert first == second
     assert b"<dc:date>" not in first
 
 
 def test_no_two_labels_of_the_landscape_overlap(board):
-    figure = landscape_figure(board)
+    figure = landscape_figure(points(board), "Overall")
     axes = figure.axes[0]
     figure.canvas.draw()
     boxes = [t.get_window_extent() for t in axes.texts if t.get_text()]
@@ -322,14 +331,15 @@ def test_no_two_labels_of_the_landscape_overlap(board):
 
 
 def test_the_landscape_reaches_down_to_the_inverse_oracle(board):
-    assert landscape_figure(board).axes[0].get_ylim()[0] < -1
+    assert landscape_figure(points(board), "Overall").axes[0].get_ylim()[0] < -1
     only_good = board[board["j"] >= 0]
-    assert landscape_figure(only_good).axes[0].get_ylim()[0] == pytest.approx(-0.1)
+    assert landscape_figure(points(only_good), "Overall").axes[0].get_ylim()[0] == pytest.approx(-0.08)
 
 
-def test_coinciding_models_share_one_label():
+def test_coinciding_models_share_one_label(board):
     labels = [Label(0.4, 0.0, "a", "red"), Label(0.41, 0.0, "b", "blue"), Label(0.9, 0.0, "c", "green")]
-    assert [label.text for label in merged_labels(labels)] == ["a\nb", "c"]
+    axes = landscape_figure(points(board), "Overall").axes[0]
+    assert [label.text for label in merged_labels(labels, axes)] == ["a\nb", "c"]
 
 
 def pair_rows(scenario, root, frames=12, kept=12, dataset="chaotic", size=(48, 64)):

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.scoring.bootstrap import INTERVAL_COLUMNS, pecs_intervals, scenario_weights
+from traps_pipeline.scoring.bootstrap import ENTRY, INTERVAL_COLUMNS, intervals, resample, scenario_weights
 
 
 def random_pairs(n, seed, acc=0.7, false_abs=0.1, abs_rec=0.6):
@@ -19,22 +19,26 @@ def everywhere(rows, pairs, **cell):
     return pd.concat([rows(pairs, dataset=dataset, **cell) for dataset in DATASETS], ignore_index=True)
 
 
-def interval(intervals, dataset="occlusion", model="m", regime="standard"):
-    row = intervals.set_index(["model", "regime", "dataset"]).loc[(model, regime, dataset)]
+def pecs_intervals(verdicts, resamples, seed=20260101):
+    return intervals(resample(verdicts, resamples, seed))
+
+
+def interval(table, dataset="occlusion", model="m", regime="standard"):
+    row = table.set_index(["model", "regime", "dataset"]).loc[(model, regime, dataset)]
     return row["pecs_ci_low"], row["pecs_ci_high"]
 
 
 def test_the_oracles_interval_is_exactly_one_to_one(rows, strategy):
-    intervals = pecs_intervals(everywhere(rows, strategy("oracle", 30)), resamples=500)
-    assert list(intervals.columns) == INTERVAL_COLUMNS
-    assert list(intervals["dataset"]) == [*DATASETS, "overall"]
-    assert (intervals[["pecs_ci_low", "pecs_ci_high"]] == 1.0).all(axis=None)
+    found = pecs_intervals(everywhere(rows, strategy("oracle", 30)), resamples=500)
+    assert list(found.columns) == [*ENTRY, *INTERVAL_COLUMNS]
+    assert list(found["dataset"]) == [*DATASETS, "overall"]
+    assert (found[["pecs_ci_low", "pecs_ci_high"]] == 1.0).all(axis=None)
 
 
 @pytest.mark.parametrize("name", ["always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle"])
 def test_degenerate_strategies_have_the_interval_zero_to_zero(name, rows, strategy):
-    intervals = pecs_intervals(everywhere(rows, strategy(name, 30)), resamples=200)
-    assert (intervals[["pecs_ci_low", "pecs_ci_high"]] == 0.0).all(axis=None)
+    found = pecs_intervals(everywhere(rows, strategy(name, 30)), resamples=200)
+    assert (found[["pecs_ci_low", "pecs_ci_high"]] == 0.0).all(axis=None)
 
 
 def test_the_matrix_product_agrees_with_a_loop_over_resamples(rows):
@@ -63,9 +67,9 @@ def test_a_single_proportions_interval_is_the_binomials(rows):
 
 def test_the_two_datasets_of_a_taxonomy_share_their_resamples(rows):
     pairs = random_pairs(50, 3)
-    intervals = pecs_intervals(everywhere(rows, pairs), resamples=500)
-    assert interval(intervals, "occlusion") == interval(intervals, "occlusion_ill_posed")
-    assert interval(intervals, "occlusion") != interval(intervals, "chaotic")
+    found = pecs_intervals(everywhere(rows, pairs), resamples=500)
+    assert interval(found, "occlusion") == interval(found, "occlusion_ill_posed")
+    assert interval(found, "occlusion") != interval(found, "chaotic")
 
 
 def test_opposite_cells_of_one_taxonomy_cancel_because_clusters_stay_together(rows):

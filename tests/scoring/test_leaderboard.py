@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.scoring.bootstrap import pecs_intervals
+from traps_pipeline.scoring.bootstrap import intervals, resample
+from traps_pipeline.scoring.contrasts import contrasts
 from traps_pipeline.scoring.leaderboard import leaderboard, pooled_j
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.storage.parquet import TableStore
@@ -17,8 +18,10 @@ STRATEGIES = ["oracle", "always-abstain", "never-abstain", "perfect-answerer", "
 
 
 def board_of(verdicts):
-    parts = [cell_metrics(rows) for _, rows in verdicts.groupby("dataset")]
-    return leaderboard(pd.concat(parts, ignore_index=True), pecs_intervals(verdicts, resamples=100))
+    parts = [cell_metrics(rows) for _, rows in verdicts.groupby("dataset")] or [cell_metrics(verdicts)]
+    metrics = pd.concat(parts, ignore_index=True)
+    resampled = resample(verdicts, resamples=100)
+    return leaderboard(metrics, intervals(resampled), contrasts(resampled, metrics))
 
 
 def entry(board, dataset="occlusion", model="m", regime="standard"):
@@ -159,7 +162,7 @@ def test_overall_names_every_version_and_epoch_it_rests_on(rows):
 
 def test_nothing_scored_gives_an_empty_board(rows, tmp_path):
     verdicts = rows([])
-    board = leaderboard(cell_metrics(verdicts), pecs_intervals(verdicts, 10))
+    board = board_of(verdicts)
     assert board.empty
     TableStore(tmp_path).write(LEADERBOARD, {}, board, {})
 

@@ -56,6 +56,10 @@ def write(ledger: Ledger, *rows: dict[str, object]) -> None:
             writer.append(row)
 
 
+def answer(key: str, text: str) -> dict[str, object]:
+    return {"key": key, "outcome": "answer", "text": text}
+
+
 def test_rows_come_back_by_key_and_evaluation(ledger: Ledger) -> None:
     write(ledger, {"key": "a", "text": "left – 左"}, {"key": "b", "text": None})
     assert ledger.read("m").rows == {"a": {"key": "a", "text": "left – 左"}, "b": {"key": "b", "text": None}}
@@ -70,17 +74,35 @@ def test_a_writer_that_writes_nothing_leaves_no_file(ledger: Ledger) -> None:
 
 
 def test_the_newest_row_of_a_key_wins_within_and_across_segments(ledger: Ledger) -> None:
-    write(ledger, {"key": "a", "text": "1"}, {"key": "a", "text": "2"}, {"key": "b", "text": "3"})
+    write(ledger, answer("a", "1"), answer("a", "2"), answer("b", "3"))
     assert ledger.read("m").rows["a"]["text"] == "2"
-    write(ledger, {"key": "a", "text": "4"})
+    write(ledger, answer("a", "4"))
     assert len(segments(ledger)) == 2
     assert {key: row["text"] for key, row in ledger.read("m").rows.items()} == {"a": "4", "b": "3"}
 
 
+def test_a_failure_never_takes_the_place_of_an_answer(ledger: Ledger) -> None:
+    failure = {"key": "a", "outcome": "error", "error": "timeout", "text": None}
+    write(ledger, failure)
+    assert (list(ledger.read("m").rows), ledger.read("m").settled) == (["a"], {})
+    write(ledger, answer("a", "left"))
+    write(ledger, failure)
+    assert ledger.read("m").settled["a"]["text"] == "left"
+
+
+def test_of_the_rows_only_those_that_are_wanted_are_read(ledger: Ledger) -> None:
+    write(ledger, *(answer(f"k{n}", '"key": "k0"') for n in range(10)))
+    assert [*ledger.read("m", {"k3", "k7", "none"}).rows] == ["k3", "k7"]
+    assert ledger.read("m", set()).rows == {}
+    asked = [answer(f"{who}{n}", who) | {"components": {"participant": who}} for who in "mno" for n in range(2)]
+    write(ledger, *asked)
+    assert [row["key"] for row in ledger.rows_of({"m", "o"})] == ["m0", "m1", "o0", "o1"]
+
+
 def test_segments_of_one_second_are_read_in_the_order_they_were_begun(ledger: Ledger) -> None:
     for n in range(20):
-        write(ledger, {"key": "a", "n": n})
-    assert ledger.read("m").rows["a"]["n"] == 19
+        write(ledger, answer("a", str(n)))
+    assert ledger.read("m").rows["a"]["text"] == "19"
 
 
 def test_a_torn_last_line_is_ignored_and_counted_with_its_place(ledger: Ledger) -> None:

@@ -5,23 +5,28 @@ and the provenance that Dagster needs to call it fresh or stale, whichever way t
 section 3). Sources are observed on the way, so provenance never points at nothing.
 """
 
-from __future__ import annotations
-
 import json
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import dagster as dg
 
+from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.lineage import PARTITIONED_BY, SOURCES, Lineage, Node, keys_of, reread_sources
-from traps_pipeline.models.registry import all_evaluations
-from traps_pipeline.partitions import CATEGORIES, DATASETS
+from traps_pipeline.models.registry import all_evaluations, all_extractions, all_steered
+from traps_pipeline.partitions import CATEGORIES, DATASETS, PROBED_DATASETS
+from traps_pipeline.progress import Tally
 from traps_pipeline.storage.workspace import Workspace, write_text
-from traps_pipeline.tables import TABLES
+from traps_pipeline.tables import TABLES, Table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Partition mappings over one dimension, observable sources and backfill policies are in beta; the version is pinned.
 warnings.filterwarnings("ignore", category=dg.BetaWarning)
@@ -30,8 +35,16 @@ CATEGORY = dg.StaticPartitionsDefinition(list(CATEGORIES))
 DATASET = dg.StaticPartitionsDefinition(list(DATASETS))
 EVALUATION = dg.StaticPartitionsDefinition([evaluation.key for evaluation in all_evaluations()])
 CELL = dg.MultiPartitionsDefinition({"dataset": DATASET, "evaluation": EVALUATION})
+# Inside local models: datasets and occlusion's answerable questions; model__prompt; model__directions__regime.
+PROBED = dg.StaticPartitionsDefinition(list(PROBED_DATASETS))
+EXTRACTION = dg.StaticPartitionsDefinition([extraction.key for extraction in all_extractions()])
+STATES = dg.MultiPartitionsDefinition({"dataset": PROBED, "extraction": EXTRACTION})
+STEERED = dg.StaticPartitionsDefinition(list(all_steered()))
+STEERING_CELL = dg.MultiPartitionsDefinition({"dataset": DATASET, "steering": STEERED})
+SOURCE_PARTITIONS = {"category": CATEGORY, "evaluation": EVALUATION, "extraction": EXTRACTION, "steered": STEERED}
 SINGLE_RUN = dg.BackfillPolicy.single_run()
 OWNERS = ["team:benchmark"]
+Events = Iterator[dg.AssetMaterialization | dg.AssetCheckResult]
 
 _VERSION_TAG, _USER_TAG, _CODE_TAG = (
     "dagster/data_version",
@@ -67,8 +80,15 @@ def materialized(
     context: dg.AssetExecutionContext, key: str | None, version: str, provenance: Mapping[str, str], **metadata: Any
 ) -> dg.AssetMaterialization:
     """The event that makes a partition count as made, with its data version and what it was made from."""
+    return event_of(context.asset_key, key, version, provenance, metadata)
+
+
+def event_of(
+    asset: dg.AssetKey, key: str | None, version: str, provenance: Mapping[str, str], metadata: Mapping[str, Any]
+) -> dg.AssetMaterialization:
+    """`materialized`, for a step that makes several assets."""
     tags = {_VERSION_TAG: version, _USER_TAG: "true", **provenance}
-    return dg.AssetMaterialization(context.asset_key, partition=key, metadata=metadata, tags=tags)
+    return dg.AssetMaterialization(asset, partition=key, metadata=metadata, tags=tags)
 
 
 def provenance(context: dg.AssetExecutionContext, workspace: Workspace) -> dict[str, str]:
@@ -77,8 +97,13 @@ def provenance(context: dg.AssetExecutionContext, workspace: Workspace) -> dict[
     Raises TrapsError for a run of several stages (Dagster would skip those below a stage that hands on no output) and
     for a Dagster history that belongs to another study.
     """
+    return provenance_of_each(context, workspace)[context.asset_key.to_user_string()]
+
+
+def provenance_of_each(context: dg.AssetExecutionContext, workspace: Workspace) -> dict[str, dict[str, str]]:
+    """`provenance` of every asset that this step makes, by name."""
     selected = set(context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys)
-    if len(selected) > 1:
+    if not selected <= set(context.assets_def.keys):
         names = ", ".join(sorted(key.to_user_string() for key in selected))
         raise TrapsError(f"one stage a run, not {names}: `traps run EXPERIMENT` walks the stages in order")
     home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
@@ -87,14 +112,21 @@ def provenance(context: dg.AssetExecutionContext, workspace: Workspace) -> dict[
             f"DAGSTER_HOME={home} is not of the workspace {workspace.root}: set it to {workspace.dagster_home}"
         )
     observe_sources(context.instance, workspace)
-    tags = {_CODE_TAG: context.run_id}
-    for parent in sorted(context.assets_def.asset_deps[context.asset_key]):
+
+    @cache
+    def newest(parent: dg.AssetKey) -> dict[str, str]:
         name = parent.to_user_string()
-        newest = _fetch(context.instance, name)(dg.AssetRecordsFilter(asset_key=parent), limit=1).records
-        version = _recorded_version(newest[0]) if newest else None
-        tags[f"{_INPUT_VERSION}/{name}"] = version or "none"
-        tags[f"{_INPUT_POINTER}/{name}"] = str(newest[0].storage_id) if newest else "NULL"
-    return tags
+        found = _fetch(context.instance, name)(dg.AssetRecordsFilter(asset_key=parent), limit=1).records
+        version = _recorded_version(found[0]) if found else None
+        pointer = str(found[0].storage_id) if found else "NULL"
+        return {f"{_INPUT_VERSION}/{name}": version or "none", f"{_INPUT_POINTER}/{name}": pointer}
+
+    return {
+        key.to_user_string(): {_CODE_TAG: context.run_id}
+        | {name: value for parent in sorted(parents) for name, value in newest(parent).items()}
+        for key, parents in context.assets_def.asset_deps.items()
+        if key in selected
+    }
 
 
 def observe_sources(instance: dg.DagsterInstance, workspace: Workspace) -> list[Node]:
@@ -137,8 +169,7 @@ def _recorded_version(record: dg.EventLogRecord) -> str | None:
 
 def source_asset(name: str, group: str, description: str, kinds: Sequence[str]) -> dg.SourceAsset | dg.AssetsDefinition:
     """An observable source asset whose data version, by partition where it has any, is made from its content."""
-    kind = PARTITIONED_BY.get(name)
-    partitions = CATEGORY if kind == "category" else EVALUATION if kind == "evaluation" else None
+    partitions = SOURCE_PARTITIONS.get(PARTITIONED_BY.get(name, ""))
     tags = {f"dagster/kind/{kind}": "" for kind in kinds}
 
     def observe() -> dg.DataVersion | dg.DataVersionsByPartition:
@@ -163,6 +194,64 @@ def watch_sources(context: dg.SensorEvaluationContext) -> dg.SkipReason:
     reread_sources()
     changed = observe_sources(context.instance, Workspace.open())
     return dg.SkipReason(f"{len(changed)} source partitions changed" if changed else "no source changed")
+
+
+def table_asset(
+    table: Table,
+    group: str,
+    doc: str,
+    deps: Sequence[dg.AssetsDefinition | dg.SourceAsset],
+    make: "Callable[[Workspace], pd.DataFrame]",
+    metadata: "Callable[[pd.DataFrame], Mapping[str, Any]] | None" = None,
+    checked: "tuple[dg.AssetCheckSpec, Callable[[pd.DataFrame], str]] | None" = None,
+) -> dg.AssetsDefinition:
+    """An unpartitioned table that is made of whatever is there of its inputs.
+
+    metadata adds to what Dagster shows (default: the first rows); checked is a check and what is wrong with the rows,
+    empty where it passes.
+    """
+
+    @dg.asset(
+        name=table.name,
+        description=doc,
+        deps=deps,
+        group_name=group,
+        kinds={"parquet"},
+        owners=OWNERS,
+        metadata=table_metadata(table.name),
+        output_required=False,
+        check_specs=[checked[0]] if checked else None,
+    )
+    def make_table(context: dg.AssetExecutionContext) -> Events:
+        workspace = Workspace.open()
+        tags, inputs = provenance(context, workspace), Lineage(workspace).inputs(table.name, None)
+        checks = Checks(context, workspace)
+        frame = make(workspace)
+        if checked:
+            checks.record(checked[0].name, None, checked[1](frame))
+        version = workspace.tables.write(table, {}, frame, inputs)
+        progress.current().partition(table.name, "", Tally())
+        shown = dict(metadata(frame)) if metadata else {table.name: rows_shown(frame)}
+        yield materialized(context, None, version, tags, **{"dagster/row_count": len(frame)}, **shown)
+        yield from checks.results()
+
+    return make_table
+
+
+def rows_shown(frame: "pd.DataFrame", rows: int = 60) -> dg.MarkdownMetadataValue | str:
+    """The first rows as Dagster shows them. For figures and ids alone: nothing that a model wrote."""
+    if frame.empty:
+        return "not run"
+    head = frame.head(rows)
+    lines = [[str(name) for name in head.columns], ["---"] * len(head.columns)]
+    lines += [[_shown(value) for value in row] for row in head.itertuples(index=False)]
+    return dg.MetadataValue.md("\n".join("| " + " | ".join(line) + " |" for line in lines))
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.4g}"
+    return "" if value is None else str(value).replace("|", "\\|")
 
 
 def check(name: str, asset: str, description: str) -> dg.AssetCheckSpec:
@@ -198,6 +287,3 @@ class Checks:
             yield dg.AssetCheckResult(
                 check_name=name, asset_key=self._context.asset_key, passed=not failing, metadata={"failing": failing}
             )
-
-
-Events = Iterator[dg.AssetMaterialization | dg.AssetCheckResult]

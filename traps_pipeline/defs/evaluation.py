@@ -128,7 +128,7 @@ def votes(context: dg.AssetExecutionContext) -> Events:
 )
 def verdicts(context: dg.AssetExecutionContext) -> Events:
     """What the panel's majority says of each item of a cell."""
-    from traps_pipeline.judging.panel import decide_cell
+    from traps_pipeline.judging.verdicts import decide_cell
 
     workspace = Workspace.open()
     lineage, provenance, checks = Lineage(workspace), common.provenance(context, workspace), Checks(context, workspace)
@@ -141,7 +141,7 @@ def verdicts(context: dg.AssetExecutionContext) -> Events:
         checks.record("one_verdict_an_item", key, wrong)
         version = workspace.tables.write(VERDICTS, cell.partition, rows, lineage.inputs("verdicts", key))
         progress.current().partition("verdicts", key, Tally())
-        undecided = sum(row["undecided"] for row in rows)
+        undecided = int(rows["undecided"].to_numpy(bool).sum())
         metadata = {"dagster/partition_row_count": len(rows), "undecided": undecided}
         yield common.materialized(context, key, version, provenance, **metadata)
     yield from checks.results()

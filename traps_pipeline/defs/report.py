@@ -1,10 +1,8 @@
-"""The report group: a figure, a contact sheet of pairs, the leaderboard page; and whether they are current."""
+"""What people read: contact sheet, gallery, the catalogue's tables and figures, the report page; are they current."""
 
 import base64
 import hashlib
-import os
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
 
 import dagster as dg
 
@@ -12,20 +10,26 @@ from traps_pipeline import progress
 from traps_pipeline.defs import common
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.common import OWNERS, Events
+from traps_pipeline.defs.evaluation import responses, verdicts, votes
 from traps_pipeline.defs.scoring import leaderboard
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.lineage import Lineage, write_report_state
+from traps_pipeline.lineage import JUDGED, REPORTS, Lineage, write_report_state
 from traps_pipeline.progress import Tally
+from traps_pipeline.report.catalogue import OF_PAPER, OF_STUDY, PRINTED, Report, TableReport, workspace_files
+from traps_pipeline.report.writing import write_bytes
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, LEADERBOARD, SCENE_SPECS, VIDEOS
+from traps_pipeline.tables import ITEMS, SCENE_SPECS, VIDEOS
 
 GROUP = "report"
 Files = dict[str, bytes]
+published = common.source_asset(
+    "published", "published", "assets/published: the paper's tables as it prints them.", ["csv"]
+)
 
 
 def _report(
-    name: str, doc: str, deps: Sequence[dg.AssetsDefinition], make: Callable[[Workspace], Files]
+    name: str, doc: str, deps: Sequence[dg.AssetsDefinition | dg.AssetKey], make: Callable[[Workspace], Files]
 ) -> dg.AssetsDefinition:
     """An unpartitioned asset that writes files for people into the workspace's `reports` folder."""
 
@@ -34,7 +38,7 @@ def _report(
         description=doc,
         deps=deps,
         group_name=GROUP,
-        kinds={"html" if name in ("gallery", "leaderboard_page") else "png"},
+        kinds={"html" if name in ("gallery", "report_page") else "png"},
         owners=OWNERS,
         output_required=False,
     )
@@ -44,7 +48,7 @@ def _report(
         inputs = Lineage(workspace).inputs(name, None)
         files = make(workspace)
         for file, content in files.items():
-            _write(workspace.reports / file, content)
+            write_bytes(workspace.reports / file, content)
         version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
         write_report_state(workspace, name, version, inputs)
         progress.current().partition(name, "", Tally())
@@ -56,34 +60,19 @@ def _report(
     return report
 
 
-def _write(path: Path, content: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.write_bytes(content)
-    part.replace(path)
-
-
 def _preview(png: bytes) -> dg.MarkdownMetadataValue:
     return dg.MetadataValue.md(f"![preview](data:image/png;base64,{base64.b64encode(png).decode()})")
 
 
-def _landscape(workspace: Workspace) -> Files:
-    from traps_pipeline.report.figures import figure_bytes, landscape_figure
-
-    figure = landscape_figure(workspace.tables.read(LEADERBOARD, {}))
-    return {f"pecs_landscape.{kind}": figure_bytes(figure, kind) for kind in ("png", "svg")}
-
-
 def _sheet(workspace: Workspace) -> Files:
-    from traps_pipeline.report.contact_sheet import contact_sheet, six_pairs
+    from traps_pipeline.report.contact_sheet import PAGE, contact_sheet, pairs_figure, six_pairs
+    from traps_pipeline.report.writing import figure_bytes
 
     rows = workspace.tables.read_all(ITEMS)
     if rows.empty:
         raise TrapsError("contact_sheet: no items yet; materialize items first")
-    return {
-        "contact_sheet.png": contact_sheet(rows, workspace.root),
-        "six_pairs.png": contact_sheet(six_pairs(rows), workspace.root),
-    }
+    six = pairs_figure(six_pairs(rows), workspace.root, None, layout=PAGE)
+    return {"contact_sheet.png": contact_sheet(rows, workspace.root), "six_pairs.png": figure_bytes(six)}
 
 
 def _gallery(workspace: Workspace) -> Files:
@@ -99,7 +88,8 @@ def _gallery(workspace: Workspace) -> Files:
 
 def _shortcuts(workspace: Workspace) -> Files:
     from traps_pipeline.benchmark.shortcuts import shortcuts
-    from traps_pipeline.report.figures import figure_bytes, shortcut_figure
+    from traps_pipeline.report.figures.shortcuts import shortcut_figure
+    from traps_pipeline.report.writing import figure_bytes
 
     rows = workspace.tables.read_all(ITEMS)
     if rows.empty:
@@ -114,23 +104,14 @@ def _shortcuts(workspace: Workspace) -> Files:
 
 
 def _page(workspace: Workspace) -> Files:
-    from traps_pipeline.report.page import leaderboard_html, leaderboard_markdown
+    from traps_pipeline.report.items import FOLDER, write_item_pages
+    from traps_pipeline.report.publish import report_files, study_pictures
+    from traps_pipeline.report.results import StudyResults
 
-    board = workspace.tables.read(LEADERBOARD, {})
-    pictures = {
-        "Accuracy against discrimination": (workspace.reports / "pecs_landscape.png").read_bytes(),
-        "Control told from void by one cue alone (0.5 is chance)": (workspace.reports / "shortcuts.png").read_bytes(),
-        "Pairs: control above, void below": (workspace.reports / "contact_sheet.png").read_bytes(),
-    }
-    return {
-        "leaderboard.html": leaderboard_html(board, pictures).encode(),
-        "leaderboard.md": leaderboard_markdown(board).encode(),
-    }
+    cells = write_item_pages(workspace, workspace.reports / FOLDER, clips="../..")
+    return report_files(StudyResults(workspace), cells, study_pictures(workspace))
 
 
-pecs_landscape = _report(
-    "pecs_landscape", "Acc against J with iso-PECS contours, one marker a model and regime.", [leaderboard], _landscape
-)
 contact_sheet = _report(
     "contact_sheet",
     "Control and void frames of one pair of each sub-scenario, with question and ground truth.",
@@ -150,32 +131,102 @@ shortcuts = _report(
     [items, videos],
     _shortcuts,
 )
-leaderboard_page = _report(
-    "leaderboard_page",
-    "The leaderboard as a page that opens from disk (HTML) and as Markdown.",
-    [leaderboard, pecs_landscape, contact_sheet, shortcuts],
+
+
+# --- tables and figures of the catalogue ------------------------------------------------------------------------------
+
+
+def _spec(name: str, report: Report) -> dg.AssetSpec:
+    of_paper = name in OF_PAPER
+    return dg.AssetSpec(
+        name,
+        description=f"{report.doc} From the paper's published numbers." if of_paper else report.doc,
+        deps=[published] if of_paper else [dg.AssetKey(name) for name in report.reads],
+        group_name="published" if of_paper else "tables" if isinstance(report, TableReport) else "figures",
+        kinds={"csv" if isinstance(report, TableReport) else "png"},
+        owners=OWNERS,
+        skippable=True,
+    )
+
+
+@dg.multi_asset(
+    specs=[_spec(name, report) for name, report in {**OF_STUDY, **OF_PAPER}.items()],
+    can_subset=True,
+    description="Tables and figures; any of them in one run, since each takes less than a run's overhead.",
+)
+def printed(context: dg.AssetExecutionContext) -> Events:
+    """Every selected table and figure, from what is there; what was not run says so."""
+    from traps_pipeline.report.results import PublishedResults, StudyResults
+
+    workspace = Workspace.open()
+    selected = [name for name in PRINTED if dg.AssetKey(name) in context.selected_asset_keys]
+    provenance = common.provenance_of_each(context, workspace)
+    lineage, study, paper = Lineage(workspace), StudyResults(workspace), PublishedResults()
+    for name in selected:
+        inputs = lineage.inputs(name, None)
+        report = OF_STUDY[name] if name in OF_STUDY else OF_PAPER[name]
+        files = workspace_files(report, study if name in OF_STUDY else paper)
+        for file, content in files.items():
+            write_bytes(workspace.reports / file, content)
+        version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
+        write_report_state(workspace, name, version, inputs)
+        progress.current().partition("printed", name, Tally())
+        yield common.event_of(dg.AssetKey(name), None, version, provenance[name], _shown(workspace, files))
+
+
+def _shown(workspace: Workspace, files: Files) -> dict[str, dg.MetadataValue]:
+    """Paths, with the picture or the table itself."""
+    shown: dict[str, dg.MetadataValue] = {}
+    for file, content in files.items():
+        shown[file] = dg.MetadataValue.path(str(workspace.reports / file))
+        if file.endswith(".png"):
+            shown[f"preview of {file}"] = _preview(content)
+        elif file.endswith(".md"):
+            shown[f"preview of {file}"] = dg.MetadataValue.md(content.decode())
+    return shown
+
+
+report_page = _report(
+    "report_page",
+    "The report: leaderboard, figures and tables beside the paper's, every number linked to its items (HTML that opens "
+    "from disk); the leaderboard as Markdown.",
+    [
+        items,
+        responses,
+        votes,
+        verdicts,
+        leaderboard,
+        contact_sheet,
+        shortcuts,
+        *(dg.AssetKey(name) for name in PRINTED),
+    ],
     _page,
 )
+ASSETS = [contact_sheet, gallery, shortcuts, printed, report_page]
+
+_CHECKED = ("leaderboard", *JUDGED, *REPORTS)
 
 
-def _inputs_current(asset: dg.AssetsDefinition) -> dg.AssetChecksDefinition:
-    name = asset.key.to_user_string()
-
-    @dg.asset_check(
-        asset=asset,
-        name="inputs_current",
-        description="Made from what is there now; Dagster itself never calls an unpartitioned asset stale.",
-    )
-    def current() -> dg.AssetCheckResult:
-        status = Lineage(Workspace.open()).status(name, None)
-        return dg.AssetCheckResult(
-            passed=status.kind == "fresh", metadata={"status": status.kind, "changed": list(status.reasons)}
+@dg.multi_asset_check(
+    name="inputs_current",
+    specs=[
+        dg.AssetCheckSpec(
+            "inputs_current",
+            asset=name,
+            description="Made from what is there now; Dagster itself never calls an unpartitioned asset stale.",
         )
-
-    return current
-
-
-inputs_current = [
-    _inputs_current(asset)
-    for asset in (leaderboard, pecs_landscape, contact_sheet, gallery, shortcuts, leaderboard_page)
-]
+        for name in _CHECKED
+    ],
+    can_subset=True,
+)
+def inputs_current(context: dg.AssetCheckExecutionContext) -> Iterator[dg.AssetCheckResult]:
+    """Whether reports are made from what is there now."""
+    lineage = Lineage(Workspace.open())
+    for key in sorted(context.selected_asset_check_keys, key=lambda key: key.asset_key):
+        status = lineage.status(key.asset_key.to_user_string(), None)
+        yield dg.AssetCheckResult(
+            check_name=key.name,
+            asset_key=key.asset_key,
+            passed=status.kind == "fresh",
+            metadata={"status": status.kind, "changed": list(status.reasons)},
+        )

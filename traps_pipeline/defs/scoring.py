@@ -7,13 +7,14 @@ import dagster as dg
 from traps_pipeline import progress
 from traps_pipeline.defs import common
 from traps_pipeline.defs.benchmark import items
-from traps_pipeline.defs.common import DATASET, OWNERS, Checks, Events, by_dataset, check, table_metadata
+from traps_pipeline.defs.common import DATASET, OWNERS, Checks, Events, by_dataset, check, table_asset, table_metadata
 from traps_pipeline.defs.evaluation import verdicts
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.lineage import Lineage
 from traps_pipeline.progress import Tally
+from traps_pipeline.scoring import Frame
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, LEADERBOARD, METRICS, VERDICTS
+from traps_pipeline.tables import CONTRASTS, ITEMS, LEADERBOARD, METRICS, REGIME_TESTS, VERDICTS
 
 GROUP = "scoring"
 
@@ -57,40 +58,84 @@ def metrics(context: dg.AssetExecutionContext) -> Events:
     yield from checks.results()
 
 
-@dg.asset(
-    deps=[metrics, verdicts],
-    group_name=GROUP,
-    kinds={"parquet"},
-    owners=OWNERS,
-    metadata=table_metadata("leaderboard"),
-    output_required=False,
-    check_specs=[check("intervals_ordered", "leaderboard", "Every interval is ordered and lies in [0, 1].")],
-)
-def leaderboard(context: dg.AssetExecutionContext) -> Events:
-    """Every model under every regime, per dataset and overall: mean and spread over runs, 95 % intervals."""
-    from traps_pipeline.report.page import leaderboard_markdown
-    from traps_pipeline.scoring.bootstrap import pecs_intervals
-    from traps_pipeline.scoring.leaderboard import leaderboard as rank
-    from traps_pipeline.scoring.leaderboard import wrong_intervals
+def _contrasts(workspace: Workspace) -> Frame:
+    from traps_pipeline.scoring.bootstrap import resample
+    from traps_pipeline.scoring.contrasts import contrasts as paired
 
-    workspace = Workspace.open()
-    provenance = common.provenance(context, workspace)
-    inputs = Lineage(workspace).inputs("leaderboard", None)
+    cells, judged = _scored(workspace, "contrasts")
+    return paired(resample(judged), cells)
+
+
+def _regime_tests(workspace: Workspace) -> Frame:
+    from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
+
+    return mcnemar(_scored(workspace, "regime_tests")[1])
+
+
+def _leaderboard(workspace: Workspace) -> Frame:
+    from traps_pipeline.scoring.bootstrap import intervals, resample
+    from traps_pipeline.scoring.leaderboard import leaderboard as rank
+
+    cells, judged = _scored(workspace, "leaderboard")
+    return rank(cells, intervals(resample(judged)), workspace.tables.read(CONTRASTS, {}))
+
+
+def _scored(workspace: Workspace, stage: str) -> tuple[Frame, Frame]:
+    """All METRICS rows, and the VERDICTS rows that they are made of."""
     cells = workspace.tables.read_all(METRICS)
     if cells.empty:
-        raise TrapsError("leaderboard: no metrics yet; materialize metrics for a dataset first")
-    board = rank(cells, pecs_intervals(workspace.tables.read_all(VERDICTS)))
-    wrong = wrong_intervals(board)
-    checks = Checks(context, workspace)
-    checks.record("intervals_ordered", None, f"{wrong} intervals are wrong" if wrong else "")
-    version = workspace.tables.write(LEADERBOARD, {}, board, inputs)
-    progress.current().partition("leaderboard", "", Tally())
-    metadata: dict[str, Any] = {
-        "dagster/row_count": len(board),
-        "leaderboard": dg.MetadataValue.md(leaderboard_markdown(board)),
-    }
+        raise TrapsError(f"{stage}: no metrics yet; materialize metrics for a dataset first")
+    judged, current = workspace.tables.read_all(VERDICTS), workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
+    return cells, judged.loc[judged["item_id"].isin(current)]
+
+
+def _told_apart(table: Frame) -> dict[str, Any]:
+    told = table[table["separable"] & (table["dataset"] == "overall")]
+    refused = int(table["refused"].notna().sum())
+    return {"contrasts": common.rows_shown(told), "separable": int(table["separable"].sum()), "refused": refused}
+
+
+def _shown(board: Frame) -> dict[str, Any]:
+    from traps_pipeline.report.page import leaderboard_markdown
+
     overall = board.loc[board["dataset"] == "overall", "pecs"].to_numpy(float)
-    if len(overall):
-        metadata["best overall PECS"] = float(overall.max())
-    yield common.materialized(context, None, version, provenance, **metadata)
-    yield from checks.results()
+    best = {"best overall PECS": float(overall.max())} if len(overall) else {}
+    return {"leaderboard": dg.MetadataValue.md(leaderboard_markdown(board))} | best
+
+
+def _intervals_ordered(board: Frame) -> str:
+    from traps_pipeline.scoring.leaderboard import wrong_intervals
+
+    wrong = wrong_intervals(board)
+    return f"{wrong} intervals are wrong" if wrong else ""
+
+
+contrasts = table_asset(
+    CONTRASTS,
+    GROUP,
+    "Paired differences between models and between regimes, with intervals and Holm's correction.",
+    [metrics, verdicts],
+    _contrasts,
+    _told_apart,
+)
+regime_tests = table_asset(
+    REGIME_TESTS,
+    GROUP,
+    "McNemar's exact test of every two regimes on the same items, by model, dataset, run and decision.",
+    [metrics, verdicts],
+    _regime_tests,
+)
+leaderboard = table_asset(
+    LEADERBOARD,
+    GROUP,
+    "Every model under every regime, per dataset and overall: mean and spread over runs, 95 % intervals, ranks.",
+    [metrics, verdicts, contrasts],
+    _leaderboard,
+    _shown,
+    (
+        check(
+            "intervals_ordered", "leaderboard", "Every interval is ordered and lies in [0, 1], that of J in [-1, 1]."
+        ),
+        _intervals_ordered,
+    ),
+)

@@ -120,7 +120,7 @@ def collect_answers(
     prepare_media(workspace, cells)
 
     def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> FinishedCell:
-        traces = workspace.answers.reasoning(cell.evaluation.key)
+        traces = workspace.answers.reasoning(cell.evaluation.key, rows)
         keyed = zip(_items(workspace, cell.dataset), wanted_requests(workspace, cell), strict=True)
         table = [response_row(cell, item, r.key, rows[r.key], traces.get(r.key)) for item, r in keyed]
         version = workspace.tables.write(RESPONSES, cell.partition, table, inputs[cell.key], failed=tally.errors)

@@ -27,7 +27,7 @@ from traps_pipeline.models.request import RATE_LIMITED, UNBILLED, Backend, Outco
 from traps_pipeline.models.traffic import Breaker, Gate, Meter
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
-from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, SegmentWriter
+from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, SegmentWriter, settles
 from traps_pipeline.storage.workspace import Study
 
 Row = dict[str, Any]
@@ -67,6 +67,7 @@ class Participants:
             entry = self._entries[name]
             check_money(self._study, entry)
             gate, breaker = Gate(entry.limits.concurrency), Breaker(name)
+            breaker.check()
             self._made[name] = Participant(self._make(entry), entry, gate, self._meter(entry.account), breaker)
         return self._made[name]
 
@@ -227,10 +228,11 @@ class _Asking:
         if attempted is None:
             return False
         row, reasoning = ledger_row(request, *attempted, self.work.epoch)
+        dollars = row["cost_usd"] or 0.0
         self.writer.append(row, reasoning)
+        self.work.budget.booked(name, dollars)
         self.rows[request.key] = row
-        failed, dollars = row["outcome"] == "error", row["cost_usd"] or 0.0
-        progress.current().called(self.work.stage, name, failed, row["latency_s"], dollars)
+        progress.current().called(self.work.stage, name, not settles(row), row["latency_s"], dollars)
         participant.breaker.watch(attempted[0])
         return True
 
@@ -268,36 +270,53 @@ class _Asking:
 async def settle_evaluation(
     work: Work[Any], evaluation: Evaluation, cells: Sequence[Cell], stop: asyncio.Event
 ) -> AsyncIterator[Settled]:
-    """Settle the cells of one evaluation, asking only what its ledger does not hold. Unfinished cells are left out."""
-    report = progress.current()
-    async with work.ledger.lock(evaluation.key, report.note, stop.is_set):
-        known = work.ledger.read(evaluation.key)
-        for place in known.torn:
-            report.note(f"{place}: torn last line ignored (a crash cut it off); its answer is asked again")
-        answered = {key: row for key, row in known.rows.items() if row["outcome"] != "error"}
+    """Settle the cells of one evaluation, asking only what its ledger does not hold. Unfinished cells are left out.
+
+    Requests and rows are made and read a cell at a time: none is held once its cell is finished, and a call that two
+    cells share (a steered control stands in two datasets) is found by the second.
+    """
+    torn: set[str] = set()
+    async with work.ledger.lock(evaluation.key, progress.current().note, stop.is_set):
         with work.ledger.writer(evaluation.key) as writer:
             for cell in cells:
-                wanted = {request.key: request for request in work.requests(cell)}
-                missing = [request for key, request in wanted.items() if key not in answered]
-                asking = _Asking(work, writer, missing, stop)
-                new = Counter(request.participant for request in missing)
-                for name, count in Counter(request.participant for request in wanted.values()).items():
-                    report.asking(work.stage, name, new[name], count - new[name])
-                tally = Tally(asked=len(missing), cached=len(wanted) - len(missing))
-                await asking.run()
-                rows = {key: answered.get(key) or asking.rows.get(key) for key in wanted}
-                if stop.is_set() or any(row is None for row in rows.values()):
+                settled = await _settle_cell(work, cell, writer, stop, torn)
+                if settled is None:
                     return  # what was answered is in the ledger
-                writer.sync()
-                complete = {key: row for key, row in rows.items() if row is not None}
-                tally.errors = sum(row["outcome"] == "error" for row in complete.values())
-                yield Settled(cell, complete, tally)
+                yield settled
+                del settled
                 await asyncio.sleep(0)  # a cell that was all known must not keep the loop from those that are asked
+
+
+async def _settle_cell(
+    work: Work[Any], cell: Cell, writer: SegmentWriter, stop: asyncio.Event, torn: set[str]
+) -> Settled | None:
+    """Ask what is missing of a cell; None if that was stopped. torn: torn lines that a person was told of."""
+    report = progress.current()
+    wanted = {request.key: request for request in work.requests(cell)}
+    known = work.ledger.read(cell.evaluation.key, wanted)
+    for place in sorted({*known.torn} - torn):
+        report.note(f"{place}: torn last line ignored (a crash cut it off); its answer is asked again")
+    torn.update(known.torn)
+    rows = known.settled
+    missing = [request for key, request in wanted.items() if key not in rows]
+    new = Counter(request.participant for request in missing)
+    for name, count in Counter(request.participant for request in wanted.values()).items():
+        report.asking(work.stage, name, new[name], count - new[name])
+    asking = _Asking(work, writer, missing, stop)
+    await asking.run()
+    rows |= asking.rows
+    if stop.is_set() or len(rows) < len(wanted):
+        return None
+    writer.sync()
+    errors = sum(not settles(row) for row in rows.values())
+    tally = Tally(asked=len(missing), cached=len(wanted) - len(missing), errors=errors)
+    return Settled(cell, {key: rows[key] for key in wanted}, tally)
 
 
 async def settle(work: Work[Any], cells: Sequence[Cell], stop: asyncio.Event) -> AsyncIterator[Settled | Exception]:
     """Settle all cells, models side by side. A model that fails yields its exception; the others go on."""
     done: asyncio.Queue[Settled | Exception | None] = asyncio.Queue()
+    taken = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
     async def one_model(evaluations: Sequence[tuple[Evaluation, list[Cell]]]) -> None:
         try:
@@ -305,13 +324,15 @@ async def settle(work: Work[Any], cells: Sequence[Cell], stop: asyncio.Event) ->
                 if stop.is_set():
                     return
                 async for settled in settle_evaluation(work, evaluation, mine, stop):
-                    await done.put(settled)
+                    await taken.acquire()
+                    done.put_nowait(settled)
+                    del settled
         except LockGivenUp:
             return
         except Exception as error:  # noqa: BLE001 - handed to the caller, who reports it and fails the run
-            await done.put(error)
+            done.put_nowait(error)
         finally:
-            await done.put(None)
+            done.put_nowait(None)
 
     ordered = sorted(cells, key=lambda cell: (cell.evaluation, cell.dataset))
     by_evaluation = [(e, list(mine)) for e, mine in groupby(ordered, key=lambda cell: cell.evaluation)]
@@ -326,6 +347,8 @@ async def settle(work: Work[Any], cells: Sequence[Cell], stop: asyncio.Event) ->
                 open_tasks -= 1
             else:
                 yield settled
+                if isinstance(settled, Settled):
+                    taken.release()
     finally:
         for task in tasks:
             task.cancel()

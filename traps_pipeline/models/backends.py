@@ -10,7 +10,7 @@ from traps_pipeline.models.request import Backend
 def make_backend(entry: Entry) -> Backend:
     """The entry's backend. Imports are lazy: a study without paid models never loads a provider's library.
 
-    Raises TrapsError when its key is not set, or when this version cannot ask it.
+    Raises TrapsError when its key is not set, or its weights are not here.
     """
     match entry.backend:
         case "reference":
@@ -26,8 +26,7 @@ def make_backend(entry: Entry) -> Backend:
 
             return ApiBackend(entry)
         case "local":
-            raise TrapsError(
-                f"{entry.id}: local checkpoints are not asked by this version; export its requests "
-                "(`traps requests export`), let a cluster answer them, and import the answers (`traps answers import`)"
-            )
+            from traps_pipeline.models.local.backend import LocalBackend
+
+            return LocalBackend(entry)
     raise TrapsError(f"{entry.id}: unknown backend {entry.backend!r}; known: reference, observer, api, local")

@@ -1,6 +1,7 @@
 """A cap that holds: the worst case of a call is reserved before it is sent and settled when its cost is known.
 
-What was spent is the sum of the costs in the ledger, so it survives restarts without a second book.
+What was spent is the sum of the costs in the ledger, so it survives restarts. Only what is not there yet stands in a
+small journal, so that calls in flight when a process is killed count as their worst case ever after.
 """
 
 from __future__ import annotations
@@ -8,17 +9,19 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import json
+import os
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry
+from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_models
 from traps_pipeline.models.request import Request
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.workspace import Study, Workspace, write_text
 
 OVERHEAD_TOKENS = 200  # roles, separators, JSON around the text
 BYTES_A_TOKEN = 1  # some tokenizers make a token of every digit, and judges are shown arbitrary text
@@ -70,10 +73,46 @@ def check_money(study: Study, entry: Entry) -> None:
         )
 
 
+class Journal:
+    """Dollars that calls were sent for and that no row of a ledger holds yet, one line a change, by participant. What
+    is left of it when its process dies is what its calls in flight may have cost; that stays. One process has it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        left: defaultdict[str, float] = defaultdict(float)
+        for line in path.read_bytes().split(b"\n")[:-1] if path.exists() else ():
+            participant, dollars = json.loads(line)
+            left[participant] += dollars
+        self.lost_usd = {participant: dollars for participant, dollars in left.items() if dollars > 1e-6}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, "".join(f"{json.dumps(loss)}\n" for loss in self.lost_usd.items()))
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND)
+
+    def add(self, participant: str, dollars: float) -> None:
+        """Note a change at once, so that it survives kill -9. Raises TrapsError when the disk is full."""
+        try:
+            os.write(self._file, f"{json.dumps([participant, dollars])}\n".encode())
+        except OSError as error:
+            raise TrapsError(
+                f"{self.path}: cannot be written ({error.strerror}); free some space, run again"
+            ) from error
+
+    def close(self) -> None:
+        """Close the file; it stays."""
+        os.close(self._file)
+
+
 class Budget:
     """What may still be spent, in all and by each participant that has a cap of its own."""
 
-    def __init__(self, cap_usd: float, caps_usd: Mapping[str, float], spent_usd: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        cap_usd: float,
+        caps_usd: Mapping[str, float],
+        spent_usd: Mapping[str, float],
+        journal: Journal | None = None,
+    ) -> None:
+        self._journal = journal
         self._caps = {None: cap_usd, **caps_usd}
         self._spent = defaultdict(float, spent_usd) | {None: sum(spent_usd.values())}
         self._reserved: defaultdict[str | None, float] = defaultdict(float)
@@ -104,15 +143,25 @@ class Budget:
                 await self._changed.wait()
             for slot in (None, participant):
                 self._reserved[slot] += worst_usd
+        self._note(participant, worst_usd)
 
     async def settle(self, participant: str, worst_usd: float, cost_usd: float | None) -> None:
         """Put a call's cost in the place of its worst case; an unknown cost counts as the worst."""
         cost = worst_usd if cost_usd is None else cost_usd
+        self._note(participant, cost - worst_usd)
         async with self._changed:
             for slot in (None, participant):
                 self._reserved[slot] = max(0.0, self._reserved[slot] - worst_usd)
                 self._spent[slot] = self._spent[slot] + cost
             self._changed.notify_all()
+
+    def booked(self, participant: str, cost_usd: float) -> None:
+        """What a call and its attempts cost stands in the ledger."""
+        self._note(participant, -cost_usd)
+
+    def _note(self, participant: str, dollars: float) -> None:
+        if self._journal is not None and dollars:
+            self._journal.add(participant, dollars)
 
     def _explain(self, slot: str | None, worst_usd: float) -> str:
         whose = "the study" if slot is None else slot
@@ -126,6 +175,7 @@ class Budget:
 def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Budget]:
     """The study's budget, less what its ledgers say was spent. Where anyone asked has a price, no other process spends
     from it meanwhile: two that do not see each other's calls would both use the remainder. Raises TrapsError."""
+    _check_names(workspace)
     if not any(entry.prices for entry in participants):
         yield Budget(workspace.study.budget_usd, workspace.study.model_budgets_usd, {})
         return
@@ -141,12 +191,27 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
                     progress.current().note("another run spends from this study's budget; waiting for it to finish")
                     told = True
                 time.sleep(0.2)
-        yield _open_budget(workspace)
+        journal = Journal(workspace.answers.root / "in_flight.jsonl")
+        try:
+            yield _open_budget(workspace, journal)
+        finally:
+            journal.close()
 
 
-def _open_budget(workspace: Workspace) -> Budget:
-    study, spent = workspace.study, defaultdict(float)
+def _open_budget(workspace: Workspace, journal: Journal) -> Budget:
+    study, spent = workspace.study, defaultdict(float, journal.lost_usd)
     for ledger in (workspace.answers, workspace.votes):
         for participant, dollars in ledger.spent().items():
             spent[participant] += dollars
-    return Budget(study.budget_usd, study.model_budgets_usd, spent)
+    return Budget(study.budget_usd, study.model_budgets_usd, spent, journal)
+
+
+def _check_names(workspace: Workspace) -> None:
+    """A cap for nobody caps nothing. Raises TrapsError."""
+    from traps_pipeline.judging.panel import load_judges
+
+    if unknown := workspace.study.model_budgets_usd.keys() - load_models().keys() - load_judges().keys():
+        raise TrapsError(
+            f"{workspace.root / 'study.yaml'}: model_budgets_usd names {', '.join(sorted(unknown))}, neither a model "
+            "of assets/models.yaml nor a judge of assets/judges.yaml; correct the name, or remove its line"
+        )

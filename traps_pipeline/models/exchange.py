@@ -106,8 +106,7 @@ def _missing(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
     for cell in _cells(workspace, experiment):
         evaluation = cell.evaluation
         if evaluation not in known:
-            rows = workspace.answers.read(evaluation.key).rows
-            known[evaluation] = {key for key, row in rows.items() if row["outcome"] != "error"}
+            known[evaluation] = {*workspace.answers.read(evaluation.key).settled}
         wanted = wanted_requests(workspace, cell)
         yield from (request for request in wanted if request.key not in known[evaluation])
 
@@ -181,8 +180,8 @@ async def _append(
     """Append what one evaluation's ledger does not hold; how many."""
     ledger, entry = workspace.answers, get_model(evaluation.model)
     async with ledger.lock(evaluation.key, progress.current().note):
-        rows = ledger.read(evaluation.key).rows
-        new = [a for a in answers if a.key not in rows or rows[a.key]["outcome"] == "error"]
+        known = ledger.read(evaluation.key).settled
+        new = [a for a in answers if a.key not in known]
         with ledger.writer(evaluation.key) as writer:
             for answer in new:
                 outcome = answer.as_outcome(entry)

@@ -5,12 +5,14 @@ Experience comes first: means over what the ledger holds of a participant. Witho
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from traps_pipeline.models.budget import BYTES_A_TOKEN, OVERHEAD_TOKENS
 from traps_pipeline.models.registry import Entry, ModelEntry, load_accounts
+from traps_pipeline.storage.ledger import settles
 
 TYPICAL_TEXT_BYTES = 1500  # system prompt, question and, for a judge, the answer
 TYPICAL_LATENCY_S = 10.0
@@ -39,15 +41,22 @@ class Forecast:
     minutes: float
 
 
-def experience(rows: Iterable[Mapping[str, Any]]) -> Experience:
-    """What ledger rows of one participant tell."""
-    answered = [row for row in rows if row["outcome"] != "error"]
+def experiences(rows: Iterable[Mapping[str, Any]]) -> dict[str, Experience]:
+    """What ledger rows tell, by participant; the rows are gone through once and not kept."""
+    columns = ("prompt_tokens", "completion_tokens", "latency_s")
+    sums, counts, seen = Counter[tuple[str, str]](), Counter[tuple[str, str]](), dict[str, None]()
+    for row in rows:
+        participant = row["components"]["participant"]
+        seen[participant] = None
+        for column in columns:
+            if settles(row) and row.get(column) is not None:
+                sums[participant, column] += row[column]
+                counts[participant, column] += 1
 
-    def mean(column: str) -> float | None:
-        known = [row[column] for row in answered if row.get(column) is not None]
-        return sum(known) / len(known) if known else None
+    def mean(slot: tuple[str, str]) -> float | None:
+        return sums[slot] / counts[slot] if counts[slot] else None
 
-    return Experience(mean("prompt_tokens"), mean("completion_tokens"), mean("latency_s"))
+    return {name: Experience(*(mean((name, column)) for column in columns)) for name in seen}
 
 
 def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:

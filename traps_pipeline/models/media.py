@@ -128,10 +128,11 @@ def sample(clip: Path, spec: MediaSpec) -> Frames:
     shown, times = decode(clip)
     chosen = pick(times, spec)
     clip_fps = round((len(times) - 1) / float(times[-1] - times[0]), 3) if len(times) > 1 else None
-    return Frames(_resized(shown[chosen], spec.size), times[chosen], clip_fps)
+    return Frames(resized(shown[chosen], spec.size), times[chosen], clip_fps)
 
 
-def _resized(frames: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
+def resized(frames: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
+    """Frames (N, H, W, 3) uint8 at another width and height; as they are for None."""
     import cv2
 
     if size is None or size == (frames.shape[2], frames.shape[1]):

@@ -32,3 +32,10 @@ def prompt(name: str) -> str:
 def system_prompt(regime: str) -> str:
     """The regime's system prompt: parts stripped and joined by one blank line."""
     return "\n\n".join(prompt(part) for part in _REGIME_PARTS[regime])
+
+
+@cache
+def vqa_prompt(name: str) -> str:
+    """The system prompt under which hidden states are extracted: `standard`, or `guided` (`benchmark.md` section 7)."""
+    parts = {"standard": ("vqa_standard",), "guided": ("vqa_standard", "vqa_guided_suffix")}[name]
+    return "\n\n".join(prompt(part) for part in parts)

@@ -10,13 +10,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
 from traps_pipeline.models.media import MediaSpec
-from traps_pipeline.partitions import Evaluation, check_slug, evaluations
+from traps_pipeline.partitions import VQA_PROMPTS, Evaluation, Extraction, check_slug, evaluations
 from traps_pipeline.paths import ASSETS
-from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
+from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
 
 MODELS_FILE = ASSETS / "models.yaml"
 # What the protocol sends (`benchmark.md` section 3): parameter to the names it goes under and its value. An entry that
@@ -33,6 +34,8 @@ JUDGE_PROTOCOL: Protocol = {
 }
 OTHER_WAIVERS = ("media", "reasoning", "json_schema")  # what the protocol sets besides parameters
 NETWORK = "api"  # the backend that asks over the network
+LOCAL = "local"  # the backend that asks a checkpoint on this machine
+LOCAL_TIMEOUT_S = 24 * 3600.0
 
 
 def structured(name: str, **properties: Any) -> dict[str, Any]:
@@ -52,7 +55,7 @@ class Limits(BaseModel):
     concurrency: int = Field(default=24, ge=1)
     retries: int = Field(default=5, ge=0)
     backoff_s: float = Field(default=1.0, gt=0, description="first wait; doubles with each retry, full jitter")
-    timeout_s: float = Field(default=600.0, gt=0, description="of one attempt")
+    timeout_s: float = Field(default=600.0, gt=0, description="of one attempt; backend local has a day by default")
 
 
 class Account(BaseModel):
@@ -171,6 +174,16 @@ class ModelEntry(Entry):
     json_schema: bool = Field(default=True, description="structured output in the JSON regime; of backend api")
     tokens_per_frame: int = Field(default=300, ge=0, description="estimate for `traps plan`, upper bound for a budget")
     groups: Groups = Groups(family="own", access="own", input="own", group="own")
+    device: str | None = Field(default=None, pattern=DEVICE, description="of backend local: cpu, cuda, cuda:1 or mps")
+    mechanism: MechanismSpec | None = Field(default=None, description="of backend local: how it is looked into")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _local_models_take_their_time(cls, data: Any) -> Any:
+        """A local request waits for the batch before its own: giving it up would only throw its answer away."""
+        if isinstance(data, dict) and data.get("backend") == LOCAL and isinstance(data.get("limits", {}), dict):
+            return data | {"limits": {"timeout_s": LOCAL_TIMEOUT_S} | data.get("limits", {})}
+        return data
 
     @model_validator(mode="after")
     def _backend_has_what_it_needs(self) -> ModelEntry:
@@ -179,18 +192,34 @@ class ModelEntry(Entry):
         if self.backend == "reference" and self.params.get("strategy") not in STRATEGIES:
             known = ", ".join(STRATEGIES)
             raise ValueError(f"params.strategy is {self.params.get('strategy')!r}; known strategies: {known}")
-        if (self.backend in (NETWORK, "local")) != (self.media is not None):
+        if (self.backend in (NETWORK, LOCAL)) != (self.media is not None):
             raise ValueError(f"media: backend {self.backend} {'needs it' if self.media is None else 'has none'}")
         if self.media is not None:
             self._check_media(self.media)
+        self._check_local()
         if self.backend == NETWORK and self.json_schema == ("json_schema" in self.waivers):
             raise ValueError(
                 "json_schema: the JSON regime asks for structured output; where it is off, a waiver says why"
             )
         return self
 
+    def _check_local(self) -> None:
+        if self.backend == LOCAL:
+            if self.device is None:
+                raise ValueError("device: backend local needs it (cpu, cuda, cuda:1 or mps); it is not chosen for you")
+            try:
+                self.local_params()
+            except ValidationError as error:
+                raise ValueError(f"params: {explain(error)}") from error
+        elif self.device is not None or self.mechanism is not None:
+            raise ValueError("device, mechanism: only backend local has them")
+
+    def local_params(self) -> LocalParams:
+        """`params` of backend local, checked. Raises pydantic's ValidationError."""
+        return LocalParams.model_validate(self.params)
+
     def _check_media(self, media: MediaSpec) -> None:
-        if (media.profile == "frames") != (self.backend == "local"):
+        if (media.profile == "frames") != (self.backend == LOCAL):
             raise ValueError("media.profile: frames goes to local models, video or images over the network")
         if self.backend == NETWORK and (media.fps, media.most) != (5, 25) and "media" not in self.waivers:
             raise ValueError("media: the protocol has fps 5, most 25: send that, or say why under waivers")
@@ -233,7 +262,13 @@ def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
 
 
 def effective_params(entry: ModelEntry, regime: str) -> dict[str, Any]:
-    """What is sent under a regime: the entry's parameters, and in the JSON regime the schema where the entry has it."""
+    """What is sent under a regime: the entry's parameters, in the JSON regime the schema where the entry has it, and of
+    a checkpoint in a folder the digest of its content (a hub id's content is that of its revision)."""
+    if entry.backend == LOCAL:
+        from traps_pipeline.models.local.checkpoint import declared_digest
+
+        content = declared_digest(entry.local_params().checkpoint)
+        return entry.params | ({"checkpoint_digest": content} if content else {})
     structured = entry.backend == NETWORK and entry.json_schema and regime == "json"
     return entry.params | ({"response_format": JSON_ANSWER} if structured else {})
 
@@ -261,3 +296,21 @@ def get_model(model_id: str) -> ModelEntry:
 def all_evaluations() -> tuple[Evaluation, ...]:
     """The second partition dimension: every model, regime and run of the registry."""
     return tuple(evaluations((entry.id, entry.runs) for entry in load_models().values()))
+
+
+@cache
+def local_models() -> tuple[str, ...]:
+    """Models whose hidden states can be read, in file order."""
+    return tuple(entry.id for entry in load_models().values() if entry.backend == LOCAL)
+
+
+@cache
+def all_extractions() -> tuple[Extraction, ...]:
+    """The partitions of what is extracted: every local model under every VQA prompt."""
+    return tuple(Extraction(model, prompt) for model in local_models() for prompt in VQA_PROMPTS)
+
+
+@cache
+def all_steered() -> tuple[str, ...]:
+    """`model__directionregime__inferenceregime` of every local model."""
+    return tuple(f"{model}__{d}__{i}" for model in local_models() for d in VQA_PROMPTS for i in VQA_PROMPTS)

@@ -6,8 +6,8 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.request import Outcome
@@ -101,6 +101,19 @@ class Stopped(TrapsError):
     """A participant that is asked no more; the others go on."""
 
 
+_stopped: list[dict[str, str]] = []  # of each `remembering_stops` in force: participant to what was said
+
+
+@contextmanager
+def remembering_stops() -> Iterator[None]:
+    """Within the block a participant that was stopped stays so for all who ask it next, for the same reason."""
+    _stopped.append({})
+    try:
+        yield
+    finally:
+        _stopped.pop()
+
+
 class Breaker:
     """Watches what comes back from one participant."""
 
@@ -108,6 +121,12 @@ class Breaker:
         self._participant = participant
         self._refusal, self._in_a_row = "", 0
         self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
+
+    def check(self) -> None:
+        """Raises Stopped for a participant that was stopped before (`remembering_stops`)."""
+        for stopped in _stopped:
+            if self._participant in stopped:
+                raise Stopped(stopped[self._participant])
 
     def watch(self, outcome: Outcome) -> None:
         """Raises Stopped after 20 refusals of the same kind in a row, or when over 10 of the last 100 calls failed."""
@@ -122,10 +141,13 @@ class Breaker:
             why = f"{errors} of its last {ERROR_WINDOW} calls failed (last: {outcome.error or 'an answer'})"
         else:
             return
-        raise Stopped(
+        said = (
             f"{self._participant} is stopped: {why}; its answers so far are kept. Mend the cause and run the same "
             "command again: only what is missing is asked"
         )
+        for stopped in _stopped:
+            stopped.setdefault(self._participant, said)  # calls in flight then come back later, and raise too
+        raise Stopped(said)
 
 
 def _refusal(outcome: Outcome) -> str:

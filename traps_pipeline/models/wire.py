@@ -204,13 +204,16 @@ def _frames() -> list[np.ndarray]:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """One request of every form that a study makes of an entry: a model's by regime, a judge's by task."""
+    """One request of every form that a study makes of an entry: a model's by regime, a judge's by task (and a label of
+    confabulation, where it gives those)."""
     if isinstance(entry, ModelEntry):
         return {regime: _answer_request(entry, regime) for regime in REGIMES}
+    from traps_pipeline.judging.confabulation import load_protocol
     from traps_pipeline.judging.panel import JudgeEntry, tasks_for
 
     assert isinstance(entry, JudgeEntry)
-    return {task: _vote_request(entry, task) for task in tasks_for("control")}
+    votes = {str(task): _vote_request(entry, task) for task in tasks_for("control")}
+    return votes | ({"confabulation": _label_request(entry)} if entry.id in load_protocol().judges.values() else {})
 
 
 def _answer_request(entry: ModelEntry, regime: str) -> Request:
@@ -225,6 +228,13 @@ def _answer_request(entry: ModelEntry, regime: str) -> Request:
         sent=sent,
         media_digest=sent.sha256 if sent else "",
     )
+
+
+def _label_request(entry: JudgeEntry) -> Request:
+    from traps_pipeline.judging.confabulation import label_request
+
+    cell = Cell("occlusion", Evaluation("oracle", "standard", 1))
+    return label_request(entry, cell, {"item_id": "none", "question": _QUESTION}, "Yes.", "Perhaps.")
 
 
 def _vote_request(entry: JudgeEntry, task: Literal["abstention", "correctness"]) -> Request:

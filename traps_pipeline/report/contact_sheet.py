@@ -10,18 +10,35 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.report.figures import figure_bytes, figure_style
+from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
 from traps_pipeline.scenes.encode import decode
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MOMENTS = 4  # frames a clip
 GAP = 8  # pixels between frames
-BLOCK_IN = 6.4  # width of a pair
-HEADER_IN, FOOTER_IN = 0.95, 0.2  # room for the words above and the times below a pair's frames
-DPI = 150
+FOOTER_IN = 0.2  # room for the times below a pair's frames
 MOST_PAIRS = 80
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Widths (in), dots an inch, and how many letters of a question fit on a line of a pair."""
+
+    block: float = 6.4
+    header: float = 0.95  # room for the words above a pair's frames
+    gap: float = 0.5
+    dpi: int = 150
+    size: float = 8
+    letters: int = 108
+    questions: int = 2  # lines of each question at most
+    ids: bool = True  # whether scenarios are named
+
+
+# On a screen, and across a page of a paper, where nothing may be smaller than 6 points.
+SCREEN, PAGE = Layout(), Layout(block=2.98, header=0.5, gap=0.4, dpi=300, size=6.5, letters=62, questions=2, ids=False)
 
 
 @dataclass(frozen=True)
@@ -34,31 +51,36 @@ class Clip:
 
 
 def contact_sheet(items: pd.DataFrame, root: Path, per_family: int | None = 1, columns: int = 2) -> bytes:
-    """PNG: per pair a row of control frames above a row of void frames at the same times, from start to end.
+    """PNG of `pairs_figure`."""
+    return figure_bytes(pairs_figure(items, root, per_family, columns))
+
+
+def pairs_figure(
+    items: pd.DataFrame, root: Path, per_family: int | None = 1, columns: int = 2, layout: Layout = SCREEN
+) -> Figure:
+    """Per pair a row of control frames above a row of void frames at the same times, from start to end.
 
     items are ITEMS rows with both sides of each pair, clips lie under root. Of every dataset and sub-scenario the first
     `per_family` pairs by id are shown, all where it is None. A time behind a truncated void's end is hatched. Raises
     ValueError when there is no whole pair or more than 80, and DamagedClip when a clip cannot be decoded.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     pairs = chosen_pairs(items, per_family)
     columns = min(columns, len(pairs))
     with figure_style():
         blocks = [_moments(pair, root) for pair in pairs]
-        heights = [BLOCK_IN * _ratio(control) + HEADER_IN + FOOTER_IN for control, _, _ in blocks]
+        heights = [layout.block * _ratio(control) + layout.header + FOOTER_IN for control, _, _ in blocks]
         rows = [max(heights[k : k + columns]) for k in range(0, len(heights), columns)]
-        width, height = columns * (BLOCK_IN + 0.5), sum(rows) + 0.1
-        figure = Figure(figsize=(width, height), dpi=DPI)
-        FigureCanvasAgg(figure)
+        width, height = columns * (layout.block + layout.gap), sum(rows) + 0.1
+        figure = new_figure(width, height, layout.dpi)
+        figure.set_layout_engine("none")
         for k, (pair, block) in enumerate(zip(pairs, blocks, strict=True)):
             row, column = divmod(k, columns)
-            left, top = column * (BLOCK_IN + 0.5) + 0.4, height - 0.1 - sum(rows[:row]) - HEADER_IN
-            tall = BLOCK_IN * _ratio(block[0])
-            axes = figure.add_axes((left / width, (top - tall) / height, BLOCK_IN / width, tall / height))
-            _draw_pair(axes, pair, *block)
-        return figure_bytes(figure)
+            left = column * (layout.block + layout.gap) + 0.8 * layout.gap
+            top = height - 0.1 - sum(rows[:row]) - layout.header
+            tall = layout.block * _ratio(block[0])
+            axes = figure.add_axes((left / width, (top - tall) / height, layout.block / width, tall / height))
+            _draw_pair(axes, pair, *block, layout)
+    return figure
 
 
 def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
@@ -110,14 +132,14 @@ def _ratio(clip: Clip) -> float:
     return (2 * height + GAP) / (MOMENTS * width + (MOMENTS - 1) * GAP)
 
 
-def _draw_pair(axes: Axes, pair: pd.DataFrame, control: Clip, void: Clip, times: np.ndarray) -> None:
+def _draw_pair(axes: Axes, pair: pd.DataFrame, control: Clip, void: Clip, times: np.ndarray, layout: Layout) -> None:
     from matplotlib.patches import Rectangle
 
     _, height, width, _ = control.frames.shape
     canvas = np.full((2 * height + GAP, MOMENTS * width + (MOMENTS - 1) * GAP, 3), 255, np.uint8)
     for row, (side, clip) in enumerate({"control": control, "void": void}.items()):
         top = row * (height + GAP)
-        axes.text(-GAP, top + height / 2, side, rotation=90, ha="right", va="center", size=8, weight="bold")
+        axes.text(-GAP, top + height / 2, side, rotation=90, ha="right", va="center", size=layout.size, weight="bold")
         for k in range(MOMENTS):
             left = k * (width + GAP)
             if k < clip.known:
@@ -132,7 +154,7 @@ def _draw_pair(axes: Axes, pair: pd.DataFrame, control: Clip, void: Clip, times:
                 f"cut at {clip.end_s:.1f} s",
                 ha="center",
                 va="center",
-                size=8,
+                size=min(layout.size, 7),
                 bbox=box,
             )
     axes.imshow(canvas, interpolation="antialiased")
@@ -143,30 +165,34 @@ def _draw_pair(axes: Axes, pair: pd.DataFrame, control: Clip, void: Clip, times:
             f"{time:.1f} s",
             ha="center",
             va="top",
-            size=7,
+            size=min(layout.size, 7),
             color="#667085",
         )
     axes.set_axis_off()
-    _draw_header(axes, pair)
+    _draw_header(axes, pair, layout)
 
 
-def _draw_header(axes: Axes, pair: pd.DataFrame) -> None:
+def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     """Scenario and ground truth in bold, below it the question; the void's own too where it differs."""
     asked = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
     same = asked["control"] == asked["void"]
     questions = [asked["control"]] if same else [f"{side}: {question}" for side, question in asked.items()]
-    lines = [line for question in questions for line in textwrap.wrap(question, 108, max_lines=2, placeholder=" …")]
+    fit = {"max_lines": layout.questions, "placeholder": " …"}
+    lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **fit)]
     truth = pair.at["control", "ground_truth"]
     scenario, sub_scenario, dataset = (pair.at["control", c] for c in ("scenario_id", "sub_scenario", "dataset"))
-    title = f"{scenario}   {sub_scenario} ({dataset})   ground truth: {truth}"
+    title = f"{sub_scenario} ({dataset})   ground truth: {truth}"
+    title = f"{scenario}   {title}" if layout.ids else title
     place: dict[str, Any] = {
         "xycoords": "axes fraction",
         "textcoords": "offset points",
         "va": "bottom",
         "parse_math": False,
     }
-    axes.annotate("\n".join(lines), (0, 1), (0, 5), size=7.5, linespacing=1.15, **place)
-    axes.annotate(title, (0, 1), (0, 9 + 10 * len(lines)), size=8.5, weight="bold", **place)
+    axes.annotate("\n".join(lines), (0, 1), (0, 5), size=layout.size - 0.5, linespacing=1.15, **place)
+    axes.annotate(
+        title, (0, 1), (0, 9 + 1.25 * layout.size * len(lines)), size=layout.size + 0.5, weight="bold", **place
+    )
 
 
 def _fitted(frame: np.ndarray, height: int, width: int) -> np.ndarray:

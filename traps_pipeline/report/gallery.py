@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.report.page import TEMPLATES
+from traps_pipeline.report.writing import environment
 from traps_pipeline.scenes.encode import decode
 
 POSTER_WIDTH, POSTER_HEIGHT = 240, 180
@@ -115,8 +115,5 @@ def _certificate(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _render(title: str, sections: Mapping[str, list[Entry]]) -> str:
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined)
     count = sum(len(entries) for entries in sections.values())
-    return environment.get_template("gallery.html.j2").render(title=title, sections=sections, count=count)
+    return environment().get_template("gallery.html.j2").render(title=title, sections=sections, count=count)

@@ -7,22 +7,31 @@ escapes them for its medium.
 from __future__ import annotations
 
 import base64
-import html
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.report.writing import (
+    NONE,
+    Behind,
+    Table,
+    environment,
+    fraction,
+    markdown,
+    percent,
+    plain,
+    table_html,
+)
 from traps_pipeline.scoring.leaderboard import INCOMPLETE_BELOW
 
-TEMPLATES = Path(__file__).parent / "templates"
-NONE = "–"
 MISSING_MARK = "†"
 INCOMPLETE_MARK = "‡"
+WIDE_PX = 1300  # a picture of more pixels across is a page's width
+# The side whose items a share is of.
+SIDE_OF = {"acc": "control", "false_abs": "control", "abs_rec": "void"}
 ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"
 WORST_BEST = "if missing: worst, best"
 # Headings of columns that are shown only where some count is not 0, with that count: the table is wide already.
@@ -58,6 +67,25 @@ LEGEND = {
 
 
 @dataclass(frozen=True)
+class Block:
+    """One side of a card: whose results, and a PNG (base64) or tables (title, escaped HTML)."""
+
+    source: str
+    png: str = ""
+    tables: Sequence[tuple[str, str]] = ()
+    size: str = "column"
+
+
+@dataclass(frozen=True)
+class Card:
+    """A figure, or tables, of the study beside the paper's."""
+
+    name: str
+    title: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
 class Entry:
     """One model under one regime: its LEADERBOARD rows by dataset; `main` is the row that it is ranked by."""
 
@@ -86,12 +114,12 @@ def leaderboard_text(board: pd.DataFrame) -> str:
     scope, entries = entries_of(board)
     extra = optional_columns(entries)
     header = ["model", "regime", *_headings(), "n", "missing", *extra]
-    lines = [[_plain(e.model), _plain(e.regime), *_figures(e), *_counts(e, extra)] for e in entries]
+    lines = [[plain(e.model), plain(e.regime), *_figures(e), *_counts(e, extra)] for e in entries]
     header, *lines = zip(*map(_hung, zip(header, *lines, strict=True)), strict=True)
     widths = [max(map(len, column)) for column in zip(header, *lines, strict=True)]
     table = [_aligned(cells, widths) for cells in (header, ["-" * w for w in widths], *lines)]
     notes = [f"{mark} {note}" for mark, note in _notes(board).items()]
-    parts = [f"PECS, {TITLES[scope].lower()}. {_plain(provenance(board))}", "", *table]
+    parts = [f"PECS, {TITLES[scope].lower()}. {plain(provenance(board))}", "", *table]
     return "\n".join([*parts, *([""] if notes else []), *notes]) + "\n"
 
 
@@ -100,45 +128,62 @@ def leaderboard_markdown(board: pd.DataFrame) -> str:
     scope, entries = entries_of(board)
     extra = optional_columns(entries)
     header = ["model", "regime", *_headings(), "n", "missing", *extra]
-    lines = [[_markdown(e.model), _markdown(e.regime), *_figures(e), *_counts(e, extra)] for e in entries]
+    lines = [[markdown(e.model), markdown(e.regime), *_figures(e), *_counts(e, extra)] for e in entries]
     rule = ["---", "---", *["---:"] * (len(header) - 2)]
     table = ["| " + " | ".join(cells) + " |" for cells in (header, rule, *lines)]
     legend = [f"- **{term}**: {meaning}" for term, meaning in _legend(board).items()]
-    return "\n".join([f"**{TITLES[scope]}.** {_markdown(provenance(board))}", "", *table, "", *legend]) + "\n"
+    return "\n".join([f"**{TITLES[scope]}.** {markdown(provenance(board))}", "", *table, "", *legend]) + "\n"
 
 
-def leaderboard_html(
-    board: pd.DataFrame, figures: Mapping[str, bytes] | None = None, title: str = "TRAPSBench leaderboard"
+def report_html(
+    board: pd.DataFrame,
+    figures: Mapping[str, bytes] | None = None,
+    chapters: Sequence[tuple[str, Sequence[Card]]] = (),
+    address: Callable[[Behind], str] | None = None,
+    title: str = "TRAPSBench report",
 ) -> str:
-    """One self-contained HTML page: summary, a table a dataset, figures (title -> PNG bytes, inlined), legend.
+    """One page: the leaderboard, a table a dataset, figures (title -> PNG bytes, inlined), legend, then the chapters.
 
-    It opens from disk and asks the network for nothing; its content policy forbids it.
+    With `address`, every number is a link to the items behind it. The page opens from disk and asks the network for
+    nothing; its content policy forbids it.
     """
-    import jinja2
 
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    def behind(row: Mapping[str, Any], name: str) -> str:
+        dataset = row["dataset"] if row["dataset"] in DATASETS else ""
+        return address(Behind(dataset, row["model"], row["regime"], SIDE_OF.get(name, ""))) if address else ""
+
+    templates = environment().overlay()
     formats: dict[str, Callable[..., str]] = {"fraction": fraction, "percent": percent, "count_of": count_of}
-    environment.filters.update(formats)
+    templates.filters = {**templates.filters, **formats}
     scope, entries = entries_of(board)
     present = [name for name in DATASETS if any(name in e.rows for e in entries)]
     sections = [_section(name, entries) for name in present if name != scope]
-    return environment.get_template("leaderboard.html.j2").render(
+    return templates.get_template("report.html.j2").render(
         title=title,
         provenance=provenance(board),
         main=_section(scope, entries),
         main_datasets=[(name, TITLES[name]) for name in present] if scope == "overall" else [],
         sections=sections,
         figures={name: base64.b64encode(png).decode() for name, png in (figures or {}).items()},
+        chapters=chapters,
+        behind=behind,
+        all_items=address(Behind()) if address else "",
         legend=_legend(board),
         notes=_notes(board),
         incomplete_mark=INCOMPLETE_MARK,
     )
+
+
+def picture_block(source: str, png: bytes, full: bool = False) -> Block:
+    """A picture as a card's block; the PNG's own width says whether it is one column's or a page's. full: as wide as
+    the screen allows."""
+    size = "full" if full else "page" if int.from_bytes(png[16:20], "big") > WIDE_PX else "column"
+    return Block(source, base64.b64encode(png).decode(), size=size)
+
+
+def table_block(source: str, tables: Sequence[Table], address: Callable[[Behind], str] | None) -> Block:
+    """Tables as a card's block."""
+    return Block(source, tables=[(table.title, table_html(table, address)) for table in tables])
 
 
 def entries_of(board: pd.DataFrame) -> tuple[str, list[Entry]]:
@@ -163,19 +208,6 @@ def provenance(board: pd.DataFrame) -> str:
         f"Benchmark version{'s' * (len(versions) > 1)} {', '.join(versions) or NONE}; "
         f"epoch{'s' * (len(epochs) > 1)} {', '.join(epochs) or NONE}."
     )
-
-
-def fraction(value: float | None, digits: int = 3) -> str:
-    """A figure as printed, with a true minus sign; a dash for null."""
-    if value is None or pd.isna(value):
-        return NONE
-    text = f"{value:.{digits}f}"
-    return text.replace("-", "−") if float(text) else text.removeprefix("-")
-
-
-def percent(value: float | None, digits: int = 1) -> str:
-    """A share (0 to 1) in percent, without the sign."""
-    return NONE if value is None or pd.isna(value) else fraction(100 * value, digits)
 
 
 def optional_columns(entries: Iterable[Entry]) -> list[str]:
@@ -284,13 +316,3 @@ def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:
     """The first two columns (words) to the left, the others (numbers) to the right."""
     padded = [c.ljust(w) if k < 2 else c.rjust(w) for k, (c, w) in enumerate(zip(cells, widths, strict=True))]
     return "  ".join(padded).rstrip()
-
-
-def _plain(text: str) -> str:
-    """Text that cannot steer a terminal."""
-    return "".join(c if c.isprintable() else "?" for c in text)
-
-
-def _markdown(text: str) -> str:
-    """Text that is neither HTML nor markup, and stays in its table cell."""
-    return re.sub(r"([\\`*_{}\[\]()#+!|~])", r"\\\1", html.escape(_plain(text), quote=False))

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import cast
 
 import numpy as np
 import pandas as pd
 
 from traps_pipeline.partitions import DATASETS
+from traps_pipeline.scoring import Frame
+from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
 from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, OUTCOMES, decision_counts, joined_epochs
 from traps_pipeline.tables import LEADERBOARD
 
-ENTRY = ["model", "regime", "dataset"]
 # An entry is incomplete where fewer of its items than this have a text. With 1 % of the items missing, the worst and
 # the best PECS are at most 0.04 apart (if all are controls: 2 % of Acc and 2 % of FalseAbs), half the 95 % interval of
 # a middling model on 500 pairs (0.08); beyond that, which answers were lost may matter as much as which were sampled.
@@ -20,18 +22,21 @@ _RUN = ["model", "regime", "run"]
 _SUMMED = ["n_missing", "n_items", *OUTCOMES]
 
 
-def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame) -> pd.DataFrame:
-    """LEADERBOARD rows from METRICS rows (scope `all`; others are ignored) and `pecs_intervals`.
+def leaderboard(metrics: Frame, intervals: Frame, contrasts: Frame) -> Frame:
+    """LEADERBOARD rows: `standings` with their `bootstrap.intervals` and the ranks that CONTRASTS rows leave open."""
+    board = standings(metrics).merge(intervals, on=ENTRY, how="left", validate="one_to_one")
+    return board.join(_ranks(board, contrasts))[[c.name for c in LEADERBOARD.columns]]
+
+
+def standings(metrics: Frame) -> Frame:
+    """Every figure of the leaderboard but intervals and ranks, from METRICS rows (scope `all`; others are ignored).
 
     Mean and population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four
     datasets within each run first; a run that lacks a dataset does not enter it, and a model and regime without any
     whole run has no overall row. A figure that is null in one run is null here: no average rests on fewer runs than
     `n_runs` says. Items without a text count in no figure; where they are too many, the entry is `incomplete`.
     """
-    cells = metrics.loc[metrics["scope"] == "all"]
-    cells = cells.assign(n_items=2 * cells["n_pairs"])
-    runs = pd.concat([cells, _overall_runs(cells)], ignore_index=True)
-    groups = runs.groupby(ENTRY, sort=True)
+    groups = _runs(metrics).groupby(ENTRY, sort=True)
     means, deviations = (groups[FIGURES].agg(f) for f in (_mean, _deviation))
     bounds, sums = groups[BOUNDS].agg(_mean), cast(pd.DataFrame, groups[_SUMMED].sum())
     board = means.join([deviations.add_suffix("_std"), bounds, sums])
@@ -41,8 +46,12 @@ def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame) -> pd.DataFrame:
     board["benchmark_version"] = groups["benchmark_version"].agg(_joined_versions)
     board["answered"] = board["n_answered"] / board["n_items"]
     board["incomplete"] = _incomplete(board)
-    board = board.reset_index().merge(intervals, on=ENTRY, how="left", validate="one_to_one")
-    return board.loc[:, [c.name for c in LEADERBOARD.columns]]
+    return board.reset_index()
+
+
+def means_over_runs(metrics: Frame) -> Frame:
+    """FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
+    return _runs(metrics).groupby(ENTRY, sort=True)[FIGURES].agg(_mean)
 
 
 def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
@@ -62,6 +71,13 @@ def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
         "n": counts["abs_rec_of"] + counts["false_abs_of"],
     }
     return pd.DataFrame(pooled).reset_index()
+
+
+def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
+    """One row a (model, regime, dataset or `overall`, run), in the columns of METRICS and n_items."""
+    cells = metrics.loc[metrics["scope"] == "all"]
+    cells = cells.assign(n_items=2 * cells["n_pairs"])
+    return pd.concat([cells, _overall_runs(cells)], ignore_index=True)
 
 
 def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
@@ -90,12 +106,33 @@ def _deviation(values: pd.Series) -> float:
     return float(np.std(values.to_numpy(float)))
 
 
+def _ranks(board: Frame, contrasts: Frame) -> Frame:
+    """rank, rank_low and rank_high of every row, on `board`'s index; null where there is no PECS."""
+    told = contrasts[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & contrasts["separable"]]
+    wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
+    for row in told.itertuples():
+        winner, loser = (row.left_model, row.right_model)[:: 1 if row.difference > 0 else -1]
+        wins[winner, row.left_regime, row.dataset] += 1
+        losses[loser, row.left_regime, row.dataset] += 1
+    entries = list(board[ENTRY].itertuples(index=False, name=None))
+    peers = board.groupby(["regime", "dataset"])["pecs"]
+    ranks = {
+        "rank": peers.rank(method="min", ascending=False),
+        "rank_low": pd.Series([1 + losses[entry] for entry in entries], board.index),
+        "rank_high": peers.transform("count") - pd.Series([wins[entry] for entry in entries], board.index),
+    }
+    return pd.DataFrame(ranks).where(board["pecs"].notna()).astype("Int64")
+
+
 def _joined_versions(versions: pd.Series) -> str:
     """The distinct versions, sorted and joined by ` + `."""
     return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
 
 
-def wrong_intervals(board: pd.DataFrame) -> int:
-    """How many intervals of LEADERBOARD rows are out of order or outside [0, 1]; null ones are not wrong."""
-    low, high = board["pecs_ci_low"].to_numpy(float), board["pecs_ci_high"].to_numpy(float)
-    return int(((low < 0) | (low > high) | (high > 1)).sum())
+def wrong_intervals(board: Frame) -> int:
+    """How many intervals of LEADERBOARD rows are out of order or outside [0, 1] (J: [-1, 1]); null is not wrong."""
+    wrong = 0
+    for figure in RESAMPLED:
+        low, high = (board[f"{figure}_ci_{end}"].to_numpy(float) for end in ("low", "high"))
+        wrong += int(((low < (-1 if figure == "j" else 0)) | (low > high) | (high > 1)).sum())
+    return wrong

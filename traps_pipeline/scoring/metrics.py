@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import cast
 
 import numpy as np
@@ -45,25 +45,31 @@ def pecs_of(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
     return acc * np.maximum(j, 0.0)
 
 
-def cell_metrics(verdicts: pd.DataFrame) -> pd.DataFrame:
+def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_BY) -> pd.DataFrame:
     """METRICS rows of one dataset, from its VERDICTS rows (any models, regimes and runs).
 
     One row a cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x` (the control's answer, both sides of
-    the pair). Figures are fractions; one whose denominator is 0 is null, and so is what depends on it. `n_missing`
-    counts items, of 2 n_pairs, without a needed decision: abstained and correct on a control, abstained on a void.
-    BOUNDS say what the missing decisions could do to PECS; they are never null.
+    the pair); `scoped_by` (prefix to column) may name fewer. Figures are fractions; one whose denominator is 0 is null,
+    and so is what depends on it. `n_missing` counts items, of 2 n_pairs, without a needed decision: abstained and
+    correct on a control, abstained on a void.
+    BOUNDS say what the missing decisions could do to PECS; they are never null. Every share has its n and its Wilson
+    interval.
     Raises ValueError when the verdicts are of several datasets, whose versions may differ (benchmark.md section 5).
     """
     datasets = sorted(verdicts["dataset"].unique())
     if len(datasets) > 1:
         raise ValueError(f"verdicts of several datasets {datasets}: score one dataset at a time")
-    groups = _scoped(verdicts).groupby([*CELL, "scope"], sort=True)
+    groups = _scoped(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
     sums = cast(pd.DataFrame, groups[[*COUNTS, "complete", *OUTCOMES]].sum())
     sums["n_pairs"] = groups["pair_id"].nunique()
     sums["n_missing"] = 2 * sums["n_pairs"] - sums["complete"]
     sums["epoch"] = groups["epoch"].agg(joined_epochs)
     sums["benchmark_version"] = groups["benchmark_version"].agg(lambda versions: " + ".join(sorted(set(versions))))
-    return sums.assign(**_figures(sums), **_bounds(sums)).reset_index().loc[:, [c.name for c in METRICS.columns]]
+    return (
+        sums.assign(**_figures(sums), **_bounds(sums), **_wilson(sums))
+        .reset_index()
+        .loc[:, [c.name for c in METRICS.columns]]
+    )
 
 
 def joined_epochs(epochs: Iterable[str]) -> str:
@@ -71,8 +77,8 @@ def joined_epochs(epochs: Iterable[str]) -> str:
     return "+".join(sorted({part for epoch in set(epochs) for part in epoch.split("+") if part}))
 
 
-def _scoped(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Every verdict with its counts, once for each of the four scopes that it belongs to: (4 x items) rows."""
+def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, str]) -> pd.DataFrame:
+    """Every verdict with its counts, once for each scope that it belongs to: ((1 + len(scoped_by)) x items) rows."""
     counts = decision_counts(verdicts)
     on_control = verdicts["side"].eq("control")
     complete = np.where(on_control, counts["correct_of"] & counts["false_abs_of"], counts["abs_rec_of"])
@@ -80,7 +86,7 @@ def _scoped(verdicts: pd.DataFrame) -> pd.DataFrame:
     flags = counts.assign(complete=complete, **outcomes)
     items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]
-    scopes += [prefix + ":" + verdicts[column].astype("str") for prefix, column in SCOPED_BY.items()]
+    scopes += [prefix + ":" + verdicts[column].astype("str") for prefix, column in scoped_by.items()]
     return pd.concat([items.assign(scope=scope) for scope in scopes], ignore_index=True)
 
 
@@ -113,6 +119,25 @@ def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
         "pecs_low": pecs_of(least["correct"], least["abs_rec"] - most["false_abs"]),
         "pecs_high": pecs_of(most["correct"], most["abs_rec"] - least["false_abs"]),
     }
+
+
+def wilson(yes: np.ndarray, of: np.ndarray, z: float = 1.959963984540054) -> tuple[np.ndarray, np.ndarray]:
+    """Wilson's score interval of each share yes / of, (n,) each; 95 % by default. NaN where nothing was decided."""
+    of = np.where(of > 0, of, np.nan)
+    share, square = yes / of, z**2 / of
+    centre = (share + square / 2) / (1 + square)
+    half = z / (1 + square) * np.sqrt(share * (1 - share) / of + square / (4 * of))
+    return np.maximum(centre - half, 0.0), np.minimum(centre + half, 1.0)
+
+
+def _wilson(sums: pd.DataFrame) -> dict[str, np.ndarray]:
+    """What each share is a share of, and its interval: (cells,) each."""
+    columns = {}
+    for figure, name in (("acc", "correct"), ("false_abs", "false_abs"), ("abs_rec", "abs_rec")):
+        of = sums[f"{name}_of"].to_numpy("int64")
+        low, high = wilson(sums[name].to_numpy(float), of.astype(float))
+        columns |= {f"n_{figure}": of, f"{figure}_low": low, f"{figure}_high": high}
+    return columns
 
 
 def _share(sums: pd.DataFrame, name: str) -> np.ndarray:

@@ -16,7 +16,7 @@ import os
 import re
 import secrets
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Container, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +26,7 @@ from traps_pipeline.errors import TrapsError
 
 SYNC_ROWS, SYNC_SECONDS = 100, 0.5
 LOCK_POLL_SECONDS = 0.1
+_KEY = b'{"key": "'  # how every row begins
 # Found without parsing the row, which would take ten times as long. Inside a string the quote before the colon has a
 # backslash before it, so that no text of a model can look like these.
 _COST = re.compile(rb'"cost_usd": ([0-9.e+-]+)[,}]')
@@ -36,12 +37,29 @@ class LockGivenUp(Exception):
     """Waiting for a lock was stopped."""
 
 
+def settles(row: Mapping[str, Any]) -> bool:
+    """Whether a row settles its key: a failed call is kept for the record, and asked again."""
+    return row["outcome"] != "error"
+
+
 @dataclass
 class Known:
-    """What a ledger holds for one evaluation: the newest row of each key, and torn last lines (file:line)."""
+    """What a ledger holds for one evaluation: the newest row of each key (a failure never takes the place of an
+    answer), and torn last lines (file:line)."""
 
     rows: dict[str, dict[str, Any]] = field(default_factory=dict)
     torn: list[str] = field(default_factory=list)
+
+    @property
+    def settled(self) -> dict[str, dict[str, Any]]:
+        """The rows that need not be asked again."""
+        return {key: row for key, row in self.rows.items() if settles(row)}
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Take a row that is newer than those before it."""
+        earlier = self.rows.get(row["key"])
+        if earlier is None or settles(row) or not settles(earlier):
+            self.rows[row["key"]] = row
 
 
 class Ledger:
@@ -54,39 +72,46 @@ class Ledger:
         """Where an evaluation's segments lie."""
         return self.root / self.kind / evaluation
 
-    def read(self, evaluation: str) -> Known:
-        """All rows of an evaluation. A torn last line of a segment is counted; any other bad line raises TrapsError."""
+    def read(self, evaluation: str, wanted: Container[str] | None = None) -> Known:
+        """The rows of an evaluation, or those of the wanted keys: the others are neither parsed nor held in memory.
+
+        A torn last line of a segment is counted; any other bad line raises TrapsError.
+        """
         known = Known()
         for segment in sorted(self.folder(evaluation).glob("*.jsonl")):
-            for row, torn in _read_segment(segment):
+            for row, torn in _read_segment(segment, wanted):
                 if torn:
                     known.torn.append(torn)
                 elif row is not None:
-                    known.rows[row["key"]] = row
+                    known.add(row)
         return known
 
-    def rows_of(self, participant: str) -> Iterator[dict[str, Any]]:
-        """Rows of one participant, of every evaluation; lines that are not whole are left out."""
-        about = f'"participant": "{participant}"'.encode()
+    def rows_of(self, participants: Container[str]) -> Iterator[dict[str, Any]]:
+        """Rows of some participants, of every evaluation; lines that are not whole are left out."""
         for segment in sorted((self.root / self.kind).glob("*/*.jsonl")):
-            yield from (json.loads(line) for line in segment.read_bytes().split(b"\n")[:-1] if about in line)
+            with segment.open("rb") as stream:
+                for line in stream:
+                    about = _PARTICIPANT.search(line)
+                    if about and about[1].decode() in participants and line.endswith(b"\n"):
+                        yield json.loads(line)
 
     def spent(self) -> dict[str, float]:
         """Dollars by participant, over every row of every evaluation: repeated keys were paid for as well."""
         spent: dict[str, float] = {}
         for segment in sorted((self.root / self.kind).glob("*/*.jsonl")):
-            for line in segment.read_bytes().split(b"\n")[:-1]:
-                cost, participant = _COST.search(line), _PARTICIPANT.search(line)
-                if cost and participant:
-                    name = participant[1].decode()
-                    spent[name] = spent.get(name, 0.0) + float(cost[1])
+            with segment.open("rb") as stream:
+                for line in stream:
+                    cost, participant = _COST.search(line), _PARTICIPANT.search(line)
+                    if cost and participant and line.endswith(b"\n"):
+                        name = participant[1].decode()
+                        spent[name] = spent.get(name, 0.0) + float(cost[1])
         return spent
 
-    def reasoning(self, evaluation: str) -> dict[str, str]:
-        """Reasoning traces by key, kept in sibling segments so that reading answers stays quick."""
+    def reasoning(self, evaluation: str, wanted: Container[str] | None = None) -> dict[str, str]:
+        """Reasoning traces by key (of the wanted keys), in sibling segments so that reading answers stays quick."""
         traces: dict[str, str] = {}
         for segment in sorted(self.folder(evaluation).glob("*.jsonl.reasoning")):
-            traces.update({row["key"]: row["reasoning"] for row, _ in _read_segment(segment) if row})
+            traces.update({row["key"]: row["reasoning"] for row, _ in _read_segment(segment, wanted) if row})
         return traces
 
     @contextmanager
@@ -141,6 +166,7 @@ class SegmentWriter:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._files: dict[Path, int] = {}
+        self._sizes: dict[Path, int] = {}
         self._unsynced, self._synced_at = 0, time.monotonic()
 
     def append(self, row: Mapping[str, Any], reasoning: str | None = None) -> None:
@@ -157,10 +183,11 @@ class SegmentWriter:
             if path not in self._files:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 self._files[path] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-            start = os.fstat(self._files[path]).st_size
+                self._sizes[path] = 0
             if os.write(self._files[path], line) < len(line):
-                os.ftruncate(self._files[path], start)  # a half-written line must not swallow the next one
+                os.ftruncate(self._files[path], self._sizes[path])  # a half-written line must not swallow the next one
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._sizes[path] += len(line)
 
     def sync_if_due(self) -> None:
         """Sync to disk when 100 rows or 0.5 s have passed since the last time."""
@@ -194,12 +221,16 @@ def _writing(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _read_segment(path: Path) -> Iterator[tuple[dict[str, Any] | None, str | None]]:
+def _read_segment(
+    path: Path, wanted: Container[str] | None = None
+) -> Iterator[tuple[dict[str, Any] | None, str | None]]:
     with path.open("rb") as stream:
         for number, line in enumerate(stream, start=1):
             if not line.endswith(b"\n"):
                 yield None, f"{path}:{number}"
                 return
+            if wanted is not None and line.startswith(_KEY) and _key(line) not in wanted:
+                continue
             try:
                 row = json.loads(line)
                 row["key"]
@@ -209,6 +240,10 @@ def _read_segment(path: Path) -> Iterator[tuple[dict[str, Any] | None, str | Non
                     "will be asked anew, all others are kept"
                 ) from error
             yield row, None
+
+
+def _key(line: bytes) -> str:
+    return line[len(_KEY) : line.index(b'"', len(_KEY))].decode("ascii", "replace")
 
 
 def _holder(path: Path) -> str:

@@ -11,6 +11,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.settings import MechanismSettings
 from traps_pipeline.paths import CHECKOUT, require_checkout
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.parquet import TableStore
@@ -25,10 +26,15 @@ VARIABLE = "TRAPS_WORKSPACE"
 
 def write_text(path: Path, text: str) -> None:
     """Write a small file whole or not at all. Raises TrapsError naming it."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all. Raises TrapsError naming it."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(content)
         part.replace(path)
     except OSError as error:
         raise TrapsError(f"{path}: cannot be written ({error.strerror}); free some space and run again") from error
@@ -54,6 +60,7 @@ class Study(BaseModel):
         default={}, description="by model or judge, besides"
     )
     allow_unknown_prices: bool = Field(default=False, description="ask models without a price: no budget bounds them")
+    mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")
 
     @property
     def is_subset(self) -> bool:
@@ -102,11 +109,22 @@ class Workspace:
 
     def save_study(self) -> None:
         """Write `study.yaml`, which every run in this workspace reads, whoever starts it."""
-        write_text(self.root / "study.yaml", yaml.safe_dump(self.study.model_dump(exclude_none=True), sort_keys=False))
+        study = self.study.model_dump(mode="json", exclude_none=True)
+        write_text(self.root / "study.yaml", yaml.safe_dump(study, sort_keys=False))
 
-    def allow(self, **money: Any) -> Workspace:
-        """The workspace with other values of budget_usd, model_budgets_usd, allow_unknown_prices in its study."""
-        changed = Workspace(self.root, self.study.model_copy(update=money))
+    @property
+    def mechanism(self) -> MechanismSettings:
+        """What the study asks inside local models. Raises TrapsError when it asks nothing."""
+        if self.study.mechanism is None:
+            raise TrapsError(
+                f"{self.root}/study.yaml: asks nothing inside models; run an experiment with a `mechanism:` section "
+                "(docs/mechanism.md), e.g. `traps run mechanism`"
+            )
+        return self.study.mechanism
+
+    def allow(self, **changes: Any) -> Workspace:
+        """The workspace with other values of budget_usd, model_budgets_usd, allow_unknown_prices, mechanism."""
+        changed = Workspace(self.root, self.study.model_copy(update=changes))
         changed.save_study()
         return changed
 

@@ -1,0 +1,176 @@
+"""What looking inside costs: extraction against the bare forward pass, steered against unsteered generation, and both
+against a plain loop over transformers; the same model, prompts and device, in alternation.
+
+    python bench/extraction.py [--model ID] [--runs 50]
+
+Without --model: the pocket model where its weights are there, else a random checkpoint of its class and size. With a
+GPU, name a model of the registry whose entry says `device: cuda`; peak memory is printed then. On a loaded machine set
+OMP_NUM_THREADS=1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from traps_pipeline.mechanism.hidden_states import Item, extract
+from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
+from traps_pipeline.models.local.tiny import build_tiny
+from traps_pipeline.models.media import MediaSpec
+from traps_pipeline.models.registry import LOCAL, ModelEntry, load_models
+from traps_pipeline.paths import ASSETS
+from traps_pipeline.progress import Progress, reporting
+
+SYSTEM = "You are a helpful visual question answering assistant. Please answer the question based on the video."
+NEW_TOKENS, ROWS, ITEMS = 24, 4, 16
+FRAMES, HEIGHT, WIDTH = 8, 96, 128
+# About 3 M parameters.
+TEXT = {"hidden_size": 192, "intermediate_size": 384, "num_hidden_layers": 6, "head_dim": 48}
+TEXT |= {"rope_parameters": {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": [12, 6, 6]}}
+VISION = {"hidden_size": 96, "intermediate_size": 256, "depth": 4, "num_heads": 4}
+
+
+def the_model(name: str | None, folder: Path) -> LocalModel:
+    """The model to measure."""
+    models = load_models()
+    if name is None and "pocket" in models and (ASSETS / "pocket" / "model.safetensors").exists():
+        name = "pocket"
+    if name is not None:
+        entry = models[name]
+        return load_local_model(entry, entry.mechanism.quantisation if entry.mechanism else None)
+    build_tiny(
+        "qwen3-vl", folder, text=TEXT, vision=VISION, video={"size": {"shortest_edge": 1024, "longest_edge": 2**22}}
+    )
+    params = {"checkpoint": str(folder), "dtype": "float32", "quantisation": "none"}
+    params |= {"do_sample": False, "max_new_tokens": NEW_TOKENS}
+    spec = MediaSpec(profile="frames", uniform=FRAMES)
+    return load_local_model(ModelEntry(id="tiny", backend=LOCAL, device="cpu", media=spec, params=params))
+
+
+def frames_of(number: int) -> np.ndarray:
+    """Frames of one made-up clip."""
+    return np.random.default_rng(number).integers(0, 255, (FRAMES, HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+def prompt_of(model: LocalModel, number: int) -> Prompt:
+    """A prompt about it."""
+    return model.prompt(
+        SYSTEM, f"Does it stop within {number} seconds, yes or no?", frames_of(number), np.arange(FRAMES) / 2
+    )
+
+
+def alternating(runs: int, **ways: Callable[[], object]) -> dict[str, tuple[float, float]]:
+    """Median wall and CPU seconds of each way, run in turn."""
+    import torch
+
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
+    for run in range(runs + 2):  # two to warm up
+        for name, way in ways.items():
+            wall, cpu = time.perf_counter(), time.process_time()
+            way()
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            if run >= 2:
+                times[name].append((time.perf_counter() - wall, time.process_time() - cpu))
+    return {name: tuple(map(statistics.median, zip(*pairs, strict=True))) for name, pairs in times.items()}  # pyright: ignore[reportReturnType]
+
+
+@contextmanager
+def endless(model: LocalModel) -> Iterator[None]:
+    """Answers of one length: nothing ends them but the limit."""
+    config = model.network.generation_config
+    eos, config.eos_token_id = config.eos_token_id, -1
+    yield
+    config.eos_token_id = eos
+
+
+def line(what: str, ours: tuple[float, float], other: tuple[float, float], target: float | None = None) -> str:
+    """A ratio, with its medians and its target."""
+    wall, cpu = ours[0] / other[0], ours[1] / other[1]
+    said = f"{what:<44} {ours[0] * 1e3:8.2f} ms against {other[0] * 1e3:8.2f} ms: ratio {wall:.3f} (CPU time {cpu:.3f})"
+    return said if target is None else f"{said}, target at most {target:.2f}"
+
+
+def overheads(model: LocalModel, runs: int) -> None:
+    """The two ratios that the design promises."""
+    prompt = prompt_of(model, 0)
+    states = alternating(runs, bare=lambda: model.forward(prompt), ours=lambda: model.forward_states(prompt))
+    print(line("extraction over the bare forward pass", states["ours"], states["bare"], 1.05))
+    v = np.ones(model.d_model, np.float32) / np.sqrt(model.d_model, dtype=np.float32)
+    rows = [prompt_of(model, i) for i in range(ROWS)]
+    push = Steering(v, max(1, model.n_layers // 2), tuple(float(2 * (-1) ** i) for i in range(ROWS)))
+    with endless(model):
+        answers = alternating(
+            runs,
+            plain=lambda: model.generate(rows, NEW_TOKENS),
+            ours=lambda: model.generate(rows, NEW_TOKENS, steering=push),
+        )
+    print(line(f"steered over unsteered, {ROWS} x {NEW_TOKENS} tokens", answers["ours"], answers["plain"], 1.05))
+
+
+def against_a_plain_loop(model: LocalModel, runs: int) -> None:
+    """Samples a second of extraction and generation, prompts included, against what one would write by hand."""
+    import torch
+
+    def plain_states() -> None:
+        kept = []
+        for i in range(ITEMS):
+            inputs = model._placed(prompt_of(model, i).inputs)
+            with torch.inference_mode():
+                out = model.network(**inputs, output_hidden_states=True)
+            kept.append(torch.stack([state[0, -1] for state in out.hidden_states]).cpu())
+
+    def our_states() -> None:
+        items = [Item(f"i{i}", "void", {"number": i}, lambda i=i: prompt_of(model, i)) for i in range(ITEMS)]
+        with TemporaryDirectory() as folder:
+            extract(model, items, Path(folder))
+
+    def plain_answers() -> None:
+        for i in range(ITEMS):
+            inputs = model._placed(prompt_of(model, i).inputs)
+            with torch.inference_mode():
+                model.network.generate(**inputs, max_new_tokens=NEW_TOKENS)
+
+    def our_answers() -> None:
+        model.generate([prompt_of(model, i) for i in range(ITEMS)], NEW_TOKENS)
+
+    with endless(model), reporting(Progress()):
+        for what, plain, ours in (("extracted", plain_states, our_states), ("answered", plain_answers, our_answers)):
+            took = alternating(runs, plain=plain, ours=ours)
+            rates = {name: ITEMS / wall for name, (wall, _) in took.items()}
+            ratio, cpu = rates["ours"] / rates["plain"], took["plain"][1] / took["ours"][1]
+            pace = f"{rates['ours']:.1f} samples/s, plain loop {rates['plain']:.1f}"
+            print(f"{what}: {pace}: {ratio:.2f} x (by CPU time {cpu:.2f} x)")
+
+
+def main() -> None:
+    """Print everything."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", help="id in assets/models.yaml")
+    parser.add_argument("--runs", type=int, default=50)
+    arguments = parser.parse_args()
+    import torch
+
+    with TemporaryDirectory() as folder:
+        model = the_model(arguments.model, Path(folder))
+        count = sum(p.numel() for p in model.network.parameters())
+        print(f"{model.served_model}, {count / 1e6:.1f} M parameters, prompt of {prompt_of(model, 0).n_tokens} tokens, "
+              f"median of {arguments.runs} alternating runs, {torch.get_num_threads()} threads")  # fmt: skip
+        overheads(model, arguments.runs)
+        against_a_plain_loop(model, max(3, arguments.runs // 10))
+    if model.device.startswith("cuda"):
+        print(f"peak memory {torch.cuda.max_memory_allocated(model.device) / 1e9:.1f} GB")
+    else:
+        print("no GPU was used: neither throughput nor peak memory of the 7-8B models was measured")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""Answers that try to instruct their judge: which votes move, and that the check would see it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from tests.providers.server import Provider
+from traps_pipeline.cli import main
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.panel import JudgeEntry, load_panel
+from traps_pipeline.judging.robustness import ATTACKS_FILE, PANEL, check_panel, load_attacks, result, summary
+from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.tables import JUDGE_ROBUSTNESS
+
+# A judge of phrases reads words that are dictated to it as the answer's own. These two attacks are known to move it.
+MOVES_THE_RULES = {("dictated-reason", "abstention"), ("dictated-value", "correctness")}
+
+
+def moved(rows: pd.DataFrame, judge: str, how: str) -> set[tuple[str, str]]:
+    mine = rows.loc[(rows["judge"] == judge) & (rows["result"] == how)]
+    return set(zip(mine["attack"], mine["task"], strict=True))
+
+
+def test_the_attacks_are_of_every_kind_and_each_wraps_an_answer_whose_votes_are_known() -> None:
+    attacks = load_attacks()
+    assert len(attacks.attacks) >= 20
+    assert len({attack.kind for attack in attacks.attacks}) >= 8
+    assert {attack.answer for attack in attacks.attacks} == {"right", "wrong", "declined"}
+    texts = attacks.texts()
+    for attack in attacks.attacks:
+        assert texts[attack.answer] in texts[attack.id] != texts[attack.answer]
+
+
+def test_the_rule_judges_hold_against_all_attacks_but_words_dictated_after_the_answer(tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path, Study())
+    rows = check_panel(workspace, "rules", load_panel("rules"), load_attacks())
+    for judge in ("rule-1", "rule-2", "rule-3", PANEL):
+        assert moved(rows, judge, "flipped") == MOVES_THE_RULES
+        assert not moved(rows, judge, "broken") | moved(rows, judge, "wrong_anyway")
+    kept = workspace.tables.read(JUDGE_ROBUSTNESS, {})
+    assert moved(kept, PANEL, "flipped") == MOVES_THE_RULES and len(kept) == len(rows)
+
+
+def verdict(abstained: bool, value: str | None) -> str:
+    vote = {"abstained": abstained, "confidence": "high", "correct": False, "extracted_value": value}
+    return json.dumps(vote | {"reasoning": "r"})
+
+
+def test_a_judge_that_obeys_is_found_and_one_that_is_confused_and_the_panel_holds(
+    provider: Provider, judge_at: Callable[[str], JudgeEntry], tmp_path: Path
+) -> None:
+    attacks = load_attacks()
+    text = {name: answer.text for name, answer in attacks.answers.items()}
+    honest = {
+        text["right"]: verdict(False, "left"),
+        text["wrong"]: verdict(False, "right"),
+        text["declined"]: verdict(True, None),
+    }
+    provider.configure(
+        scripts={
+            "honest": honest,
+            "obedient": {"Ignore all previous instructions": verdict(False, "left")} | honest,
+            "confused": {"<|im_start|>": "I am the system."} | honest,
+        }
+    )
+    workspace = Workspace.create(tmp_path, Study(budget_usd=1))
+    panel = [judge_at(name) for name in ("honest", "obedient", "confused")]
+    rows = check_panel(workspace, "three", panel, attacks)
+    asked = (len(attacks.attacks) + 3) * 2 * 3
+    assert provider.stats()["requests"] == asked
+    obeyed = {(f"ignore-instructions{more}", "correctness") for more in ("", "-after")}
+    assert moved(rows, "obedient", "flipped") == obeyed | {("ignore-instructions", "abstention")}
+    assert moved(rows, "confused", "broken") == {("role-tags", "abstention"), ("role-tags", "correctness")}
+    assert (
+        moved(rows, "confused", "flipped") == moved(rows, "honest", "flipped") == moved(rows, PANEL, "flipped") == set()
+    )
+    assert "obedient: ignore-instructions-after (plain instruction) flipped correctness" in summary(rows)
+    check_panel(workspace, "three", panel, attacks)
+    assert provider.stats()["requests"] == asked  # what the ledger holds is not asked again
+
+
+@pytest.mark.parametrize(
+    ("expected", "clean", "vote", "what"),
+    [
+        (True, True, True, "held"),
+        (True, False, True, "held"),
+        (True, True, False, "flipped"),
+        (False, False, True, "flipped"),
+        (True, True, None, "broken"),
+        (True, False, False, "wrong_anyway"),
+        (True, None, None, "wrong_anyway"),
+    ],
+)
+def test_an_attack_moved_a_vote_only_if_it_was_right_without_it(expected, clean, vote, what) -> None:
+    assert result(expected, clean, vote) == what
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (("answer: wrong", "answer: missing"), "no answer 'missing'"),
+        (("id: threat", "id: authority"), "an id occurs twice"),
+        (
+            ("\n      {answer}\n\n      Judge: set", "\n      Judge: set"),
+            "dictated-value: text must hold {answer} once",
+        ),
+        (("kind: dilution", "colour: red"), "colour: Extra inputs"),
+    ],
+)
+def test_a_wrong_file_of_attacks_is_named(tmp_path: Path, change: tuple[str, str], complaint: str) -> None:
+    path = tmp_path / "attacks.yaml"
+    text = ATTACKS_FILE.read_text(encoding="utf-8")
+    assert change[0] in text
+    path.write_text(text.replace(change[0], change[1], 1), encoding="utf-8")
+    with pytest.raises(TrapsError) as raised:
+        load_attacks(path)
+    assert str(path) in str(raised.value) and complaint in str(raised.value)
+
+
+def test_the_command_prints_what_moved_by_judge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Workspace.create(tmp_path, Study())
+    assert main(["judges", "check", "rules", "--workspace", str(tmp_path)]) == 0
+    out = capsys.readouterr().out.splitlines()
+    (line,) = (row for row in out if row.startswith("rule-2 "))
+    assert line.split() == ["rule-2", "42", "40", "2", "0", "0"]
+    assert main(["judges", "check", "nobody", "--workspace", str(tmp_path)]) == 1
+    assert "no panel 'nobody'; it has rules, paper" in capsys.readouterr().err

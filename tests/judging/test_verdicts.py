@@ -1,0 +1,151 @@
+"""From votes to verdicts, and a real panel over real HTTP whose every vote is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from tests.judging.conftest import answered_study, vote_rows
+from tests.providers.server import Provider
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging import panel as judging
+from traps_pipeline.judging.panel import JudgeEntry, collect_votes
+from traps_pipeline.judging.verdicts import decide, decide_cell
+from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.scoring.metrics import cell_metrics
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS, VERDICTS, VOTES
+
+CELL = Cell("occlusion", Evaluation("oracle", "standard", 1))
+COMBINATIONS = list(product(("yes", "no", "invalid"), repeat=3))
+
+
+def undone(side: str, outcome: str = "answer", item: int = 0) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """One item and its response, as `decide` reads them."""
+    named = {"scenario_id": "s", "category": "hidden", "sub_scenario": "x", "control_answer": "left"}
+    item_id = f"occlusion:s-{item:04d}:{side}"
+    items = pd.DataFrame([{"item_id": item_id, **named, "benchmark_version": "v1"}])
+    about = {"dataset": "occlusion", "model": "m", "regime": "standard", "run": 1, "epoch": "e1"}
+    response = {"item_id": item_id, "pair_id": "p", "side": side, "outcome": outcome, **about}
+    return items, pd.DataFrame([response])
+
+
+def control_votes(abstention: str, correctness: str) -> pd.DataFrame:
+    tasks = ((abstention, "control_abstention"), (correctness, "correctness"))
+    return pd.concat([vote_rows([said], task) for said, task in tasks], ignore_index=True)
+
+
+@pytest.mark.parametrize(
+    ("abstention", "correctness", "abstained", "correct", "unanimous", "undecided"),
+    [
+        ("nnn", "yyy", False, True, True, False),
+        ("yyy", "yyy", True, True, True, False),  # both at once: they are decided independently
+        ("nnn", "yyn", False, True, False, False),
+        ("nn-", "yyy", False, True, False, False),
+        ("yn-", "yyy", None, True, False, True),
+        ("nnn", "y--", False, None, False, True),
+        ("---", "---", None, None, False, True),
+    ],
+)
+def test_a_controls_two_decisions_are_made_apart(
+    abstention: str, correctness: str, abstained: Any, correct: Any, unanimous: bool, undecided: bool
+) -> None:
+    (row,) = decide(*undone("control"), control_votes(abstention, correctness)).to_dict("records")
+    assert [None if pd.isna(row[name]) else row[name] for name in ("abstained", "correct")] == [abstained, correct]
+    assert (row["unanimous"], row["undecided"]) == (unanimous, undecided)
+    assert row["n_valid"] == 3 - abstention.count("-")
+    assert row["n_valid_correctness"] == 3 - correctness.count("-")
+
+
+def test_an_answer_that_nobody_judges_has_no_verdict_and_is_not_undecided() -> None:
+    items, responses = undone("void", "refused")
+    (row,) = decide(items, responses, vote_rows(["yyy"])[:0]).to_dict("records")
+    assert pd.isna(row["abstained"])
+    assert not row["undecided"] and not row["unanimous"]
+
+
+def test_a_judged_answer_without_three_votes_a_task_is_refused_by_name() -> None:
+    items, responses = undone("control")
+    whole = control_votes("nnn", "yyy")
+    for votes in (whole[whole["task"] == "abstention"], whole[whole["judge"] != "c"], whole.iloc[1:]):
+        with pytest.raises(TrapsError, match=r"votes occlusion\|m__standard__run1: item occlusion:s-0000:control has"):
+            decide(items, responses, votes)
+
+
+def test_a_response_to_an_item_that_is_gone_is_refused_by_name() -> None:
+    items, responses = undone("void")
+    with pytest.raises(TrapsError, match="item occlusion:s-0000:void is no longer in items"):
+        decide(items.iloc[:0], responses, vote_rows(["yyy"]))
+
+
+# --- over HTTP --------------------------------------------------------------------------------------------------------
+
+
+def seat(monkeypatch: pytest.MonkeyPatch, judge_at: Callable[[str], JudgeEntry], *names: str) -> None:
+    """Seat these judges, whatever panel a study names."""
+    seated = tuple(judge_at(name) for name in names)
+    monkeypatch.setattr(judging, "load_panel", lambda name: seated)
+
+
+def said(word: str) -> str:
+    """What a judge says on either task to cast this vote; the ground truth is `left`."""
+    value = {"yes": "left", "no": "right"}.get(word)
+    vote = {"abstained": word == "yes", "confidence": "low", "correct": None, "extracted_value": value}
+    return json.dumps(vote | {"correct": True, "reasoning": "r"}) if value else "I would rather not say."
+
+
+def vote(workspace: Workspace) -> pd.DataFrame:
+    """Ask the panel what is missing; the votes and the verdicts of the cell are then written."""
+    (done,) = collect_votes(workspace, [CELL], {CELL.key: {}})
+    assert done.rows == 2 * 3 * 27
+    workspace.tables.write(VERDICTS, CELL.partition, decide_cell(workspace, CELL), {})
+    return workspace.tables.read(VERDICTS, CELL.partition)
+
+
+def test_a_panel_over_http_comes_to_the_expected_verdict_on_all_27_votes_and_asks_no_model_again(
+    provider: Provider, judge_at: Callable[[str], JudgeEntry], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    judges = ("one", "two", "three")
+    provider.configure(
+        scripts={
+            judge: {f"case-{k:02d}.": said(cast[seat]) for k, cast in enumerate(COMBINATIONS)}
+            for seat, judge in enumerate(judges)
+        }
+    )
+    seat(monkeypatch, judge_at, *judges)
+    answers = {(k, "control"): f"It goes left, case-{k:02d}." for k in range(27)}
+    workspace = answered_study(tmp_path, {CELL: answers}, budget_usd=10)
+    verdicts = vote(workspace).set_index("item_id")
+    for k, cast in enumerate(COMBINATIONS):
+        verdict = verdicts.loc[f"occlusion:s-{k:04d}:control"]
+        expected = True if cast.count("yes") >= 2 else False if cast.count("no") >= 2 else None
+        assert (verdict["abstained"], verdict["correct"]) == (expected, expected), cast
+        assert verdict["undecided"] == (expected is None)
+        assert verdict["unanimous"] == (set(cast) in ({"yes"}, {"no"}))
+        assert verdict["n_valid"] == verdict["n_valid_correctness"] == 3 - cast.count("invalid")
+    votes = workspace.tables.read(VOTES, CELL.partition)
+    assert votes.loc[~votes["valid"], "invalid_reason"].str.startswith("Invalid JSON").all()
+    assert provider.stats()["requests"] == 2 * 3 * 27
+
+    # Undecided ones are counted and bounded: 7 of 27 decide for yes, 7 for no, 13 are open.
+    (cell,) = cell_metrics(verdicts.reset_index(), {}).to_dict("records")
+    assert (cell["acc"], cell["false_abs"]) == pytest.approx((7 / 14, 7 / 14))
+    assert cell["n_missing"] == 13 + 27  # the voids were never asked
+    assert (cell["pecs_low"], cell["pecs_high"]) == pytest.approx((0, 20 / 27 * (1 - 7 / 27)))
+
+    # The same votes again, then another panel: judges are asked what is not known, and the model never.
+    pd.testing.assert_frame_equal(vote(workspace).set_index("item_id"), verdicts)
+    assert provider.stats()["requests"] == 2 * 3 * 27
+    seat(monkeypatch, judge_at, "two", "three", "four")  # the fourth is not scripted: it finds `left` in every answer
+    rejudged = vote(workspace)
+    assert provider.stats()["requests"] == 2 * 3 * 27 + 2 * 27
+    assert {record["body"]["model"] for record in provider.requests()} == {"one", "two", "three", "four"}
+    assert not list((tmp_path / "ledger" / "answers").rglob("*.jsonl"))
+    assert rejudged["correct"].notna().sum() > verdicts["correct"].notna().sum()
+    assert len(workspace.tables.read(ITEMS, {"dataset": "occlusion"})) == 27

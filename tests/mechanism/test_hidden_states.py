@@ -1,0 +1,226 @@
+"""Hidden states are the library's own, and an extraction that was stopped goes on where it stopped."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+
+from tests.local_models import FAMILIES, SIX_FRAMES, SYSTEM, Family, ask, clip, model, three_prompts
+from traps_pipeline.digests import file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.hidden_states import Item, clip_item, extract, read_layer, read_record
+from traps_pipeline.models.local.adapter import LocalModel, Prompt
+from traps_pipeline.models.local.capture import pool
+
+each_family = pytest.mark.parametrize("family", FAMILIES)
+
+
+def own_states(of: LocalModel, prompt: Prompt) -> list[np.ndarray]:
+    """The library's hidden_states: (T, d) a layer."""
+    with torch.inference_mode():
+        out = of.network.base_model(**prompt.inputs, use_cache=False, output_hidden_states=True)
+    return [states[0].numpy() for states in out.hidden_states]
+
+
+@each_family
+def test_hooked_states_equal_the_librarys_own_at_every_layer(family: Family) -> None:
+    of = model(family)
+    for prompt in three_prompts(family)[:2]:
+        own, hooked = own_states(of, prompt), of.forward_states(prompt)
+        assert hooked.raw.shape == (of.n_layers + 1, of.d_model) == (len(own), own[0].shape[1])
+        for layer in range(of.n_layers):
+            assert (hooked.raw[layer] == own[layer][-1]).all(), layer
+        assert (hooked.normed == own[-1][-1]).all()  # the library's last one is normed
+        with torch.inference_mode():
+            normed = of.norm(torch.from_numpy(hooked.raw[-1])).numpy()
+        np.testing.assert_allclose(normed, hooked.normed, rtol=0, atol=1e-5)
+        assert np.abs(hooked.raw[-1] - hooked.normed).max() > 0.1  # ours is what leaves the last block
+
+
+@each_family
+def test_mean_pooling_is_the_mean_over_all_tokens(family: Family) -> None:
+    of, prompt = model(family), three_prompts(family)[0]
+    own, hooked = own_states(of, prompt), of.forward_states(prompt, "mean")
+    for layer in range(of.n_layers):
+        np.testing.assert_allclose(hooked.raw[layer], own[layer].mean(axis=0), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(hooked.normed, own[-1].mean(axis=0), rtol=0, atol=1e-4)
+
+
+def test_a_kept_state_keeps_no_other_alive() -> None:
+    states = torch.zeros(1, 1000, 8)
+    assert pool(states, "last").untyped_storage().nbytes() == 8 * 4
+    with pytest.raises(ValueError, match="one prompt at a time"):
+        pool(torch.zeros(2, 10, 8), "last")
+
+
+# --- extraction -------------------------------------------------------------------------------------------------------
+
+
+def work(of: LocalModel, n: int = 5, opened: Callable[[int], None] = lambda i: None, **changed: str) -> list[Item]:
+    """Items of different questions; `opened` is told whenever a prompt is made. changed: questions by item id."""
+
+    def item(i: int) -> Item:
+        question = changed.get(f"item{i}", f"Does it stop after {i} s?")
+        row = {"item_id": f"item{i}", "side": ("control", "void")[i % 2], "question": question}
+        made = clip_item(of, SIX_FRAMES, row | {"media_digest": file_digest(clip())}, clip(), SYSTEM)
+
+        def prompt() -> Prompt:
+            opened(i)
+            return made.prompt()
+
+        return replace(made, prompt=prompt)
+
+    return [item(i) for i in range(n)]
+
+
+@each_family
+def test_what_is_read_back_is_what_the_model_gave(family: Family, tmp_path: Path) -> None:
+    of = model(family)
+    done = extract(of, work(of), tmp_path, shard_size=2)
+    assert (done.n_items, done.n_new) == (5, 5)
+    expected = [of.forward_states(item.prompt()) for item in work(of)]
+    for layer in range(of.n_layers + 1):
+        ids, states = read_layer(tmp_path, layer)
+        assert list(ids["item_id"]) == [f"item{i}" for i in range(5)]
+        assert list(ids["side"]) == ["control", "void", "control", "void", "control"]
+        assert (states == np.stack([one.raw[layer] for one in expected])).all()
+    assert (read_layer(tmp_path, "normed")[1] == np.stack([one.normed for one in expected])).all()
+    with safe_open(tmp_path / "shard-00000.safetensors", framework="np") as shard:
+        assert sorted(shard.keys()) == [*(f"layer_{layer:03d}" for layer in range(of.n_layers + 1)), "normed"]
+    assert [path.name for path in tmp_path.glob(".*")] == [".lock"]
+
+
+def test_a_second_extraction_makes_no_pass_and_a_corrected_item_one(tmp_path: Path) -> None:
+    of, opened = model("qwen3-vl"), []
+    first = extract(of, work(of), tmp_path, shard_size=2)
+    again = extract(of, work(of, opened=opened.append), tmp_path, shard_size=2)
+    assert (again.n_new, opened, again.version) == (0, [], first.version)
+    before = read_layer(tmp_path, 2)[1]
+    corrected = extract(of, work(of, opened=opened.append, item3="Is it red?"), tmp_path, shard_size=2)
+    assert (corrected.n_new, opened) == (1, [3])
+    assert corrected.version != first.version
+    changed = (read_layer(tmp_path, 2)[1] != before).any(axis=1)
+    assert list(changed) == [False, False, False, True, False]
+    fewer = extract(of, work(of)[:2], tmp_path, shard_size=2)
+    assert fewer.n_new == 0
+    assert len(read_layer(tmp_path, 2)[0]) == 2
+    assert [path.name for path in sorted(tmp_path.glob("*.safetensors"))] == ["shard-00000.safetensors"]
+
+
+def test_another_precision_or_pooling_is_another_extraction(tmp_path: Path) -> None:
+    of = model("llava-next-video")
+    extract(of, work(of, 2), tmp_path)
+    assert extract(of, work(of, 2), tmp_path, pooling="mean").n_new == 2
+    assert read_record(tmp_path)["pooling"] == "mean"
+    half = model("llava-next-video", dtype="bfloat16")
+    assert extract(half, work(half, 2), tmp_path).n_new == 2
+    record = read_record(tmp_path)
+    assert (record["dtype"], record["pooling"], record["n_layers"], record["d_model"]) == ("bfloat16", "last", 4, 64)
+    assert record["checkpoint_digest"] == of.checkpoint.digest
+    assert "bfloat16 on cpu" in record["served_model"]
+    with safe_open(tmp_path / "shard-00002.safetensors", framework="pt") as shard:
+        assert shard.get_tensor("layer_001").dtype == torch.bfloat16
+    expected = half.forward_states(work(half, 1)[0].prompt()).raw[1]
+    assert (read_layer(tmp_path, 1)[1][0] == expected).all()  # 16 bits hold what a model in 16 bits gives
+
+
+def test_of_two_extractions_at_once_one_makes_the_states_and_the_other_finds_them(tmp_path: Path) -> None:
+    of, opened = model("llava-next-video"), []
+    with ThreadPoolExecutor(2) as pool:
+        twice = [pool.submit(extract, of, work(of, opened=opened.append), tmp_path, shard_size=2) for _ in range(2)]
+    assert sorted(one.result().n_new for one in twice) == [0, 5]
+    assert opened == list(range(5))
+
+
+class _Stop(Exception):
+    pass
+
+
+def test_an_extraction_that_breaks_off_keeps_what_was_made(tmp_path: Path) -> None:
+    of, opened = model("qwen3-vl"), []
+
+    def failing(i: int) -> None:
+        if i == 3:
+            raise _Stop
+
+    with pytest.raises(_Stop):
+        extract(of, work(of, opened=failing), tmp_path, shard_size=2)
+    with pytest.raises(TrapsError, match="not there or not finished"):
+        read_layer(tmp_path, 1)
+    assert extract(of, work(of, opened=opened.append), tmp_path, shard_size=2).n_new == 2
+    assert opened == [3, 4]
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+from tests.mechanism.test_hidden_states import work
+from tests.local_models import model
+from traps_pipeline.mechanism.hidden_states import extract
+of = model("qwen3-vl")
+extract(of, work(of, 40, opened=lambda i: time.sleep(0.05)), Path(sys.argv[1]), shard_size=2)
+"""
+
+
+def test_an_extraction_killed_half_way_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    process = subprocess.Popen([sys.executable, "-c", KILLED, tmp_path], cwd=Path(__file__).resolve().parents[2])
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "shard-00001.parquet").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    kept = 2 * len(list(tmp_path.glob("shard-*.parquet")))
+    assert 4 <= kept < 40
+    (tmp_path / f"shard-{kept // 2:05d}.safetensors").write_bytes(b"torn")  # as if it had been writing one
+    of, opened = model("qwen3-vl"), []
+    done = extract(of, work(of, 40, opened=opened.append), tmp_path, shard_size=2)
+    assert (done.n_new, opened) == (40 - kept, list(range(kept, 40)))
+    states = read_layer(tmp_path, 3)[1]
+    for i in (0, kept - 1, kept, 39):
+        assert (states[i] == of.forward_states(work(of, 40)[i].prompt()).raw[3]).all()
+
+
+def test_a_damaged_shard_is_made_again_and_one_that_is_read_is_named(tmp_path: Path) -> None:
+    of = model("qwen3-vl")
+    extract(of, work(of), tmp_path, shard_size=2)
+    shard = tmp_path / "shard-00001.safetensors"
+    shard.write_bytes(shard.read_bytes()[:-100])
+    with pytest.raises(TrapsError, match=r"shard-00001\.safetensors: cannot be read"):
+        read_layer(tmp_path, 1)
+    assert extract(of, work(of), tmp_path, shard_size=2).n_new == 2
+    assert len(read_layer(tmp_path, 1)[1]) == 5
+
+
+def test_a_layer_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    of = model("qwen3-vl")
+    extract(of, work(of, 1), tmp_path)
+    for layer in (5, -1):
+        with pytest.raises(TrapsError, match=rf"no layer {layer}; .* has 0 \(embeddings\) to 4"):
+            read_layer(tmp_path, layer)
+
+
+def test_a_full_disk_says_so(tiny_disk: Path) -> None:
+    of = model("qwen3-vl")
+    with pytest.raises(TrapsError, match="cannot be written"):
+        extract(of, work(of, 40), tiny_disk / "states", shard_size=40)
+
+
+def test_an_item_about_a_clip_reads_its_frames(tmp_path: Path) -> None:
+    of = model("llava-next-video")
+    (item,) = work(of, 1)
+    assert torch.equal(
+        item.prompt().inputs["pixel_values_videos"], ask(of, "Does it stop after 0 s?").inputs["pixel_values_videos"]
+    )
+    assert item.about["clip"] == file_digest(clip())

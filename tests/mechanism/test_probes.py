@@ -1,0 +1,286 @@
+"""Probes: the exact solver against scikit-learn, AUROC, what a fit may see, what the protocol finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
+from sklearn.preprocessing import StandardScaler
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.paths import LONG, STEERING_PATHS, TRANSFER_PAIRS, transfer_type
+from traps_pipeline.mechanism.probes import (
+    Split,
+    auroc,
+    auroc_interval,
+    fit_probe,
+    nearest_centroid,
+    scenario_folds,
+    solve_gram,
+    standardiser,
+    swapped_labels,
+    within_split,
+)
+from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
+from traps_pipeline.mechanism.settings import ProbeSettings
+from traps_pipeline.partitions import ANSWERABLE, DATASETS
+from traps_pipeline.scoring.bootstrap import scenario_weights
+from traps_pipeline.scoring.published import published
+
+
+def random_states(rows: int, columns: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    void = np.arange(rows) % 2 == 1
+    states = rng.normal(size=(rows, columns)) * rng.lognormal(size=columns) + rng.normal(size=columns)
+    states[void, : columns // 4] += 0.7
+    return states, void
+
+
+def collinear_states(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Every column twice, one of them constant, one scenario's rows equal."""
+    states, void = random_states(rows, columns // 2, 1)
+    states[:, 3] = 5.0
+    states[1] = states[0]
+    return np.hstack([states, 2 * states - 1]), void
+
+
+CASES = {
+    "wide": random_states(60, 300),
+    "narrow": random_states(200, 12),
+    "collinear": collinear_states(60, 200),
+    "unbalanced": (lambda s, v: (s[v | (np.arange(80) < 20)], v[v | (np.arange(80) < 20)]))(*random_states(80, 50)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_exact_solver_finds_the_minimum_that_scikit_learn_approaches(case: str) -> None:
+    states, void = CASES[case]
+    probe = fit_probe(states, void)
+    scaled = StandardScaler().fit_transform(states)
+    reference = LogisticRegression(solver="newton-cholesky", tol=1e-12, max_iter=1000).fit(scaled, void)
+    assert np.allclose(probe.scores(states), reference.decision_function(scaled), atol=1e-6)
+    assert np.allclose(probe.weights, reference.coef_[0], atol=1e-7)
+    chance = 1 / (1 + np.exp(-probe.scores(states)))
+    assert np.allclose(chance, reference.predict_proba(scaled)[:, 1], atol=1e-7)
+    # At the minimum the gradient is zero: w = C X' (y - p), and the intercept's: sum (y - p) = 0.
+    assert np.allclose(probe.weights, scaled.T @ (void - chance), atol=1e-8)
+    assert abs((void - chance).sum()) < 1e-8
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_auroc_on_unseen_items_equals_scikit_learns(case: str) -> None:
+    states, void = CASES[case]
+    seen = np.arange(len(void)) % 3 > 0
+    own, reference = (
+        fit_probe(states[seen], void[seen], solver).scores(states[~seen]) for solver in ("exact", "sklearn")
+    )
+    assert abs(float(auroc(void[~seen], own)) - roc_auc_score(void[~seen], reference)) < 1e-8
+    assert np.allclose(own, reference, atol=1e-5)
+
+
+def test_auroc_counts_ties_half_and_takes_many_columns_at_once() -> None:
+    void = np.array([True, True, False, False])
+    assert float(auroc(void, np.array([2.0, 1.0, 1.0, 0.0]))) == pytest.approx(0.875)  # 3 wins and a tie of 4
+    rng = np.random.default_rng(0)
+    labels, scores = rng.random(200) < 0.3, rng.integers(0, 9, (200, 5)).astype(float)
+    expected = [roc_auc_score(labels, column) for column in scores.T]
+    assert np.allclose(auroc(labels, scores), expected, atol=1e-12)
+    assert np.isnan(auroc(np.ones(3, bool), np.arange(3.0)))
+
+
+def test_an_interval_resamples_scenarios_as_a_loop_over_resamples_does() -> None:
+    rng = np.random.default_rng(3)
+    scenario, void = np.repeat(np.arange(12), 2), np.tile([True, False], 12)
+    scores = np.round(rng.normal(size=24) + void, 1)
+    weights = scenario_weights(12, 300, 5)
+    drawn = [roc_auc_score(np.repeat(void, w), np.repeat(scores, w)) for w in weights[:, scenario].astype(int)]
+    assert auroc_interval(void, scores, scenario, weights) == pytest.approx(tuple(np.quantile(drawn, [0.025, 0.975])))
+
+
+def test_a_constant_column_is_not_blown_up_by_rounding() -> None:
+    states = np.full((50, 2), 0.1) * np.array([1e6, 1.0]) + np.array([1e-11, 0]) * np.arange(50)[:, None]
+    assert np.array_equal(standardiser(states)[1], [1.0, 1.0])
+    assert np.array_equal(StandardScaler().fit(states).scale_, [1.0, 1.0])
+
+
+def test_folds_keep_a_scenario_together_and_differ_by_one_at_most() -> None:
+    scenario = np.repeat(np.arange(13), 2)
+    folds = scenario_folds(scenario, 5, seed=1)
+    assert all(len(set(folds[scenario == s])) == 1 for s in range(13))
+    sizes = [len(set(scenario[folds == f])) for f in range(5)]
+    assert sorted(sizes) == [2, 2, 3, 3, 3]
+    with pytest.raises(TrapsError, match="5 folds need 5 scenarios, there are 4"):
+        scenario_folds(np.arange(4), 5, seed=1)
+
+
+def test_shuffled_labels_give_half_on_average_even_where_the_signal_is_perfect() -> None:
+    rng = np.random.default_rng(0)
+    scenario, void = np.repeat(np.arange(40), 2), np.tile([True, False], 40)
+    states = np.repeat(rng.normal(size=(40, 30)), 2, axis=0) + rng.normal(size=(80, 30))
+    states[void, 0] += 6
+    split, folds = Split(states, void, scenario), scenario_folds(scenario, 5, 0)
+    swapped = swapped_labels(void, scenario, 40, seed=2)
+    assert (swapped.sum(axis=0) == 40).all()  # one void a scenario, whichever it is
+    areas = within_split(split, np.column_stack([void, swapped]), folds)
+    assert areas[0] > 0.99
+    error = areas[1:].std() / np.sqrt(40)
+    assert abs(areas[1:].mean() - 0.5) < 3 * error < 0.1
+    assert np.allclose(areas[:2], within_split(split, np.column_stack([void, swapped[:, :1]]), folds, "sklearn"))
+
+
+def test_states_that_are_no_numbers_and_a_missing_class_are_told() -> None:
+    states, void = random_states(20, 5)
+    with pytest.raises(TrapsError, match="needs void and control items, there are 20 void of 20"):
+        fit_probe(states, np.ones(20, bool))
+    with pytest.raises(TrapsError, match="no probe can be fitted to these 20 rows"):
+        solve_gram(np.full((20, 20), np.nan), void)
+
+
+def test_nearest_centroid_goes_by_direction_alone() -> None:
+    rng = np.random.default_rng(0)
+    void = np.arange(40) % 2 == 1
+    states = rng.normal(size=(40, 6)) + 5
+    states[void, 0] += 8
+    source = Split(states, void, np.arange(40) // 2)
+    mean, scale = standardiser(states)
+    towards = np.zeros(6)
+    towards[0] = 1
+    near, far = mean + 0.01 * towards * scale, mean + 100 * towards * scale
+    assert nearest_centroid(source, np.stack([near, far, 2 * mean - near])).tolist() == [True, True, False]
+
+
+# --- the protocol -----------------------------------------------------------------------------------------------------
+
+LAYERS, PLANTED, WIDTH = 4, 2, 20
+
+
+def study(pairs: int = 12, seed: int = 0) -> tuple[pd.DataFrame, dict[tuple[str, int], np.ndarray]]:
+    """Items of all datasets and states of four layers; sides differ at layer 2 alone."""
+    rng, rows, states = np.random.default_rng(seed), [], {}
+    for dataset in (*DATASETS, ANSWERABLE):
+        sides = ("control",) if dataset == ANSWERABLE else ("control", "void")
+        taxonomy = "chaotic" if dataset.startswith("chaotic") else "occlusion"
+        of = [(dataset, f"{taxonomy}-{n:02d}", side, f"sub{n % 2}") for n in range(pairs) for side in sides]
+        rows += of
+        void = np.array([side == "void" for _, _, side, _ in of])
+        for layer in range(LAYERS):
+            states[dataset, layer] = rng.normal(size=(len(of), WIDTH)).astype(np.float32)
+            if layer == PLANTED:
+                states[dataset, layer][void, :5] += 3
+    items = pd.DataFrame(rows, columns=["dataset", "scenario_id", "side", "sub_scenario"])
+    return items, states
+
+
+def protocol(items: pd.DataFrame, states: dict, confabulated: Confabulated | None = None) -> pd.DataFrame:
+    settings = ProbeSettings(folds=3, shuffles=20, resamples=100)
+    run = ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, settings, 7, confabulated or Confabulated({}))
+    return pd.DataFrame(run.rows())
+
+
+@pytest.fixture(scope="module")
+def rows() -> pd.DataFrame:
+    items, states = study()
+    some = {d: frozenset(f"{d.split('_')[0]}-{n:02d}" for n in range(8)) for d in DATASETS if d != "chaotic"}
+    return protocol(items, states, Confabulated(some, {"chaotic": "none there"}))
+
+
+def test_a_planted_signal_is_found_at_its_layer_and_nowhere_else(rows: pd.DataFrame) -> None:
+    transfer = rows[rows["analysis"] == "transfer"]
+    assert len(transfer) == len(TRANSFER_PAIRS) * LAYERS == 48
+    best = transfer[transfer["own_best"]]
+    assert best["layer"].tolist() == [PLANTED] * 12 and best["value"].min() > 0.99
+    assert (best["low"] <= best["value"]).all() and (best["value"] <= best["high"]).all()
+    elsewhere = transfer[transfer["layer"] != PLANTED].groupby("layer")["value"].mean()
+    assert (elsewhere - 0.5).abs().max() < 0.12  # twelve paths of 24 items: standard error 0.035
+    chosen = transfer[transfer["source_best"]]
+    assert chosen["layer"].tolist() == [PLANTED] * 12
+
+
+def test_shuffled_rows_lie_around_half_at_every_layer(rows: pd.DataFrame) -> None:
+    shuffled = rows[rows["analysis"] == "shuffled"]
+    assert len(shuffled) == 4 * LAYERS and (shuffled["spread"] > 0).all()
+    assert abs(shuffled["value"].mean() - 0.5) < 0.05
+    within = rows[(rows["analysis"] == "within") & (rows["layer"] == PLANTED)]
+    assert within["value"].min() > 0.95
+
+
+def test_cf_restricts_both_sets_and_says_why_where_it_cannot(rows: pd.DataFrame) -> None:
+    cf = rows[(rows["analysis"] == "confabulated") & rows["value"].notna()]
+    assert set(zip(cf["source"], cf["target"], strict=True)) == {p for p in TRANSFER_PAIRS if "chaotic" not in p}
+    assert set(cf["n_voids"]) == set(cf["n_controls"]) == {8}
+    silent = rows[(rows["analysis"] == "confabulated") & rows["value"].isna()]
+    assert len(silent) == 6 and set(silent["note"]) == {"none there"}
+    assert cf.groupby(["source", "target"])["own_best"].sum().tolist() == [1] * 6
+    assert cf[cf["all_sample_best"]]["layer"].unique().tolist() == [PLANTED]
+
+
+def test_a_target_label_never_influences_a_fit() -> None:
+    """Swapping the sides of a target mirrors its AUROC exactly, and leaves every figure of other targets as it is."""
+    items, states = study(pairs=6)
+    before = protocol(items, states)
+    swapped = items.copy()
+    target = (items["dataset"] == "chaotic").to_numpy()
+    swapped.loc[target, "side"] = np.where(items.loc[target, "side"] == "void", "control", "void")
+    after = protocol(swapped, states)
+    keys = ["analysis", "source", "target", "layer", "scope"]
+    both = before.merge(after, on=keys, suffixes=("", "_after"))
+    both = both[both["analysis"] == "transfer"]
+    of_target = both[both["target"] == "chaotic"]
+    assert np.allclose(of_target["value"] + of_target["value_after"], 1, atol=1e-12)
+    others = both[(both["target"] != "chaotic") & (both["source"] != "chaotic")]
+    assert len(others) == 6 * LAYERS and (others["value"] == others["value_after"]).all()
+    assert (of_target["source_best"] == of_target["source_best_after"]).all()  # the source's choice saw no target label
+
+
+def test_answerable_questions_tell_what_hides_from_what_cannot_be_known(rows: pd.DataFrame) -> None:
+    at = rows[(rows["layer"] == PLANTED) & (rows["target"] == ANSWERABLE)].set_index(["analysis", "source"])["value"]
+    for source in DATASETS:  # the planted signal is of voids, and the answerable items do not have it
+        assert at["answerable_void", source] > 0.97
+        assert 0.1 < at["answerable_control", source] < 0.9
+
+
+def test_catch_rates_are_shares_of_a_sub_scenarios_voids(rows: pd.DataFrame) -> None:
+    catch = rows[rows["analysis"] == "centroid_void"]
+    assert set(catch["scope"]) == {"all", "sub_scenario:sub0", "sub_scenario:sub1"} and set(catch["layer"]) == {1}
+    wide = catch.pivot(index=["source", "target"], columns="scope", values="value")
+    assert np.allclose(wide["all"], (wide["sub_scenario:sub0"] + wide["sub_scenario:sub1"]) / 2)
+
+
+def test_a_layer_out_of_range_and_missing_states_are_told() -> None:
+    items, states = study(pairs=4)
+    settings = ProbeSettings(resamples=100)
+    with pytest.raises(TrapsError, match="centroid layer 32 is out of range, there are states of layers 0 to 3"):
+        ProbeRun(items, lambda d, n: states[d, n], LAYERS, 32, settings, 7)
+    with pytest.raises(TrapsError, match="no hidden states of any dataset"):
+        ProbeRun(items.iloc[:0], lambda d, n: states[d, n], LAYERS, 1, settings, 7)
+    short = ProbeRun(items, lambda d, n: states[d, n][:3], LAYERS, 1, settings, 7)
+    with pytest.raises(TrapsError, match="hidden states of occlusion, layer 0"):
+        short.layer_rows(0)
+
+
+def test_confabulated_items_are_decided_voids_that_were_answered() -> None:
+    verdicts = pd.DataFrame(
+        [("a", "void", False), ("b", "void", True), ("c", "void", None), ("d", "control", False)],
+        columns=["scenario_id", "side", "abstained"],
+    )
+    assert confabulated_scenarios(verdicts, "chaotic", "m") == {"a"}
+    with pytest.raises(NothingConfabulated, match="m confabulated on none of the 1 judged void items of chaotic"):
+        confabulated_scenarios(verdicts[1:3], "chaotic", "m")
+
+
+# --- paths ------------------------------------------------------------------------------------------------------------
+
+
+def test_transfer_types_of_the_twelve_pairs_are_the_papers() -> None:
+    rows = published("probe_transfer")
+    derived = [transfer_type(LONG[s], LONG[t]) for s, t in zip(rows["source"], rows["target"], strict=True)]
+    assert derived == rows["transfer_type"].tolist()
+
+
+def test_there_are_fourteen_steering_paths() -> None:
+    qwen = published("steering_alpha10_qwen")
+    gemma = published("steering_dose_gemma")[["source", "target"]].drop_duplicates()
+    printed = {(LONG[s], LONG[t]) for f in (qwen, gemma) for s, t in zip(f["source"], f["target"], strict=True)}
+    assert set(STEERING_PATHS) == printed and len(STEERING_PATHS) == 14

@@ -1,0 +1,284 @@
+"""The mechanistic stages from tables to tables, on a tiny random checkpoint of a real class."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_items, write_verdicts
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism import probing, stages
+from traps_pipeline.mechanism.directions import vector_digest
+from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.settings import MechanismSettings
+from traps_pipeline.mechanism.steering import (
+    UNSTEERED,
+    collect_steered,
+    collect_steering_votes,
+    count_answers,
+    strengths,
+)
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, Extraction, StatesCell, SteeringCell
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import (
+    DIRECTIONS,
+    HIDDEN_STATES,
+    ITEMS,
+    PROBE_ITEMS,
+    PROBES,
+    STEERING,
+    STEERING_VOTES,
+)
+
+STANDARD = Extraction("tiny", "standard")
+
+
+@pytest.fixture(scope="module")
+def patch() -> Iterator[pytest.MonkeyPatch]:
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def entry(patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> ModelEntry:
+    made = tiny_entry(tmp_path_factory.mktemp("tiny") / "checkpoint")
+    register(patch, made)
+    return made
+
+
+def extract_all(workspace: Workspace) -> int:
+    made = 0
+    for dataset in PROBED_DATASETS:
+        workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, stages.probe_items(workspace, dataset), {})
+        cell = StatesCell(dataset, STANDARD)
+        rows, new = stages.extract_states(workspace, cell)
+        workspace.tables.write(HIDDEN_STATES, cell.partition, rows, {})
+        made += new
+    return made
+
+
+@pytest.fixture(scope="module")
+def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """Extracted, with directions."""
+    workspace = make_study(tmp_path_factory.mktemp("study"))
+    assert extract_all(workspace) == 4 * 2 * PAIRS + PAIRS
+    workspace.tables.write(DIRECTIONS, STANDARD.partition, stages.direction_rows(workspace, STANDARD), {})
+    return workspace
+
+
+@pytest.fixture
+def own(study: Workspace, tmp_path: Path) -> Workspace:
+    """A copy to be changed."""
+    shutil.copytree(study.root, tmp_path / "study", symlinks=True)
+    return Workspace.open(tmp_path / "study")
+
+
+def test_answerable_items_are_the_void_clips_with_the_question_that_they_answer(study: Workspace) -> None:
+    own = study.tables.read(PROBE_ITEMS, {"dataset": ANSWERABLE}).set_index("scenario_id")
+    voids = study.tables.read(ITEMS, {"dataset": "occlusion"}).query("side == 'void'").set_index("scenario_id")
+    assert (own["media_digest"] == voids["media_digest"]).all() and set(own["side"]) == {"control"}
+    assert own.loc["hidden-2", "question"] == "Which colour is the floor of hidden-2?"
+    other = study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"})
+    assert other["question"].tolist() == study.tables.read(ITEMS, {"dataset": "chaotic"})["question"].tolist()
+
+
+def test_a_second_extraction_computes_nothing_and_a_corrected_item_alone_is_extracted_again(own: Workspace) -> None:
+    assert extract_all(own) == 0
+    items = own.tables.read(ITEMS, {"dataset": "chaotic"})
+    clips = {(r["scenario_id"], r["side"]): (r["clip"], r["media_digest"]) for r in items.to_dict("records")}
+    before = own.tables.read(HIDDEN_STATES, StatesCell("chaotic", STANDARD).partition).set_index("item_id")
+    names = sorted(set(items["scenario_id"]))
+    write_items(own, "chaotic", names, clips, **{names[0]: "Which side does the ball end on?"})
+    assert extract_all(own) == 2  # control and void of one scenario of one dataset
+    after = own.tables.read(HIDDEN_STATES, StatesCell("chaotic", STANDARD).partition).set_index("item_id")
+    changed = before.index[(before["states_key"] != after["states_key"]).to_numpy()]
+    assert sorted(changed) == [f"chaotic:{names[0]}:control", f"chaotic:{names[0]}:void"]
+
+
+def test_states_stand_in_the_order_of_their_table(study: Workspace) -> None:
+    states = stages.States.of(study, STANDARD)
+    ill_posed = states.dataset("chaotic_ill_posed")
+    controls = [states.read(d, 3)[(states.dataset(d)["side"] == "control").to_numpy()] for d in DATASETS[2:]]
+    assert np.allclose(*controls, atol=1e-5)  # the same clip and question
+    assert not np.allclose(states.read("chaotic", 3), states.read("chaotic_ill_posed", 3), atol=1e-3)
+    assert len(ill_posed) == 2 * PAIRS and states.n_layers == 5
+
+
+def test_states_that_are_gone_are_told(own: Workspace) -> None:
+    shutil.rmtree(own.root / "states" / "tiny" / "standard" / "chaotic")
+    with pytest.raises(TrapsError, match="hidden states are not there or not finished; materialize hidden_states"):
+        stages.direction_rows(own, STANDARD)
+    with pytest.raises(TrapsError, match="no hidden states of tiny__guided"):
+        stages.direction_rows(own, Extraction("tiny", "guided"))
+
+
+def test_directions_are_what_the_states_say(study: Workspace) -> None:
+    table = study.tables.read(DIRECTIONS, STANDARD.partition)
+    assert len(table) == 4 * 3 * 5
+    row = table.query("dataset == 'occlusion' and kind == 'void' and layer == 2").iloc[0]
+    said = json.loads(study.resolve(row["path"]).with_suffix(".json").read_text())
+    states, items = stages.States.of(study, STANDARD), stages.States.of(study, STANDARD).dataset("occlusion")
+    chosen, at = items["scenario_id"].isin(said["scenarios"]).to_numpy(), states.read("occlusion", 2).astype(float)
+    void = (items["side"] == "void").to_numpy()
+    difference = at[chosen & void].mean(axis=0) - at[chosen & ~void].mean(axis=0)
+    saved = stages.saved_directions(study, STANDARD)["occlusion"].vectors["void"][2]
+    assert np.allclose(saved, difference / np.linalg.norm(difference), atol=1e-6)
+    assert row["direction_digest"] == vector_digest(saved) and row["n_pairs"] == 3 and row["n_steered"] == 1
+    assert row["norm"] == pytest.approx(np.linalg.norm(difference), rel=1e-5)
+    assert row["residual_norm"] == pytest.approx(np.linalg.norm(at[chosen & ~void], axis=1).mean(), rel=1e-5)
+    cosines = pd.DataFrame(stages.cosine_rows(study))
+    same = cosines.query("dataset == other_dataset and prompt == other_prompt")
+    assert np.allclose(same["cosine"], 1) and len(cosines.query("layer == 2")) == 16
+
+
+def test_probes_take_confabulated_items_from_the_verdicts_and_are_fitted_once(
+    own: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_verdicts(own, "occlusion", {f"hidden-{n}": n > 2 for n in range(PAIRS)})
+    write_verdicts(own, "chaotic", {f"plinko-{n}": False for n in range(PAIRS)})
+    write_verdicts(own, "chaotic_ill_posed", {f"plinko-{n}": True for n in range(PAIRS)})
+    rows = pd.DataFrame(stages.probe_rows(own, STANDARD))
+    cf = rows.query("analysis == 'confabulated'")
+    assert set(cf.query("target == 'occlusion' and source == 'chaotic'")["n_voids"]) == {3}
+    notes = cf[cf["value"].isna()].set_index(["source", "target"])["note"]
+    assert len(notes) == 10
+    assert "confabulated on none of the 4 judged void items" in notes["chaotic", "chaotic_ill_posed"]
+    assert "verdicts occlusion_ill_posed|tiny__standard__run1 are not there" in notes["chaotic", "occlusion_ill_posed"]
+    own.tables.write(PROBES, STANDARD.partition, rows.to_dict("records"), {})
+    monkeypatch.setattr(probing.ProbeRun, "rows", lambda *_: pytest.fail("fitted again"))
+    again = pd.DataFrame(stages.probe_rows(own, STANDARD))
+    assert len(again) == len(rows) and set(again["made_of"]) == set(rows["made_of"])
+    monkeypatch.undo()
+    write_verdicts(own, "chaotic", {f"plinko-{n}": n > 2 for n in range(PAIRS)})
+    register(monkeypatch, tiny_entry(Path(own.tables.read_all(HIDDEN_STATES)["checkpoint"].iloc[0])))
+    assert set(pd.DataFrame(stages.probe_rows(own, STANDARD))["made_of"]) != set(rows["made_of"])
+
+
+def test_a_model_that_is_not_local_or_not_asked_for_is_told(study: Workspace, entry: ModelEntry) -> None:
+    with pytest.raises(TrapsError, match="oracle: is asked through backend reference, and only local models"):
+        stages.looked_into(study, "oracle")
+    with pytest.raises(TrapsError, match=r"mechanism\.models does not name qwen3-vl-8b"):
+        stages.looked_into(study, "qwen3-vl-8b")
+    with pytest.raises(TrapsError, match="asks nothing inside models; run an experiment with a `mechanism:` section"):
+        _ = study.allow(mechanism=None).mechanism
+    study.save_study()
+
+
+def test_a_layer_that_the_model_has_not_is_told_before_anything_is_extracted(own: Workspace) -> None:
+    layers = {"tiny": {"steering": 9, "centroid": 1}}
+    wrong = own.allow(mechanism=MechanismSettings.model_validate({"models": layers}))
+    with pytest.raises(TrapsError, match=r"tiny\.steering: layer 9 is out of range, tiny has blocks 1 to 4"):
+        stages.extract_states(wrong, StatesCell("chaotic", Extraction("tiny", "guided")))
+    assert not (own.root / "states" / "tiny" / "guided").exists()
+
+
+# --- steering ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def steered(study: Workspace, entry: ModelEntry) -> Workspace:
+    """All four targets, steered and judged."""
+    cells = [SteeringCell.make(dataset, "tiny", "standard", "guided") for dataset in DATASETS]
+    along = {"standard": stages.saved_directions(study, STANDARD)}
+    empty = {cell.key: {} for cell in cells}
+    done = list(collect_steered(study, entry, cells, along, empty))
+    # chaotic: 4 sources x (void, random) x 2 alphas x 4 rows, the sweep's 2 x 2 controls, 4 rows as they are
+    rows = {one.cell.dataset: (one.rows, one.tally.asked) for one in done}
+    assert rows["chaotic"] == rows["occlusion"] == (72, 72)
+    # ill-posed: 3 sources, whose controls the well-posed cell has asked: its voids are new, and its sweep's controls
+    assert rows["chaotic_ill_posed"] == rows["occlusion_ill_posed"] == (56, 3 * 2 * 2 * 2 + 2 + 2 * 2)
+    planned = count_answers(study.mechanism, "tiny", DATASETS, {"occlusion": PAIRS, "chaotic": PAIRS})
+    assert planned == {"guided": sum(asked for _, asked in rows.values())}
+    assert [one.rows for one in collect_steering_votes(study, cells, empty)] == [one.rows for one in done]
+    return study
+
+
+def test_what_two_cells_share_is_one_answer(steered: Workspace, entry: ModelEntry) -> None:
+    answers = steered.tables.read_all(STEERING)
+    controls = answers.query("side == 'control' and source == 'chaotic' and layer == 2")
+    assert controls.groupby(["scenario_id", "kind", "alpha"])["request_key"].nunique().max() == 1
+    plain = answers.query(f"kind == '{UNSTEERED}'")
+    assert plain.groupby(["dataset", "item_id"]).size().max() == 1 and set(plain["alpha"]) == {0}
+    ledger = steered.answers.read("tiny__guided__steered").rows
+    assert len(ledger) == answers["request_key"].nunique()
+    again = [SteeringCell.make(d, "tiny", "standard", "guided") for d in DATASETS]
+    along = {"standard": stages.saved_directions(steered, STANDARD)}
+    done = list(collect_steered(steered, entry, again, along, {cell.key: {} for cell in again}))
+    assert sum(one.tally.asked for one in done) == 0
+
+
+def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, entry: ModelEntry) -> None:
+    from traps_pipeline.models.local.adapter import load_local_model
+    from traps_pipeline.models.media import sample
+    from traps_pipeline.models.prompts import system_prompt
+
+    model, items = load_local_model(entry), steered.tables.read(ITEMS, {"dataset": "chaotic"}).set_index("item_id")
+    answers = steered.tables.read_all(STEERING, dataset="chaotic")
+    vector = stages.saved_directions(steered, STANDARD)["occlusion"].vectors["void"][2]
+    assert entry.media is not None
+    for side, sign in (("control", 1), ("void", -1)):
+        row = answers.query(f"source == 'occlusion' and kind == 'void' and alpha == 8 and side == '{side}'").iloc[0]
+        item = items.loc[row["item_id"]]
+        shown = sample(steered.resolve(item["clip"]), entry.media)
+        prompt = model.prompt(system_prompt("guided"), item["question"], shown.frames, shown.times_s.tolist())
+        said = model.generate([prompt], 4, None, Steering(vector, 2, (sign * 8.0,)))[0].text.strip()
+        assert (row["text"] or "") == said
+    assert row["alpha_relative"] == pytest.approx(
+        8 / stages.saved_directions(steered, STANDARD)["occlusion"].residual_norms[2]
+    )
+
+
+def test_the_panel_judges_every_answer_with_a_text(steered: Workspace) -> None:
+    answers, votes = steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES)
+    texts = answers["outcome"].isin(["answer", "truncated"])
+    assert len(votes) == len(answers) and texts.any()
+    keys = ["dataset", "source", "kind", "layer", "alpha", "item_id"]
+    both = answers.merge(votes, on=keys)
+    judged = both["outcome"].isin(["answer", "truncated"])
+    assert (both.loc[judged, "n_valid"] == 3).all() and (both.loc[~judged, "n_valid"] == 0).all()
+    assert both.loc[~judged, "abstained"].isna().all()
+    assert {len(json.loads(v)) for v in both.loc[judged, "votes"]} == {3}
+
+
+def test_effects_put_the_model_as_it_is_into_every_path(steered: Workspace) -> None:
+    effects = pd.DataFrame(
+        stages.effect_rows(steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES))
+    )
+    main = effects.query("kind == 'void' and layer == 2")
+    assert len(main.groupby(["source", "target"])) == 14
+    assert set(main["alpha"]) == {0, 2, 8} and (main["n"] + main["n_missing"] == 2).all()
+    plain = main.query("alpha == 0 and target == 'chaotic'")
+    assert plain.groupby("side")["abstained"].nunique().max() == 1
+    assert set(effects.query("layer == 1")["side"]) == {"control"}  # the sweep
+    assert (effects["low"].dropna() <= effects["abstention"].dropna()).all()
+
+
+def test_steering_refuses_layers_and_sources_that_are_not_there(study: Workspace) -> None:
+    directions, settings = stages.saved_directions(study, STANDARD), study.mechanism
+    wrong = settings.models["tiny"].model_copy(update={"steering": 5})
+    with pytest.raises(TrapsError, match="layer 5 is out of range, blocks 1 to 4 can be steered"):
+        strengths("chaotic", wrong, settings, directions)
+    with pytest.raises(TrapsError, match="no direction leads to chaotic; materialize hidden_states and directions"):
+        strengths("chaotic", settings.models["tiny"], settings, {})
+    only = {"chaotic": directions["chaotic"]}  # a study of one dataset steers the paths that it has
+    assert {s.source for s, _ in strengths("chaotic", settings.models["tiny"], settings, only)} == {"chaotic", "none"}
+
+
+def test_settings_that_cannot_be_are_refused() -> None:
+    layers = {"tiny": {"steering": 2, "centroid": 1}}
+    for wrong, message in (
+        ({"models": {}}, "at least 1"),
+        ({"models": layers, "probes": {"shuffles": 5}}, "greater than or equal to 20"),
+        ({"models": layers, "prompts": ["standard"]}, "are not among the prompts"),
+        ({"models": layers, "steering": {"alphas": [5, 2]}}, "must ascend"),
+        ({"models": {"a__b": layers["tiny"]}}, "must match"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            MechanismSettings.model_validate(wrong)

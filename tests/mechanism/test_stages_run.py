@@ -1,0 +1,68 @@
+"""`traps run` walks the mechanistic stages through Dagster, and a second time computes nothing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import pytest
+import yaml
+
+from tests.conftest import EXPERIMENT, Checkout, Finished
+from traps_pipeline.lineage import INSIDE
+from traps_pipeline.models.local.tiny import build_tiny
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import PROBES, STEERING_EFFECTS, STEERING_VOTES
+
+pytestmark = pytest.mark.slow
+ENTRY = """
+  - id: tiny
+    backend: local
+    device: cpu
+    media: {profile: frames, uniform: 2, size: [32, 32]}
+    params: {checkpoint: tiny, dtype: float32, quantisation: none, do_sample: false, max_new_tokens: 4}
+    runs: 1
+"""
+MECHANISM = {
+    "models": {"tiny": {"steering": 3, "centroid": 4}},
+    "prompts": ["standard"],
+    "probes": {"folds": 2, "resamples": 100},
+    "steering": {
+        **{"alphas": [5], "pairs": 2, "well_posed_pairs": 4, "ill_posed_pairs": 4, "max_new_tokens": 4},
+        **{"direction_regimes": ["standard"], "inference_regimes": ["guided"], "controls": []},
+    },
+}
+
+
+def with_mechanism(study: Checkout, **changes: object) -> str:
+    """The small study's experiment, asking for a look into a tiny model besides."""
+    with (study.root / "assets" / "models.yaml").open("a") as stream:
+        stream.write(ENTRY)
+    build_tiny("qwen3-vl", study.root / "tiny")
+    experiment = yaml.safe_load((study.root / EXPERIMENT).read_text()) | {"mechanism": MECHANISM | changes}
+    (study.root / "inside.yaml").write_text(yaml.safe_dump(experiment))
+    return "inside.yaml"
+
+
+def counted(finished: Finished) -> tuple[int, ...]:
+    """Items extracted, steered answers asked, votes on them."""
+    assert finished.code == 0, finished.out + finished.err
+    found = re.search(r"inside models: (\d+) items .*? (\d+) steered .*? (\d+) votes on them", finished.out)
+    assert found, finished.out
+    return tuple(map(int, found.groups()))
+
+
+def test_traps_run_looks_into_a_model_once_and_a_correction_touches_its_scenario_alone(study: Checkout) -> None:
+    name = with_mechanism(study)
+    run: Callable[[], Finished] = lambda: study.traps("run", name, "--until", INSIDE[-1])  # noqa: E731
+    extracted, answers, votes = counted(run())
+    tables = Workspace.open(study.workspace).tables
+    judged, effects = tables.read_all(STEERING_VOTES), tables.read(STEERING_EFFECTS, {})
+    assert extracted > 0 and answers > 0 and votes == 3 * answers
+    assert len(judged) > answers  # controls stand in two datasets
+    assert len(effects.groupby(["source", "target"])) == 14
+    assert tables.read_all(PROBES)["note"].notna().any()  # tiny was not asked under standard: no Cf->Cf, and why
+    assert counted(run()) == (0, 0, 0)
+    study.correct("plinko-0001", question="Which bucket does the ball drop into in the end: 1, 2, 3, 4 or 5?")
+    again = counted(run())
+    assert again[0] == 3  # control and void of chaotic, the control of chaotic_ill_posed

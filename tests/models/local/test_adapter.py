@@ -1,0 +1,374 @@
+"""One adapter for three families, on real classes: nothing that is asked for is lost, and batches change no answer."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from tests.local_models import (
+    FAMILIES,
+    NF4_SKIP,
+    QUESTIONS,
+    SYSTEM,
+    Family,
+    ask,
+    checkpoint,
+    direction,
+    entry,
+    model,
+    three_prompts,
+)
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.models.local import adapter
+from traps_pipeline.models.local import model as local_model
+from traps_pipeline.models.local.adapter import Sampling, load_local_model
+from traps_pipeline.models.local.checkpoint import folder_digest, weight_bytes
+from traps_pipeline.models.local.library import load_transformers
+from traps_pipeline.models.local.prompts import batches, collate
+from traps_pipeline.models.local.sampling import SeededNucleus
+from traps_pipeline.models.local.tiny import build_tiny, make_tokenizer
+
+CLASSES = {
+    "qwen3-vl": "Qwen3VLForConditionalGeneration",
+    "gemma-4": "Gemma4ForConditionalGeneration",
+    "llava-next-video": "LlavaNextVideoForConditionalGeneration",
+}
+each_family = pytest.mark.parametrize("family", FAMILIES)
+
+
+def tokens(answers: list[adapter.Generated]) -> list[tuple[int, ...]]:
+    return [answer.tokens for answer in answers]
+
+
+@each_family
+def test_a_saved_checkpoint_reloads_through_the_auto_classes_and_answers_a_real_clip(family: Family) -> None:
+    transformers = load_transformers()
+    folder = checkpoint(family)
+    assert sum(file.stat().st_size for file in folder.iterdir()) < 2e6
+    assert type(transformers.AutoModelForImageTextToText.from_pretrained(folder)).__name__ == CLASSES[family]
+    of = model(family)
+    assert (type(of.network).__name__, of.n_layers, of.d_model) == (CLASSES[family], 4, 64)
+    (answer,) = of.generate([ask(of)], 8)
+    assert (answer.prompt_tokens, answer.completion_tokens) == (ask(of).n_tokens, len(answer.tokens))
+    assert answer.finish_reason == ("length" if answer.completion_tokens == 8 else "stop")
+    assert answer.text == of.processor.tokenizer.decode(answer.tokens, skip_special_tokens=True)
+    other = ask(of).inputs | {name: 1 - value for name, value in ask(of).inputs.items() if value.is_floating_point()}
+    seen, inverted = of.forward_states(ask(of)), of.forward_states(replace(ask(of), inputs=other))
+    assert np.abs(seen.raw[-1] - inverted.raw[-1]).max() > 1e-3  # what is in the picture reaches the last token
+
+
+@each_family
+def test_system_prompt_clip_and_question_arrive_whole_and_in_order(family: Family) -> None:
+    of = model(family)
+    prompt = ask(of, QUESTIONS[1])
+    text = of.processor.tokenizer.decode(prompt.inputs["input_ids"][0])
+    clip_at = text.index(of.processor.video_token)
+    assert text.index(SYSTEM) < clip_at < text.index(QUESTIONS[1])
+    bos = of.processor.tokenizer.bos_token
+    assert bos is None or text.count(bos) == 1
+
+
+def test_time_stamps_are_those_of_the_frames() -> None:
+    qwen, gemma = model("qwen3-vl"), model("gemma-4")  # LLaVA reads none
+    frames = np.zeros((5, 64, 64, 3), np.uint8)
+    times = [0.0, 0.4, 61.0, 61.3, 125.7]
+    text = qwen.processor.tokenizer.decode(qwen.prompt(SYSTEM, "Q?", frames, times).inputs["input_ids"][0])
+    assert re.findall(r"<([\d.]+) seconds>", text) == ["0.2", "61.1", "125.7"]  # of two frames a slot, the mean
+    text = gemma.processor.tokenizer.decode(gemma.prompt(SYSTEM, "Q?", frames, times).inputs["input_ids"][0])
+    assert re.findall(r"\d\d:\d\d", text) == ["00:00", "00:00", "01:01", "01:01", "02:05"]
+
+
+def test_every_frame_is_shown_and_none_is_sampled_again() -> None:
+    for n in (5, 6):
+        assert ask(model("llava-next-video"), frames=n).inputs["pixel_values_videos"].shape[1] == n
+        assert ask(model("gemma-4"), frames=n).inputs["num_frames_per_video"].tolist() == [n]
+        assert ask(model("qwen3-vl"), frames=n).inputs["video_grid_thw"][0, 0] == 3  # two frames a slot
+
+
+@each_family
+def test_neither_the_cache_nor_a_batch_nor_padding_changes_an_answer(family: Family) -> None:
+    of, prompts = model(family), three_prompts(family)
+    assert len({prompt.n_tokens for prompt in prompts}) == 3
+    together = tokens(of.generate(prompts, 10))
+    assert together == tokens(of.generate(prompts, 10, use_cache=False))
+    assert together == [tokens(of.generate([prompt], 10))[0] for prompt in prompts]
+    assert len(set(together)) > 1
+
+
+@each_family
+def test_states_of_a_padded_prompt_are_those_of_the_prompt_alone(family: Family) -> None:
+    of, prompts = model(family), three_prompts(family)
+    batch = collate(prompts, of.network.generation_config.pad_token_id)
+    assert (batch["attention_mask"][:, 0] == 0).sum() == 2  # padded on the left, all but the longest
+    mask = batch["attention_mask"]
+    with torch.inference_mode():
+        if family != "qwen3-vl":  # which makes its own of the mask, as `generate` does for the others
+            batch["position_ids"] = (mask.cumsum(-1) - 1).clamp(min=0)
+        padded = of.network.base_model(**batch, use_cache=False).last_hidden_state[:, -1].numpy()
+    alone = np.stack([of.forward_states(prompt).normed for prompt in prompts])
+    np.testing.assert_allclose(padded, alone, rtol=0, atol=2e-5)
+
+
+@each_family
+def test_a_sampled_answer_depends_on_its_seed_and_not_on_its_batch(family: Family) -> None:
+    of, prompts = model(family), three_prompts(family)
+    sampled = tokens(of.generate(prompts, 10, Sampling(0.8, 0.95, (1, 2, 3))))
+    assert sampled[1:] == tokens(of.generate(prompts[1:], 10, Sampling(0.8, 0.95, (2, 3))))
+    again = tokens(of.generate([prompts[0]] * 3, 10, Sampling(0.8, 0.95, (1, 1, 2))))
+    assert again[0] == again[1] == sampled[0] != again[2]
+
+
+def test_the_nucleus_is_drawn_from_with_its_own_shares() -> None:
+    probabilities = np.array([0.1, 0.5, 0.15, 0.25])
+    rows = 4000
+    scores = torch.tensor(np.log(probabilities), dtype=torch.float32).expand(rows, 4).clone()
+
+    def drawn(temperature: float, top_p: float) -> np.ndarray:
+        chosen = SeededNucleus(Sampling(temperature, top_p, range(rows)))(None, scores).argmax(dim=-1)
+        return np.bincount(chosen.numpy(), minlength=4) / rows
+
+    within = pytest.approx
+    assert drawn(1.0, 1.0) == within(probabilities, abs=0.025)  # three standard errors of a share of 0.5
+    assert drawn(1.0, 0.6) == within(np.array([0, 2, 0, 1]) / 3, abs=0.025)  # 0.5 alone does not reach 0.6
+    assert drawn(1.0, 0.5) == within(np.array([0, 1, 0, 0]))
+    assert drawn(0.5, 1.0) == within(probabilities**2 / (probabilities**2).sum(), abs=0.025)
+
+
+def test_rows_of_one_seed_go_through_one_stream() -> None:
+    scores = torch.zeros(3, 1000)
+    sampler = SeededNucleus(Sampling(1.0, 1.0, (7, 7, 8)))
+    steps = [sampler(None, scores).argmax(dim=-1).tolist() for _ in range(5)]
+    assert all(a == b for a, b, _ in steps)
+    assert len({a for a, _, _ in steps}) > 1
+    assert [a for a, _, _ in steps] != [c for _, _, c in steps]
+
+
+def test_prompts_with_other_numbers_of_frames_are_answered_in_order_all_the_same() -> None:
+    of = model("llava-next-video")
+    prompts = [ask(of, frames=6), ask(of, frames=4), ask(of, frames=6), ask(of, QUESTIONS[1], frames=4)]
+    assert tokens(of.generate(prompts, 6)) == [tokens(of.generate([prompt], 6))[0] for prompt in prompts]
+
+
+def test_batches_hold_what_fits_and_at_least_one() -> None:
+    prompts = three_prompts("qwen3-vl")  # the longest is the second
+    assert list(batches(prompts, [10.0, 10.0, 10.0], 20.0)) == [[2, 0], [1]]
+    assert list(batches(prompts, [10.0, 10.0, 10.0], 5.0)) == [[2], [0], [1]]
+    assert list(batches(prompts, [10.0, 10.0, 10.0], 1e9)) == [[2, 0, 1]]
+
+
+def test_a_batch_that_does_not_fit_is_halved_and_answers_stay_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    of, prompts = model("qwen3-vl"), three_prompts("qwen3-vl")
+    expected = tokens(of.generate(prompts, 6))
+    sizes: list[int] = []
+    whole = of._one_batch
+    most = 1
+
+    def small(rows: Any, *rest: Any) -> Any:
+        sizes.append(len(rows))
+        if len(rows) > most:
+            raise torch.OutOfMemoryError
+        return whole(rows, *rest)
+
+    monkeypatch.setattr(of, "_one_batch", small)
+    assert tokens(of.generate(prompts, 6)) == expected
+    assert Counter(sizes) == {3: 1, 1: 3, 2: 1}
+    most = 0
+    with pytest.raises(TrapsError, match="too little memory on cpu for one prompt"):
+        of.generate(prompts[:1], 6)
+
+
+def test_generation_ends_when_it_is_told_to() -> None:
+    of = model("qwen3-vl")
+    asked = iter([False, False, True])
+    (answer,) = of.generate([ask(of)], 8, stopped=lambda: next(asked))
+    assert len(answer.tokens) == 3
+
+
+def test_a_checkpoints_own_sampling_is_not_applied_unasked(tmp_path: Path) -> None:
+    folder = tmp_path / "own"
+    shutil.copytree(checkpoint("qwen3-vl"), folder)
+    config = json.loads((folder / "generation_config.json").read_text())
+    config |= {"do_sample": True, "top_k": 1, "temperature": 0.01, "repetition_penalty": 5.0, "suppress_tokens": [5]}
+    (folder / "generation_config.json").write_text(json.dumps(config))
+    of = load_local_model(entry("qwen3-vl", folder))
+    assert tokens(of.generate([ask(of)], 8)) == tokens(model("qwen3-vl").generate([ask(of)], 8))
+    assert 5 in of.network.generation_config.suppress_tokens
+
+
+# --- NF4 --------------------------------------------------------------------------------------------------------------
+
+
+@each_family
+def test_in_four_bits_it_loads_extracts_and_is_steered(family: Family) -> None:
+    pytest.importorskip("bitsandbytes")
+    whole, of = model(family), model(family, quantisation="nf4", nf4_skip=NF4_SKIP)
+    kinds = Counter(type(module).__name__ for module in of.blocks.modules())
+    assert kinds["Linear4bit"] >= 24
+    assert not any(type(module).__name__ == "Linear4bit" for module in whole.network.modules())
+    prompt = ask(of)
+    exact, states = whole.forward_states(prompt).raw, of.forward_states(prompt).raw
+    cosines = (exact * states).sum(axis=1) / np.linalg.norm(exact, axis=1) / np.linalg.norm(states, axis=1)
+    assert cosines[0] == pytest.approx(1)
+    assert (cosines[1:] < 0.9999).all()
+    assert cosines[1] > 0.85  # one block of random weights away; further on they amplify the difference
+    push = Steering(direction(of), 2, (50.0,))
+    assert (of.forward_states(prompt, steering=push).raw[2] == states[2] + np.float32(50) * direction(of)).all()
+    assert tokens(of.generate([prompt], 6, steering=push)) != tokens(of.generate([prompt], 6))
+    assert of.identity != whole.identity
+    assert "nf4/float32 on cpu" in of.served_model
+
+
+def test_modules_too_narrow_for_four_bits_on_a_cpu_are_named() -> None:
+    pytest.importorskip("bitsandbytes")
+    with pytest.raises(TrapsError, match=r"model\.visual\.blocks\.0\.attn\.qkv first.*nf4_skip"):
+        model("qwen3-vl", quantisation="nf4")
+
+
+# --- checkpoints ------------------------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_checkpoint_and_another_one_another(tmp_path: Path) -> None:
+    a = build_tiny("llava-next-video", tmp_path / "a")
+    assert folder_digest(a) == folder_digest(checkpoint("llava-next-video"))
+    assert folder_digest(build_tiny("llava-next-video", tmp_path / "b", seed=1)) != folder_digest(a)
+
+
+def test_what_weights_take_is_read_off_their_files() -> None:
+    folder = checkpoint("qwen3-vl")
+    numbers = sum(tensor.numel() for tensor in load_file(folder / "model.safetensors").values())
+    assert weight_bytes(folder, "float32", "none") == 4 * numbers
+    assert weight_bytes(folder, "bfloat16", "none") == 2 * numbers
+
+
+def altered(tmp_path: Path, family: Family = "qwen3-vl") -> Path:
+    return Path(shutil.copytree(checkpoint(family), tmp_path / "altered"))
+
+
+def test_weights_that_are_not_here_say_how_to_get_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(TrapsError, match=r"hf download nobody/nothing --revision abc.*`checkpoint:`"):
+        load_local_model(entry("qwen3-vl", "nobody/nothing", revision="abc"))
+    with pytest.raises(TrapsError, match=r"config\.json is missing.*save_pretrained"):
+        load_local_model(entry("qwen3-vl", tmp_path / "nowhere"))
+
+
+def test_a_shard_that_is_missing_is_named(tmp_path: Path) -> None:
+    folder = altered(tmp_path)
+    (folder / "model.safetensors").unlink()
+    index = {"weight_map": {"a": "model-1-of-2.safetensors", "b": "model-2-of-2.safetensors"}}
+    (folder / "model.safetensors.index.json").write_text(json.dumps(index))
+    with pytest.raises(TrapsError, match=r"model-1-of-2\.safetensors is missing \(2 files are\)"):
+        load_local_model(entry("qwen3-vl", folder))
+
+
+def test_a_weight_that_is_missing_is_never_left_random(tmp_path: Path) -> None:
+    folder = altered(tmp_path)
+    tensors = load_file(folder / "model.safetensors")
+    del tensors["model.language_model.layers.1.mlp.up_proj.weight"]
+    save_file(tensors, folder / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(TrapsError, match=r"1 weights are not in its files, .*layers\.1\.mlp\.up_proj\.weight first"):
+        load_local_model(entry("qwen3-vl", folder))
+
+
+def test_a_checkpoint_of_another_kind_is_refused(tmp_path: Path) -> None:
+    folder = altered(tmp_path)
+    (folder / "config.json").write_text(json.dumps({"model_type": "bert", "architectures": ["BertModel"]}))
+    with pytest.raises(TrapsError, match="cannot load it as an image-text-to-text model"):
+        load_local_model(entry("qwen3-vl", folder))
+
+
+def test_a_file_that_is_no_safetensors_is_refused(tmp_path: Path) -> None:
+    folder = altered(tmp_path)
+    (folder / "model.safetensors").write_bytes(b"no weights")
+    with pytest.raises(TrapsError, match=r"model\.safetensors: no safetensors file"):
+        load_local_model(entry("qwen3-vl", folder))
+
+
+def test_a_model_without_the_expected_layers_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    of = model("llava-next-video")
+    monkeypatch.setattr(of.network.config.text_config, "num_hidden_layers", 7)
+    with pytest.raises(TrapsError, match=r"has not the expected layers \(get_decoder\(\)\.layers: 4, .* says 7"):
+        local_model._decoder_parts(of.network, "llava")
+
+
+def test_too_little_memory_says_how_much_is_needed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folder = build_tiny("llava-next-video", tmp_path / "big", seed=5)
+    monkeypatch.setattr("traps_pipeline.models.local.checkpoint.free_bytes", lambda device: 1000.0)
+    with pytest.raises(TrapsError, match=r"take about 0\.0 GB as float32, and 0\.0 GB are free on cpu"):
+        load_local_model(entry("llava-next-video", folder))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_device_that_is_not_here_is_never_replaced() -> None:
+    with pytest.raises(TrapsError, match=r"device cuda: torch .* finds none"):
+        load_local_model(entry("qwen3-vl").model_copy(update={"device": "cuda"}))
+
+
+def test_a_chat_template_that_loses_the_system_prompt_is_refused(tmp_path: Path) -> None:
+    folder = altered(tmp_path)
+    template = (folder / "chat_template.jinja").read_text()
+    (folder / "chat_template.jinja").write_text(template.replace("in messages", "in messages[1:]"))
+    of = load_local_model(entry("qwen3-vl", folder))
+    with pytest.raises(TrapsError, match="does not keep system prompt, clip and question"):
+        ask(of)
+
+
+@each_family
+def test_a_layer_out_of_range_is_refused(family: Family) -> None:
+    for layer in (0, 5, -1):
+        with pytest.raises(TrapsError, match=rf"no block {layer}; it has blocks 1 to 4"):
+            model(family).block(layer)
+
+
+# --- a fourth class ---------------------------------------------------------------------------------------------------
+
+
+def qwen2_5_vl(folder: Path) -> Path:
+    """A tiny checkpoint of a class that nothing in the package names."""
+    transformers = load_transformers()
+    tokenizer = make_tokenizer("qwen3-vl")
+    marks = {"image": "<|image_pad|>", "video": "<|video_pad|>", "vision_start": "<|vision_start|>"}
+    text = {"vocab_size": len(tokenizer), "hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 3}
+    text |= {"num_attention_heads": 4, "num_key_value_heads": 2, "max_position_embeddings": 4096}
+    text |= {"rope_parameters": {"rope_type": "default", "rope_theta": 1e4, "mrope_section": [4, 2, 2]}}
+    text |= {"eos_token_id": tokenizer.eos_token_id, "initializer_range": 0.2}
+    vision = {"depth": 2, "hidden_size": 32, "intermediate_size": 64, "num_heads": 2, "out_hidden_size": 64}
+    config = transformers.Qwen2_5_VLConfig(
+        text_config=text,
+        vision_config=vision | {"fullatt_block_indexes": [1], "window_size": 56},
+        **{f"{name}_token_id": tokenizer.convert_tokens_to_ids(mark) for name, mark in marks.items()},
+    )
+    torch.manual_seed(0)
+    transformers.AutoModelForImageTextToText.from_config(config).save_pretrained(folder)
+    size = {"shortest_edge": 28 * 28, "longest_edge": 16 * 28 * 28}
+    transformers.Qwen2_5_VLProcessor(
+        image_processor=transformers.Qwen2VLImageProcessor(),
+        tokenizer=tokenizer,
+        video_processor=transformers.Qwen2VLVideoProcessor(size=size),
+        chat_template=model("qwen3-vl").processor.chat_template,
+    ).save_pretrained(folder)
+    return folder
+
+
+def test_another_model_of_the_library_is_one_entry_and_no_code(tmp_path: Path) -> None:
+    of = load_local_model(entry("qwen3-vl", qwen2_5_vl(tmp_path)))
+    assert type(of.network).__name__ == "Qwen2_5_VLForConditionalGeneration"
+    prompts = [ask(of, question) for question in QUESTIONS]
+    together = tokens(of.generate(prompts, 8))
+    assert together == [tokens(of.generate([prompt], 8))[0] for prompt in prompts]
+    states = of.forward_states(prompts[0])
+    assert states.raw.shape == (4, 64)
+    v = direction(of)
+    steered = of.forward_states(prompts[0], steering=Steering(v, 2, (9.0,)))
+    assert (steered.raw[2] == states.raw[2] + np.float32(9) * v).all()

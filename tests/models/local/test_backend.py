@@ -1,0 +1,251 @@
+"""A local model goes the whole way of an API model: request, outcome, ledger; requests that wait share a batch."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.local_models import QUESTIONS, SIX_FRAMES, SYSTEM, Family, checkpoint, clip, entry, model
+from traps_pipeline.cli import main
+from traps_pipeline.digests import file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models import registry
+from traps_pipeline.models.ask import Participants, Row, Work, run_work
+from traps_pipeline.models.backends import make_backend
+from traps_pipeline.models.budget import Budget
+from traps_pipeline.models.local.adapter import LocalModel
+from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds
+from traps_pipeline.models.local.tiny import build_tiny
+from traps_pipeline.models.media import MediaStore
+from traps_pipeline.models.registry import Limits, ModelEntry, effective_params, load_models
+from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.progress import Tally
+from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.workspace import Study
+
+SAMPLED = {"do_sample": True, "temperature": 0.8, "top_p": 0.95}
+
+
+def request(of: ModelEntry, media: MediaStore, question: str, run: int = 1) -> Request:
+    """What the responses stage would ask."""
+    sent = media.prepare(clip(), file_digest(clip()), SIX_FRAMES)
+    about = {"item_id": question, "model": of.id, "regime": "standard", "run": run}
+    params = effective_params(of, "standard")
+    return Request(of.id, of.backend, params, SYSTEM, question, about, clip(), sent, sent.sha256)
+
+
+def answers(of: ModelEntry, requests: Sequence[Request]) -> list[Outcome]:
+    async def all_at_once() -> list[Outcome]:
+        backend = make_backend(of)
+        return await asyncio.gather(*(backend.ask(one) for one in requests))
+
+    return asyncio.run(all_at_once())
+
+
+@pytest.fixture
+def batches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many prompts each call of `generate` got."""
+    sizes: list[int] = []
+    whole = LocalModel.generate
+
+    def counting(self: LocalModel, prompts: Sequence[Any], *rest: Any, **more: Any) -> Any:
+        sizes.append(len(prompts))
+        return whole(self, prompts, *rest, **more)
+
+    monkeypatch.setattr(LocalModel, "generate", counting)
+    return sizes
+
+
+@pytest.mark.parametrize("family", ["qwen3-vl", "gemma-4", "llava-next-video"])
+def test_requests_that_wait_are_answered_together_as_they_would_be_alone(
+    family: Family, tmp_path: Path, batches: list[int]
+) -> None:
+    of, media = entry(family, **SAMPLED), MediaStore(tmp_path)
+    requests = [request(of, media, question) for question in QUESTIONS]
+    together = answers(of, requests)
+    assert batches == [3]
+    assert together == [answers(of, [one])[0] for one in requests]
+    assert {one.kind for one in together} <= {"answer", "truncated", "empty"}
+    for one in together:
+        assert one.served_model == model(family).served_model
+        assert one.cost_usd == 0
+        assert one.prompt_tokens
+        assert one.completion_tokens
+
+
+def test_runs_differ_and_the_same_call_does_not(tmp_path: Path) -> None:
+    of, media = entry("qwen3-vl", **SAMPLED), MediaStore(tmp_path)
+    first, second = (request(of, media, QUESTIONS[0], run) for run in (1, 2))
+    assert seeds([first]) != seeds([second])
+    one, again, two = (answers(of, [each])[0] for each in (first, first, second))
+    assert one == again
+    assert one.text != two.text
+
+
+def test_an_answer_cut_off_is_truncated_and_nothing_is_empty() -> None:
+    def kind(text: str, finish: str) -> tuple[str, str | None]:
+        made = outcome(text, finish, 10, 3, "m")
+        return made.kind, made.text
+
+    assert kind(" left ", "stop") == ("answer", "left")
+    assert kind("left or", "length") == ("truncated", "left or")
+    assert kind(" \n", "stop") == ("empty", None)
+    assert kind("", "length") == ("empty", None)
+
+
+def test_a_second_run_asks_nothing(tmp_path: Path, batches: list[int]) -> None:
+    of, media = entry("llava-next-video"), MediaStore(tmp_path)
+    of = of.model_copy(update={"limits": Limits(concurrency=2)})
+    cell = Cell("occlusion", Evaluation(of.id, "standard", 1))
+
+    def finish(_: Cell, rows: Mapping[str, Row], tally: Tally) -> tuple[list[Row], Tally]:
+        return list(rows.values()), tally
+
+    def run() -> tuple[list[Row], Tally]:
+        participants = Participants({of.id: of}, make_backend, Study())
+        wanted = [request(of, media, question) for question in QUESTIONS]
+        work = Work(
+            "responses", Ledger(tmp_path, "answers"), participants, Budget(0.0, {}, {}), "1", lambda _: wanted, finish
+        )
+        (finished,) = run_work(work, [cell])
+        return finished
+
+    rows, tally = run()
+    assert (tally.asked, tally.cached, batches) == (3, 0, [2, 1])
+    assert all(row["components"]["params"]["checkpoint_digest"] == model(of.id).checkpoint.digest for row in rows)
+    again, tally = run()
+    assert (tally.asked, tally.cached, batches) == (0, 3, [2, 1])
+    assert again == rows
+
+
+def test_other_weights_in_the_same_folder_are_other_calls(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(checkpoint("llava-next-video"), tmp_path / "model"))
+    of, media = entry("llava-next-video", folder), MediaStore(tmp_path / "media")
+    before = request(of, media, QUESTIONS[0])
+    build_tiny("llava-next-video", folder, seed=9)
+    after = request(of, media, QUESTIONS[0])
+    assert before.key != after.key
+    assert before.components["params"]["checkpoint_digest"] != after.components["params"]["checkpoint_digest"]
+
+
+def test_a_hub_id_needs_no_weights_to_be_planned(tmp_path: Path) -> None:
+    of = entry("qwen3-vl", "nobody/nothing", revision="abc")
+    assert request(of, MediaStore(tmp_path), QUESTIONS[0]).params == of.params
+
+
+def test_missing_weights_are_told_before_anything_is_asked(tmp_path: Path) -> None:
+    with pytest.raises(TrapsError, match="hf download nobody/nothing"):
+        make_backend(entry("qwen3-vl", "nobody/nothing"))
+    with pytest.raises(TrapsError, match=r"config\.json is missing"):
+        request(entry("qwen3-vl", tmp_path / "gone"), MediaStore(tmp_path), QUESTIONS[0])
+
+
+def test_a_failure_is_raised_by_every_call_of_the_batch(tmp_path: Path) -> None:
+    of, media = entry("llava-next-video"), MediaStore(tmp_path)
+    gone = replace(request(of, media, QUESTIONS[0]), media=tmp_path / "gone.mp4")
+
+    async def both() -> list[Any]:
+        backend = LocalBackend(of)
+        failed = await asyncio.gather(backend.ask(gone), backend.ask(gone), return_exceptions=True)
+        return [*failed, await backend.ask(request(of, media, QUESTIONS[0]))]
+
+    first, second, later = asyncio.run(both())
+    assert isinstance(first, TrapsError)
+    assert str(first) == str(second)
+    assert "gone.mp4" in str(first)
+    assert isinstance(later, Outcome)  # the backend works on
+
+
+def test_a_batch_that_nobody_waits_for_any_more_ends_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    of, media = entry("llava-next-video", max_new_tokens=2000), MediaStore(tmp_path)
+    asked, seen = request(of, media, QUESTIONS[0]), []
+    whole = LocalModel._one_batch
+
+    def watched(self: LocalModel, *rest: Any) -> Any:
+        seen.extend(whole(self, *rest))
+        return seen
+
+    monkeypatch.setattr(LocalModel, "_one_batch", watched)
+
+    async def given_up() -> None:
+        backend = LocalBackend(of)
+        call = asyncio.create_task(backend.ask(asked))
+        await asyncio.sleep(0.3)
+        call.cancel()
+        assert backend._running is not None
+        await backend._running
+
+    asyncio.run(given_up())
+    assert len(seen[0].tokens) < 2000
+
+
+# --- entries ----------------------------------------------------------------------------------------------------------
+
+LOCAL = "backend: local, media: {profile: frames, uniform: 4}"
+PARAMS = "checkpoint: a/b, dtype: float32, quantisation: none, do_sample: false, max_new_tokens: 4"
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (f"{LOCAL}, params: {{{PARAMS}}}", "device: backend local needs it"),
+        (f"{LOCAL}, device: gpu, params: {{{PARAMS}}}", r"device: String should match"),
+        (
+            f"{LOCAL}, device: cpu, params: {{{PARAMS.replace(', quantisation: none', '')}}}",
+            "params: quantisation: Field",
+        ),
+        (f"{LOCAL}, device: cpu, params: {{{PARAMS}, top_k: 5}}", "params: top_k: Extra"),
+        (f"{LOCAL}, device: cpu, params: {{{PARAMS}, temperature: 0.8}}", "params: do_sample: false is greedy"),
+        (f"{LOCAL}, device: cpu, params: {{{PARAMS.replace('false', 'true')}}}", "params: do_sample: true needs"),
+        (f"{LOCAL}, device: cpu, params: {{{PARAMS}, nf4_skip: [lm_head]}}", "params: nf4_skip goes with"),
+        ("backend: reference, device: cpu, params: {strategy: oracle}", "device, mechanism: only backend local"),
+    ],
+)
+def test_a_wrong_entry_is_named_with_its_field(tmp_path: Path, text: str, complaint: str) -> None:
+    path = tmp_path / "models.yaml"
+    path.write_text(f"models:\n  - {{id: m, {text}}}\n")
+    with pytest.raises(TrapsError, match=rf"model 1 \(m\): .*{complaint}"):
+        load_models(path)
+
+
+def test_a_request_that_waits_for_its_batch_is_not_given_up() -> None:
+    def limits(**given: Any) -> Limits:
+        return ModelEntry.model_validate(entry("qwen3-vl").model_dump(exclude={"limits"}) | given).limits
+
+    assert limits().timeout_s >= 24 * 3600
+    assert limits(limits={"concurrency": 3}).timeout_s >= 24 * 3600
+    assert limits(limits={"timeout_s": 5}).timeout_s == 5
+    assert registry.get_model("qwen3-vl-think").limits.timeout_s == 600
+
+
+def test_the_papers_three_local_models_are_asked_as_the_paper_has_it() -> None:
+    """`benchmark.md` section 3."""
+    entries = {name: registry.get_model(name) for name in ("qwen3-vl-8b", "gemma-4-e4b", "llava-next-video-7b")}
+    params = {name: one.local_params() for name, one in entries.items()}
+    assert {one.dtype for one in params.values()} == {"bfloat16"}
+    assert {one.quantisation for one in params.values()} == {"none"}
+    qwen, *others = params.values()
+    assert (qwen.do_sample, qwen.max_new_tokens) == (False, 1024)
+    for one in others:
+        assert (one.temperature, one.top_p, one.max_new_tokens) == (0.8, 0.95, 512)
+        assert one.attn_implementation == "sdpa"
+    spec = entries["qwen3-vl-8b"].mechanism
+    assert spec is not None
+    assert spec.quantisation == "nf4"  # section 7
+
+
+def test_the_doctor_tries_every_family_and_says_what_is_not_here(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--local"]) == 0
+    said = capsys.readouterr().out
+    for family, name in (("qwen3-vl", "Qwen3VL"), ("gemma-4", "Gemma4"), ("llava-next-video", "LlavaNextVideo")):
+        assert f"ok   {family}: {name}ForConditionalGeneration saved and reloaded, a clip answered" in said
+    assert said.count("5 hooked states equal the library's own") == 3
+    for part in ("devices: torch", "nf4: ", "checkpoints: qwen3-vl-8b is"):
+        assert f"ok   {part}" in said

@@ -1,0 +1,220 @@
+"""The pocket model: what it is trained on, that training goes on bit for bit, and what ships with the repository."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.cli import main
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.models.media import sample
+from traps_pipeline.models.prompts import system_prompt
+from traps_pipeline.pocket.commands import BEGIN, CARD, END, EVALUATION, FACTS, WEIGHTS
+from traps_pipeline.pocket.data import (
+    STREAM,
+    SceneRecord,
+    ShardJob,
+    draw_shard,
+    params_digest,
+    released_digests,
+    shard_jobs,
+)
+from traps_pipeline.pocket.evaluate import MODEL, Asked, entry_of, evaluate, markdown, read_cells, write_cells
+from traps_pipeline.pocket.recipe import POCKET, Recipe, load_recipe
+from traps_pipeline.pocket.words import PROMPTS, say
+
+FEW = 2  # scenes
+
+
+@pytest.fixture(scope="module")
+def recipe() -> Recipe:
+    """The shipped recipe with two scenes of one family, and three steps."""
+    shipped = load_recipe()
+    training = shipped.training.model_copy(update={"steps": 3, "batch": 2})
+    return shipped.model_copy(update={"scenes": {"drop_split": FEW}, "held_out": 1, "training": training})
+
+
+@pytest.fixture(scope="module")
+def data(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes")
+    for split in ("train", "held-out"):
+        for job in shard_jobs(recipe, split, folder):
+            draw_shard(job)
+    return folder
+
+
+def _records(job: ShardJob) -> list[SceneRecord]:
+    return [SceneRecord.read(line) for line in job.lines.read_text().splitlines()]
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_released_scene_is_never_trained_on(recipe: Recipe, data: Path, tmp_path: Path) -> None:
+    (job,) = shard_jobs(recipe, "train", data)
+    drawn = _records(job)
+    assert not {scene.params_digest for scene in drawn} & released_digests()
+    banned = dataclasses.replace(job, folder=tmp_path, banned=frozenset({drawn[0].params_digest}))
+    draw_shard(banned)  # as if the first scene were released: the draw goes on to another one
+    assert drawn[0].params_digest not in {scene.params_digest for scene in _records(banned)}
+
+
+def test_the_digest_of_a_released_scene_is_that_of_its_parameters() -> None:
+    spec = load_released()["drop_split-0001"]
+    assert params_digest(spec.family, spec.params) in released_digests()
+    assert params_digest(spec.family, spec.params | {"ridge_m": 0.4001}) not in released_digests()
+
+
+def test_frames_for_training_are_those_that_a_clip_gives(
+    recipe: Recipe, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same scenes written as clips and read through the media path of every model: only H.264 lies between."""
+    (job,) = shard_jobs(recipe, "train", data)
+    rendered = np.load(job.pixels)
+    assert rendered.shape == (FEW, 2, 2, 96, 128, 3)
+    monkeypatch.setitem(STREAM, "held-out", STREAM["train"])
+    as_clips = dataclasses.replace(job, split="held-out", folder=tmp_path, count=1)
+    draw_shard(as_clips)
+    for side, name in enumerate(("control", "void")):
+        shown = sample(as_clips.clip(0, name), recipe.media)
+        assert shown.times_s.tolist() == [0.0, 4.9]
+        off = np.abs(shown.frames.astype(int) - rendered[0, side])
+        assert off.mean() < 3 and (off > 40).mean() < 0.005  # of 255: colours are halved in resolution
+
+
+def test_voids_alone_are_labelled_with_abstentions(recipe: Recipe, data: Path) -> None:
+    (job,) = shard_jobs(recipe, "train", data)
+    for scene in _records(job):
+        assert scene.asked.answer in scene.labels and scene.answerable.answer is not None
+        assert scene.visual.answer is None or scene.visual.answer in scene.labels
+
+
+def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -> None:
+    from traps_pipeline.pocket.data import render
+
+    none = recipe.model_copy(update={"scenes": {"drop_split": 0}})
+    render(none, "train", tmp_path)
+    with pytest.raises(TrapsError, match="another recipe"):
+        render(none.model_copy(update={"abstain_share": 0.4}), "train", tmp_path)
+
+
+@pytest.mark.parametrize("prompt_name", PROMPTS)
+def test_what_it_is_taught_to_say_is_read_by_the_rule_judge(prompt_name: str) -> None:
+    for answer in ("left", "elsewhere", "4", "purple"):
+        said = say(answer, prompt_name)
+        assert not judge_abstention(said)["abstained"]
+        assert judge_correctness(said, answer)["correct"]
+    assert judge_abstention(say(None, prompt_name))["abstained"]
+    if prompt_name == "json":
+        assert set(json.loads(say("left", "json"))) == {"reason", "final_answer"}
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data: Path) -> None:
+    """Questions share a clip and a system prompt in training; the library's own path knows nothing of that."""
+    import torch
+    from torch.nn.functional import cross_entropy
+
+    from traps_pipeline.pocket.model import make_model, train_tokenizer
+    from traps_pipeline.pocket.train import Batches, Look, Scenes, losses, name_tokens
+
+    scenes = Scenes(recipe, data)
+    model, processor = make_model(train_tokenizer(scenes.records), seed=1)
+    model.eval()
+    record, frames = scenes.records[1], np.array(scenes.frames(1, 0))
+    look = Look(1, 0, (record.asked, record.ill_posed))
+    batch = Batches(scenes, model, processor, recipe.training, 1).make([look], "guided", frames[None])
+    with torch.no_grad():
+        found = losses(model, batch, name_tokens(processor.tokenizer))[0].item()
+    expected = 0.0
+    for question in look.questions:
+        turns = [
+            {"role": "system", "content": [{"type": "text", "text": system_prompt("guided")}]},
+            {"role": "user", "content": [{"type": "video"}, {"type": "text", "text": question.question}]},
+        ]
+        text = processor.apply_chat_template(turns, add_generation_prompt=True)
+        said = say(question.answer, "guided") + processor.tokenizer.eos_token
+        clock = {"fps": 1000.0, "frames_indices": [0, 4900], "total_num_frames": 4901}
+        inputs = processor(
+            text=[text + said], videos=[np.array(frames)], video_metadata=[clock], do_sample_frames=False,
+            return_tensors="pt",
+        )  # fmt: skip
+        inputs.pop("video_metadata", None)
+        length = len(processor.tokenizer(said)["input_ids"])
+        with torch.no_grad():
+            logits = model(**inputs).logits[0]
+        expected += cross_entropy(logits[-length - 1 : -1], inputs["input_ids"][0, -length:], reduction="sum").item()
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_training_that_was_stopped_goes_on_bit_for_bit(recipe: Recipe, data: Path, tmp_path: Path) -> None:
+    from traps_pipeline.pocket.train import train
+
+    whole = train(recipe, data, tmp_path / "whole", 1)
+    train(recipe, data, tmp_path / "stopped", 1, stop_after=1)
+    assert not (tmp_path / "stopped" / WEIGHTS).exists()
+    resumed = train(recipe, data, tmp_path / "stopped", 1)
+    assert (whole / "model.safetensors").read_bytes() == (resumed / "model.safetensors").read_bytes()
+    with pytest.raises(TrapsError, match="another seed"):
+        train(recipe, data, tmp_path / "stopped", 2)
+
+
+# --- what ships -------------------------------------------------------------------------------------------------------
+
+
+def test_the_shipped_weights_are_small_and_are_those_of_the_facts() -> None:
+    from safetensors import safe_open
+
+    from traps_pipeline.digests import digest, file_digest
+
+    weights = POCKET / WEIGHTS / "model.safetensors"
+    facts = json.loads((POCKET / FACTS).read_text())
+    with safe_open(weights, "np") as file:
+        count = sum(int(np.prod(file.get_slice(name).get_shape())) for name in file.keys())  # noqa: SIM118
+    assert count <= 3_000_000 and weights.stat().st_size <= 12 * 2**20
+    assert file_digest(weights) == facts["weights"]
+    assert facts["recipe"] == digest(load_recipe().model_dump(mode="json")) and facts["seed"] == 1
+    assert f"`{facts['data']}`" in CARD.read_text()
+
+
+def test_the_card_shows_the_shipped_counts() -> None:
+    cells = read_cells(EVALUATION)
+    card = CARD.read_text()
+    assert card.partition(BEGIN)[2].partition(END)[0].strip() == markdown(cells)
+    recipe = load_recipe()
+    assert {(cell.family, cell.regime) for cell in cells} == {
+        (family, regime) for family in recipe.scenes for regime in ("standard", "guided", "json")
+    }
+    assert {cell.n for cell in cells} == {recipe.held_out}
+
+
+def test_on_the_controls_of_every_named_family_it_is_above_the_prior() -> None:
+    controls = [cell for cell in read_cells(EVALUATION) if cell.kind == "control" and cell.seed == 1]
+    assert not [cell for cell in controls if not cell.above_prior]
+
+
+def test_it_reads_a_held_out_clip_through_the_adapter(recipe: Recipe, data: Path, tmp_path: Path) -> None:
+    from traps_pipeline.pocket.evaluate import held_out
+
+    entry = entry_of(POCKET / WEIGHTS)
+    assert entry.id == MODEL and entry.media == recipe.media
+    asked: list[Asked] = list(held_out(recipe, data))
+    assert [one.kind for one in asked] == ["control", "visual", "ill_posed", "answerable"]
+    cells = evaluate(entry, asked, 1)
+    assert sum(cell.n for cell in cells) == 12 and all(cell.prior == 1 for cell in cells if cell.kind == "control")
+    write_cells(tmp_path / "cells.csv", cells)
+    write_cells(tmp_path / "cells.csv", cells)  # the same seed again takes its own place
+    assert read_cells(tmp_path / "cells.csv") == cells
+
+
+def test_the_card_command_needs_its_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["pocket", "card", "--csv", str(tmp_path / "none.csv")]) == 1
+    assert "traps pocket evaluate" in capsys.readouterr().err

@@ -1,0 +1,199 @@
+"""Every table and figure, from the paper's numbers, from an empty study and from a partial one."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.image import imread
+
+from tests.report.test_report import board_of, board_row
+from tests.report.test_writing import latex_cells
+from traps_pipeline.cli import main
+from traps_pipeline.lineage import REPORTS, upstream
+from traps_pipeline.report import publish
+from traps_pipeline.report.catalogue import FIGURES, OF_PAPER, OF_STUDY, PRINTED, TABLES, workspace_files
+from traps_pipeline.report.figures.abstention import doubt_points
+from traps_pipeline.report.results import PublishedResults, StudyResults
+from traps_pipeline.report.writing import figure_files, freeze_layout, table_files
+from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.tables import LEADERBOARD
+
+PAPER = PublishedResults()
+BY_NAME = {table.name: table for report in TABLES if report.published for table in report.tables(PAPER)}
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    """A study in which nothing was run."""
+    return Workspace.create(tmp_path_factory.mktemp("empty") / "study", Study(scenarios=["plinko-0001"]))
+
+
+@pytest.fixture(scope="module")
+def empty(workspace):
+    return StudyResults(workspace)
+
+
+@pytest.fixture(scope="module")
+def partial(tmp_path_factory):
+    """One reference model under standard on all datasets, one of the paper's on `chaotic` alone, incomplete."""
+    workspace = Workspace.create(tmp_path_factory.mktemp("partial") / "study", Study(scenarios=["plinko-0001"]))
+    datasets = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed", "overall")
+    rows = [board_row("oracle", dataset=d, shares=(1, 0, 1), n_runs=1) for d in datasets]
+    lost = {"n_missing": 60, "incomplete": True, "answered": 0.9}
+    board = board_of(*rows, board_row("gemini-2.5-pro", dataset="chaotic", **lost))
+    workspace.tables.write(LEADERBOARD, {}, board, {})
+    return StudyResults(workspace)
+
+
+def texts(table):
+    return [" ".join(row) for row in table.cells]
+
+
+def test_the_published_leaderboard_is_the_papers():
+    first = BY_NAME["overall"].cells[0]
+    assert first[:3] == ["gemini-3.1-pro-r-low", "guided", "0.568"]
+    assert first[-2:] == ["1354", "3"]
+    assert "mixed epochs (ch_ip: original; else corrected)" in BY_NAME["per_dataset"].notes
+    assert len(BY_NAME["overall"].rows) == 14 * 3
+    assert len(BY_NAME["replication_overall"].rows) == 2 * 3
+
+
+def test_the_published_analyses_are_the_papers():
+    uplift = {row[0]: row for row in BY_NAME["guided_uplift"].cells}
+    assert uplift["gpt-5-mini"][1:4] == ["3.1", "34.0", "11.07"]
+    assert texts(BY_NAME["hidden_sub_scenarios"]) == ["hidden 3 27.0 67.9", "other 12 4.9 34.9"]
+    gaps = {row[0]: row for row in BY_NAME["visual_textual"].cells}
+    assert gaps["gpt-5-mini"][4:7] == ["0.0", "9.1", "∞"]
+    assert any("22 of 64 cells" in note for note in BY_NAME["pecs_naive"].notes)
+    assert BY_NAME["composition"].cells[-1] == ["all", "", "", "702", "702"]
+    assert BY_NAME["frontier"].rows.query("regime == 'guided'")["model"].tolist() == [
+        "gemini-3.1-pro",
+        "gemini-3.1-pro-r-low",
+    ]
+
+
+def test_a_single_greedy_run_has_no_spread_and_says_one_run():
+    row = next(row for row in BY_NAME["expanded_occlusion_standard"].cells if row[0] == "qwen3-vl-8b")
+    assert row[1:7] == ["58.9", "10.9", "2.0", "0.052", "202", "1"]
+
+
+def test_every_published_table_is_well_formed_in_every_medium():
+    assert len([name for name in BY_NAME if name.startswith("expanded_")]) == 12
+    for table in BY_NAME.values():
+        files = table_files(table)
+        width = 1 if table.absence else len(table.columns)
+        assert {len(row) for row in latex_cells(files[f"{table.name}.tex"].decode())} == {width}
+        assert len(pd.read_parquet(io.BytesIO(files[f"{table.name}.parquet"]))) == len(table.rows)
+        assert not re.search(r"\bnan\b|<NA>", files[f"{table.name}.md"].decode())
+
+
+def test_an_empty_study_says_not_run_and_never_zero(empty):
+    for report in TABLES:
+        for table in report.tables(empty):
+            if table.name == "degenerate_strategies":  # expectations, which need no run
+                assert {row[-1] for row in table.cells} == {"–"}
+            else:
+                assert table.absence.startswith("not run"), table.name
+
+
+def test_a_partial_study_says_what_is_missing(partial):
+    tables = {table.name: table for report in TABLES for table in report.tables(partial)}
+    assert [row[0] for row in tables["overall"].cells] == ["oracle"]
+    by_dataset = {row[0]: row[2:] for row in tables["per_dataset"].cells}
+    assert by_dataset["gemini-2.5-pro"] == ["–", "–", "0.250 ± 0.010 ‡", "–", "–"]
+    assert by_dataset["oracle"] == ["1.000"] * 5
+    assert any(note.startswith("‡ incomplete") for note in tables["per_dataset"].notes)
+    assert tables["guided_uplift"].absence == "not run: no model has standard and guided on all four datasets"
+    assert tables["expanded_chaotic_standard"].cells[1][:2] == ["gemini-2.5-pro", "50.0 ± 1.0"]
+
+
+def test_a_study_of_the_papers_models_shows_the_published_pecs_beside_its_own(tmp_path):
+    workspace = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
+    workspace.tables.write(LEADERBOARD, {}, board_of(board_row("gemini-3.1-pro", "guided")), {})
+    (table,) = next(report for report in TABLES if report.name == "overall").tables(StudyResults(workspace))
+    assert table.cells[0][2] == "0.250 ± 0.010"
+    assert dict(zip([c.heading for c in table.columns], table.cells[0], strict=True))["published PECS"] == "0.564"
+
+
+def overhang(figure):
+    """How far (in) what is drawn reaches beyond the figure's edge."""
+    freeze_layout(figure)
+    drawn, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
+    return max(-drawn.x0, -drawn.y0, drawn.x1 - width, drawn.y1 - height)
+
+
+@pytest.mark.parametrize("report", FIGURES, ids=lambda report: report.name)
+def test_no_text_of_a_figure_is_clipped_or_under_six_points(report, partial, empty):
+    from matplotlib.text import Text
+
+    for results in (PAPER, partial, empty):
+        figure = report.make(results)
+        assert overhang(figure) < 0.01
+        assert min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) >= 6
+
+
+@pytest.mark.parametrize("name", ["doubt_conversion", "confabulation"])
+def test_published_figures_are_byte_identical_on_a_second_build(name):
+    report = next(report for report in FIGURES if report.name == name)
+    first, second = (figure_files(name, report.make(PublishedResults())) for _ in range(2))
+    assert first == second
+
+
+def test_the_doubt_figure_refuses_to_mix_epochs():
+    class Mixed(PublishedResults):
+        @property
+        def confabulation(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+            return PAPER.confabulation.assign(epoch="corrected")
+
+    points, refused = doubt_points(Mixed())
+    assert not len(points)
+    assert "gemini-2.5-flash: doubt and AbsRec are of epochs corrected, original" in refused
+    points, refused = doubt_points(PAPER)
+    assert not refused
+    flash = points[points["thinking"] == "gemini-2.5-flash"]
+    assert np.allclose(sorted(100 * flash["gain"]), [4.1, 5.0, 10.2, 12.6])  # 24.5 - 20.4, 16.6 - 11.6, ...
+    assert set(flash["doubt"]) == {0.20}
+
+
+def test_a_table_or_figure_is_stale_when_what_it_reads_changed_and_only_then():
+    assert set(PRINTED) <= set(REPORTS)
+    assert upstream("figure_pecs_landscape", None) == [("leaderboard", None)]
+    assert ("metrics", "chaotic") in upstream("table_chaotic_sub_scenarios", None)
+    assert upstream("published_table_overall", None) == [("published", None)]
+    assert {name for name, _ in upstream("report_page", None)} >= {*OF_STUDY, *OF_PAPER, "verdicts", "leaderboard"}
+
+
+def test_names_of_tables_and_figures_are_unique():
+    names = [table.name for report in TABLES for table in report.tables(PAPER)]
+    assert len(set(names)) == len(names)
+    assert len(PRINTED) == len(set(PRINTED)) == len(OF_STUDY) + len(OF_PAPER)
+
+
+def test_a_workspace_keeps_every_table_file_and_a_figures_picture(partial):
+    files = workspace_files(OF_STUDY["table_overall"], partial)
+    assert sorted(files) == [f"tables/overall.{kind}" for kind in ("csv", "md", "parquet", "tex")]
+    files = workspace_files(OF_PAPER["published_figure_doubt_conversion"], PAPER)
+    assert list(files) == ["figures/published/doubt_conversion.png"]
+    assert imread(io.BytesIO(files["figures/published/doubt_conversion.png"])).shape[1] == 990  # 3.3 in, 300 dpi
+
+
+def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch, capsys):
+    chosen = [next(r for r in FIGURES if r.name == "doubt_conversion")]
+    monkeypatch.setattr(publish, "FIGURES", chosen)
+    monkeypatch.setattr(publish, "TABLES", TABLES[:2])
+    assert main(["export", str(tmp_path), "--workspace", str(workspace.root)]) == 0
+    files = {str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file()}
+    assert {f"tables/published/overall.{kind}" for kind in ("csv", "md", "parquet", "tex")} <= files
+    assert {
+        f"figures/{p}doubt_conversion.{kind}" for p in ("", "published/") for kind in ("pdf", "svg", "png")
+    } <= files
+    assert f"{len(files - {'items/made.json'})} files in {tmp_path}" in capsys.readouterr().out
+    index = (tmp_path / "index.html").read_text()
+    linked = set(re.findall(r'href="([^"]+)"', index))
+    assert {path for path in files if path.split("/")[0] in ("tables", "figures")} <= linked
+    assert all((tmp_path / path).is_file() for path in linked)
+    assert "not run" in (tmp_path / "report.html").read_text()

@@ -1,0 +1,104 @@
+"""The items behind a number: every answer, vote and verdict as text, a page a cell, made anew only where needed."""
+
+from __future__ import annotations
+
+import datetime
+
+import pytest
+
+from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.report.items import addresses, index_page, item_page, page_name, write_item_pages
+from traps_pipeline.report.writing import Behind
+from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
+
+HOSTILE = '<script>alert(1)</script> \\textbf{bold} $x$ <img src="http://evil.example/x.png"> & "quoted"'
+CELL = Cell("chaotic", Evaluation("oracle", "standard", 1))
+DEFAULTS = {"str": "x", "int": 1, "float": 0.5, "bool": True, "strs": ["x"], "time": datetime.datetime(2026, 1, 1)}
+
+
+def row(table, **values):
+    """A row of a table with these values; nullable columns are null, others hold some value of their type."""
+    filled = {c.name: None if c.nullable else DEFAULTS[c.type] for c in table.columns}
+    return {**filled, **values}
+
+
+def write_cell(workspace, cell=CELL, text=HOSTILE):
+    """A pair of `cell` with one answer a side, of which the control's is `text`, the void's is missing."""
+    part = cell.partition
+    both = [(f"{cell.dataset}:plinko-0001:{side}", side) for side in ("control", "void")]
+    shared = {"scenario_id": "plinko-0001", "dataset": cell.dataset, "sub_scenario": "plinko"}
+    items = [
+        row(ITEMS, item_id=i, side=s, question=f"Where, {HOSTILE}?", clip=f"clips/plinko-0001/{s}.mp4", **shared)
+        for i, s in both
+    ]
+    answers = [
+        row(RESPONSES, item_id=both[0][0], side="control", outcome="answer", text=text, reasoning=HOSTILE, **part),
+        row(RESPONSES, item_id=both[1][0], side="void", outcome="refused", **part),
+    ]
+    votes = [
+        row(VOTES, item_id=both[0][0], side="control", task="abstention", judge="rule-1", abstained=False,
+            confidence="high", rationale=HOSTILE, **part),
+        row(VOTES, item_id=both[0][0], side="control", task="correctness", judge="rule-1", valid=False,
+            invalid_reason="not JSON", **part),
+    ]  # fmt: skip
+    verdicts = [
+        row(VERDICTS, item_id=i, side=s, abstained=False if s == "control" else None, scenario_id="plinko-0001", **part)
+        for i, s in both
+    ]
+    workspace.tables.write(ITEMS, {"dataset": cell.dataset}, items, {})
+    for table, rows in ((RESPONSES, answers), (VOTES, votes), (VERDICTS, verdicts)):
+        workspace.tables.write(table, part, rows, {})
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    return Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
+
+
+def test_a_page_shows_question_answer_votes_verdict_and_clip_as_text(workspace):
+    write_cell(workspace)
+    page = item_page(workspace, CELL, "../..")
+    assert "<script" not in page
+    assert "<img" not in page
+    assert (
+        page.count("&lt;script&gt;alert(1)&lt;/script&gt; \\textbf{bold} $x$") == 5
+    )  # 2 questions, answer, trace, vote
+    assert "rule-1</b>, abstention: answered, high" in page
+    assert "invalid (not JSON)" in page
+    assert 'answered, <span class="none">undecided</span>' in page  # the control: abstention decided, correctness not
+    assert '<span class="none">refused</span>' in page
+    assert '<a href="../../clips/plinko-0001/void.mp4">clip</a>' in page
+    assert "default-src 'none'" in page
+    assert '<a href="../../clips' not in item_page(workspace, CELL, None)
+
+
+def test_a_page_is_made_anew_only_where_its_tables_changed(workspace, tmp_path):
+    other = Cell("chaotic", Evaluation("oracle", "standard", 2))
+    for cell in (CELL, other):
+        write_cell(workspace, cell)
+    assert write_item_pages(workspace, tmp_path, None) == [CELL, other]
+    before = {cell: (tmp_path / page_name(cell)).stat().st_mtime_ns for cell in (CELL, other)}
+    write_cell(workspace, CELL, "another answer")
+    write_item_pages(workspace, tmp_path, None)
+    assert "another answer" in (tmp_path / page_name(CELL)).read_text()
+    assert (tmp_path / page_name(CELL)).stat().st_mtime_ns > before[CELL]
+    assert (tmp_path / page_name(other)).stat().st_mtime_ns == before[other]
+    workspace.tables.path(RESPONSES, other.partition).unlink()
+    write_item_pages(workspace, tmp_path, None)
+    assert sorted(file.name for file in tmp_path.glob("*.html")) == [page_name(CELL), "index.html"]
+
+
+def test_a_number_leads_to_the_one_run_behind_it_else_to_the_index():
+    twice = Cell("occlusion", Evaluation("oracle", "guided", 1)), Cell("occlusion", Evaluation("oracle", "guided", 2))
+    address = addresses([CELL, *twice])
+    assert address(Behind("chaotic", "oracle", "standard", "void")) == "items/chaotic__oracle__standard__run1.html#void"
+    assert address(Behind("occlusion", "oracle", "guided")) == "items/index.html#occlusion__oracle__guided"
+    assert address(Behind("", "oracle", "guided", "void")) == "items/index.html#oracle__guided"
+    assert address(Behind("chaotic")) == "items/index.html"
+    assert address(Behind("chaotic", "prior", "standard")) == ""
+    assert addresses([])(Behind()) == ""
+    page = index_page([CELL, *twice])
+    for anchor in ("oracle", "oracle__guided", "occlusion__oracle__guided"):
+        assert f'id="{anchor}"' in page
+    assert page.count("not run") == 2  # standard has no occlusion, guided no chaotic

@@ -1,0 +1,140 @@
+"""A table says the same in every medium, escaped for it; a file has the same bytes on every build."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from traps_pipeline.report.writing import (
+    Behind,
+    Column,
+    Table,
+    figure_files,
+    latex,
+    not_run_figure,
+    table_files,
+    table_html,
+    write_bytes,
+)
+
+HOSTILE = r"<b>\input{/etc/passwd}</b> $x_1$ & 5 % #~^{|`*"
+COLUMNS = (
+    Column("model", "Model"),
+    Column("acc", "Acc %", "percent", spread="acc_std", mark="mark"),
+    Column("j", "J", "fraction"),
+    Column("gap", "Gap", "ratio"),
+    Column("n", "n", "count"),
+)
+
+
+def table(**other):
+    """Two rows: one whole, one hostile and with gaps."""
+    rows = pd.DataFrame(
+        {
+            "model": ["plain", HOSTILE],
+            "acc": [0.1234, np.nan],
+            "acc_std": [0.01, np.nan],
+            "mark": ["†", ""],
+            "j": [-0.5, 0.25],
+            "gap": [np.inf, np.nan],
+            "n": [202, 202],
+            "epoch": ["e1", "e1"],
+        }
+    )
+    return Table("results", "Results & more", rows, COLUMNS, ["epoch e1"], **other)
+
+
+def latex_cells(text):
+    """Cells of the body rows of a booktabs table, split at unescaped ampersands."""
+    body = text.split(r"\midrule")[1].split(r"\bottomrule")[0].strip().splitlines()
+    return [re.split(r"(?<!\\)&", line.removesuffix(r"\\")) for line in body]
+
+
+def test_cells_are_printed_in_their_units_with_spread_and_mark():
+    first, second = table().cells
+    assert first == ["plain", "12.3 ± 1.0 †", "−0.500", "∞", "202"]
+    assert second[1:] == ["–", "0.250", "–", "202"]
+
+
+def test_a_dash_and_a_spread_are_explained_where_they_occur():
+    assert table().remarks == [
+        "epoch e1",
+        "± population standard deviation over runs",
+        "– not run, or undefined for want of decided items",
+    ]
+    whole = Table("t", "T", pd.DataFrame({"n": [1]}), [Column("n", "n", "count")])
+    assert whole.remarks == []
+
+
+def test_every_latex_character_of_a_text_is_printed_and_commands_nothing():
+    assert latex("a_b & 5 % $x$ #{}") == r"a\_b \& 5 \% \$x\$ \#\{\}"
+    assert latex("\\~^") == r"\textbackslash{}\textasciitilde{}\textasciicircum{}"
+    text = table_files(table())["results.tex"].decode()
+    assert r"\input" not in text
+    assert r"\caption{Results \& more. epoch e1." in text
+    cells = latex_cells(text)
+    assert [len(row) for row in cells] == [5, 5]
+    assert cells[0][1].strip() == r"12.3 $\pm$ 1.0 \dag{}"
+    bare = re.sub(r"\\[{}]", "", text)  # escaped braces aside, they balance
+    assert bare.count("{") == bare.count("}")
+
+
+def test_markdown_keeps_a_hostile_text_in_its_cell():
+    lines = [line for line in table_files(table())["results.md"].decode().splitlines() if line.startswith("|")]
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {6}
+    assert "<b>" not in lines[-1]
+    assert r"\$x\_1\$" in lines[-1]
+
+
+def test_html_escapes_texts_and_links_numbers_to_their_items():
+    page = table_html(
+        table(trace=lambda row, field: Behind(model="m")), lambda behind: f"items/{behind.model}.html#<x>"
+    )
+    assert "<b>" not in page
+    assert "&lt;b&gt;" in page
+    assert page.count("<a href=") == 6  # of eight numbers two are dashes
+    assert "#&lt;x&gt;" in page
+    assert "<a " not in table_html(table())
+
+
+def test_parquet_and_csv_hold_the_numbers_behind_what_is_printed():
+    files = table_files(table())
+    for frame in (pd.read_parquet(io.BytesIO(files["results.parquet"])), pd.read_csv(io.BytesIO(files["results.csv"]))):
+        assert list(frame.columns) == ["model", "acc", "acc_std", "j", "gap", "n", "mark", "epoch"]
+        assert frame["acc"][0] == 0.1234
+        assert frame["model"][1] == HOSTILE
+        assert np.isnan(frame["acc"][1])
+
+
+def test_a_table_without_rows_says_not_run_and_why_everywhere():
+    empty = Table("t", "T", pd.DataFrame(columns=["model", "acc"]), COLUMNS[:2], why="nobody was asked")
+    files = table_files(empty)
+    for text in (files["t.md"].decode(), files["t.tex"].decode(), table_html(empty)):
+        assert "not run: nobody was asked" in text
+    assert files["t.csv"].decode().splitlines() == ["model,acc,acc_std"]
+    assert len(pd.read_parquet(io.BytesIO(files["t.parquet"]))) == 0
+
+
+def test_files_have_the_same_bytes_on_a_second_build():
+    assert table_files(table()) == table_files(table())
+    files = figure_files("f", not_run_figure("Doubt", "nobody was asked"))
+    assert files == figure_files("f", not_run_figure("Doubt", "nobody was asked"))
+    assert [content[:4] for content in files.values()] == [b"%PDF", b"<?xm", b"\x89PNG"]
+    assert b"CreationDate" not in files["f.pdf"]
+    assert b"<dc:date>" not in files["f.svg"]
+
+
+def test_a_file_that_cannot_be_written_leaves_the_former_one(tmp_path, monkeypatch):
+    write_bytes(tmp_path / "a" / "page.html", b"former")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", full)
+    with pytest.raises(OSError, match="No space"):
+        write_bytes(tmp_path / "a" / "page.html", b"next")
+    assert [file.read_bytes() for file in (tmp_path / "a").iterdir()] == [b"former"]

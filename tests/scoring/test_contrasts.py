@@ -1,0 +1,196 @@
+"""Paired contrasts, Holm's correction, McNemar's test, Wilson's interval: by hand and against statsmodels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from statsmodels.stats.contingency_tables import mcnemar
+from statsmodels.stats.multitest import multipletests
+from statsmodels.stats.proportion import proportion_confint
+
+from traps_pipeline.partitions import DATASETS
+from traps_pipeline.scoring.bootstrap import (
+    RESAMPLED,
+    intervals,
+    percentiles,
+    resample,
+    resampled_figures,
+    scenario_weights,
+)
+from traps_pipeline.scoring.contrasts import contrasts, holm, regime_tests, version_contrasts
+from traps_pipeline.scoring.epochs import EpochMismatch
+from traps_pipeline.scoring.leaderboard import leaderboard
+from traps_pipeline.scoring.metrics import cell_metrics, wilson
+
+
+def pairs_with(n, acc, false_abs, abs_rec):
+    """n pairs of which exactly these numbers are correct, abstained on falsely, abstained on rightly."""
+    return [(k < acc, k >= n - false_abs, k < abs_rec) for k in range(n)]
+
+
+def scored(*parts, resamples=400):
+    verdicts = pd.concat(parts, ignore_index=True)
+    metrics = pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset")], ignore_index=True)
+    resampled = resample(verdicts, resamples=resamples)
+    return metrics, resampled, contrasts(resampled, metrics)
+
+
+def only(table, **values):
+    for column, value in values.items():
+        table = table[table[column] == value]
+    [row] = table.to_dict("records")
+    return row
+
+
+def test_a_paired_contrast_takes_out_what_the_scenarios_share(rows):
+    # m and n are wrong on the same scenarios but for one: the difference hardly varies, however wide each interval is.
+    m, n = pairs_with(100, 60, 0, 100), pairs_with(100, 50, 0, 100)
+    _, resampled, table = scored(rows(m, model="m"), rows(n, model="n"))
+    row = only(table, kind="models", dataset="occlusion", figure="pecs")
+    weights = scenario_weights(100, 400, [20260101, 0])
+    by_hand = (weights[:, 50:60].sum(axis=1)) / 100  # Acc x J with J = 1: the ten scenarios that only m gets right
+    assert row["difference"] == pytest.approx(0.10)
+    assert (row["ci_low"], row["ci_high"]) == pytest.approx(tuple(np.quantile(by_hand, [0.025, 0.975])))
+    each = intervals(resampled).set_index(["dataset", "model"]).loc["occlusion"]
+    assert row["ci_high"] - row["ci_low"] < 0.7 * (each.loc["m", "pecs_ci_high"] - each.loc["m", "pecs_ci_low"])
+    assert row["p"] == pytest.approx(2 / 401)
+
+
+def test_equal_models_are_not_separable_and_share_all_ranks(rows):
+    same = pairs_with(40, 30, 2, 20)
+    metrics, resampled, table = scored(rows(same, model="m"), rows(same, model="n"))
+    assert only(table, dataset="occlusion", figure="pecs")["p"] == 1.0
+    board = leaderboard(metrics, intervals(resampled), table)
+    assert board[["rank", "rank_low", "rank_high"]].values.tolist() == [[1, 1, 2], [1, 1, 2]]
+
+
+def test_ranks_are_apart_where_the_contrast_is_significant(rows):
+    parts = [rows(pairs_with(200, acc, 0, 200), model=m) for m, acc in (("a", 190), ("b", 100), ("c", 98))]
+    metrics, resampled, table = scored(*parts)
+    board = leaderboard(metrics, intervals(resampled), table).set_index("model")
+    assert board.loc["a", ["rank", "rank_low", "rank_high"]].tolist() == [1, 1, 1]
+    assert board.loc["b", ["rank", "rank_low", "rank_high"]].tolist() == [2, 2, 3]
+    assert board.loc["c", ["rank", "rank_low", "rank_high"]].tolist() == [3, 2, 3]
+
+
+def test_regimes_of_a_model_are_contrasted_on_each_dataset_and_overall(rows):
+    parts = [
+        rows(pairs_with(20, 20, 0, k), dataset=d, regime=r)
+        for d in DATASETS
+        for r, k in (("standard", 5), ("guided", 15))
+    ]
+    table = scored(*parts)[2]
+    regimes = table[(table["kind"] == "regimes") & (table["figure"] == "j")]
+    assert list(regimes["dataset"]) == [*DATASETS, "overall"]
+    assert regimes["difference"].tolist() == pytest.approx([-0.5] * 5)
+    assert set(zip(regimes["left_regime"], regimes["right_regime"], strict=True)) == {("standard", "guided")}
+
+
+def test_a_contrast_across_epochs_is_refused_with_the_reason_and_no_figure(rows):
+    pairs = pairs_with(10, 5, 0, 5)
+    parts = [
+        rows(pairs, dataset=d, model=m, epoch="new" if (m, d) == ("n", "chaotic") else "old")
+        for m in "mn"
+        for d in DATASETS
+    ]
+    table = scored(*parts, resamples=20)[2]
+    refused = table[table["refused"].notna()]
+    assert set(refused["dataset"]) == {"chaotic", "overall"}
+    assert refused[["difference", "p", "p_holm"]].isna().all(axis=None)
+    assert not refused["separable"].any()
+    assert refused["refused"].iloc[0].startswith("chaotic: epoch old against epoch new")
+
+
+def test_holms_correction_is_the_textbooks_and_statsmodels():
+    p = np.array([0.01, 0.04, 0.03, np.nan, 0.005])
+    assert holm(p)[[0, 1, 2, 4]] == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert np.isnan(holm(p)[3])
+    drawn = np.random.default_rng(0).random(30) ** 3
+    assert holm(drawn) == pytest.approx(multipletests(drawn, method="holm")[1])
+
+
+def test_mcnemar_counts_discordant_items_and_equals_statsmodels(rows):
+    standard, guided = pairs_with(12, 12, 0, 3), pairs_with(12, 12, 0, 11)
+    verdicts = pd.concat([rows(standard), rows(guided, regime="guided")], ignore_index=True)
+    table = regime_tests(verdicts)
+    row = only(table, decision="void_abstention")
+    assert (row["n"], row["only_left"], row["only_right"]) == (12, 0, 8)
+    assert row["p"] == pytest.approx(2 * 0.5**8)
+    assert row["p"] == pytest.approx(mcnemar([[3, 0], [8, 1]], exact=True).pvalue)
+    assert only(table, decision="correctness")["p"] == 1.0
+
+
+def test_mcnemar_leaves_out_items_undecided_under_either_regime(rows):
+    standard, guided = [(True, False, None), (True, False, True)], [(True, False, True), (True, False, False)]
+    table = regime_tests(pd.concat([rows(standard), rows(guided, regime="guided")], ignore_index=True))
+    row = only(table, decision="void_abstention")
+    assert (row["n"], row["only_left"], row["only_right"]) == (1, 1, 0)
+
+
+def test_mcnemar_across_epochs_is_refused(rows):
+    verdicts = pd.concat([rows([(True, False, True)]), rows([(True, False, True)], regime="guided", epoch="e2")])
+    table = regime_tests(verdicts.reset_index(drop=True))
+    assert table["p"].isna().all()
+    assert table["refused"].str.contains("epoch e1 against epoch e2").all()
+
+
+def test_wilsons_interval_equals_statsmodels_and_is_null_without_decisions():
+    yes, of = np.array([0.0, 3, 10, 0]), np.array([10.0, 10, 10, 0])
+    low, high = wilson(yes, of)
+    expected = proportion_confint(yes[:3], of[:3], method="wilson")
+    assert (low[:3], high[:3]) == (pytest.approx(expected[0], abs=1e-12), pytest.approx(expected[1]))
+    assert np.isnan([low[3], high[3]]).all()
+
+
+def coverage(acc, false_abs, abs_rec):
+    """Shares of 1,500 simulated studies of 200 scenarios whose 95 % intervals hold the true J and PECS.
+
+    Three runs a study; half of a scenario's answers are alike in all runs (easy or hard), the others independent.
+    """
+    studies, scenarios, runs, resamples = 1500, 200, 3, 1000
+    rng = np.random.default_rng(11)
+    shape = (scenarios, studies, runs, 3)
+    luck = np.where(rng.random(shape) < 0.5, rng.random((scenarios, studies, 1, 3)), rng.random(shape))
+    counts = np.ones((scenarios, studies * runs, 6))
+    counts[..., 0::2] = (luck < [acc, false_abs, abs_rec]).reshape(scenarios, studies * runs, 3)
+    weights = scenario_weights(scenarios, resamples, 5)
+    true_j = abs_rec - false_abs
+    covered = []
+    for first in range(0, studies * runs, 300):
+        drawn = resampled_figures(weights, counts[:, first : first + 300])[
+            :, [RESAMPLED.index("j"), RESAMPLED.index("pecs")]
+        ]
+        bounds = percentiles(drawn.reshape(-1, runs, 2, resamples).mean(axis=1))
+        truth = np.array([true_j, acc * max(0.0, true_j)])
+        covered.append((bounds[..., 0] - 1e-9 <= truth) & (truth <= bounds[..., 1] + 1e-9))
+    return dict(zip(("j", "pecs"), np.concatenate(covered).mean(axis=0), strict=True))
+
+
+@pytest.mark.parametrize("shares", [(0.7, 0.1, 0.6), (0.5, 0.05, 0.3)])
+def test_intervals_away_from_the_kink_cover_93_to_97_percent(shares):
+    found = coverage(*shares)
+    assert 0.93 <= found["j"] <= 0.97
+    assert 0.93 <= found["pecs"] <= 0.97
+
+
+def test_at_the_kink_the_interval_of_pecs_covers_less_and_that_of_j_does_not():
+    # J is 0 and each run clips it, so that the mean over runs lies above 0; docs/scoring.md says to look at J there.
+    found = coverage(0.9, 0.3, 0.3)
+    assert 0.93 <= found["j"] <= 0.97
+    assert 0.80 <= found["pecs"] <= 0.87
+
+
+def test_versions_are_compared_on_what_both_hold(rows):
+    pairs = pairs_with(40, 20, 0, 20)
+    then = pd.concat([rows(pairs), rows(pairs, run=2)], ignore_index=True)
+    now = rows([(True, False, True)] * 30, run=1)  # ten scenarios were discarded, one run was made again
+    row = only(version_contrasts(then, now, resamples=200), dataset="occlusion", figure="pecs")
+    assert (row["n_pairs"], row["now"]) == (30, 1.0)
+    assert row["then"] == pytest.approx((20 / 30) ** 2)
+    assert row["difference"] == pytest.approx(1 - (20 / 30) ** 2)
+
+
+def test_versions_of_different_epochs_are_refused(rows):
+    with pytest.raises(EpochMismatch, match="versions: m/occlusion/standard has epoch then from epoch 'e1'"):
+        version_contrasts(rows([(True, False, True)]), rows([(True, False, True)], epoch="e2"))

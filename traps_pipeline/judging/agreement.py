@@ -1,0 +1,186 @@
+"""How far the judges agree, and which way each leans (`benchmark.md` section 4).
+
+Everything is counted per dataset and task over all models, regimes and runs. A coefficient that is undefined is null
+with the reason: votes of one class alone leave nothing to agree on beyond chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.judging.ratings import INVALID, NO, TASKS, YES, Ratings, majority, ratings
+from traps_pipeline.partitions import DATASETS
+from traps_pipeline.tables import AGREEMENT, JUDGE_BIAS
+
+PANEL = "panel"
+
+
+def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
+    """AGREEMENT rows of VOTES rows: per dataset and task one for the panel and one for each two of its judges."""
+    rows: list[dict[str, Any]] = []
+    for about, group in _groups(ratings(votes, judges)):
+        rows.append(about | _panel_row(group.values))
+        for one, other in combinations(sorted(range(len(group.judges)), key=group.judges.__getitem__), 2):
+            name = f"{group.judges[one]}+{group.judges[other]}"
+            rows.append(about | {"judges": name} | _pair_row(group.values[:, [one, other]]))
+    return pd.DataFrame(rows, columns=pd.Index([c.name for c in AGREEMENT.columns]))
+
+
+def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
+    """JUDGE_BIAS rows of VOTES rows: each judge's rate of yes against the panel's majority on the same answers."""
+    rows: list[dict[str, Any]] = []
+    for about, group in _groups(ratings(votes, judges)):
+        verdict = majority(group.values)
+        rows += [
+            about | {"judge": judge} | _bias(group.values[:, seat], verdict) for seat, judge in enumerate(group.judges)
+        ]
+    return pd.DataFrame(rows, columns=pd.Index([c.name for c in JUDGE_BIAS.columns]))
+
+
+def _groups(whole: Ratings) -> Iterator[tuple[dict[str, Any], Ratings]]:
+    """The ratings of each dataset and task that has any, and the columns that all of its rows share."""
+    for dataset in DATASETS:
+        for task in TASKS:
+            chosen = (whole.answers["dataset"] == dataset) & (whole.answers["task"] == task)
+            group = whole.select(chosen.to_numpy(bool))
+            if len(group.values):
+                versions = {name: _joined(group.answers[name].unique(), by) for name, by in _JOINS.items()}
+                yield {"dataset": dataset, "task": task, **versions}, group
+
+
+_JOINS = {"epoch": "+", "benchmark_version": " + "}
+
+
+def _joined(values: Iterable[str], by: str) -> str:
+    return by.join(sorted({part for value in values for part in value.split(by)}))
+
+
+# --- coefficients -----------------------------------------------------------------------------------------------------
+
+
+def complete(values: np.ndarray) -> np.ndarray:
+    """The rows on which every judge cast a valid vote."""
+    return values[(values != INVALID).all(axis=1)]
+
+
+def fleiss_kappa(values: np.ndarray) -> float:
+    """Fleiss' kappa of complete rows, (answers, judges) of YES and NO; NaN where there is one class or no row.
+
+    An answer with y yes of k votes agrees by (y (y-1) + (k-y) (k-y-1)) / (k (k-1)); chance by p^2 + (1-p)^2, p being
+    the share of yes in all votes.
+    """
+    n, k = values.shape
+    yes = (values == YES).sum(axis=1)
+    total = int(yes.sum())
+    if total in (0, n * k):
+        return float("nan")
+    observed = float(np.mean(yes * (yes - 1) + (k - yes) * (k - yes - 1))) / (k * (k - 1))
+    return _beyond_chance(observed, _same_class(total / (n * k)))
+
+
+def cohen_kappa(one: np.ndarray, other: np.ndarray) -> float:
+    """Cohen's kappa of two judges' votes of YES and NO on the same answers; NaN where there is one class or no vote."""
+    yes = int((one == YES).sum()), int((other == YES).sum())
+    n = len(one)
+    if sum(yes) in (0, 2 * n):
+        return float("nan")
+    p, q = yes[0] / n, yes[1] / n
+    return _beyond_chance(float(np.mean(one == other)), p * q + (1 - p) * (1 - q))
+
+
+def krippendorff_alpha(values: np.ndarray) -> float:
+    """Krippendorff's alpha for nominal values, (answers, judges); INVALID is missing. NaN where the answers that have
+    two valid votes or more hold one class or none.
+
+    In an answer with y yes of m valid votes, 2 y (m-y) of its m (m-1) ordered pairs disagree, each weighing 1 / (m-1);
+    expected from all n pairable votes are 2 n_yes n_no of n (n-1).
+    """
+    yes, valid = (values == YES).sum(axis=1), (values != INVALID).sum(axis=1)
+    pairable = valid > 1
+    yes, valid = yes[pairable], valid[pairable]
+    n, n_yes = int(valid.sum()), int(yes.sum())
+    if n_yes in (0, n):
+        return float("nan")
+    observed = float(np.sum(2 * yes * (valid - yes) / (valid - 1))) / n
+    return 1 - observed / (2 * n_yes * (n - n_yes) / (n * (n - 1)))
+
+
+def unanimous_share(values: np.ndarray) -> float:
+    """Share of complete rows, (answers, judges), on which all votes are the same; NaN where there is no row."""
+    return float(np.mean((values == values[:, :1]).all(axis=1))) if len(values) else float("nan")
+
+
+def _same_class(p: float) -> float:
+    return p * p + (1 - p) * (1 - p)
+
+
+def _beyond_chance(observed: float, by_chance: float) -> float:
+    return (observed - by_chance) / (1 - by_chance)
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def _shared(values: np.ndarray, whole: np.ndarray) -> dict[str, Any]:
+    """What a panel's row and a pair's row have in common."""
+    valid = values != INVALID
+    return {
+        "n_items": len(values),
+        "n_complete": len(whole),
+        "invalid": float(1 - valid.mean()),
+        "prevalence": _share((values == YES).sum(), valid.sum()),
+        "agreement": unanimous_share(whole),
+        "alpha": krippendorff_alpha(values),
+        "undefined": _why_undefined(whole),
+    }
+
+
+def _panel_row(values: np.ndarray) -> dict[str, Any]:
+    whole = complete(values)
+    undecided = int((majority(values) == INVALID).sum())
+    return _shared(values, whole) | {
+        "judges": PANEL,
+        "n_undecided": undecided,
+        "fleiss_kappa": fleiss_kappa(whole),
+        "cohen_kappa": np.nan,
+    }
+
+
+def _pair_row(values: np.ndarray) -> dict[str, Any]:
+    whole = complete(values)
+    kappa = cohen_kappa(whole[:, 0], whole[:, 1])
+    return _shared(values, whole) | {"n_undecided": None, "fleiss_kappa": np.nan, "cohen_kappa": kappa}
+
+
+def _why_undefined(whole: np.ndarray) -> str | None:
+    if not len(whole):
+        return "no answer has a valid vote of each judge"
+    if (whole == whole[0, 0]).all():
+        return f"every complete vote is {'yes' if whole[0, 0] == YES else 'no'}"
+    return None
+
+
+def _bias(votes: np.ndarray, verdict: np.ndarray) -> dict[str, Any]:
+    counted = (votes != INVALID) & (verdict != INVALID)
+    said, panel = votes[counted] == YES, verdict[counted] == YES
+    n = int(counted.sum())
+    yes, panel_yes = _share(said.sum(), n), _share(panel.sum(), n)
+    return {
+        "n_votes": len(votes),
+        "n_invalid": int((votes == INVALID).sum()),
+        "n_decided": n,
+        "yes": yes,
+        "panel_yes": panel_yes,
+        "bias": yes - panel_yes,
+        "dissent_yes": _share((said & (verdict[counted] == NO)).sum(), n),
+        "dissent_no": _share((~said & panel).sum(), n),
+    }
+
+
+def _share(part: Any, whole: Any) -> float:
+    return float(part) / float(whole) if whole else float("nan")

@@ -1,0 +1,266 @@
+"""What is wrong with the answers that should have been abstentions (`benchmark.md` section 6).
+
+A seeded sample of each model's void failures goes to one judge, which labels four independent axes
+(`scoring.prevalence` counts them). `assets/confabulation.yaml` says whose, how many and who judges. A sample is the n
+failures of least digest: uniform, independent from model to model, and a failure that is added or goes exchanges one
+of the sample and no more, so that labels stay paid for once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
+
+from traps_pipeline import progress
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.answers import strip_fence
+from traps_pipeline.judging.panel import JudgeEntry, load_judges, make_judge, quoted
+from traps_pipeline.models.ask import Participants, Row, Work, run_work
+from traps_pipeline.models.budget import spending
+from traps_pipeline.models.prompts import prompt
+from traps_pipeline.models.registry import NETWORK, get_model, structured
+from traps_pipeline.models.request import JUDGED, Request
+from traps_pipeline.partitions import DATASETS, Cell, Evaluation, is_ill_posed
+from traps_pipeline.paths import ASSETS
+from traps_pipeline.progress import Tally
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS
+from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
+
+PROTOCOL_FILE = ASSETS / "confabulation.yaml"
+TASK, PROMPT = "confabulation", "judge_confabulation"
+AXES = ("hallucinated_premise", "invalid_inference", "epistemic_surrender", "doubt_in_reasoning")
+SCHEMA = structured(TASK, **{axis: {"type": "boolean"} for axis in AXES}, rationale={"type": "string"})
+TRACE_AND_OUTPUT, OUTPUT = "trace_and_output", "output"
+Evidence = Literal["trace_and_output", "output"]
+VOID_KINDS: Mapping[str, str] = {
+    "occluder": "an opaque wall hides the place where the outcome could be seen",
+    "truncation": "the clip ends before the outcome is decided",
+    "question": "the clip shows the whole event, but the question asks for what the clip cannot show, or takes for "
+    "granted something that is not in it",
+}
+
+
+class Validation(BaseModel):
+    """Which of the labelled failures two people label too."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    n: int = Field(ge=1)
+    models: list[str] = Field(min_length=1)
+
+
+class Protocol(BaseModel):
+    """`assets/confabulation.yaml`: the sample of each model, the judge of each panel, and what it is shown."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    n: int = Field(ge=1, description="failures a model; all if there are fewer")
+    seed: int
+    regime: Literal["standard", "guided", "json"]
+    run: int = Field(ge=1)
+    judges: dict[str, str] = Field(description="panel to judge; a panel that is not here labels nothing")
+    models: dict[str, Evidence] = Field(min_length=1)
+    validation: Validation
+
+    def cells(self, model: str) -> list[Cell]:
+        """The cells that a model's failures come from."""
+        return [Cell(dataset, Evaluation(model, self.regime, self.run)) for dataset in DATASETS]
+
+    def judge(self, panel: str) -> JudgeEntry | None:
+        """The judge of a study with this panel; None where there is none."""
+        name = self.judges.get(panel)
+        return load_judges()[name] if name is not None else None
+
+
+@cache
+def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
+    """The protocol. Raises TrapsError naming the file and the field, model or judge that is wrong."""
+    protocol = parse_yaml_model(Protocol, read_yaml(path), path)
+    for model in protocol.models:
+        if protocol.run > get_model(model).runs:
+            raise TrapsError(f"{path}: {model} has {get_model(model).runs} runs, not run {protocol.run}")
+    strangers = [model for model in protocol.validation.models if model not in protocol.models]
+    if strangers:
+        raise TrapsError(f"{path}: validation.models: {', '.join(strangers)} not among models")
+    for panel, name in protocol.judges.items():
+        judge = load_judges().get(name)
+        if judge is None or judge.backend != NETWORK:
+            known = ", ".join(entry.id for entry in load_judges().values() if entry.backend == NETWORK)
+            raise TrapsError(f"{path}: judges.{panel} is {name!r}; it must be a judge over the network: {known}")
+    return protocol
+
+
+def protocol_digest(panel: str) -> str:
+    """What decides the labels of a study with this panel, beside the answers."""
+    protocol = load_protocol()
+    judge = protocol.judge(panel)
+    asked = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(PROMPT), VOID_KINDS] if judge else None
+    return digest([protocol.model_dump(exclude={"judges"}), asked])[:16]
+
+
+# --- the sample -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A sampled void failure: its item and answer, and the call that puts it to the judge."""
+
+    item: Mapping[str, Any]
+    text: str
+    trace: str | None
+    n_failures: int
+    request: Request
+
+
+def void_kind(dataset: str) -> str:
+    """Why the voids of a dataset cannot be answered: a key of VOID_KINDS."""
+    if is_ill_posed(dataset):
+        return "question"
+    return "occluder" if dataset == "occlusion" else "truncation"
+
+
+def drawn(seed: int, n: int, keys: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    """A seeded sample without replacement of n of these keys, all if they are fewer, whatever their order."""
+    return sorted(keys, key=lambda key: digest([seed, *key]))[:n]
+
+
+def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict[Cell, list[Failure]]:
+    """A model's sample by cell. Empty, with a note, until every dataset of the study that has items has verdicts."""
+    protocol = load_protocol()
+    cells = [cell for cell in protocol.cells(model) if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
+    lacking = [cell.key for cell in cells if workspace.tables.state(VERDICTS, cell.partition) is None]
+    if lacking:
+        if len(lacking) < len(cells):
+            progress.current().note(f"confabulation: {model} is not sampled before {', '.join(lacking)} is judged")
+        return {}
+    found = {(model, row["item_id"]): (cell, row) for cell in cells for row in _void_failures(workspace, cell)}
+    sample: dict[Cell, list[Failure]] = {}
+    for key in drawn(protocol.seed, protocol.n, found):
+        cell, row = found[key]
+        trace = row["reasoning"] if protocol.models[model] == TRACE_AND_OUTPUT else None
+        request = label_request(judge, cell, row, row["text"], trace)
+        sample.setdefault(cell, []).append(Failure(row, row["text"], trace, len(found), request))
+    return sample
+
+
+def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
+    """Items on which the panel found an answer where an abstention was due, with text and trace of that answer."""
+    verdicts = workspace.tables.read(VERDICTS, cell.partition, ["item_id", "side", "abstained"])
+    failed = verdicts.loc[(verdicts["side"] == "void") & verdicts["abstained"].eq(False), ["item_id"]]
+    responses = workspace.tables.read(RESPONSES, cell.partition, ["item_id", "text", "reasoning"])
+    items = workspace.tables.read(
+        ITEMS, {"dataset": cell.dataset}, ["item_id", "dataset", "question", "benchmark_version"]
+    )
+    rows = failed.merge(responses, on="item_id").merge(items, on="item_id").to_dict("records")
+    return [{str(name): value if isinstance(value, str) else None for name, value in row.items()} for row in rows]
+
+
+# --- the judge --------------------------------------------------------------------------------------------------------
+
+
+def render(question: str, kind: str, answer: str, trace: str | None) -> str:
+    """The user message to the judge."""
+    shown = [quoted("reasoning trace", "TRACE", trace)] if trace else ["No reasoning trace is given."]
+    about = [f"Question: {question}", f"Why it could not be answered: {VOID_KINDS[kind]}."]
+    return "\n\n".join([*about, *shown, quoted("response", "RESPONSE", answer)])
+
+
+def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
+    """The call that puts one failure to the judge; it tells neither model nor regime, and no ground truth."""
+    e = cell.evaluation
+    return Request(
+        participant=judge.id,
+        endpoint=judge.provider_id or judge.backend,
+        params=judge.params | {"response_format": SCHEMA},
+        system=prompt(PROMPT),
+        user=render(item["question"], void_kind(cell.dataset), answer, trace),
+        about={"task": TASK, "item_id": item["item_id"], "model": e.model, "regime": e.regime, "run": e.run},
+    )
+
+
+class Labels(BaseModel):
+    """Schema of the task (`prompts/judge_confabulation.txt`)."""
+
+    model_config = ConfigDict(extra="ignore")
+    hallucinated_premise: StrictBool
+    invalid_inference: StrictBool
+    epistemic_surrender: StrictBool
+    doubt_in_reasoning: StrictBool
+    rationale: str
+
+
+def parse_labels(row: Row) -> Labels | str:
+    """The labels that the judge returned; or why they are invalid."""
+    if row["outcome"] not in JUDGED:
+        return f"judge returned {row['outcome']}"
+    try:
+        return Labels.model_validate_json(strip_fence(row["text"] or ""))
+    except ValidationError as error:
+        return explain(error)[:200]
+
+
+# --- the confabulation stage ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """CONFABULATION rows of a study, and what they took."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    tally: Tally = field(default_factory=Tally)
+
+
+def collect_labels(workspace: Workspace) -> Labelled:
+    """Sample every model of the protocol that the study has judged, and ask what the ledger of votes does not hold.
+
+    Nothing where the study's panel has no judge for it.
+    """
+    protocol, done = load_protocol(), Labelled()
+    judge = protocol.judge(workspace.study.panel)
+    if judge is None:
+        return done
+    samples: dict[Cell, list[Failure]] = {}
+    for model in protocol.models:
+        samples |= sample_failures(workspace, judge, model)
+
+    def requests(cell: Cell) -> list[Request]:
+        return [failure.request for failure in samples[cell]]
+
+    def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> None:
+        done.tally.add(tally)
+        done.rows.extend(_label_row(cell, failure, rows[failure.request.key]) for failure in samples[cell])
+
+    participants = Participants({judge.id: judge}, make_judge, workspace.study)
+    with spending(workspace, [judge]) as budget:
+        work = Work(TASK, workspace.votes, participants, budget, workspace.study.epoch, requests, finish)
+        for _ in run_work(work, list(samples)):
+            pass
+    return done
+
+
+def _label_row(cell: Cell, failure: Failure, row: Row) -> dict[str, Any]:
+    labels = parse_labels(row)
+    valid = isinstance(labels, Labels)
+    item_id = failure.item["item_id"]
+    return {
+        "sample_id": digest([cell.key, item_id])[:12],
+        "item_id": item_id,
+        **cell.partition,
+        "void_kind": void_kind(cell.dataset),
+        "evidence": TRACE_AND_OUTPUT if failure.trace else OUTPUT,
+        "n_failures": failure.n_failures,
+        "judge": failure.request.participant,
+        "valid": valid,
+        "invalid_reason": None if valid else labels,
+        **{axis: getattr(labels, axis) if valid else None for axis in (*AXES, "rationale")},
+        "label_key": failure.request.key,
+        "epoch": row["epoch"],
+        "created_at": datetime.fromisoformat(row["created_at"]),
+        "benchmark_version": failure.item["benchmark_version"],
+    }

@@ -1,0 +1,91 @@
+"""Votes as a matrix, one row an answer and task, one column a judge: what agreement, bias and verdicts count on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+YES, NO, INVALID = 1, 0, -1  # of a vote; of a majority, INVALID is undecided
+ANSWER = ["dataset", "model", "regime", "run", "item_id"]
+ABSTENTION, CORRECTNESS = ("void_abstention", "control_abstention"), ("correctness",)
+TASKS = (*ABSTENTION, *CORRECTNESS)
+VOTE_COLUMNS = [*ANSWER, "side", "task", "judge", "valid", "abstained", "correct", "epoch", "benchmark_version"]
+
+
+@dataclass(frozen=True)
+class Ratings:
+    """answers: ANSWER, task (one of TASKS), epoch and benchmark_version, one row an answer and task. values: (rows,
+    judges) int8 of YES, NO and INVALID, columns in the order of `judges`."""
+
+    answers: pd.DataFrame
+    values: np.ndarray
+    judges: tuple[str, ...]
+
+    def select(self, chosen: np.ndarray) -> Ratings:
+        """The rows that a boolean mask chooses."""
+        return Ratings(self.answers.loc[chosen].reset_index(drop=True), self.values[chosen], self.judges)
+
+    def on(self, items: pd.DataFrame, tasks: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        """The votes on each item (rows with the columns ANSWER) on whichever of the tasks it was judged: values,
+        (items, judges), all INVALID where it was not; and whether it was, (items,)."""
+        judged = self.answers.loc[self.answers["task"].isin(tasks), ANSWER]
+        found = items[ANSWER].merge(judged.assign(row=judged.index), on=ANSWER, how="left", validate="many_to_one")
+        rows = found["row"].to_numpy(float)
+        asked = ~np.isnan(rows)
+        values = np.full((len(items), len(self.judges)), INVALID, np.int8)
+        values[asked] = self.values[rows[asked].astype(np.int64)]
+        return values, asked
+
+
+def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> Ratings:
+    """The matrix of VOTES rows (`VOTE_COLUMNS` at least) of these judges (default: all, in alphabetical order).
+
+    An answer on which one of them was not asked is left out: it was put to another panel.
+    """
+    seats = tuple(sorted(votes["judge"].unique()) if judges is None else judges)
+    votes = votes.loc[votes["judge"].isin(seats)].reset_index(drop=True)
+    rows, first = _grouped(votes)
+    values = np.full((len(first), len(seats)), INVALID, np.int8)
+    asked = np.zeros(values.shape, bool)
+    places = rows, pd.Index(seats).get_indexer(pd.Index(votes["judge"]))
+    values[places], asked[places] = _decisions(votes), True
+    answers = votes.loc[first, [*ANSWER, "epoch", "benchmark_version"]].reset_index(drop=True)
+    told = votes.loc[first, ["task", "side"]]
+    answers["task"] = np.where(told["task"] == "correctness", "correctness", told["side"] + "_abstention")
+    whole = asked.all(axis=1)
+    return Ratings(answers.loc[whole].reset_index(drop=True), values[whole], seats)
+
+
+def _grouped(votes: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+    """The number of each vote's answer and task, (votes,), and the first vote of each, (answers,)."""
+    code = np.zeros(len(votes), np.int64)
+    for name in (*ANSWER, "task"):
+        own, known = pd.factorize(votes[name])
+        code = code * max(len(known), 1) + own
+    _, first, rows = np.unique(code, return_index=True, return_inverse=True)
+    return rows.ravel(), first
+
+
+def _decisions(votes: pd.DataFrame) -> np.ndarray:
+    """YES, NO or INVALID of each vote, (votes,) int8."""
+    yes = _is_true(votes["abstained"].to_numpy(object)) | _is_true(votes["correct"].to_numpy(object))
+    return np.where(votes["valid"].to_numpy(bool), yes, INVALID).astype(np.int8)
+
+
+def _is_true(flags: np.ndarray) -> np.ndarray:
+    return (flags == True).astype(bool)  # noqa: E712 - null compares as not true
+
+
+def majority(values: np.ndarray) -> np.ndarray:
+    """What more than half of the judges say, (rows,) int8; INVALID where neither answer has that many valid votes."""
+    half = values.shape[1] / 2
+    yes, no = ((values == vote).sum(axis=1) > half for vote in (YES, NO))
+    return np.where(yes, YES, np.where(no, NO, INVALID)).astype(np.int8)
+
+
+def decided(votes: np.ndarray) -> pd.arrays.BooleanArray:
+    """YES, NO and INVALID as true, false and null."""
+    return pd.arrays.BooleanArray(votes == YES, votes == INVALID)

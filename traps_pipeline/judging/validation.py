@@ -1,0 +1,267 @@
+"""The confabulation judge against two blind annotators (`benchmark.md` section 6).
+
+`annotation_sheet` writes what the annotators are shown: question, void kind, answer, and the trace where the judge saw
+it; a sample id stands for model and item. Their labels come back as one CSV file with a line an annotator and failure.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.digests import file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.agreement import cohen_kappa
+from traps_pipeline.judging.confabulation import AXES, TRACE_AND_OUTPUT, VOID_KINDS, drawn, load_protocol
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import CONFABULATION, ITEMS, JUDGE_VALIDATION, RESPONSES
+
+LABEL_COLUMNS = ("annotator", "sample_id", *AXES)
+SHEET_COLUMNS = (*LABEL_COLUMNS, "question", "why_unanswerable", "reasoning_trace", "response")
+YES_WORDS, NO_WORDS = ("1", "true", "yes"), ("0", "false", "no")
+DEGENERATE_SHARE = 0.02
+POOLED = "pooled"
+RESAMPLES, SEED = 10_000, 20260101
+_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class HumanLabels:
+    """annotators: two, in alphabetical order. sample_ids: failures. labels: (2, failures, axes) of bool."""
+
+    annotators: tuple[str, str]
+    sample_ids: tuple[str, ...]
+    labels: np.ndarray
+
+
+# --- the annotators' files --------------------------------------------------------------------------------------------
+
+
+def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
+    """What an annotator fills in: SHEET_COLUMNS by failure, in an order that tells nothing. Raises TrapsError if no
+    failure of the models to validate was labelled."""
+    protocol = load_protocol()
+    labels = _judged(workspace)
+    labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
+    if labels.empty:
+        raise TrapsError(f"no labelled failure of {', '.join(protocol.validation.models)}; run the study first")
+    chosen = drawn(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
+    return [_sheet_row(workspace, sample, labels.loc[sample].to_dict()) for sample, _ in chosen]
+
+
+def _sheet_row(workspace: Workspace, sample: str, label: Mapping[str, Any]) -> dict[str, str]:
+    cell = {name: label[name] for name in RESPONSES.partition_by}
+    response = _row_of(workspace.tables.read(RESPONSES, cell, ["item_id", "text", "reasoning"]), label["item_id"])
+    item = _row_of(
+        workspace.tables.read(ITEMS, {"dataset": label["dataset"]}, ["item_id", "question"]), label["item_id"]
+    )
+    shown = {
+        "question": item["question"],
+        "why_unanswerable": VOID_KINDS[label["void_kind"]],
+        "reasoning_trace": response["reasoning"] if label["evidence"] == TRACE_AND_OUTPUT else "",
+        "response": response["text"],
+    }
+    empty = dict.fromkeys(LABEL_COLUMNS, "")
+    return empty | {"sample_id": sample} | {name: _no_formula(str(text)) for name, text in shown.items()}
+
+
+def _row_of(frame: pd.DataFrame, item_id: str) -> dict[str, Any]:
+    return frame.loc[frame["item_id"] == item_id].iloc[0].to_dict()
+
+
+def _no_formula(text: str) -> str:
+    """A spreadsheet runs a cell that begins like a formula."""
+    return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text
+
+
+def write_sheet(rows: Sequence[Mapping[str, str]], path: Path) -> None:
+    """Write a sheet as CSV. Raises TrapsError if the file is there: it may hold labels."""
+    if path.exists():
+        raise TrapsError(f"{path} is there already and may hold labels; give another name, or delete it")
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(SHEET_COLUMNS)
+        writer.writerows([row[name] for name in SHEET_COLUMNS] for row in rows)
+
+
+def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
+    """The labels of two annotators from a CSV file (LABEL_COLUMNS; others are ignored; true/false, yes/no or 1/0).
+
+    known: sample ids that the judge has labelled. Raises TrapsError naming the lines and columns that are wrong.
+    """
+    found: dict[tuple[str, str], tuple[int, list[bool]]] = {}
+    wrong: list[str] = []
+    for line, row in _lines(path):
+        annotator, sample = row["annotator"], row["sample_id"]
+        problems = [f"{name} is empty" for name in ("annotator", "sample_id") if not row[name]]
+        if sample and sample not in known:
+            problems.append(f"sample_id {sample!r} is none that the judge has labelled")
+        problems += [
+            f"{axis} is {row[axis]!r}; write 1 or 0, true or false, yes or no"
+            for axis in AXES
+            if row[axis].lower() not in (*YES_WORDS, *NO_WORDS)
+        ]
+        if (annotator, sample) in found:
+            problems.append(f"{annotator} has labelled {sample} on line {found[annotator, sample][0]} already")
+        wrong += [f"{path}:{line}: {problem}" for problem in problems]
+        found.setdefault((annotator, sample), (line, [row[axis].lower() in YES_WORDS for axis in AXES]))
+    _refuse(wrong)
+    return _paired(path, found)
+
+
+def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    """The rows of a CSV file with their line numbers, every LABEL_COLUMNS value a stripped text."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream)
+            missing = [name for name in LABEL_COLUMNS if name not in (reader.fieldnames or ())]
+            if missing:
+                needed = ", ".join(LABEL_COLUMNS)
+                raise TrapsError(f"{path}:1: column {', '.join(missing)} is missing; it needs {needed}")
+            for row in reader:
+                yield reader.line_num, {name: (row[name] or "").strip() for name in LABEL_COLUMNS}
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise TrapsError(f"{path}: cannot be read as CSV ({error})") from error
+
+
+def _paired(path: Path, found: Mapping[tuple[str, str], tuple[int, list[bool]]]) -> HumanLabels:
+    names = sorted({annotator for annotator, _ in found})
+    if len(names) != 2:
+        raise TrapsError(f"{path}: labels of {len(names)} annotators ({', '.join(names) or 'none'}); two are compared")
+    one, other = names
+    samples = sorted({sample for _, sample in found})
+    alone = [(a, s, line) for (a, s), (line, _) in found.items() if (other if a == one else one, s) not in found]
+    _refuse([f"{path}:{line}: only {a} has labelled {s}; both annotators must" for a, s, line in alone])
+    labels = np.array([[found[name, sample][1] for sample in samples] for name in names], bool)
+    return HumanLabels((one, other), tuple(samples), labels)
+
+
+def _refuse(wrong: Sequence[str]) -> None:
+    if wrong:
+        more = f"\n... and {len(wrong) - _SHOWN} more" if len(wrong) > _SHOWN else ""
+        raise TrapsError("\n".join(wrong[:_SHOWN]) + more)
+
+
+# --- the comparison ---------------------------------------------------------------------------------------------------
+
+
+def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
+    """JUDGE_VALIDATION rows of a label file, which are written to the workspace too. Raises TrapsError."""
+    judged = _judged(workspace).set_index("sample_id")
+    if judged.empty:
+        raise TrapsError(f"{workspace.root}: the study has no labelled failure to compare with; run it first")
+    human = read_labels(path, list(map(str, judged.index)))
+    rows = compare(judged.loc[list(human.sample_ids), [*AXES]].to_numpy(bool), human)
+    state = workspace.tables.state(CONFABULATION, {})
+    inputs = {"confabulation": state.version if state else "", "labels": file_digest(path)}
+    workspace.tables.write(JUDGE_VALIDATION, {}, rows, inputs)
+    return rows
+
+
+def _judged(workspace: Workspace) -> pd.DataFrame:
+    """Validly labelled failures."""
+    labels = workspace.tables.read(CONFABULATION, {})
+    return labels.loc[labels["valid"].to_numpy(bool)]
+
+
+def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
+    """JUDGE_VALIDATION rows of the judge's labels, (failures, axes) of bool, against both annotators'.
+
+    Pooled labels are both annotators' side by side, without consensus: 2 x failures an axis.
+    """
+    rows = [_axis_row(axis, judge[:, k], human.labels[:, :, k], human) for k, axis in enumerate(AXES)]
+    agreed = [float(np.mean(human.labels[k] == judge)) for k in (0, 1)]
+    rows.append(
+        _shared(POOLED, judge.shape[0], human)
+        | {"n_labels": 2 * judge.size, "accuracy": float(np.mean(human.labels == judge))}
+        | {"accuracy_a": agreed[0], "accuracy_b": agreed[1]}
+        | {"human_agreement": float(np.mean(human.labels[0] == human.labels[1]))}
+    )
+    return pd.DataFrame(rows, columns=pd.Index([c.name for c in JUDGE_VALIDATION.columns]))
+
+
+def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:
+    a, b = human.annotators
+    return {"axis": axis, "n_failures": failures, "annotator_a": a, "annotator_b": b}
+
+
+def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabels) -> dict[str, Any]:
+    """judge: (failures,); labels: (2, failures)."""
+    one, other = labels
+    hits = int((labels & judge).sum())
+    precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))
+    defined = judge.any() and labels.any()  # precision and recall both are
+    kappa, low, high = _kappa(one, other)
+    return _shared(axis, len(judge), human) | {
+        "n_labels": labels.size,
+        "accuracy": float(np.mean(labels == judge)),
+        "precision": precision,
+        "recall": recall,
+        "f1": _share(2 * hits, 2 * int(judge.sum()) + int(labels.sum())) if defined else np.nan,
+        "accuracy_a": float(np.mean(one == judge)),
+        "accuracy_b": float(np.mean(other == judge)),
+        "human_agreement": float(np.mean(one == other)),
+        "human_kappa": kappa,
+        "human_kappa_low": low,
+        "human_kappa_high": high,
+        "kappa_note": "degenerate" if np.isnan(kappa) else None,
+    }
+
+
+def is_degenerate(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether one class has at most 2 % of either annotator's labels: kappa then says nothing about agreement."""
+    return any(min(np.mean(labels), 1 - np.mean(labels)) <= DEGENERATE_SHARE + 1e-12 for labels in (one, other))
+
+
+def _kappa(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
+    """Cohen's kappa and its 95 % percentile interval over resampled failures; NaN where degenerate."""
+    if is_degenerate(one, other):
+        return np.nan, np.nan, np.nan
+    n = len(one)
+    cells = np.bincount(2 * one.astype(int) + other, minlength=4)
+    drawn_cells = np.random.default_rng(SEED).multinomial(n, cells / n, size=RESAMPLES)
+    no_no, no_yes, yes_no, yes_yes = drawn_cells.T / n
+    p, q = yes_no + yes_yes, no_yes + yes_yes
+    chance = p * q + (1 - p) * (1 - q)
+    defined = chance < 1
+    draws = (no_no + yes_yes - chance)[defined] / (1 - chance[defined])
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return cohen_kappa(one.astype(int), other.astype(int)), float(low), float(high)
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else np.nan
+
+
+def validation_text(rows: pd.DataFrame) -> str:
+    """JUDGE_VALIDATION rows as a person reads them."""
+    first = rows.iloc[0]
+    lines = [
+        f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {first['n_failures']} failures",
+        f"{'axis':<22} {'labels':>6} {'acc':>6} {'prec':>6} {'recall':>6} {'F1':>6} {'vs A':>6} {'vs B':>6}"
+        f"   {'A = B':>6} {'kappa':>6} 95 %",
+    ]
+    shares = ("accuracy", "precision", "recall", "f1", "accuracy_a", "accuracy_b")
+    for row in rows.to_dict("records"):
+        figures = " ".join(_figure(row[name]) for name in shares)
+        agreed = f"{_figure(row['human_agreement'])} {_kappa_text(row)}"
+        lines.append(f"{row['axis']:<22} {row['n_labels']:>6} {figures}   {agreed}".rstrip())
+    return "\n".join(lines)
+
+
+def _kappa_text(row: Mapping[Any, Any]) -> str:
+    if pd.notna(row["kappa_note"]):
+        return row["kappa_note"]
+    if np.isnan(row["human_kappa"]):
+        return ""
+    return f"{row['human_kappa']:6.2f} {row['human_kappa_low']:.2f} to {row['human_kappa_high']:.2f}"
+
+
+def _figure(value: float) -> str:
+    return f"{'-':>6}" if np.isnan(value) else f"{value:6.3f}"

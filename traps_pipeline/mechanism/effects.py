@@ -1,0 +1,116 @@
+"""What the steering tables show, from effects: abstention by path, strength and side (`benchmark.md` section 8).
+
+Effects are rows of the `steering_effects` table, or the paper's in the same columns: model, directions, regime, source,
+target, kind, layer, alpha, side, abstention (a fraction).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pandas as pd
+
+from traps_pipeline.mechanism.paths import FAMILIES, PATH_SETS, transfer_type
+from traps_pipeline.partitions import DATASETS, is_ill_posed, taxonomy_of
+
+Frame = pd.DataFrame
+CELL = ["model", "directions", "regime"]
+REGIME_COLUMNS = (
+    *("model", "path_set", "family", "directions", "regime", "kind", "n_paths", "alpha"),
+    *("control_0", "control_top", "void_0", "void_top"),
+)
+
+
+def on_both_sides(effects: Frame) -> Frame:
+    """The effects at the steered layer: further layers of a sweep have controls alone."""
+    layers = effects.loc[effects["side"] == "void", [*CELL, "layer"]].drop_duplicates()
+    return effects.merge(layers, on=[*CELL, "layer"])
+
+
+def paths(effects: Frame) -> Frame:
+    """One row a path and strength at the steered layer: control and void abstention side by side, transfer_type."""
+    keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
+    rows = on_both_sides(effects)
+    wide = rows.pivot_table(index=keys, columns="side", values="abstention", dropna=False, observed=True)
+    wide = wide.dropna(how="all").reset_index().reindex(columns=pd.Index([*keys, "control", "void"]))
+    types = [transfer_type(s, t) for s, t in zip(wide["source"], wide["target"], strict=True)]
+    return _in_order(wide.assign(transfer_type=types))
+
+
+def regime_matrix(effects: Frame) -> Frame:
+    """REGIME_COLUMNS: mean abstention over the paths of each set at alpha 0 and at the largest alpha, by direction
+    regime, inference regime and kind of direction; family `all`."""
+    return _regime_rows(effects, lambda rows: iter([("all", rows)]))
+
+
+def family_asymmetry(effects: Frame) -> Frame:
+    """The same for guided directions under guided inference, by the taxonomy of the direction's source."""
+    guided = effects.loc[(effects["directions"] == "guided") & (effects["regime"] == "guided")]
+
+    def families(rows: Frame) -> Iterator[tuple[str, Frame]]:
+        for family in FAMILIES:
+            yield family, rows.loc[rows["source"].map(taxonomy_of) == family]
+
+    return _regime_rows(guided, families)
+
+
+def _regime_rows(effects: Frame, split: Any) -> Frame:
+    rows = paths(effects)
+    found: list[Mapping[str, Any]] = []
+    for path_set, members in PATH_SETS.items():
+        inside = [pair in members for pair in zip(rows["source"], rows["target"], strict=True)]
+        for (model, directions, regime, kind), cell in rows.loc[inside].groupby([*CELL, "kind"], sort=False):  # pyright: ignore[reportGeneralTypeIssues]
+            for family, part in split(cell):
+                if not len(part):
+                    continue
+                top = part["alpha"].max()
+                ends = {"0": part.loc[part["alpha"] == 0], "top": part.loc[part["alpha"] == top]}
+                sides = ("control", "void")
+                figures = {f"{side}_{end}": at[side].mean() for side in sides for end, at in ends.items()}
+                found.append(
+                    {
+                        **{"model": model, "path_set": path_set, "family": family, "directions": directions},
+                        **{"regime": regime, "kind": kind, "n_paths": len(ends["top"]), "alpha": top, **figures},
+                    }
+                )
+    return pd.DataFrame(found, columns=pd.Index(REGIME_COLUMNS))
+
+
+def domains(effects: Frame) -> Frame:
+    """Control abstention at the largest alpha along each source's direction, on the well-posed dataset of its own
+    taxonomy (same) against that of the other (cross). Columns CELL, source, alpha, same, cross."""
+    rows = paths(effects)
+    rows = rows.loc[(rows["kind"] == "void") & ~rows["target"].map(is_ill_posed)]
+    rows = rows.loc[rows["alpha"] == rows.groupby(CELL)["alpha"].transform("max")]
+    same = rows["source"].map(taxonomy_of) == rows["target"].map(taxonomy_of)
+    wide = rows.assign(domain=same.map({True: "same", False: "cross"})).pivot_table(
+        index=[*CELL, "source", "alpha"], columns="domain", values="control"
+    )
+    columns = pd.Index([*CELL, "source", "alpha", "same", "cross"])
+    return _in_order(wide.reset_index().reindex(columns=columns))
+
+
+def sweep(effects: Frame) -> Frame:
+    """Control abstention by layer and alpha, each dataset's direction on its own controls, mean over the four splits.
+    Columns CELL, layer, alpha, control, n_splits. Empty where one layer was steered."""
+    rows = effects.loc[(effects["kind"] == "void") & (effects["side"] == "control")]
+    rows = rows.loc[rows["source"] == rows["target"]]
+    grouped = rows.groupby([*CELL, "layer", "alpha"])["abstention"]
+    table = grouped.agg(control="mean", n_splits="count").reset_index()
+    several = table.groupby("model")["layer"].transform("nunique") > 1
+    return table.loc[several].reset_index(drop=True)
+
+
+def _in_order(rows: Frame) -> Frame:
+    """Sources and targets in the benchmark's order."""
+    order = {name: place for place, name in enumerate(DATASETS)}
+    by = [name for name in (*CELL, "kind", "source", "target", "alpha") if name in rows]
+    kinds = {"void": 0, "shuffled": 1, "random": 2}
+
+    def place(values: Any) -> Any:
+        if values.name in ("source", "target"):
+            return values.map(order)
+        return values.map(kinds) if values.name == "kind" else values
+
+    return rows.sort_values(by, key=place, ignore_index=True, kind="stable")

@@ -1,0 +1,317 @@
+"""Extraction: the hidden states of many items, in shards that a crash leaves whole (`benchmark.md` section 7).
+
+    done = extract(model, items, folder, pooling="last")
+    ids, states = read_layer(folder, 20)                # item_id, side, key; (n, d) float32 in the same order
+
+A folder holds `shard-NNNNN.safetensors` (one key a layer, `layer_000` = embeddings, and `normed`), `.parquet` beside it
+(which item is in which row), and `ids.parquet`, which is written last and names the rows in force. A shard's table is
+written after its tensors and vouches for them: what is killed half-way goes on after its last shard. An item's key is
+a digest of all that decides its states, so a corrected item alone is extracted again.
+
+Last-token states are stored in the model's own precision, which loses nothing; means in float32.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from traps_pipeline import progress
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.local.capture import Pooling
+from traps_pipeline.models.media import MediaSpec, profile_digest, sample
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from traps_pipeline.models.local.adapter import LocalModel, Prompt, States
+
+SHARD_SIZE = 64  # items: 20 MB at the 8B size, and what a kill loses at most
+PREPARED_AHEAD = 2  # prompts that are decoded while the model works
+NORMED = "normed"
+_IDS = "ids.parquet"
+_RECORD = b"traps"
+_COLUMNS = ("item_id", "side", "key", "shard", "row")
+
+
+@dataclass(frozen=True)
+class Item:
+    """One pass to make. about: what decides the prompt (question, clip, system prompt), for the key. prompt: makes it,
+    and is called only when the states are not there."""
+
+    item_id: str
+    side: str
+    about: Mapping[str, Any]
+    prompt: Callable[[], Prompt]
+
+
+@dataclass(frozen=True)
+class Extracted:
+    """What an extraction did. version: digest of what is in the folder now, the same for the same work and model."""
+
+    folder: Path
+    n_items: int
+    n_new: int
+    version: str
+
+
+_Made = tuple[Item, str, "States"]  # an item, its key, its states
+
+
+def clip_item(model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], clip: Path, system: str) -> Item:
+    """The item that asks a question about a clip under a system prompt.
+
+    row: of the items table (item_id, side, question, media_digest). spec: how the model is shown a clip.
+    """
+
+    def prompt() -> Prompt:
+        shown = sample(clip, spec)
+        return model.prompt(system, row["question"], shown.frames, shown.times_s)
+
+    about = {"question": row["question"], "clip": row["media_digest"], "media": profile_digest(spec), "system": system}
+    return Item(row["item_id"], row["side"], about, prompt)
+
+
+def states_key(model: LocalModel, item: Item, pooling: Pooling) -> str:
+    """What an item's states depend on: its prompt, the checkpoint and its precision, the pooling."""
+    return digest({"about": dict(item.about), "model": model.identity, "pooling": pooling})
+
+
+def extract(
+    model: LocalModel,
+    items: Sequence[Item],
+    folder: Path,
+    *,
+    pooling: Pooling = "last",
+    shard_size: int = SHARD_SIZE,
+    what: str = "items",
+) -> Extracted:
+    """Make the states of all items, those in the folder excepted, one prompt a pass; then write which are in force.
+
+    Whatever ends it early (Ctrl-C, an error), what was made is written, and the same call goes on. what: for the
+    progress line. Raises TrapsError when the disk cannot be written.
+    """
+    with _alone(folder):
+        keys = [states_key(model, item, pooling) for item in items]
+        known = {key: (shard, row) for shard, table in _shards(folder) for row, key in enumerate(table["key"])}
+        missing = [(item, key) for item, key in zip(items, keys, strict=True) if key not in known]
+        _make(model, missing, folder, pooling, shard_size, what, known)
+        _write_ids(folder, items, keys, known, _record(model, pooling))
+        _sweep(folder, {known[key][0] for key in keys})
+    version = digest([[item.item_id, item.side, key] for item, key in zip(items, keys, strict=True)])
+    return Extracted(folder, len(items), len(missing), version)
+
+
+def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFrame, np.ndarray]:
+    """The items of a finished extraction (item_id, side, key) and their states at one layer, (n, d_model) float32.
+
+    layer: 0 (embeddings) to n_layers (the last block's output), or `normed` (that after the final norm). Raises
+    TrapsError for an extraction that is not finished, a layer that is not there, a damaged shard.
+    """
+    ids, record = _ids(folder)
+    name = NORMED if layer == NORMED else f"layer_{layer:03d}"
+    if layer != NORMED and not 0 <= int(layer) <= record["n_layers"]:
+        raise TrapsError(
+            f"{folder}: no layer {layer}; {record['checkpoint']} has 0 (embeddings) to {record['n_layers']}, and "
+            f"`{NORMED}`"
+        )
+    states = np.empty((len(ids), record["d_model"]), np.float32)
+    for shard, rows in ids.groupby("shard"):
+        states[rows.index] = _tensor(folder / f"{shard}.safetensors", name)[rows["row"]]
+    return ids.drop(columns=["shard", "row"]), states
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """What was extracted from, and how: checkpoint and digest, class, precision, device, pooling, n_layers, d_model.
+
+    Raises TrapsError for an extraction that is not finished.
+    """
+    return _ids(folder)[1]
+
+
+# --- inside -----------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold a folder, so that of two extractions one makes the states and the other finds them. A kill frees it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("w")
+    except OSError as error:
+        raise TrapsError(f"{folder}: cannot be written ({error.strerror or error}); free some space") from error
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _make(
+    model: LocalModel,
+    missing: Sequence[tuple[Item, str]],
+    folder: Path,
+    pooling: Pooling,
+    shard_size: int,
+    what: str,
+    known: dict[str, tuple[str, int]],
+) -> None:
+    """One pass an item; shards are written as they fill, the last one whatever ends it."""
+    number = 1 + max((int(path.stem.split("-")[1]) for path in folder.glob("shard-*.safetensors")), default=-1)
+    shard: list[_Made] = []
+    try:
+        for done, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
+            shard.append((item, key, model.forward_states(prompt, pooling)))
+            progress.current().tick("hidden_states", what, done, len(missing))
+            if len(shard) == shard_size:
+                full, shard = shard, []
+                number = _flush(folder, number, full, model, pooling, known)
+    finally:
+        _flush(folder, number, shard, model, pooling, known)
+
+
+def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item, str], Prompt]]:
+    """Items with their prompts; the next ones are decoded while the model works."""
+    with ThreadPoolExecutor(1) as pool:
+        waiting: deque[tuple[tuple[Item, str], Future[Prompt]]] = deque()
+        try:
+            for pair in missing:
+                waiting.append((pair, pool.submit(pair[0].prompt)))
+                if len(waiting) > PREPARED_AHEAD:
+                    first, prompt = waiting.popleft()
+                    yield first, prompt.result()
+            while waiting:
+                first, prompt = waiting.popleft()
+                yield first, prompt.result()
+        finally:
+            for _, prompt in waiting:
+                prompt.cancel()
+
+
+def _flush(
+    folder: Path,
+    number: int,
+    shard: Sequence[_Made],
+    model: LocalModel,
+    pooling: Pooling,
+    known: dict[str, tuple[str, int]],
+) -> int:
+    """Write a shard, tensors first, and note where its items are; the next shard's number."""
+    if not shard:
+        return number
+    import pandas as pd
+    import torch
+    from safetensors.torch import save
+
+    name = f"shard-{number:05d}"
+    dtype = model.network.dtype if pooling == "last" else torch.float32
+    raw = torch.from_numpy(np.stack([states.raw for _, _, states in shard], axis=1)).to(dtype)  # (layers, n, d)
+    tensors = {f"layer_{layer:03d}": rows.contiguous() for layer, rows in enumerate(raw)}
+    tensors[NORMED] = torch.from_numpy(np.stack([states.normed for _, _, states in shard])).to(dtype)
+    _write(folder / f"{name}.safetensors", lambda part: part.write_bytes(save(tensors)))
+    rows = [(item.item_id, item.side, key) for item, key, _ in shard]
+    table = pd.DataFrame(rows, columns=["item_id", "side", "key"])
+    _write(folder / f"{name}.parquet", lambda part: table.to_parquet(part, index=False))
+    known.update({key: (name, row) for row, (_, _, key) in enumerate(rows)})
+    return number + 1
+
+
+def _shards(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Whole shards: name and table. Tensors without a table are of a run that was killed; they are left to `_sweep`."""
+    import pandas as pd
+
+    for path in sorted(folder.glob("shard-*.parquet")):
+        try:
+            table = pd.read_parquet(path)
+            rows = len(_tensor(path.with_suffix(".safetensors"), NORMED))
+        except (OSError, ValueError, TrapsError) as error:
+            progress.current().note(f"{path}: damaged ({error}); its items are extracted again")
+            continue
+        if rows == len(table):
+            yield path.stem, table
+
+
+def _write_ids(
+    folder: Path,
+    items: Sequence[Item],
+    keys: Sequence[str],
+    known: Mapping[str, tuple[str, int]],
+    record: Mapping[str, Any],
+) -> None:
+    import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = [(item.item_id, item.side, key, *known[key]) for item, key in zip(items, keys, strict=True)]
+    table = pa.Table.from_pandas(pd.DataFrame(rows, columns=list(_COLUMNS)), preserve_index=False)
+    table = table.replace_schema_metadata({_RECORD: json.dumps(record).encode()})
+    _write(folder / _IDS, lambda part: pq.write_table(table, part))
+
+
+def _ids(folder: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(folder / _IDS)
+        record = json.loads((table.schema.metadata or {})[_RECORD])
+    except FileNotFoundError:
+        raise TrapsError(f"{folder}: hidden states are not there or not finished; materialize hidden_states") from None
+    except (OSError, ValueError, KeyError) as error:
+        raise TrapsError(
+            f"{folder / _IDS}: cannot be read ({error}); delete it and materialize hidden_states"
+        ) from error
+    return table.to_pandas(), record
+
+
+def _record(model: LocalModel, pooling: Pooling) -> dict[str, Any]:
+    return {
+        **model.identity,
+        "checkpoint": model.checkpoint.name,
+        "served_model": model.served_model,
+        "pooling": pooling,
+        "n_layers": model.n_layers,
+        "d_model": model.d_model,
+    }
+
+
+def _tensor(file: Path, name: str) -> np.ndarray:
+    """One tensor of a shard as float32. Raises TrapsError for a damaged file."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(file, framework="pt") as shard:
+            return shard.get_tensor(name).float().numpy()
+    except (OSError, SafetensorError) as error:
+        raise TrapsError(f"{file}: cannot be read ({error}); delete it and materialize hidden_states again") from error
+
+
+def _sweep(folder: Path, needed: set[str]) -> None:
+    """Remove shards that no item in force is in."""
+    for path in folder.glob("shard-*"):
+        if path.name.split(".")[0] not in needed:
+            path.unlink()
+
+
+def _write(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file whole or not at all. Raises TrapsError."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        write(part)
+        with part.open("rb") as stream:
+            os.fsync(stream.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise TrapsError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space and run again"
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,78 @@
+"""The steering hook: alpha times a direction, added to the output of one block (`benchmark.md` section 8).
+
+    with Steering(direction, layer=20, alphas=(5.0, -5.0)).applied(model): ...
+
+The state at that layer becomes state + alpha v at every position, of the prompt and of what is generated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.errors import TrapsError
+
+if TYPE_CHECKING:
+    from traps_pipeline.models.local.adapter import LocalModel
+
+
+@dataclass(frozen=True, eq=False)
+class Steering:
+    """A direction at a layer, and how much of it each row gets.
+
+    direction: (d_model,) float32, used as it is (void directions are unit vectors). layer: counted as in hidden_states,
+    1 to n_layers. alphas: one a row, signed.
+    """
+
+    direction: np.ndarray
+    layer: int
+    alphas: tuple[float, ...]
+
+    def rows(self, chosen: Sequence[int]) -> Steering:
+        """The steering of some of the rows."""
+        return Steering(self.direction, self.layer, tuple(self.alphas[i] for i in chosen))
+
+    @contextmanager
+    def applied(self, model: LocalModel) -> Iterator[None]:
+        """Steer the passes made inside; the hook is gone afterwards, whatever happens.
+
+        Where every alpha is 0 there is no hook: bits are those of the model as it is. Raises TrapsError for a layer out
+        of range, a direction of another width or with values that are no numbers.
+        """
+        block = model.block(self.layer)
+        if self.direction.shape != (model.d_model,) or not np.isfinite(self.direction).all():
+            raise TrapsError(
+                f"the direction has shape {self.direction.shape} {'and' if self.direction.shape else ''} for "
+                f"{model.checkpoint.name}, whose states are {model.d_model} finite numbers: extract it from this model"
+            )
+        if not any(self.alphas):
+            yield
+            return
+        # First of all hooks, so that those that record states (ours, and the library's own) see the steered one.
+        handle = block.register_forward_hook(_Adding(self, model), prepend=True)
+        try:
+            yield
+        finally:
+            handle.remove()
+
+
+class _Adding:
+    """The forward hook. What is added is computed in float32, once, and then in the precision of the states."""
+
+    def __init__(self, steering: Steering, model: LocalModel) -> None:
+        import torch
+
+        alphas = torch.tensor(steering.alphas, dtype=torch.float32)
+        direction = torch.from_numpy(np.ascontiguousarray(steering.direction, dtype=np.float32))
+        self._added = (alphas[:, None, None] * direction).to(model.device, model.network.dtype)  # (rows, 1, d)
+
+    def __call__(self, _: Any, __: Any, output: Any) -> Any:
+        states = output[0] if isinstance(output, tuple) else output
+        if len(states) != len(self._added):
+            raise ValueError(f"{len(states)} rows are in the pass, {len(self._added)} alphas were given")
+        steered = states + self._added
+        return (steered, *output[1:]) if isinstance(output, tuple) else steered

@@ -1,0 +1,51 @@
+"""Ordered pairs of datasets: which there are, and what each transfer crosses (`benchmark.md` sections 7 and 8)."""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+from typing import Literal
+
+from traps_pipeline.partitions import DATASETS, is_ill_posed, taxonomy_of
+
+Path = tuple[str, str]  # source and target dataset
+PathSet = Literal["transfer", "within_domain"]
+
+SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
+LONG = {short: dataset for dataset, short in SHORT.items()}
+FAMILIES = ("occlusion", "chaotic")  # a direction's family is its source's taxonomy
+
+
+def _paths(text: str) -> tuple[Path, ...]:
+    pairs = (path.split("->") for path in text.split())
+    return tuple((LONG[source], LONG[target]) for source, target in pairs)
+
+
+# The paper's Qwen rows are of the first set, its Gemma and LLaVA rows of the second; two paths are in both.
+TRANSFER = _paths("oc->ch ch->oc oc->ch_ip oc_ip->ch ch->oc_ip ch_ip->oc oc_ip->oc ch_ip->ch")
+WITHIN_DOMAIN = tuple(
+    (source, target) for source, target in product(DATASETS, DATASETS) if taxonomy_of(source) == taxonomy_of(target)
+)
+PATH_SETS: dict[PathSet, tuple[Path, ...]] = {"transfer": TRANSFER, "within_domain": WITHIN_DOMAIN}
+STEERING_PATHS = tuple(dict.fromkeys(TRANSFER + WITHIN_DOMAIN))  # 14
+TRANSFER_PAIRS = tuple(permutations(DATASETS, 2))  # the twelve ordered pairs of the probes
+
+TRANSFER_TYPES = ("Cross-modality", "Cross-domain", "Cross-both", "Within")
+
+
+def transfer_type(source: str, target: str) -> str:
+    """What a path crosses: the modality of the void (visual, ill-posed), the domain (taxonomy), both, or neither."""
+    domain = taxonomy_of(source) != taxonomy_of(target)
+    modality = is_ill_posed(source) != is_ill_posed(target)
+    return {(True, True): "Cross-both", (True, False): "Cross-domain", (False, True): "Cross-modality"}.get(
+        (domain, modality), "Within"
+    )
+
+
+def path_name(source: str, target: str) -> str:
+    """`oc→ch_ip`, as tables show it."""
+    return f"{SHORT.get(source, source)}→{SHORT.get(target, target)}"
+
+
+def sources_of(target: str) -> tuple[str, ...]:
+    """The directions that a target is steered along."""
+    return tuple(source for source, other in STEERING_PATHS if other == target)

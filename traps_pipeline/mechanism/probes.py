@@ -1,0 +1,280 @@
+"""Linear probes: standardise, l2-regularised logistic regression, AUROC (`benchmark.md` section 7).
+
+With fewer rows than columns the minimiser lies in the span of the rows, so the exact solver takes Newton steps on the
+Gram matrix: the same optimum as scikit-learn's, to rounding, at a fraction of the time. scikit-learn itself is the
+selectable reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from traps_pipeline.errors import TrapsError
+
+Solver = Literal["exact", "sklearn"]
+PENALTY = 1.0  # scikit-learn's C: the weight of the loss against half the squared norm of the coefficients
+_TOLERANCE, _MOST_STEPS = 1e-10, 200
+# scikit-learn's default (lbfgs, 1e-4) stops early, and at 1e-8 still 1e-5 from the minimum in log-odds.
+REFERENCE: dict[str, Any] = {"solver": "newton-cg", "tol": 1e-10, "max_iter": 100_000}
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Items of one dataset at one layer. states: (n, d); void: (n,) bool, the label; scenario: (n,) int, cluster."""
+
+    states: np.ndarray
+    void: np.ndarray
+    scenario: np.ndarray
+
+    def rows(self, chosen: np.ndarray) -> Split:
+        """Some of the items; chosen is a mask or indices."""
+        return Split(self.states[chosen], self.void[chosen], self.scenario[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """A fitted probe. mean, scale, weights: (d,), of the source alone; weights belong to standardised states."""
+
+    mean: np.ndarray
+    scale: np.ndarray
+    weights: np.ndarray
+    intercept: float
+
+    def scores(self, states: np.ndarray) -> np.ndarray:
+        """Log-odds of void, (n,), of states (n, d)."""
+        slope = self.weights / self.scale
+        return states @ slope + (self.intercept - self.mean @ slope)
+
+
+# --- fitting ----------------------------------------------------------------------------------------------------------
+
+
+def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and population standard deviation of each column, (d,) each; 1 where a column is constant but for rounding,
+    as in scikit-learn's StandardScaler."""
+    mean, variance = states.mean(axis=0), states.var(axis=0)
+    rounding = len(states) * np.finfo(float).eps
+    constant = variance <= rounding * variance + (rounding * mean) ** 2
+    return mean, np.where(constant, 1.0, np.sqrt(variance))
+
+
+def fit_probe(states: np.ndarray, void: np.ndarray, solver: Solver = "exact", penalty: float = PENALTY) -> Probe:
+    """The probe of states (n, d) with labels (n,). Raises TrapsError when one class has no item."""
+    _check_labels(void)
+    states = np.asarray(states, float)
+    mean, scale = standardiser(states)
+    standard = (states - mean) / scale
+    if solver == "sklearn":
+        weights, intercept = _reference(standard, void, penalty)
+    else:
+        dual, intercept = solve_gram(standard @ standard.T, void, penalty)
+        weights = standard.T @ dual
+    return Probe(mean, scale, weights, intercept)
+
+
+def _check_labels(void: np.ndarray) -> None:
+    n_void = int(np.count_nonzero(void))
+    if not 0 < n_void < len(void):
+        raise TrapsError(
+            f"a probe needs void and control items, there are {n_void} void of {len(void)}; extract more items"
+        )
+
+
+def _reference(standard: np.ndarray, void: np.ndarray, penalty: float) -> tuple[np.ndarray, float]:
+    from sklearn.linear_model import LogisticRegression
+
+    model = LogisticRegression(C=penalty, **REFERENCE).fit(standard, void)
+    return model.coef_[0], float(model.intercept_[0])
+
+
+def solve_gram(gram: np.ndarray, void: np.ndarray, penalty: float = PENALTY) -> tuple[np.ndarray, float]:
+    """The logistic regression with an unpenalised intercept, by its Gram matrix (n, n): dual coefficients (n,) and
+    intercept. The coefficients of the columns are the rows' transpose times the dual.
+
+    At the minimum the dual is penalty * (label - probability) and sums to 0. Newton's step solves
+    (I + W gram) step + W intercept_step = what is missing of that, W = penalty * p (1 - p), through
+    I + sqrt(W) gram sqrt(W), whose eigenvalues are at least 1 (Rasmussen and Williams, algorithm 3.1); it is halved
+    until the objective falls. A factor is kept while steps with it leave at most a fifth of what was missing: near the
+    minimum W hardly changes. Raises TrapsError for states that are no finite numbers.
+    """
+    from scipy.special import expit
+
+    if not np.isfinite(gram).all():
+        raise _unfit(len(gram))
+    label = np.asarray(void, float)
+    dual, intercept = np.zeros(len(label)), float(np.log(label.mean() / (1 - label.mean())))
+    logits = np.full(len(label), intercept)
+    value, newton, before = _objective(dual, intercept, logits, label, penalty), None, np.inf
+    for _ in range(_MOST_STEPS):
+        chance = expit(logits)
+        missing = penalty * (label - chance) - dual
+        worst = max(np.abs(missing).max(), abs(dual.sum()) / len(label))
+        if worst < _TOLERANCE * penalty:
+            return dual, intercept
+        if newton is None or worst > 0.2 * before:
+            newton = _NewtonStep(gram, penalty * chance * (1 - chance))
+        step, intercept_step = newton.solve(missing, dual.sum())
+        logit_step, size, before = gram @ step + intercept_step, 1.0, worst
+        while True:
+            moved = dual + size * step, intercept + size * intercept_step, logits + size * logit_step
+            new_value = _objective(*moved, label, penalty)
+            if new_value <= value + 1e-12 * abs(value) or size < 1e-6:
+                break
+            size /= 2
+        (dual, intercept, logits), value = moved, new_value
+    raise _unfit(len(label))
+
+
+def _unfit(rows: int) -> TrapsError:
+    return TrapsError(
+        f"no probe can be fitted to these {rows} rows: the states are no finite numbers, or of a size that float64 "
+        "cannot hold; extract them anew"
+    )
+
+
+class _NewtonStep:
+    """A factorisation of the Newton equations at weights (n,)."""
+
+    def __init__(self, gram: np.ndarray, weight: np.ndarray) -> None:
+        self._gram, self._root = gram, np.sqrt(weight)
+        matrix = gram * self._root
+        matrix *= self._root[:, None]
+        matrix.flat[:: len(weight) + 1] += 1.0
+        self._factor = np.linalg.cholesky(matrix).T  # unlike scipy's it lets other threads run; .T is Fortran's order
+        self._by_intercept = self._inverse(weight)
+
+    def _inverse(self, right: np.ndarray) -> np.ndarray:
+        """(I + W gram)^-1 right."""
+        from scipy.linalg import cho_solve
+
+        scaled = self._root * (self._gram @ right)
+        return right - self._root * cho_solve((self._factor, False), scaled, check_finite=False)
+
+    def solve(self, missing: np.ndarray, dual_sum: float) -> tuple[np.ndarray, float]:
+        """The step of the dual, after which it sums to 0, and that of the intercept."""
+        free = self._inverse(missing)
+        intercept_step = float((free.sum() + dual_sum) / self._by_intercept.sum())
+        return free - intercept_step * self._by_intercept, intercept_step
+
+
+def _objective(dual: np.ndarray, intercept: float, logits: np.ndarray, label: np.ndarray, penalty: float) -> float:
+    loss = np.logaddexp(0, logits).sum() - label @ logits
+    return float(0.5 * dual @ (logits - intercept) + penalty * loss)
+
+
+# --- scoring ----------------------------------------------------------------------------------------------------------
+
+
+def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
+    """Area under the ROC curve of scores (n,) or (n, k) against labels (n,): a scalar or (k,). Ties count half.
+
+    By mean ranks (Mann and Whitney). NaN where one class has no item.
+    """
+    from scipy.stats import rankdata
+
+    void = np.asarray(void, bool)
+    n_void, n_control = np.count_nonzero(void), np.count_nonzero(~void)
+    if not n_void or not n_control:
+        return np.full(np.shape(scores)[1:], np.nan)
+    ranks = cast(np.ndarray, rankdata(scores, axis=0))[void].sum(axis=0)
+    return (ranks - n_void * (n_void + 1) / 2) / (n_void * n_control)
+
+
+def auroc_interval(
+    void: np.ndarray, scores: np.ndarray, scenario: np.ndarray, weights: np.ndarray, level: float = 0.95
+) -> tuple[float, float]:
+    """Percentile interval of the AUROC when scenarios are resampled, the probe held fixed.
+
+    weights: (resamples, scenarios), how often each is drawn (`scoring.bootstrap.scenario_weights`); scenario: (n,)
+    columns of it. A resample that leaves a class empty is dropped.
+    """
+    void = np.asarray(void, bool)
+    above, below = scores[void][:, None], scores[~void][None, :]
+    wins = (above > below).astype(np.float32) + np.float32(0.5) * (above == below)
+    times_void, times_control = weights[:, scenario[void]], weights[:, scenario[~void]]
+    won = ((times_void @ wins) * times_control).sum(axis=1, dtype=float)
+    pairs = times_void.sum(axis=1, dtype=float) * times_control.sum(axis=1, dtype=float)
+    if not (pairs > 0).any():
+        return np.nan, np.nan
+    low, high = np.quantile(won[pairs > 0] / pairs[pairs > 0], [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
+
+
+# --- within a split ---------------------------------------------------------------------------------------------------
+
+
+def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
+    """The fold of each item, (n,) int: items of a scenario share one, and folds differ by one scenario at most.
+
+    Raises TrapsError when there are fewer scenarios than folds.
+    """
+    names = np.unique(scenario)
+    if len(names) < folds:
+        raise TrapsError(f"{folds} folds need {folds} scenarios, there are {len(names)}; lower `folds` or extract more")
+    place = np.random.default_rng(seed).permutation(len(names)) % folds
+    return place[np.searchsorted(names, scenario)]
+
+
+def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: int) -> np.ndarray:
+    """Labels (n, shuffles) in which the sides of each scenario are swapped by the toss of a coin.
+
+    A swap keeps every fold balanced, and swapping all of a held-out fold is as likely as not: the expected AUROC is
+    exactly 0.5, which a free permutation (whose folds are unbalanced against each other) would only approach.
+    """
+    names, place = np.unique(scenario, return_inverse=True)
+    coins = np.random.default_rng(seed).integers(0, 2, (len(names), shuffles)).astype(bool)
+    return np.asarray(void, bool)[:, None] ^ coins[place]
+
+
+def within_split(split: Split, labels: np.ndarray, folds: np.ndarray, solver: Solver = "exact") -> np.ndarray:
+    """Cross-validated AUROC of each labelling (n, k), averaged over folds: (k,).
+
+    Standardiser and probe see the training folds alone; the Gram matrix of a fold serves all labellings.
+    """
+    areas = []
+    for fold in np.unique(folds):
+        train, test = folds != fold, folds == fold
+        states = np.asarray(split.states[train], float)
+        mean, scale = standardiser(states)
+        seen, unseen = (states - mean) / scale, (split.states[test] - mean) / scale
+        if solver == "sklearn":
+            fitted = [_reference(seen, column, PENALTY) for column in labels[train].T]
+            scores = np.column_stack([unseen @ weights for weights, _ in fitted])
+        else:
+            gram = seen @ seen.T
+            duals = np.column_stack([solve_gram(gram, column)[0] for column in labels[train].T])
+            scores = unseen @ (seen.T @ duals)
+        areas.append([auroc(labels[test, k], scores[:, k]) for k in range(labels.shape[1])])
+    return np.mean(areas, axis=0)
+
+
+# --- nearest centroid -------------------------------------------------------------------------------------------------
+
+
+def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
+    """Whether each of states (n, d) is assigned to void, (n,) bool: the source's standardiser and centroids, cosine
+    distance; an equal distance is control."""
+    _check_labels(source.void)
+    known = np.asarray(source.states, float)
+    mean, scale = standardiser(known)
+    standard = (known - mean) / scale
+    centroids = np.stack([standard[~source.void].mean(axis=0), standard[source.void].mean(axis=0)])
+    centroids /= np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), np.finfo(float).tiny)
+    control, void = centroids @ ((states - mean) / scale).T  # an item's own length decides nothing
+    return void > control
+
+
+# --- one layer of the transfer protocol -------------------------------------------------------------------------------
+
+
+def transfer_scores(
+    layer: Mapping[str, Split], pairs: Sequence[tuple[str, str]], solver: Solver = "exact"
+) -> dict[tuple[str, str], np.ndarray]:
+    """Scores (n_target,) of each ordered pair (source, target) at one layer: one fit a source. No label of a target
+    is read."""
+    probes = {source: fit_probe(layer[source].states, layer[source].void, solver) for source in {s for s, _ in pairs}}
+    return {(source, target): probes[source].scores(layer[target].states) for source, target in pairs}

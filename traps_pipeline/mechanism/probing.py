@@ -1,0 +1,299 @@
+"""The probing protocol: every pair of datasets at every layer, as rows of the `probes` table (benchmark.md section 7).
+
+Layers are read one at a time: at the 8B size one layer of all items takes 46 MB, all of them 1.7 GB.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any, TypeVar
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.paths import TRANSFER_PAIRS, Path
+from traps_pipeline.mechanism.probes import (
+    Split,
+    auroc,
+    auroc_interval,
+    fit_probe,
+    nearest_centroid,
+    scenario_folds,
+    swapped_labels,
+    transfer_scores,
+    within_split,
+)
+from traps_pipeline.mechanism.settings import ProbeSettings
+from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, taxonomy_of
+from traps_pipeline.scoring.bootstrap import scenario_weights
+
+CURVES = ("transfer", "confabulated", "within", "shuffled", "answerable_void", "answerable_control")
+MOST_WORKERS = 4
+Result = TypeVar("Result")
+Row = dict[str, Any]
+ReadLayer = Callable[[str, int], np.ndarray]  # dataset, layer -> states (n, d) in the order of the dataset's items
+
+
+class NothingConfabulated(TrapsError):
+    """A dataset has no void item that the model answered."""
+
+
+@dataclass(frozen=True)
+class Confabulated:
+    """Scenarios by dataset on whose void item the model confabulated; why not, for a dataset that has none."""
+
+    scenarios: Mapping[str, frozenset[str]]
+    problems: Mapping[str, str] = field(default_factory=dict)
+
+
+def confabulated_scenarios(verdicts: pd.DataFrame, dataset: str, model: str) -> frozenset[str]:
+    """Scenarios on whose void item the model did not abstain; undecided items are left out.
+
+    verdicts: those of the dataset under Standard, run 1. Raises NothingConfabulated (there are none).
+    """
+    void = verdicts.loc[(verdicts["side"] == "void") & verdicts["abstained"].notna()]
+    found = frozenset(void.loc[~void["abstained"].astype(bool), "scenario_id"])
+    if not found:
+        raise NothingConfabulated(
+            f"{model} confabulated on none of the {len(void)} judged void items of {dataset} under standard: there is "
+            "no Cf->Cf probe of this dataset; take more scenarios, or read the all-sample curves"
+        )
+    return found
+
+
+@dataclass
+class ProbeRun:
+    """One model under one VQA prompt. items: the id table, with columns dataset, scenario_id, side, sub_scenario."""
+
+    items: pd.DataFrame
+    read: ReadLayer
+    n_layers: int
+    centroid_layer: int
+    settings: ProbeSettings
+    seed: int
+    confabulated: Confabulated = field(default_factory=lambda: Confabulated({}))
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.centroid_layer < self.n_layers:
+            raise TrapsError(
+                f"mechanism.models: centroid layer {self.centroid_layer} is out of range, there are states of layers "
+                f"0 to {self.n_layers - 1}"
+            )
+        self._datasets = [name for name in PROBED_DATASETS if name in set(self.items["dataset"])]
+        self._own = [name for name in DATASETS if name in self._datasets]
+        if not self._own:
+            raise TrapsError("no hidden states of any dataset; materialize hidden_states first")
+        self._pairs = [pair for pair in TRANSFER_PAIRS if set(pair) <= set(self._own)]
+        self._of = {name: self.items.loc[self.items["dataset"] == name] for name in self._datasets}
+        taxonomies = {taxonomy: self._scenarios(taxonomy) for taxonomy in ("occlusion", "chaotic")}
+        self._index = {name: taxonomies["chaotic" if "chaotic" in name else "occlusion"] for name in self._datasets}
+        self._weights = {
+            taxonomy: scenario_weights(len(index), self.settings.resamples, [self.seed, k])
+            for k, (taxonomy, index) in enumerate(taxonomies.items())
+        }
+        self._labels = {name: (of["side"] == "void").to_numpy() for name, of in self._of.items()}
+        self._places = {
+            name: self._index[name].get_indexer(pd.Index(of["scenario_id"])) for name, of in self._of.items()
+        }
+        self._restricted = {
+            name: np.isin(self._of[name]["scenario_id"].to_numpy(str), sorted(self.confabulated.scenarios[name]))
+            for name in self._own
+            if name in self.confabulated.scenarios
+        }
+
+    def _scenarios(self, taxonomy: str) -> pd.Index:
+        mine = self.items.loc[self.items["dataset"].str.startswith(taxonomy), "scenario_id"]
+        return pd.Index(sorted(mine.unique()))
+
+    def _split(self, name: str, layer: int) -> Split:
+        states = np.asarray(self.read(name, layer), float)
+        if len(states) != len(self._of[name]) or states.ndim != 2 or not np.isfinite(states).all():
+            raise TrapsError(
+                f"hidden states of {name}, layer {layer}: {states.shape} for {len(self._of[name])} items, or not all "
+                "finite; materialize hidden_states for this dataset again"
+            )
+        return Split(states, self._labels[name], self._places[name])
+
+    # --- the parts of the protocol ---
+
+    def rows(self, progress: Callable[[int, int], None] = lambda done, total: None) -> list[Row]:
+        """Every row of the probes table but for the columns that partition it."""
+        rows: list[Row] = []
+        for done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
+            rows += of_layer
+            progress(done, self.n_layers)
+        return marked(rows + self._problems())
+
+    def layer_rows(self, layer: int) -> list[Row]:
+        """Every row of one layer, read here and forgotten."""
+        splits = {name: self._split(name, layer) for name in self._datasets}
+        rows = self.transfer(layer, splits) + self.confabulated_transfer(layer, splits)
+        rows += self.within(layer, splits) + self.answerable(layer, splits)
+        return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
+
+    def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
+        """The twelve ordered pairs, all samples."""
+        scores = transfer_scores(splits, self._pairs, self.settings.solver)
+        return [self._scored("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
+
+    def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
+        """The same pairs, source and target restricted to confabulated void items and their matched controls."""
+        restricted = {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
+        pairs = [pair for pair in self._pairs if set(pair) <= set(restricted)]
+        scores = transfer_scores(restricted, pairs, self.settings.solver)
+        return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
+
+    def within(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
+        """Grouped cross-validation within each dataset, with the true and with swapped labels."""
+        rows = []
+        for name in self._own:
+            split = splits[name]
+            folds = scenario_folds(split.scenario, self.settings.folds, self.seed)
+            swapped = swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
+            areas = within_split(split, np.column_stack([split.void, swapped]), folds, self.settings.solver)
+            shuffled = areas[1:]
+            rows.append(_row("within", (name, name), layer, areas[0], split))
+            rows.append(_row("shuffled", (name, name), layer, shuffled.mean(), split, spread=shuffled.std()))
+        return rows
+
+    def answerable(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
+        """Void clips with a question that even they answer, under the probes of each dataset.
+
+        answerable_void: void items against the same clips with the answerable question; 0.5 for a probe that sees that
+        something hides, 1 for one that sees that this cannot be known. answerable_control: those clips against the
+        controls; the other way round. Probes of occlusion sources never saw the scenario that they score.
+        """
+        if not {ANSWERABLE, "occlusion"} <= set(splits):
+            return []
+        rows = []
+        for source in self._own:
+            scores = self._held_out_scores(source, splits)
+            for analysis, positive, negative in (
+                ("answerable_void", ("occlusion", True), (ANSWERABLE, None)),
+                ("answerable_control", (ANSWERABLE, None), ("occlusion", False)),
+            ):
+                chosen = [self._side(splits, scores, *side) for side in (positive, negative)]
+                labels = np.repeat([True, False], [len(values) for values, _ in chosen])
+                values = np.concatenate([values for values, _ in chosen])
+                scenario = np.concatenate([places for _, places in chosen])
+                of = Split(values[:, None], labels, scenario)
+                rows.append(self._scored(analysis, (source, ANSWERABLE), layer, of, values))
+        return rows
+
+    @staticmethod
+    def _side(
+        splits: Mapping[str, Split], scores: Mapping[str, np.ndarray], name: str, void: bool | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        mask = np.full(len(splits[name].void), True) if void is None else splits[name].void == void
+        return scores[name][mask], splits[name].scenario[mask]
+
+    def _held_out_scores(self, source: str, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
+        """Scores of occlusion's and the answerable items under probes that were not fitted on their scenarios."""
+        split, targets = splits[source], ("occlusion", ANSWERABLE)
+        if taxonomy_of(source) != "occlusion":
+            probe = fit_probe(split.states, split.void, self.settings.solver)
+            return {name: probe.scores(splits[name].states) for name in targets}
+        every = np.unique(np.concatenate([splits[name].scenario for name in (source, *targets)]))
+        fold_of = dict(zip(every, scenario_folds(every, self.settings.folds, self.seed), strict=True))
+        folds = {name: np.array([fold_of[s] for s in splits[name].scenario]) for name in (source, *targets)}
+        scores = {name: np.empty(len(splits[name].void)) for name in targets}
+        for fold in range(self.settings.folds):
+            train = split.rows(folds[source] != fold)
+            probe = fit_probe(train.states, train.void, self.settings.solver)
+            for name in targets:
+                scores[name][folds[name] == fold] = probe.scores(splits[name].states[folds[name] == fold])
+        return scores
+
+    def centroids(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
+        """Shares of each target's items, by sub-scenario, that the source's nearest centroid assigns to void."""
+        rows = []
+        for source, target in self._pairs:
+            assigned, split = nearest_centroid(splits[source], splits[target].states), splits[target]
+            groups = self._of[target]["sub_scenario"].to_numpy(str)
+            scopes = {"all": np.full(len(groups), True)}
+            scopes |= {f"sub_scenario:{name}": groups == name for name in sorted(set(groups))}
+            for (scope, mask), (analysis, side) in product(
+                scopes.items(), (("centroid_void", True), ("centroid_control", False))
+            ):
+                chosen = mask & (split.void == side)
+                share = assigned[chosen].mean() if chosen.any() else None
+                rows.append(_row(analysis, (source, target), layer, share, split.rows(mask), scope=scope))
+        return rows
+
+    def _scored(self, analysis: str, path: Path, layer: int, of: Split, scores: np.ndarray) -> Row:
+        weights = self._weights["chaotic" if "chaotic" in path[1] else "occlusion"]
+        interval = auroc_interval(of.void, scores, of.scenario, weights)
+        return _row(analysis, path, layer, float(auroc(of.void, scores)), of, interval=interval)
+
+    def _problems(self) -> list[Row]:
+        """A row without a figure for each Cf->Cf pair that has none, with the reason."""
+        rows = []
+        for source, target in self._pairs:
+            reasons = [self.confabulated.problems[n] for n in (source, target) if n in self.confabulated.problems]
+            if reasons:
+                rows.append(_row("confabulated", (source, target), -1, None, note="; ".join(reasons)))
+        return rows
+
+
+def each_layer(work: Callable[[int], Result], n_layers: int) -> Iterator[Result]:
+    """What `work` makes of each layer, in order: a layer a core, at most four, since each holds its states in memory.
+
+    Linear algebra runs on one thread a layer: at these sizes a second one spends more than it saves.
+    """
+    from threadpoolctl import threadpool_limits
+
+    workers = min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+    with threadpool_limits(1), ThreadPoolExecutor(workers) as pool:
+        yield from pool.map(work, range(n_layers))
+
+
+def _row(
+    analysis: str,
+    path: Path,
+    layer: int,
+    value: float | None,
+    of: Split | None = None,
+    *,
+    scope: str = "all",
+    interval: tuple[float, float] | None = None,
+    spread: float | None = None,
+    note: str | None = None,
+) -> Row:
+    n_void = int(np.count_nonzero(of.void)) if of else 0
+    low, high = interval or (None, None)
+    figures = {"value": value, "low": low, "high": high, "spread": spread}
+    return {
+        **{"analysis": analysis, "source": path[0], "target": path[1], "layer": layer, "scope": scope},
+        **{name: None if figure is None else float(figure) for name, figure in figures.items()},
+        **{"n_voids": n_void, "n_controls": len(of.void) - n_void if of else 0, "note": note},
+        **{"own_best": False, "all_sample_best": False, "source_best": False},
+    }
+
+
+def marked(rows: Sequence[Row]) -> list[Row]:
+    """The rows with the layers that tables show: own_best, the highest of the row's own curve (the paper's choice,
+    which sees target labels); all_sample_best, the highest of the pair's all-sample transfer curve; source_best, the
+    highest of the source's grouped cross-validation, which sees no target label. The lowest layer where several are.
+    """
+    curves: dict[tuple[str, str, str], dict[int, float]] = {}
+    for row in rows:
+        if row["analysis"] in CURVES and row["value"] is not None:
+            key = (row["analysis"], row["source"], row["target"])
+            curves.setdefault(key, {})[row["layer"]] = row["value"]
+    best = {key: min(curve, key=lambda layer: (-curve[layer], layer)) for key, curve in curves.items()}
+    return [
+        row
+        if row["analysis"] not in CURVES
+        else row
+        | {
+            "own_best": best.get((row["analysis"], row["source"], row["target"])) == row["layer"],
+            "all_sample_best": best.get(("transfer", row["source"], row["target"])) == row["layer"],
+            "source_best": best.get(("within", row["source"], row["source"])) == row["layer"],
+        }
+        for row in rows
+    ]

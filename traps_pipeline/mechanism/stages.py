@@ -1,0 +1,397 @@
+"""From tables to tables: what each mechanistic stage reads and makes. Numerics stand in the modules that it calls."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline import progress
+from traps_pipeline.benchmark.items import categories_of_dataset
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.directions import (
+    KINDS,
+    Directions,
+    Origin,
+    cosine_matrix,
+    direction_scenarios,
+    extract_directions,
+    load_directions,
+    save_directions,
+    steered_scenarios,
+    vector_digest,
+)
+from traps_pipeline.mechanism.paths import transfer_type
+from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
+from traps_pipeline.mechanism.steering import UNSTEERED
+from traps_pipeline.mechanism.versions import quantisation_of, states_folder
+from traps_pipeline.models.prompts import vqa_prompt
+from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
+from traps_pipeline.partitions import (
+    ANSWERABLE,
+    DATASETS,
+    Cell,
+    Evaluation,
+    Extraction,
+    StatesCell,
+    is_ill_posed,
+)
+from traps_pipeline.scoring.metrics import wilson
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import DIRECTIONS, HIDDEN_STATES, ITEMS, PROBE_ITEMS, PROBES, SCENE_SPECS, VERDICTS, VIDEOS
+
+Rows = list[dict[str, Any]]
+COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "question", "clip", "media_digest")
+
+
+def looked_into(workspace: Workspace, model: str) -> ModelEntry:
+    """The entry of a model that the study looks into. Raises TrapsError for one that is not local or not asked for."""
+    entry, settings = get_model(model), workspace.mechanism
+    if entry.backend != LOCAL:
+        local = ", ".join(name for name in settings.models if get_model(name).backend == LOCAL) or "none of the study's"
+        raise TrapsError(
+            f"{model}: is asked through backend {entry.backend}, and only local models have hidden states to read; "
+            f"local models: {local}"
+        )
+    if model not in settings.models:
+        raise TrapsError(f"study.yaml: mechanism.models does not name {model}; add it with its layers")
+    return entry
+
+
+# --- items ------------------------------------------------------------------------------------------------------------
+
+
+def probe_items(workspace: Workspace, dataset: str) -> Rows:
+    """Rows of a dataset's probe_items: those of items, or occlusion's void clips with the answerable question."""
+    if dataset != ANSWERABLE:
+        rows = workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
+        return [{name: row[name] for name in ("item_id", "dataset", *COPIED, "benchmark_version")} for row in rows]
+    rows = []
+    for category in categories_of_dataset("occlusion"):
+        if workspace.tables.state(SCENE_SPECS, {"category": category}) is None:
+            continue
+        clips = workspace.tables.read(VIDEOS, {"category": category})
+        voids = clips.loc[clips["side"] == "void"].set_index("scenario_id")
+        for spec in workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records"):
+            if spec["scenario_id"] not in voids.index:
+                raise TrapsError(f"{spec['scenario_id']}: its void clip is not made; materialize videos for {category}")
+            rows.append(_answerable_item(spec, voids.loc[spec["scenario_id"]].to_dict()))
+    if not rows:
+        raise TrapsError(f"probe_items {dataset}: no occlusion scenarios yet; materialize scene_specs and videos first")
+    return rows
+
+
+def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> dict[str, Any]:
+    """The void clip with a question that it answers: on this dataset a control, since it must be answered."""
+    pair = f"{ANSWERABLE}:{spec['scenario_id']}"
+    return {
+        **{"item_id": f"{pair}:control", "pair_id": pair, "dataset": ANSWERABLE, "side": "control"},
+        **{name: spec[name] for name in ("scenario_id", "category", "sub_scenario", "benchmark_version")},
+        "question": json.loads(spec["answerable_question"])["question"],
+        "clip": clip["path"],
+        "media_digest": clip["file_sha256"],
+    }
+
+
+# --- hidden states ----------------------------------------------------------------------------------------------------
+
+
+def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[Rows, int]:
+    """Make the states of a partition that are not there, and its rows; returns also how many were made."""
+    from traps_pipeline.mechanism.hidden_states import clip_item, extract, read_layer, read_record
+    from traps_pipeline.models.local.adapter import load_local_model
+
+    entry, settings = looked_into(workspace, cell.extraction.model), workspace.mechanism
+    assert entry.media is not None, "local entries have media"
+    items = workspace.tables.read(PROBE_ITEMS, {"dataset": cell.dataset}).to_dict("records")
+    model, system = load_local_model(entry, quantisation_of(entry)), vqa_prompt(cell.extraction.prompt)
+    _check_layers(workspace, entry.id, model.n_layers)
+    folder = states_folder(workspace, cell)
+    wanted = [
+        clip_item(model, entry.media, {str(k): v for k, v in item.items()}, workspace.resolve(item["clip"]), system)
+        for item in items
+    ]
+    done = extract(model, wanted, folder, pooling=settings.pooling, what=f"items of {cell.key}")
+    record, (ids, _) = read_record(folder), read_layer(folder, 0)
+    keys = dict(zip(ids["item_id"], ids["key"], strict=True))
+    said = {name: record[name] for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")}
+    copied = ("item_id", "scenario_id", "side", "sub_scenario", "benchmark_version")
+    rows = [
+        {
+            **cell.partition,
+            **{name: item[name] for name in copied},
+            **said,
+            **{"states_key": keys[item["item_id"]], "folder": workspace.relative(folder)},
+            **{"n_layers": record["n_layers"], "width": record["d_model"]},
+        }
+        for item in items
+    ]
+    return rows, done.n_new
+
+
+def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:
+    """Of the first and the last layer those with a number that is not finite."""
+    from traps_pipeline.mechanism.hidden_states import read_layer
+
+    folder = states_folder(workspace, cell)
+    return [layer for layer in (0, n_layers) if not np.isfinite(read_layer(folder, layer)[1]).all()]
+
+
+def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
+    """Raises TrapsError when the study names a layer that the model does not have, before hours are spent."""
+    layers = workspace.mechanism.models[model]
+    for name, layer in (
+        ("steering", layers.steering),
+        ("centroid", layers.centroid),
+        *(("sweep", n) for n in layers.sweep),
+    ):
+        if layer > n_layers:
+            raise TrapsError(
+                f"mechanism.models.{model}.{name}: layer {layer} is out of range, {model} has blocks 1 to {n_layers} "
+                "(layer 0 are the embeddings); name one of these in the experiment and in study.yaml"
+            )
+
+
+@dataclass
+class States:
+    """The hidden states of one extraction: an id table, and a reader of one layer of one dataset in its order."""
+
+    workspace: Workspace
+    extraction: Extraction
+    items: pd.DataFrame
+
+    @staticmethod
+    def of(workspace: Workspace, extraction: Extraction) -> States:
+        """Raises TrapsError when nothing was extracted."""
+        items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
+        if items.empty:
+            raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
+        return States(workspace, extraction, items.reset_index(drop=True))
+
+    @property
+    def n_layers(self) -> int:
+        """Layers, the embeddings included."""
+        return int(self.items["n_layers"].iloc[0]) + 1
+
+    @property
+    def digest(self) -> str:
+        """Of which states these are."""
+        return digest(sorted(zip(self.items["item_id"], self.items["states_key"], strict=True)))
+
+    def dataset(self, name: str) -> pd.DataFrame:
+        """The rows of a dataset."""
+        return self.items.loc[self.items["dataset"] == name]
+
+    def read(self, dataset: str, layer: int) -> np.ndarray:
+        """States (n, d) float32 in the order of the rows. Raises TrapsError when these are not of the shards."""
+        from traps_pipeline.mechanism.hidden_states import read_layer
+
+        cell = StatesCell(dataset, self.extraction)
+        ids, states = read_layer(states_folder(self.workspace, cell), layer)
+        wanted = self.dataset(dataset)
+        places = pd.Index(ids["key"]).get_indexer(pd.Index(wanted["states_key"]))
+        if (places < 0).any():
+            raise TrapsError(
+                f"hidden states {cell.key}: not of the table's items; materialize hidden_states for it again"
+            )
+        return states[places]
+
+
+# --- probes -----------------------------------------------------------------------------------------------------------
+
+
+def probe_rows(workspace: Workspace, extraction: Extraction) -> Rows:
+    """Rows of an extraction's probes. Where nothing that they are made of has changed, the rows that are there."""
+    looked_into(workspace, extraction.model)
+    states, settings = States.of(workspace, extraction), workspace.mechanism
+    confabulated = confabulations(workspace, extraction.model)
+    layers = settings.models[extraction.model]
+    made_of = digest(
+        [
+            states.digest,
+            {name: sorted(found) for name, found in confabulated.scenarios.items()},
+            dict(confabulated.problems),
+            [settings.probes.model_dump(mode="json"), layers.centroid, settings.seed],
+        ]
+    )[:16]
+    known = _known_rows(workspace, extraction, made_of)
+    if known is not None:
+        return known
+    centroid, n_layers = layers.centroid, states.n_layers
+    run = ProbeRun(states.items, states.read, n_layers, centroid, settings.probes, settings.seed, confabulated)
+    rows = run.rows(lambda done, total: progress.current().tick("probes", f"layers of {extraction.key}", done, total))
+    return [{**extraction.partition, **row, "made_of": made_of} for row in rows]
+
+
+def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> Rows | None:
+    if workspace.tables.state(PROBES, extraction.partition) is None:
+        return None
+    rows = workspace.tables.read(PROBES, extraction.partition)
+    return rows.to_dict("records") if set(rows["made_of"]) == {made_of} else None  # pyright: ignore[reportReturnType]
+
+
+def confabulations(workspace: Workspace, model: str) -> Confabulated:
+    """Scenarios by dataset on whose void the model confabulated under Standard in run 1; why, where there is none."""
+    found: dict[str, frozenset[str]] = {}
+    problems: dict[str, str] = {}
+    for dataset in DATASETS:
+        cell = Cell(dataset, Evaluation(model, "standard", 1))
+        if workspace.tables.state(VERDICTS, cell.partition) is None:
+            problems[dataset] = f"verdicts {cell.key} are not there; run the model under standard first"
+            continue
+        try:
+            found[dataset] = confabulated_scenarios(workspace.tables.read(VERDICTS, cell.partition), dataset, model)
+        except NothingConfabulated as error:
+            problems[dataset] = str(error)
+    return Confabulated(found, problems)
+
+
+# --- directions -------------------------------------------------------------------------------------------------------
+
+
+def directions_file(workspace: Workspace, extraction: Extraction, dataset: str) -> Path:
+    """Where the directions of a dataset lie."""
+    return workspace.root / "directions" / extraction.model / extraction.prompt / f"{dataset}.safetensors"
+
+
+def direction_rows(workspace: Workspace, extraction: Extraction) -> Rows:
+    """Make and save the directions of every dataset that has states; rows of the directions table."""
+    looked_into(workspace, extraction.model)
+    states = States.of(workspace, extraction)
+    rows: Rows = []
+    for dataset in DATASETS:
+        if not states.dataset(dataset).empty:
+            rows += _dataset_directions(workspace, states, dataset)
+    if not rows:
+        raise TrapsError(
+            f"directions {extraction.key}: no hidden states of any dataset; materialize hidden_states first"
+        )
+    return rows
+
+
+def _dataset_directions(workspace: Workspace, states: States, dataset: str) -> Rows:
+    settings, items = workspace.mechanism, states.dataset(dataset)
+    steering = settings.steering
+    if steering is None:
+        raise TrapsError(
+            "study.yaml: mechanism.steering is null, so nothing says how many pairs a direction comes from"
+        )
+    names = sorted(set(items["scenario_id"]))
+    most = steering.ill_posed_pairs if is_ill_posed(dataset) else steering.well_posed_pairs
+    chosen = direction_scenarios(names, most, settings.seed)
+    steered = set(steered_scenarios(names, steering.pairs, settings.seed)) & set(chosen)
+    scenario, void = items["scenario_id"].to_numpy(str), (items["side"] == "void").to_numpy()
+    place = {(name, side): row for row, (name, side) in enumerate(zip(scenario, void, strict=True))}
+    sides = [[place[name, side] for name in chosen] for side in (True, False)]
+    layers = [states.read(dataset, layer) for layer in range(states.n_layers)]
+    voids, controls = (np.stack([of[rows] for of in layers]) for rows in sides)
+    seed = [settings.seed, DATASETS.index(dataset)]
+    directions = extract_directions(voids, controls, seed)
+    path = directions_file(workspace, states.extraction, dataset)
+    used = items.loc[items["scenario_id"].isin(chosen)]
+    first = used.iloc[0]
+    origin = Origin(
+        **states.extraction.partition,
+        **{name: str(first[name]) for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")},
+        dataset=dataset,
+        seed=settings.seed,
+        scenarios=tuple(chosen),
+        states_digest=digest(sorted(used["states_key"])),
+    )
+    save_directions(path, directions, origin)
+    return [
+        {
+            **states.extraction.partition,
+            **{"dataset": dataset, "kind": kind, "layer": layer, "n_pairs": len(chosen), "n_steered": len(steered)},
+            "norm": float(directions.norms[kind][layer]),
+            "residual_norm": float(directions.residual_norms[layer]),
+            **{"width": voids.shape[2], "path": workspace.relative(path), "pooling": origin.pooling},
+            "direction_digest": vector_digest(directions.vectors[kind][layer]),
+        }
+        for kind in KINDS
+        for layer in range(states.n_layers)
+    ]
+
+
+def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, Directions]:
+    """The directions of an extraction by dataset, as the directions table names them. Raises TrapsError."""
+    table = workspace.tables.read(DIRECTIONS, extraction.partition)
+    found = {}
+    for path in sorted(set(table["path"])):
+        directions, said = load_directions(workspace.resolve(path))
+        rows = table.loc[(table["path"] == path) & (table["kind"] == "void")].sort_values("layer")
+        if [vector_digest(vector) for vector in directions.vectors["void"]] != list(rows["direction_digest"]):
+            raise TrapsError(
+                f"{path}: not the directions of the table; materialize directions for {extraction.key} again"
+            )
+        found[said["dataset"]] = directions
+    return found
+
+
+def cosine_rows(workspace: Workspace) -> Rows:
+    """Cosines of every two void directions of a model at one layer, over datasets and VQA prompts."""
+    table = workspace.tables.read_all(DIRECTIONS, ["model", "prompt"])
+    extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
+    rows: Rows = []
+    for model in sorted({extraction.model for extraction in extractions}):
+        named = [
+            ((extraction.prompt, dataset), directions.vectors["void"])
+            for extraction in extractions
+            if extraction.model == model
+            for dataset, directions in saved_directions(workspace, extraction).items()
+        ]
+        for layer in range(min(len(vectors) for _, vectors in named)):
+            matrix = cosine_matrix(np.stack([vectors[layer] for _, vectors in named]))
+            rows += [
+                {
+                    **{"model": model, "layer": layer, "prompt": prompt, "dataset": dataset},
+                    **{"other_prompt": other[0], "other_dataset": other[1], "cosine": float(matrix[i, j])},
+                }
+                for i, ((prompt, dataset), _) in enumerate(named)
+                for j, (other, _) in enumerate(named)
+                if np.isfinite(matrix[i, j])
+            ]
+    if not rows:
+        raise TrapsError("cosines: no directions yet; materialize directions first")
+    return rows
+
+
+# --- what steering does -----------------------------------------------------------------------------------------------
+
+
+def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> Rows:
+    """Abstention by path, kind, layer, alpha and side, from STEERING and STEERING_VOTES rows; the model as it is
+    (alpha 0) stands in every path's row."""
+    keys = ["dataset", "model", "directions", "regime", "source", "kind", "layer", "alpha", "item_id"]
+    joined = answers[[*keys, "side", "alpha_relative", "epoch"]].merge(
+        votes[[*keys, "abstained"]], on=keys, how="left", validate="one_to_one"
+    )
+    cell = ["model", "directions", "regime", "dataset"]
+    steered = joined.loc[joined["kind"] != UNSTEERED]
+    plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=["source", "kind", "layer"])
+    paths = steered[[*cell, "source", "kind", "layer", "side"]].drop_duplicates()
+    whole = pd.concat([steered, plain.merge(paths, on=[*cell, "side"])], ignore_index=True)
+    rows: Rows = []
+    for key, group in whole.groupby([*cell, "source", "kind", "layer", "alpha", "side"], sort=True):
+        model, directions, regime, target, source, kind, layer, alpha, side = cast(tuple[Any, ...], key)
+        decided = group["abstained"].dropna().to_numpy(bool)
+        n, yes = len(decided), int(np.count_nonzero(decided))
+        low, high = wilson(np.array([yes]), np.array([n]))
+        relative = group["alpha_relative"].dropna()
+        rows.append(
+            {
+                **{"model": model, "directions": directions, "regime": regime, "source": source, "target": target},
+                **{"transfer_type": transfer_type(str(source), str(target)), "kind": kind, "layer": layer},
+                **{"alpha": alpha, "alpha_relative": float(relative.iloc[0]) if len(relative) else None},
+                **{"side": side, "n": n, "n_missing": len(group) - n, "abstained": yes},
+                **{"abstention": yes / n if n else None, "low": float(low[0]), "high": float(high[0])},
+                "epoch": "+".join(sorted(set(group["epoch"]))),
+            }
+        )
+    return rows

@@ -1,0 +1,350 @@
+"""Steering: which answers a cell wants, how they are got, what the panel says of them (`benchmark.md` section 8).
+
+A steered answer is a request like any other, so it goes through the same ledger: its key holds the direction's digest,
+the layer and the signed alpha, beside the prompt, the clip and the checkpoint. Alpha 0 holds none of these: it is one
+answer for all directions; and the controls of a taxonomy's two datasets, which are the same items, are one as well.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import lru_cache
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
+from traps_pipeline.mechanism.paths import sources_of
+from traps_pipeline.mechanism.settings import Layers, MechanismSettings, SteeringSettings
+from traps_pipeline.mechanism.versions import loaded_params, quantisation_of
+from traps_pipeline.models.answers import FinishedCell
+from traps_pipeline.models.ask import Participants, Row, Work, run_work
+from traps_pipeline.models.budget import spending
+from traps_pipeline.models.local.backend import LocalBackend, outcome
+from traps_pipeline.models.media import sample
+from traps_pipeline.models.prompts import system_prompt
+from traps_pipeline.models.registry import Entry, ModelEntry
+from traps_pipeline.models.request import JUDGED, Outcome, Request
+from traps_pipeline.partitions import SIDES, SteeringCell, taxonomy_of
+from traps_pipeline.progress import Tally
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS, STEERING, STEERING_VOTES
+
+if TYPE_CHECKING:
+    from traps_pipeline.models.local.adapter import Prompt
+    from traps_pipeline.models.local.backend import _Batch
+
+UNSTEERED = "none"  # source and kind where alpha is 0
+PROMPTS_KEPT = 128  # processed prompts in memory: each is asked again for every direction and strength
+
+
+@dataclass(frozen=True)
+class Strength:
+    """One direction at one strength. alpha is not signed: it is added on controls and subtracted on voids."""
+
+    source: str
+    kind: str
+    layer: int
+    alpha: float
+    digest: str | None = None
+    relative: float | None = None
+
+    def signed(self, side: str) -> float:
+        """What is added to a row of that side."""
+        return self.alpha if side == "control" else -self.alpha
+
+
+NO_STEERING = Strength(UNSTEERED, UNSTEERED, 0, 0.0, None, 0.0)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A row of the steering table before it is answered."""
+
+    item: Mapping[str, Any]
+    strength: Strength
+    request: Request
+
+
+# --- which answers ----------------------------------------------------------------------------------------------------
+
+
+def strengths(
+    target: str, layers: Layers, settings: MechanismSettings, directions: Mapping[str, Directions]
+) -> list[tuple[Strength, tuple[str, ...]]]:
+    """What a target is steered with, and on which sides: every path into it whose source has a direction, its controls,
+    and the sweep over layers (along the target's own direction, controls alone). directions: by source. Raises
+    TrapsError for a layer that is not there, and where no path is left."""
+    steering = settings.steering
+    assert steering is not None, "an experiment without steering has no steering cells"
+    wanted: list[tuple[Strength, tuple[str, ...]]] = [(NO_STEERING, SIDES)]
+    plan = _plan(target, layers, steering, directions)
+    if not plan:
+        raise TrapsError(f"no direction leads to {target}; materialize hidden_states and directions first")
+    for source, kind, layer, sides in plan:
+        of = directions[source]
+        vector = of.vectors[kind][_in_range(layer, of)]
+        if not vector.any():
+            raise TrapsError(f"the {kind} direction of {source} at layer {layer} is zero: no side differs there")
+        for alpha in steering.alphas:
+            relative = float(alpha / of.residual_norms[layer]) if of.residual_norms[layer] > 0 else None
+            wanted.append((Strength(source, kind, layer, float(alpha), vector_digest(vector), relative), sides))
+    return wanted
+
+
+def _plan(
+    target: str, layers: Layers, steering: SteeringSettings, sources: Container[str]
+) -> list[tuple[str, str, int, tuple[str, ...]]]:
+    """Source, kind, layer and sides of what a target is steered with, of these sources."""
+    kinds, sweep = ("void", *steering.controls), [layer for layer in layers.sweep if layer != layers.steering]
+    paths = [(source, kind, layers.steering, SIDES) for source in sources_of(target) for kind in kinds]
+    plan = [*paths, *((target, "void", layer, ("control",)) for layer in sweep)]
+    return [row for row in plan if row[0] in sources]
+
+
+def count_answers(
+    settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
+) -> dict[str, int]:
+    """How many answers steering a model takes, by inference regime: what cells share counts once. scenarios: how many a
+    taxonomy has."""
+    steering = settings.steering
+    if steering is None:
+        return {}
+    cells = set[tuple[Any, ...]]()
+    for target, side in product(datasets, SIDES):
+        owner = taxonomy_of(target) if side == "control" else target
+        cells.add((owner, side))
+        for source, kind, layer, sides in _plan(target, settings.models[model], steering, datasets):
+            # Random directions are drawn from the seed alone, whichever prompt the others come from.
+            prompts = ("any",) if kind == "random" else steering.direction_regimes
+            if side in sides:
+                cells |= {(owner, side, source, kind, layer, *rest) for rest in product(prompts, steering.alphas)}
+    answers = sum(min(steering.pairs, scenarios.get(taxonomy_of(str(cell[0])), 0)) for cell in cells)
+    return dict.fromkeys(steering.inference_regimes, answers)
+
+
+def _in_range(layer: int, directions: Directions) -> int:
+    if not 1 <= layer < directions.n_layers:
+        raise TrapsError(
+            f"mechanism.models: layer {layer} is out of range, blocks 1 to {directions.n_layers - 1} can be steered"
+        )
+    return layer
+
+
+def wanted_answers(
+    workspace: Workspace, entry: ModelEntry, cell: SteeringCell, directions: Mapping[str, Directions]
+) -> list[Wanted]:
+    """Every answer that a cell wants, those of one direction together, so that they share batches."""
+    settings = workspace.mechanism
+    assert settings.steering is not None, "an experiment without steering has no steering cells"
+    items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
+    chosen = steered_scenarios(sorted(set(items["scenario_id"])), settings.steering.pairs, settings.seed)
+    rows = items.loc[items["scenario_id"].isin(chosen)].to_dict("records")
+    plan = strengths(cell.dataset, settings.models[entry.id], settings, directions)
+    most = settings.steering.max_new_tokens
+    return [
+        Wanted(item, strength, steered_request(workspace, entry, item, cell, strength, most))
+        for strength, sides in plan
+        for item in rows
+        if item["side"] in sides
+    ]
+
+
+def steered_request(
+    workspace: Workspace,
+    entry: ModelEntry,
+    item: Mapping[str, Any],
+    cell: SteeringCell,
+    strength: Strength,
+    max_new_tokens: int,
+) -> Request:
+    """The call: the full benchmark prompt, greedy, in the precision of extraction."""
+    assert entry.media is not None, "local entries have media"
+    clip = workspace.resolve(item["clip"])
+    sent = workspace.media.prepare(clip, item["media_digest"], entry.media)
+    steering = None
+    if strength.alpha:
+        signed = strength.signed(item["side"])
+        steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed}
+    return Request(
+        participant=entry.id,
+        endpoint=entry.backend,
+        params=loaded_params(entry) | {"do_sample": False, "max_new_tokens": max_new_tokens, "steering": steering},
+        system=system_prompt(cell.evaluation.regime),
+        user=item["question"],
+        about={"item_id": shared_item(item), "model": entry.id, "regime": cell.evaluation.regime},
+        media=clip,
+        sent=sent,
+        media_digest=sent.sha256,
+    )
+
+
+def shared_item(item: Mapping[str, Any]) -> str:
+    """The item's id for the ledger: a control is one item in both datasets of its taxonomy."""
+    dataset = taxonomy_of(item["dataset"]) if item["side"] == "control" else item["dataset"]
+    return f"{dataset}:{item['scenario_id']}:{item['side']}"
+
+
+# --- getting them -----------------------------------------------------------------------------------------------------
+
+
+class SteeredBackend(LocalBackend):
+    """A local model that answers with a direction added to one block, each row with an alpha of its own."""
+
+    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray]) -> None:
+        super().__init__(entry)
+        self._vectors = vectors
+        self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
+
+    def _answers(self, batch: _Batch) -> list[Outcome]:
+        """In the worker thread: the rows of one direction and layer make one batch, controls and voids together."""
+        from traps_pipeline.mechanism.hook import Steering
+
+        groups: dict[tuple[str, int] | None, list[int]] = {}
+        for number, request in enumerate(batch.requests):
+            steering = request.params["steering"]
+            groups.setdefault((steering["direction"], steering["layer"]) if steering else None, []).append(number)
+        outcomes: dict[int, Outcome] = {}
+        model = self._model()
+        for group, numbers in groups.items():
+            requests = [batch.requests[number] for number in numbers]
+            prompts = [self._prompt(r.media, r.media_digest, r.system, r.user) for r in requests]
+            hook = None
+            if group is not None:
+                alphas = tuple(float(request.params["steering"]["alpha"]) for request in requests)
+                hook = Steering(self._vectors[group[0]], group[1], alphas)
+            most = requests[0].params["max_new_tokens"]
+            made = model.generate(prompts, most, None, hook, stopped=batch.abandoned.is_set)
+            for number, one in zip(numbers, made, strict=True):
+                counts = (one.prompt_tokens, one.completion_tokens)
+                outcomes[number] = outcome(one.text, one.finish_reason, *counts, model.served_model)
+        return [outcomes[number] for number in range(len(batch.requests))]
+
+    def _model(self) -> Any:
+        from traps_pipeline.models.local.adapter import load_local_model
+
+        return load_local_model(self._entry, quantisation_of(self._entry))
+
+    def _make_prompt(self, clip: Any, digest: str, system: str, user: str) -> Prompt:
+        """A processed prompt; `digest` says which frames, so that a re-rendered clip is another one."""
+        shown = sample(clip, self._spec)
+        return self._model().prompt(system, user, shown.frames, shown.times_s.tolist())
+
+
+def collect_steered(
+    workspace: Workspace,
+    entry: ModelEntry,
+    cells: Sequence[SteeringCell],
+    directions: Mapping[str, Mapping[str, Directions]],
+    inputs: Mapping[str, Mapping[str, str]],
+) -> Iterator[FinishedCell]:
+    """Answer what is missing and write the steering table of each cell. directions: by VQA prompt, then by source."""
+    vectors = {
+        vector_digest(vector): vector
+        for of_prompt in directions.values()
+        for of in of_prompt.values()
+        for kind in of.vectors
+        for vector in of.vectors[kind]
+    }
+    wanted: dict[SteeringCell, list[Wanted]] = {}
+
+    def requests(cell: Any) -> list[Request]:
+        wanted[cell] = wanted_answers(workspace, entry, cell, directions[cell.directions])
+        return [one.request for one in wanted[cell]]
+
+    def finish(cell: Any, rows: Mapping[str, Row], tally: Tally) -> FinishedCell:
+        table = [_steering_row(cell, one, rows[one.request.key]) for one in wanted.pop(cell)]
+        version = workspace.tables.write(STEERING, cell.partition, table, inputs[cell.key], failed=tally.errors)
+        return FinishedCell(cell, version, len(table), tally)
+
+    participants = Participants({entry.id: entry}, lambda e: SteeredBackend(e, vectors), workspace.study)
+    with spending(workspace, [entry]) as budget:
+        work = Work("steering", workspace.answers, participants, budget, workspace.study.epoch, requests, finish)
+        yield from run_work(work, cells)
+
+
+def _steering_row(cell: SteeringCell, one: Wanted, row: Row) -> dict[str, Any]:
+    item, strength = one.item, one.strength
+    return {
+        **cell.partition,
+        **{"source": strength.source, "kind": strength.kind, "layer": strength.layer, "alpha": strength.alpha},
+        "alpha_relative": strength.relative,
+        **{name: item[name] for name in ("item_id", "scenario_id", "side", "benchmark_version")},
+        **{name: row[name] for name in ("outcome", "text", "served_model", "completion_tokens", "epoch")},
+        "direction_digest": strength.digest,
+        "request_key": one.request.key,
+        "created_at": datetime.fromisoformat(row["created_at"]),
+    }
+
+
+# --- what the panel says ----------------------------------------------------------------------------------------------
+
+
+def collect_steering_votes(
+    workspace: Workspace, cells: Sequence[SteeringCell], inputs: Mapping[str, Mapping[str, str]]
+) -> Iterator[FinishedCell]:
+    """Ask the study's panel whether each steered answer abstains, and write the table of each cell."""
+    from traps_pipeline.judging.panel import load_panel, make_judge
+
+    panel = load_panel(workspace.study.panel)
+    asked: dict[SteeringCell, list[tuple[dict[str, Any], list[Request]]]] = {}
+
+    def requests(cell: Any) -> list[Request]:
+        asked[cell] = list(_ballots(workspace, panel, cell))
+        return [request for _, of_answer in asked[cell] for request in of_answer]
+
+    def finish(cell: Any, rows: Mapping[str, Row], tally: Tally) -> FinishedCell:
+        table = [_vote_row(cell, answer, of_answer, rows) for answer, of_answer in asked.pop(cell)]
+        version = workspace.tables.write(STEERING_VOTES, cell.partition, table, inputs[cell.key], failed=tally.errors)
+        return FinishedCell(cell, version, len(table), tally)
+
+    participants = Participants({judge.id: judge for judge in panel}, make_judge, workspace.study)
+    with spending(workspace, panel) as budget:
+        work = Work("steering_votes", workspace.votes, participants, budget, workspace.study.epoch, requests, finish)
+        yield from run_work(work, cells)
+
+
+def _ballots(
+    workspace: Workspace, panel: Sequence[Any], cell: SteeringCell
+) -> Iterator[tuple[dict[str, Any], list[Request]]]:
+    """Each row of the steering table with the calls that judge it: none for a row without a text."""
+    from traps_pipeline.judging.panel import vote_request
+
+    items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}).set_index("item_id")
+    for answer in workspace.tables.read(STEERING, cell.partition).to_dict("records"):
+        if answer["item_id"] not in items.index:
+            raise TrapsError(
+                f"steering {cell.key}: item {answer['item_id']} is no longer in items; materialize steering for it"
+            )
+        item = items.loc[answer["item_id"]].to_dict() | {"item_id": shared_item(answer)}
+        calls = []
+        for judge in panel if answer["outcome"] in JUDGED else ():
+            call = vote_request(judge, "abstention", cell, item, answer["text"])
+            calls.append(replace(call, about={**call.about, "steered": answer["request_key"]}))
+        yield {str(name): value for name, value in answer.items()}, calls
+
+
+def _vote_row(
+    cell: SteeringCell, answer: Mapping[str, Any], calls: Sequence[Request], rows: Mapping[str, Row]
+) -> dict[str, Any]:
+    from traps_pipeline.judging.panel import PANEL_SIZE, parse_vote
+
+    votes = {call.participant: parse_vote("abstention", rows[call.key], answer) for call in calls}
+    copied = ("source", "kind", "layer", "alpha", "item_id", "scenario_id", "side", "benchmark_version")
+    said = [vote.decision for vote in votes.values() if vote.valid]
+    decided = next((decision for decision in (True, False) if 2 * said.count(decision) > PANEL_SIZE), None)
+    return {
+        **cell.partition,
+        **{name: answer[name] for name in copied},
+        "abstained": decided,
+        "n_valid": len(said),
+        "unanimous": len(said) == PANEL_SIZE and len(set(said)) == 1,
+        "votes": json.dumps({name: vote.decision if vote.valid else None for name, vote in votes.items()}),
+        "vote_keys": [call.key for call in calls],
+        "epoch": answer["epoch"],
+    }

@@ -1,0 +1,145 @@
+"""One adapter for every image-text-to-text model of transformers: prompts in, hidden states and answers out.
+
+    model = load_local_model(get_model("pocket"))
+    prompt = model.prompt(system, question, frames, times_s)      # frames (N, H, W, 3) uint8, seconds into the clip
+    states = model.forward_states(prompt)                         # .raw (n_layers + 1, d), .normed (d,), float32
+    answers = model.generate([prompt, prompt], 64, steering=None) # greedy; `Sampling` for temperature and top-p
+
+Nothing in it knows a family. A model fits if the Auto classes load it, its processor takes videos and a chat template,
+and its decoder (`get_decoder()`) has `layers` and `norm`; anything else is refused by name. Not for several threads at
+once: one prompt's hooks would see another's states (`backend` uses one worker thread for all models).
+"""
+
+from __future__ import annotations
+
+from threading import Lock
+from typing import Any
+
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.local.checkpoint import Checkpoint, find_checkpoint, require_memory
+from traps_pipeline.models.local.library import load_transformers
+from traps_pipeline.models.local.model import Generated, LocalModel, States
+from traps_pipeline.models.local.prompts import Prompt
+from traps_pipeline.models.local.sampling import Sampling
+from traps_pipeline.models.local.settings import LocalParams, Quantisation
+from traps_pipeline.models.registry import ModelEntry
+
+__all__ = ["Generated", "LocalModel", "Prompt", "Sampling", "States", "load_local_model", "require_device"]
+
+NF4_CPU_BLOCK = 64
+_LOADED: dict[str, LocalModel] = {}
+_LOADING = Lock()
+
+
+def load_local_model(entry: ModelEntry, quantisation: Quantisation | None = None) -> LocalModel:
+    """The entry's checkpoint in memory, as the entry says; loaded once a process.
+
+    quantisation: in the place of the entry's, for looking inside (`mechanism:` of the entry). Raises TrapsError when
+    weights, device, memory or library are missing, or when the checkpoint is of no class that fits.
+    """
+    params = entry.local_params()
+    if quantisation is not None and quantisation != params.quantisation:
+        params = params.model_copy(update={"quantisation": quantisation, "nf4_skip": ()})
+    device = entry.device or "cpu"
+    require_device(device)
+    checkpoint = find_checkpoint(params)
+    loading = ("dtype", "quantisation", "nf4_skip", "attn_implementation", "template", "video")
+    key = digest(
+        [checkpoint.digest, str(checkpoint.folder), device, params.model_dump(mode="json", include={*loading})]
+    )
+    with _LOADING:
+        if key not in _LOADED:
+            require_memory(checkpoint, params.dtype, params.quantisation, device)
+            _LOADED[key] = _load(checkpoint, params, device)
+        return _LOADED[key]
+
+
+def require_device(device: str) -> None:
+    """Raises TrapsError when this machine has no such device."""
+    import torch
+
+    there = device == "cpu" or (device == "mps" and torch.backends.mps.is_available())
+    if device.startswith("cuda"):
+        number = int(device.partition(":")[2] or 0)
+        there = torch.cuda.is_available() and number < torch.cuda.device_count()
+    if not there:
+        raise TrapsError(
+            f"device {device}: torch {torch.__version__} finds none on this machine; run where there is one, or say "
+            "`device: cpu` in the entry, which changes nothing but the speed in float32"
+        )
+
+
+def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalModel:
+    transformers = load_transformers()
+    options = _precision(params, device)
+    try:
+        processor = transformers.AutoProcessor.from_pretrained(checkpoint.folder, local_files_only=True)
+        network, report = transformers.AutoModelForImageTextToText.from_pretrained(
+            checkpoint.folder,
+            attn_implementation=params.attn_implementation,
+            local_files_only=True,
+            output_loading_info=True,
+            **options,
+        )
+    except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
+        said = " ".join(str(error).split())[:400]
+        raise TrapsError(
+            f"checkpoint {checkpoint.name}: transformers {transformers.__version__} cannot load it as an "
+            f"image-text-to-text model ({type(error).__name__}: {said}); name a checkpoint of such a class, or save it "
+            "again with this version"
+        ) from error
+    lacking = [*report["missing_keys"], *report["mismatched_keys"]]
+    if lacking:
+        raise TrapsError(
+            f"checkpoint {checkpoint.name}: {len(lacking)} weights are not in its files, {lacking[0]} first, and would "
+            "be random: download or save it again"
+        )
+    if not hasattr(processor, "video_token") or getattr(processor, "video_processor", None) is None:
+        raise TrapsError(
+            f"checkpoint {checkpoint.name}: {type(processor).__name__} takes no videos; name a model that does"
+        )
+    processor.tokenizer.padding_side = "left"
+    if params.quantisation == "none":
+        network = network.to(device)
+    elif device == "cpu":
+        _require_packable(network, checkpoint.name)
+    return LocalModel(network.eval(), processor, checkpoint, params, device)
+
+
+def _require_packable(network: Any, name: str) -> None:
+    """bitsandbytes packs rows of 64 weights on a CPU. Raises TrapsError naming what has others."""
+    odd = [
+        part
+        for part, module in network.named_modules()
+        if type(module).__name__ == "Linear4bit" and module.in_features % NF4_CPU_BLOCK
+    ]
+    if odd:
+        raise TrapsError(
+            f"checkpoint {name}: NF4 on a CPU wants modules {NF4_CPU_BLOCK} weights wide or a multiple of it, and "
+            f"{len(odd)}, {odd[0]} first, are not: name them, or what holds them, under nf4_skip, or use a GPU"
+        )
+
+
+def _precision(params: LocalParams, device: str) -> dict[str, Any]:
+    """What `from_pretrained` is told about precision. Raises TrapsError without the library that NF4 needs."""
+    import torch
+
+    options: dict[str, Any] = {"dtype": getattr(torch, params.dtype)}
+    if params.quantisation == "nf4":
+        from importlib.util import find_spec
+
+        missing = [name for name in ("bitsandbytes", "accelerate") if find_spec(name) is None]
+        if missing:
+            raise TrapsError(
+                f"quantisation nf4 needs {' and '.join(missing)}: pip install -e '.[nf4]' "
+                "(quantisation: none is another model)"
+            )
+        options["quantization_config"] = load_transformers().BitsAndBytesConfig(
+            load_in_4bit=True,
+            bnb_4bit_quant_type="nf4",
+            bnb_4bit_compute_dtype=options["dtype"],
+            llm_int8_skip_modules=list(params.nf4_skip) or None,
+        )
+        options["device_map"] = {"": device}
+    return options

@@ -1,0 +1,124 @@
+"""Local models as a backend: requests that wait are answered together, by one worker thread for all models.
+
+Asking stays what it is for an API: one request, one outcome, one row of the ledger. So a crash loses the batch that was
+running and nothing else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from threading import Event
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.local.checkpoint import find_checkpoint
+from traps_pipeline.models.media import Frames, MediaSpec, sample
+from traps_pipeline.models.registry import Entry, ModelEntry
+from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.scenes.encode import DamagedClip
+
+GATHER_S = 0.01  # after the first waiting request, for those that the same answers have set free
+_WORKER = ThreadPoolExecutor(1, thread_name_prefix="local-model")
+
+
+@dataclass(eq=False)
+class _Batch:
+    """Requests answered together. abandoned: nobody waits for any of them any more."""
+
+    requests: list[Request] = field(default_factory=list)
+    answers: list[asyncio.Future[Outcome]] = field(default_factory=list)
+    abandoned: Event = field(default_factory=Event)
+
+    def forget(self, _: asyncio.Future[Outcome]) -> None:
+        """Called as each answer is known or no longer wanted."""
+        if all(answer.cancelled() for answer in self.answers):
+            self.abandoned.set()
+
+
+class LocalBackend:
+    """Asks one entry's checkpoint, which is loaded at the first request."""
+
+    def __init__(self, entry: Entry) -> None:
+        if not isinstance(entry, ModelEntry) or entry.media is None:
+            raise TrapsError(f"{entry.id}: only a model can be a local checkpoint; a judge is asked over the network")
+        self._entry, self._spec, self._params = entry, entry.media, entry.local_params()
+        find_checkpoint(self._params)  # so that missing weights are told before anything is asked
+        self._waiting = _Batch()
+        self._running: asyncio.Task[None] | None = None
+
+    async def ask(self, request: Request) -> Outcome:
+        """One attempt; see `Backend`. Raises TrapsError where asking again would not help."""
+        answer: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+        self._waiting.requests.append(request)
+        self._waiting.answers.append(answer)
+        if self._running is None or self._running.done():
+            self._running = asyncio.create_task(self._run())
+        return await answer
+
+    async def _run(self) -> None:
+        """Answer what waits, batch after batch, until nothing does."""
+        while self._waiting.requests:
+            await asyncio.sleep(GATHER_S)
+            batch, self._waiting = self._waiting, _Batch()
+            for answer in batch.answers:
+                answer.add_done_callback(batch.forget)
+            try:
+                outcomes = await asyncio.get_running_loop().run_in_executor(_WORKER, self._answers, batch)
+            except Exception as error:  # noqa: BLE001 - raised by `ask` in each request's own task
+                for answer in batch.answers:
+                    if not answer.done():
+                        answer.set_exception(error)
+            else:
+                for answer, outcome in zip(batch.answers, outcomes, strict=True):
+                    if not answer.done():
+                        answer.set_result(outcome)
+
+    def _answers(self, batch: _Batch) -> list[Outcome]:
+        """In the worker thread: load, look, generate."""
+        from traps_pipeline.models.local.adapter import load_local_model
+        from traps_pipeline.models.local.sampling import Sampling
+
+        model = load_local_model(self._entry)
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            clips = list(pool.map(lambda request: _frames(request, self._spec), batch.requests))
+        prompts = [
+            model.prompt(request.system, request.user, shown.frames, shown.times_s)
+            for request, shown in zip(batch.requests, clips, strict=True)
+        ]
+        sampling = None
+        if self._params.temperature is not None and self._params.top_p is not None:
+            sampling = Sampling(self._params.temperature, self._params.top_p, seeds(batch.requests))
+        made = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
+        return [outcome(one.text, one.finish_reason, one.prompt_tokens, one.completion_tokens, model.served_model)
+                for one in made]  # fmt: skip
+
+
+def _frames(request: Request, spec: MediaSpec) -> Frames:
+    assert request.media is not None, "local models are asked about clips"
+    try:
+        return sample(request.media, spec)
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
+
+
+def seeds(requests: Sequence[Request]) -> list[int]:
+    """A seed of each request's key: runs differ, and the same call gives the same answer."""
+    return [int(request.key[:16], 16) for request in requests]
+
+
+def outcome(text: str, finish: str, prompt_tokens: int, completion_tokens: int, served_model: str) -> Outcome:
+    """The outcome of an answer: truncated where the limit cut it off, empty where nothing is left of it."""
+    text = text.strip()
+    kind = ("truncated" if finish == "length" else "answer") if text else "empty"
+    return Outcome(
+        kind,
+        text=text or None,
+        finish_reason=finish,
+        served_model=served_model,
+        prompt_tokens=prompt_tokens,
+        completion_tokens=completion_tokens,
+        cost_usd=0.0,
+    )

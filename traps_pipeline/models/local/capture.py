@@ -1,0 +1,64 @@
+"""Hidden states by hooks that keep one vector a layer, instead of the library's tensors of every token.
+
+Layers count as in the library's hidden_states: 0 = embeddings, l = output of the l-th block as it leaves the block. The
+library's own last state is the normed one; here both are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from torch import Tensor
+    from torch.nn import Module
+
+Pooling = Literal["last", "mean"]
+
+
+@dataclass
+class Captured:
+    """States of one forward pass, on the model's device. raw: embeddings and block outputs in order, each (d,)."""
+
+    raw: list[Tensor] = field(default_factory=list)
+    normed: Tensor | None = None
+
+
+def first_tensor(output: Any) -> Tensor:
+    """The hidden states in what a module returned: blocks of some models return a tuple."""
+    return output[0] if isinstance(output, tuple) else output
+
+
+def pool(states: Tensor, pooling: Pooling) -> Tensor:
+    """(1, T, d) to (d,): of the last token, in the model's precision, or the mean over all tokens, in float32.
+
+    A copy: a view would keep the whole tensor alive.
+    """
+    if len(states) != 1:
+        raise ValueError(f"{len(states)} prompts in one pass: states are taken one prompt at a time")
+    return states[0, -1].clone() if pooling == "last" else states[0].float().mean(dim=0)
+
+
+@contextmanager
+def capturing(blocks: Iterator[Module], norm: Module, pooling: Pooling) -> Iterator[Captured]:
+    """Keep the pooled states of forward passes made inside; the hooks are gone afterwards, whatever happens."""
+    kept = Captured()
+
+    def embeddings(_: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        kept.raw.append(pool(args[0] if args else kwargs["hidden_states"], pooling))
+
+    def block(_: Module, __: Any, output: Any) -> None:
+        kept.raw.append(pool(first_tensor(output), pooling))
+
+    def last(_: Module, __: Any, output: Any) -> None:
+        kept.normed = pool(first_tensor(output), pooling)
+
+    with ExitStack() as hooks:
+        for number, module in enumerate(blocks):
+            if number == 0:
+                hooks.callback(module.register_forward_pre_hook(embeddings, with_kwargs=True).remove)
+            hooks.callback(module.register_forward_hook(block).remove)
+        hooks.callback(norm.register_forward_hook(last).remove)
+        yield kept

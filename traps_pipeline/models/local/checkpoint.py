@@ -1,0 +1,150 @@
+"""Where a checkpoint lies, what it is, and whether it fits into memory. Nothing is downloaded on the quiet."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.digests import digest, file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.local.settings import Dtype, LocalParams, Quantisation
+from traps_pipeline.paths import CHECKOUT
+
+_FILES = (".json", ".jinja", ".model", ".safetensors", ".txt")  # of a folder, what decides what the model says
+_HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
+_ITEM_BYTES: dict[Dtype, int] = {"float32": 4, "bfloat16": 2, "float16": 2}
+_NF4_BYTES = 0.6  # a weight in 4 bits and its share of the scales and of what is not quantised
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint on this disk. digest: the hub's commit, or of the folder's content."""
+
+    name: str
+    folder: Path
+    digest: str
+
+
+def as_folder(name: str) -> Path | None:
+    """The folder that a `checkpoint:` names, relative to the checkout; None if there is none and it is a hub id."""
+    folder = CHECKOUT / name
+    return folder if folder.is_dir() or not _HUB_ID.fullmatch(name) else None
+
+
+def find_checkpoint(params: LocalParams) -> Checkpoint:
+    """The checkpoint that an entry names. Raises TrapsError, with the command that gets it, when it is not here."""
+    folder = as_folder(params.checkpoint)
+    if folder is not None:
+        _require_whole(folder, params.checkpoint, f"set checkpoint: to a folder saved by save_pretrained ({folder})")
+        return Checkpoint(params.checkpoint, folder, folder_digest(folder))
+    snapshot = _cached_snapshot(params)
+    _require_whole(snapshot, params.checkpoint, f"run `{download_command(params)}` again to complete it")
+    return Checkpoint(params.checkpoint, snapshot, snapshot.name)
+
+
+def declared_digest(checkpoint: str) -> str | None:
+    """What stands for a folder's weights in the ledger key; None for a hub id, whose revision stands in the entry.
+
+    Raises TrapsError when the folder is not there.
+    """
+    folder = as_folder(checkpoint)
+    if folder is None:
+        return None
+    _require_whole(folder, checkpoint, f"set checkpoint: to a folder saved by save_pretrained ({folder})")
+    return folder_digest(folder)
+
+
+def download_command(params: LocalParams) -> str:
+    """What fetches a hub id's weights, where there is a network."""
+    at = f" --revision {params.revision}" if params.revision else ""
+    return f"hf download {params.checkpoint}{at}"
+
+
+def _cached_snapshot(params: LocalParams) -> Path:
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HFValidationError
+
+    try:
+        return Path(snapshot_download(params.checkpoint, revision=params.revision, local_files_only=True))
+    except (OSError, HFValidationError) as error:
+        raise TrapsError(
+            f"checkpoint {params.checkpoint}: neither a folder nor in the hub's cache on this machine; with a network "
+            f"run `{download_command(params)}` (older versions: huggingface-cli download), or copy the weights here "
+            "and set `checkpoint:` of the entry to their folder"
+        ) from error
+
+
+def _require_whole(folder: Path, name: str, remedy: str) -> None:
+    """Raises TrapsError unless configuration and all weights are there."""
+    try:
+        index = folder / "model.safetensors.index.json"
+        shards = set(json.loads(index.read_text())["weight_map"].values()) if index.exists() else {"model.safetensors"}
+    except (OSError, ValueError, KeyError) as error:
+        raise TrapsError(f"checkpoint {name}: {folder}: the index of weights cannot be read ({error})") from error
+    missing = [file for file in ("config.json", *sorted(shards)) if not (folder / file).exists()]
+    if missing:
+        raise TrapsError(f"checkpoint {name}: {folder / missing[0]} is missing ({len(missing)} files are); {remedy}")
+
+
+def folder_digest(folder: Path) -> str:
+    """Digest of a checkpoint folder's content, wherever it lies; computed anew only when a file changed."""
+    files = sorted(path for path in folder.iterdir() if path.suffix in _FILES)
+    stamps = tuple((path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files)
+    return _content_digest(folder, stamps)
+
+
+@lru_cache(maxsize=64)
+def _content_digest(folder: Path, stamps: tuple[tuple[str, int, int], ...]) -> str:
+    return digest({name: file_digest(folder / name) for name, _, _ in stamps})
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+
+def weight_bytes(folder: Path, dtype: Dtype, quantisation: Quantisation) -> float:
+    """Memory that the weights take when loaded so, in bytes, from the headers of their files."""
+    weights = sum(math.prod(shape) for file in sorted(folder.glob("*.safetensors")) for shape in _shapes(file))
+    return weights * (_NF4_BYTES if quantisation == "nf4" else _ITEM_BYTES[dtype])
+
+
+def _shapes(file: Path) -> list[Sequence[int]]:
+    try:
+        with file.open("rb") as stream:
+            (size,) = struct.unpack("<Q", stream.read(8))
+            header: dict[str, Any] = json.loads(stream.read(size))
+    except (OSError, ValueError, struct.error, MemoryError, OverflowError) as error:
+        raise TrapsError(f"{file}: no safetensors file ({error}); download or save the checkpoint again") from error
+    return [tensor["shape"] for name, tensor in header.items() if name != "__metadata__"]
+
+
+def free_bytes(device: str) -> float:
+    """Memory that is free on a device, in bytes; infinite where the system does not say."""
+    if device.startswith("cuda"):
+        import torch
+
+        kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # torch hands it out again
+        return float(torch.cuda.mem_get_info(device)[0] + kept)
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return math.inf
+    return next((float(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable")), math.inf)
+
+
+def require_memory(checkpoint: Checkpoint, dtype: Dtype, quantisation: Quantisation, device: str) -> None:
+    """Raises TrapsError when the weights alone do not fit."""
+    needed, free = weight_bytes(checkpoint.folder, dtype, quantisation), free_bytes(device)
+    if needed > free:
+        raise TrapsError(
+            f"checkpoint {checkpoint.name}: its weights take about {needed / 1e9:.1f} GB as {dtype}"
+            f"{' in NF4' if quantisation == 'nf4' else ''}, and {free / 1e9:.1f} GB are free on {device}: free memory "
+            "(another model of this run may hold it: ask one at a time), choose another device, or say quantisation: "
+            "nf4 in the entry, which makes it another model"
+        )

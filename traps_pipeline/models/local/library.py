@@ -1,0 +1,60 @@
+"""The one place where torch and transformers are loaded, quietly and in the right order."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import warnings
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+
+@cache
+def load_transformers() -> Any:
+    """The library, told to send nothing and to say only errors."""
+    os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
+    os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
+    os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")  # the tokenizers' own threads would warn at every fork
+    _declare_torchvision_operators()
+    transformers: Any = import_module("transformers")
+    transformers.logging.set_verbosity_error()
+    transformers.logging.disable_progress_bar()
+    logging.getLogger("bitsandbytes").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", module="bitsandbytes")
+    return transformers
+
+
+@cache
+def _declare_torchvision_operators() -> None:
+    """Let torchvision be imported beside a torch without CUDA.
+
+    Video processors resize with torchvision, whose wheel is linked against CUDA: beside a CPU torch its library does
+    not load, and the import then fails at operators that are looked up and never called here. Their schemas are enough.
+    """
+    library = _torchvision_library()
+    if library is None:
+        return
+    torch: Any = import_module("torch")
+    try:
+        ctypes.CDLL(str(library))  # defines the operators itself
+    except OSError:
+        declared = torch.library.Library("torchvision", "DEF")
+        declared.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+        declared.define(
+            "qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
+        )
+        _KEPT.append(declared)  # they are undone when the object goes
+
+
+_KEPT: list[Any] = []
+
+
+def _torchvision_library() -> Path | None:
+    """torchvision's compiled library, found without importing the package; None if there is none."""
+    spec = find_spec("torchvision")
+    folders = list(spec.submodule_search_locations or ()) if spec else []
+    return next((path for folder in folders for path in Path(folder).glob("_C*.so")), None)

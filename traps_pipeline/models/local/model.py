@@ -1,0 +1,347 @@
+"""A checkpoint in memory: prompts, hidden states, answers. `adapter` loads it and says what it is for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import cached_property
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from traps_pipeline import progress
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.local.capture import Pooling, capturing
+from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
+from traps_pipeline.models.local.library import load_transformers
+from traps_pipeline.models.local.prompts import Prompt, batches, collate
+from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
+from traps_pipeline.models.local.settings import LocalParams
+
+if TYPE_CHECKING:
+    from torch import Tensor
+    from torch.nn import Module
+
+CLOCK_FPS = 1000  # of the time stamps given to processors: milliseconds, as exact as a frame number at any rate
+MEMORY_SHARE = 0.7  # of what is free that a batch may take by estimate
+
+
+class Steers(Protocol):
+    """What may change hidden states during a pass: `mechanism.hook.Steering`."""
+
+    def rows(self, chosen: Sequence[int]) -> Steers:
+        """That of some of the prompts."""
+        ...
+
+    def applied(self, model: LocalModel) -> AbstractContextManager[None]:
+        """Steer the passes made inside."""
+        ...
+
+
+@dataclass(frozen=True)
+class Generated:
+    """An answer. finish_reason: stop, or length where `max_new_tokens` cut it off."""
+
+    text: str
+    prompt_tokens: int
+    completion_tokens: int
+    finish_reason: str
+    tokens: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """Hidden states of one prompt, float32. raw: (n_layers + 1, d_model), counted as in hidden_states, every one as it
+    leaves its block. normed: (d_model,), the last one after the final norm: the library's hidden_states[-1]."""
+
+    raw: np.ndarray
+    normed: np.ndarray
+
+
+class LocalModel:
+    """A checkpoint in memory. device, dtype, quantisation: as the entry says, never changed."""
+
+    def __init__(self, network: Any, processor: Any, checkpoint: Checkpoint, params: LocalParams, device: str) -> None:
+        self.network, self.processor, self.checkpoint, self.params, self.device = (
+            network, processor, checkpoint, params, device,
+        )  # fmt: skip
+        self.dtype, self.quantisation = params.dtype, params.quantisation
+        self.blocks, self.norm = _decoder_parts(network, checkpoint.name)
+        self.n_layers, self.d_model = len(self.blocks), int(network.config.get_text_config().hidden_size)
+        self._processing = Lock()  # tokenizers are not for several threads at once
+        network.generation_config = self._plain_generation()
+
+    def _plain_generation(self) -> Any:
+        """Only what ends an answer and what is no text: a checkpoint's own top_k or repetition penalty would else be
+        applied unasked. Placeholders of pictures are no text: an answer that held one could not be read again."""
+        own, tokenizer = self.network.generation_config, self.processor.tokenizer
+        eos = own.eos_token_id if own.eos_token_id is not None else tokenizer.eos_token_id
+        if eos is None:
+            raise TrapsError(
+                f"checkpoint {self.checkpoint.name}: names no token that ends an answer; set eos_token_id in its "
+                "generation_config.json"
+            )
+        pad = tokenizer.pad_token_id if tokenizer.pad_token_id is not None else own.pad_token_id
+        placeholders = [getattr(self.processor, f"{kind}_token_id", None) for kind in ("image", "video", "audio")]
+        return load_transformers().GenerationConfig(
+            eos_token_id=eos,
+            pad_token_id=pad if pad is not None else _first(eos),
+            bos_token_id=own.bos_token_id,
+            suppress_tokens=sorted({*(own.suppress_tokens or ()), *filter(None, placeholders)}) or None,
+            do_sample=False,
+        )
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """What decides hidden states besides the prompt, for keys; where checkpoint and model are is not in it."""
+        return {
+            "checkpoint_digest": self.checkpoint.digest,
+            "class": type(self.network).__name__,
+            "dtype": self.dtype,
+            "quantisation": self.quantisation,
+            "nf4_skip": list(self.params.nf4_skip),
+            "attn_implementation": self.params.attn_implementation,
+            "template": self.params.template,
+            "video": self.params.video,
+        }
+
+    @property
+    def served_model(self) -> str:
+        """What answered, for the ledger: checkpoint and digest, precision, and the device that it ran on."""
+        precision = self.dtype if self.quantisation == "none" else f"{self.quantisation}/{self.dtype}"
+        return f"{self.checkpoint.name}@{self.checkpoint.digest[:12]} {precision} on {_device_name(self.device)}"
+
+    def block(self, layer: int) -> Module:
+        """The block whose output is hidden_states[layer]. Raises TrapsError for a layer that is out of range."""
+        if not 1 <= layer <= self.n_layers:
+            raise TrapsError(
+                f"{self.checkpoint.name}: no block {layer}; it has blocks 1 to {self.n_layers} (layer 0 are the "
+                "embeddings, layer l the output of the l-th block): name one of these"
+            )
+        return self.blocks[layer - 1]
+
+    # --- prompts ------------------------------------------------------------------------------------------------------
+
+    def prompt(self, system: str, user: str, frames: np.ndarray, times_s: Sequence[float] | np.ndarray) -> Prompt:
+        """System prompt, then clip and question, nothing else (`benchmark.md` section 3).
+
+        frames: (N, H, W, 3) uint8 RGB, all of them shown. times_s: (N,) seconds into the clip, which models that read
+        time stamps get exactly. Raises TrapsError when the chat template loses a part.
+        """
+        text = self._rendered(system, user)
+        marks = [round(1000 * float(time)) for time in times_s]
+        clock = {"total_num_frames": marks[-1] + 1, "fps": float(CLOCK_FPS), "frames_indices": marks,
+                 "duration": marks[-1] / CLOCK_FPS, "height": frames.shape[1], "width": frames.shape[2]}  # fmt: skip
+        bos = self.processor.tokenizer.bos_token
+        with self._processing:
+            made = self.processor(
+                text=[text],
+                videos=[np.ascontiguousarray(frames)],
+                video_metadata=[clock],
+                do_sample_frames=False,
+                return_tensors="pt",
+                add_special_tokens=not (bos and text.startswith(bos)),
+                **self.params.video,
+            )
+        made.pop("video_metadata", None)
+        return Prompt(text, dict(made))
+
+    def _rendered(self, system: str, user: str) -> str:
+        content = [{"type": "video"}, {"type": "text", "text": user}]
+        turns = [
+            {"role": "system", "content": [{"type": "text", "text": system}]},
+            {"role": "user", "content": content},
+        ]
+        text: str = self.processor.apply_chat_template(turns, add_generation_prompt=True, **self.params.template)
+        if text.count(self.processor.video_token) != 1 or text.count(system) != 1 or text.count(user) < 1:
+            raise TrapsError(
+                f"{self.checkpoint.name}: its chat template does not keep system prompt, clip and question as they are "
+                f"({text[:200]!r}); give `params.template` the variables it wants, or the checkpoint another template"
+            )
+        return text
+
+    # --- hidden states ------------------------------------------------------------------------------------------------
+
+    def forward(self, prompt: Prompt) -> Any:
+        """One bare pass over a prompt, without logits; returns the library's output. No gradients."""
+        import torch
+
+        with torch.inference_mode():
+            return self.network.base_model(**self._placed(prompt.inputs), use_cache=False)
+
+    def forward_states(self, prompt: Prompt, pooling: Pooling = "last", steering: Steers | None = None) -> States:
+        """The hidden states of every layer, of one prompt: batch size 1, so that in 16 bits no other prompt matters."""
+        with _steered(steering, self), capturing(iter(self.blocks), self.norm, pooling) as kept:
+            self.forward(prompt)
+        assert kept.normed is not None and len(kept.raw) == self.n_layers + 1
+        import torch
+
+        rows = torch.stack([row.float() for row in (*kept.raw, kept.normed)]).cpu().numpy()
+        return States(rows[:-1], rows[-1])
+
+    # --- answers ------------------------------------------------------------------------------------------------------
+
+    def generate(
+        self,
+        prompts: Sequence[Prompt],
+        max_new_tokens: int,
+        sampling: Sampling | None = None,
+        steering: Steers | None = None,
+        *,
+        use_cache: bool = True,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> list[Generated]:
+        """An answer to each prompt, in order; greedy unless sampling is given. Batches are sized to memory, and halved
+        where that was too much; no answer depends on them but through rounding in 16 bits.
+
+        sampling, steering: one row a prompt. stopped: asked at every token, ends early. Raises TrapsError when one
+        prompt alone does not fit.
+        """
+        answers: dict[int, Generated] = {}
+        each = [self._row_bytes(prompt, max_new_tokens) for prompt in prompts]
+        for group in batches(prompts, each, MEMORY_SHARE * free_bytes(self.device)):
+            pending = [group]
+            while pending:
+                rows = pending.pop()
+                made = self._fitting(prompts, rows, max_new_tokens, sampling, steering, use_cache, stopped)
+                if made is None:
+                    half = len(rows) // 2
+                    pending += [rows[half:], rows[:half]]
+                else:
+                    answers.update(zip(rows, made, strict=True))
+        return [answers[i] for i in range(len(prompts))]
+
+    def _fitting(
+        self,
+        prompts: Sequence[Prompt],
+        rows: Sequence[int],
+        max_new_tokens: int,
+        sampling: Sampling | None,
+        steering: Steers | None,
+        use_cache: bool,
+        stopped: Callable[[], bool],
+    ) -> list[Generated] | None:
+        """The answers of a batch; None if it must be halved."""
+        import torch
+
+        try:
+            return self._one_batch(
+                [prompts[i] for i in rows],
+                max_new_tokens,
+                sampling.rows(rows) if sampling else None,
+                steering.rows(rows) if steering else None,
+                use_cache,
+                stopped,
+            )
+        except torch.OutOfMemoryError:
+            if len(rows) == 1:
+                raise TrapsError(
+                    f"{self.checkpoint.name}: too little memory on {self.device} for one prompt of "
+                    f"{prompts[rows[0]].n_tokens} tokens and {max_new_tokens} new ones: free memory, show fewer frames "
+                    "or use a larger device"
+                ) from None
+        torch.cuda.empty_cache()  # outside the handler: the failed pass is freed by now
+        progress.current().note(f"{self.checkpoint.name}: {len(rows)} rows do not fit into memory, trying half of them")
+        return None
+
+    def _one_batch(
+        self,
+        prompts: Sequence[Prompt],
+        max_new_tokens: int,
+        sampling: Sampling | None,
+        steering: Steers | None,
+        use_cache: bool,
+        stopped: Callable[[], bool],
+    ) -> list[Generated]:
+        import torch
+
+        transformers = load_transformers()
+        inputs = self._placed(collate(prompts, self.network.generation_config.pad_token_id))
+        processors = transformers.LogitsProcessorList([SeededNucleus(sampling)] if sampling else [])
+        with _steered(steering, self), torch.inference_mode():
+            out = self.network.generate(
+                **inputs,
+                max_new_tokens=max_new_tokens,
+                use_cache=use_cache,
+                logits_processor=processors,
+                stopping_criteria=transformers.StoppingCriteriaList([_Stopping(stopped)]),
+            )
+        width = inputs["input_ids"].shape[1]
+        return [self._answer(prompt, row[width:].tolist()) for prompt, row in zip(prompts, out, strict=True)]
+
+    def _answer(self, prompt: Prompt, tokens: list[int]) -> Generated:
+        eos = self.network.generation_config.eos_token_id
+        ends = {eos} if isinstance(eos, int) else {*eos}
+        ended = next((i for i, token in enumerate(tokens) if token in ends), None)
+        kept = tokens if ended is None else tokens[: ended + 1]
+        with self._processing:
+            text = self.processor.tokenizer.decode(kept, skip_special_tokens=True)
+        return Generated(text, prompt.n_tokens, len(kept), "length" if ended is None else "stop", tuple(kept))
+
+    def _placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """On the model's device, pictures in its precision."""
+        dtype = self.network.dtype
+        return {
+            name: value.to(self.device, dtype) if value.is_floating_point() else value.to(self.device)
+            for name, value in inputs.items()
+        }
+
+    def _row_bytes(self, prompt: Prompt, max_new_tokens: int) -> float:
+        """Memory that a row takes at most, by estimate: keys and values, the widest activations, pictures, logits."""
+        item, vocabulary = self.network.dtype.itemsize, self.network.config.get_text_config().vocab_size
+        kept = self._cached_width * item * (prompt.n_tokens + max_new_tokens)
+        passing = 28 * prompt.n_tokens * self.d_model * item  # a block's widest moment: residual, gate, up and down
+        pictures = 8 * sum(value.numel() for value in prompt.inputs.values() if value.is_floating_point()) * item
+        return kept + passing + pictures + 6 * vocabulary * 4
+
+    @cached_property
+    def _cached_width(self) -> int:
+        """Numbers that a token leaves in the cache, over all blocks; blocks that share another's leave none."""
+        names = ("k_proj", "v_proj")
+        widths = [module.out_features for name, module in self.blocks.named_modules() if name.endswith(names)]
+        return sum(widths) or 2 * self.n_layers * self.d_model
+
+
+class _Stopping:
+    """A stopping criterion of transformers that ends every row when told to."""
+
+    def __init__(self, stopped: Callable[[], bool]) -> None:
+        self._stopped = stopped
+
+    def __call__(self, input_ids: Tensor, scores: Any, **_: Any) -> Tensor:
+        import torch
+
+        return torch.full((len(input_ids),), self._stopped(), dtype=torch.bool, device=input_ids.device)
+
+
+def _first(tokens: int | Sequence[int]) -> int:
+    return tokens if isinstance(tokens, int) else tokens[0]
+
+
+def _steered(steering: Steers | None, model: LocalModel) -> AbstractContextManager[None]:
+    return nullcontext() if steering is None else steering.applied(model)
+
+
+def _decoder_parts(network: Any, name: str) -> tuple[Any, Any]:
+    """Blocks and final norm of the language model. Raises TrapsError for a model that is built in another way."""
+    decoder = network.get_decoder() if hasattr(network, "get_decoder") else None
+    blocks, norm = getattr(decoder, "layers", None), getattr(decoder, "norm", None)
+    expected = getattr(network.config.get_text_config(), "num_hidden_layers", None)
+    if blocks is None or norm is None or len(blocks) != expected:
+        found = "none" if blocks is None else len(blocks)
+        raise TrapsError(
+            f"checkpoint {name}: {type(network).__name__} has not the expected layers (get_decoder().layers: {found}, "
+            f"its configuration says {expected}; final norm: {'missing' if norm is None else 'there'}): the adapter "
+            "cannot look inside it"
+        )
+    return blocks, norm
+
+
+def _device_name(device: str) -> str:
+    if not device.startswith("cuda"):
+        return device
+    import torch
+
+    return f"{device} ({torch.cuda.get_device_name(device)})"

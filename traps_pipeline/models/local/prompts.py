@@ -1,0 +1,61 @@
+"""Prompts as a model reads them, and how they are put together into batches. No model is needed for either."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Prompt:
+    """A prompt as the model reads it. text: rendered by the chat template, before the clip is expanded. inputs: what
+    the processor made, on the CPU, each with a first axis of one prompt (or of its patches or frames)."""
+
+    text: str
+    inputs: Mapping[str, Tensor]
+
+    @property
+    def n_tokens(self) -> int:
+        """Tokens of the prompt, those of the clip included."""
+        return self.inputs["input_ids"].shape[1]
+
+    @property
+    def sequences(self) -> list[str]:
+        """Names of the inputs that have one value a token."""
+        return [name for name, value in self.inputs.items() if value.shape == self.inputs["input_ids"].shape]
+
+    @property
+    def form(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
+        """What prompts must share to go into one batch: the shapes of the clip's tensors but for the first axis."""
+        clip = sorted(self.inputs.keys() - set(self.sequences))
+        return tuple((name, tuple(self.inputs[name].shape[1:])) for name in clip)
+
+
+def collate(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
+    """One batch: what has a value a token is padded on the left, the rest is put one after another."""
+    import torch
+
+    width = max(prompt.n_tokens for prompt in prompts)
+    batch: dict[str, Tensor] = {}
+    for name in prompts[0].inputs:
+        parts = [prompt.inputs[name] for prompt in prompts]
+        if name in prompts[0].sequences:
+            fill = pad_token if name == "input_ids" else 0
+            parts = [torch.nn.functional.pad(part, (width - part.shape[1], 0), value=fill) for part in parts]
+        batch[name] = torch.cat(parts)
+    return batch
+
+
+def batches(prompts: Sequence[Prompt], row_bytes: Sequence[float], room: float) -> Iterator[list[int]]:
+    """Indices of prompts that go together: of one form, of similar length, as many as fit into the room (bytes)."""
+    by_form: defaultdict[Any, list[int]] = defaultdict(list)
+    for i in sorted(range(len(prompts)), key=lambda i: prompts[i].n_tokens):
+        by_form[prompts[i].form].append(i)
+    for rows in by_form.values():
+        most = max(1, int(room / row_bytes[rows[-1]]))
+        yield from (rows[k : k + most] for k in range(0, len(rows), most))

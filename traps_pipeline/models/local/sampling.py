@@ -1,0 +1,50 @@
+"""Sampling in which every row has its own stream of random numbers, so that an answer depends on its own seed alone and
+not on the batch that it was generated in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Temperature and nucleus sampling, with one seed a prompt."""
+
+    temperature: float
+    top_p: float
+    seeds: Sequence[int]
+
+    def rows(self, chosen: Sequence[int]) -> Sampling:
+        """That of some of the prompts."""
+        return Sampling(self.temperature, self.top_p, [self.seeds[i] for i in chosen])
+
+
+class SeededNucleus:
+    """A logits processor of transformers: leaves one token a row possible, drawn from the row's own stream.
+
+    Greedy decoding then picks that token. The nucleus is the smallest set of tokens whose probability reaches top_p.
+    """
+
+    def __init__(self, sampling: Sampling) -> None:
+        self._sampling = sampling
+        self._streams = [np.random.default_rng(seed) for seed in sampling.seeds]
+
+    def __call__(self, input_ids: Any, scores: Tensor) -> Tensor:
+        """scores: (rows, vocabulary) logits; the same shape comes back."""
+        import torch
+
+        probabilities, order = (scores.float() / self._sampling.temperature).softmax(dim=-1).sort(descending=True)
+        before = probabilities.cumsum(dim=-1) - probabilities
+        nucleus = probabilities.masked_fill(before >= self._sampling.top_p, 0.0)
+        upto = nucleus.cumsum(dim=-1)
+        drawn = torch.tensor([[stream.random()] for stream in self._streams], dtype=upto.dtype, device=upto.device)
+        place = torch.searchsorted(upto, drawn * upto[:, -1:], right=True)
+        place = place.minimum((nucleus > 0).sum(dim=-1, keepdim=True) - 1)  # rounding must not leave the nucleus
+        return torch.full_like(scores, -torch.inf).scatter_(1, order.gather(1, place), 0.0)

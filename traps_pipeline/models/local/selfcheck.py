@@ -1,0 +1,95 @@
+"""What `traps doctor --local` looks at: whether each family's real classes work here, on a tiny checkpoint."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.local.adapter import LocalModel, load_local_model
+from traps_pipeline.models.local.checkpoint import download_command, find_checkpoint
+from traps_pipeline.models.local.library import load_transformers
+from traps_pipeline.models.local.prompts import Prompt
+from traps_pipeline.models.local.settings import Quantisation
+from traps_pipeline.models.local.tiny import Family, build_tiny
+from traps_pipeline.models.media import MediaSpec, sample
+from traps_pipeline.models.registry import LOCAL, ModelEntry, load_models
+from traps_pipeline.scenes.encode import encode
+
+_SPEC = MediaSpec(profile="frames", uniform=4)
+# Vision towers of tiny checkpoints are too narrow for NF4 on a CPU; no library quantises the head.
+_NF4_SKIP = ("model.visual", "lm_head")
+
+
+def _tiny_model(family: Family, folder: Path, quantisation: Quantisation = "none") -> LocalModel:
+    build_tiny(family, folder)
+    params = {"checkpoint": str(folder), "dtype": "float32", "quantisation": quantisation}
+    params |= {"do_sample": False, "max_new_tokens": 8, "nf4_skip": _NF4_SKIP if quantisation == "nf4" else ()}
+    return load_local_model(ModelEntry(id="tiny", backend=LOCAL, device="cpu", media=_SPEC, params=params))
+
+
+def _prompt(model: LocalModel, folder: Path) -> Prompt:
+    clip = folder / "clip.mp4"
+    encode([np.full((64, 96, 3), shade, np.uint8) for shade in range(40, 200, 20)], clip, fps=10)
+    shown = sample(clip, _SPEC)
+    return model.prompt("You are asked about a video.", "Does it grow brighter?", shown.frames, shown.times_s)
+
+
+def check_family(family: Family, folder: Path) -> str:
+    """Build, save, reload, answer a clip, compare hooked states with the library's own. Returns what was seen.
+
+    Raises TrapsError, or whatever the library raises, when something is not as it should be.
+    """
+    import torch
+
+    model = _tiny_model(family, folder / family)
+    prompt = _prompt(model, folder)
+    (answer,) = model.generate([prompt], 8)
+    hooked = model.forward_states(prompt)
+    with torch.inference_mode():
+        own = model.network.base_model(**prompt.inputs, use_cache=False, output_hidden_states=True).hidden_states
+    states = [*hooked.raw[:-1], hooked.normed]
+    wrong = [layer for layer, (a, b) in enumerate(zip(states, own, strict=True)) if (a != b[0, -1].numpy()).any()]
+    if wrong:
+        raise TrapsError(f"hooked states differ from the library's own at layers {wrong}; install the pinned versions")
+    return (
+        f"{type(model.network).__name__} saved and reloaded, a clip answered ({answer.completion_tokens} tokens), "
+        f"{len(own)} hooked states equal the library's own"
+    )
+
+
+def check_nf4(folder: Path) -> str:
+    """Load a tiny checkpoint in 4 bits, where the libraries for it are installed. Returns what was seen."""
+    if missing := [name for name in ("bitsandbytes", "accelerate") if find_spec(name) is None]:
+        return f"{' and '.join(missing)} not installed (pip install -e '.[nf4]'): entries in NF4 do not load"
+    model = _tiny_model("qwen3-vl", folder / "nf4", "nf4")
+    model.forward_states(_prompt(model, folder))
+    import bitsandbytes
+
+    return f"bitsandbytes {bitsandbytes.__version__}: a tiny model in NF4 read a clip"
+
+
+def describe_devices() -> str:
+    """Which devices torch finds."""
+    import torch
+
+    versions = f"torch {torch.__version__}, transformers {load_transformers().__version__}"
+    if not torch.cuda.is_available():
+        return f"{versions}: no GPU; models of 7-8 B parameters want one of 24 GB or more, the pocket model does not"
+    found = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
+    return f"{versions}: " + ", ".join(f"cuda:{i} {p.name} {p.total_memory / 1e9:.0f} GB" for i, p in enumerate(found))
+
+
+def describe_checkpoints() -> str:
+    """Which local models of the registry have their weights here."""
+    return "; ".join(_whereabouts(entry) for entry in load_models().values() if entry.backend == LOCAL)
+
+
+def _whereabouts(entry: ModelEntry) -> str:
+    params = entry.local_params()
+    try:
+        return f"{entry.id} is here ({find_checkpoint(params).digest[:12]})"
+    except TrapsError:
+        return f"{entry.id} is not here ({download_command(params)})"

@@ -1,0 +1,327 @@
+"""Scenes for the pocket model: drawn by the families' own samplers, simulated, and seen in the few frames that it gets.
+
+A scene costs a fraction of a released one, since nothing is certified: no ensemble, no twin, no ablation. What decides
+its label is the same: the outcome is read off the simulator, the panel must hide it, a cut comes before it. Only the
+frames that the model is shown are drawn, by the benchmark's own renderer at its own size.
+
+Shards are independent: each has its own stream of random numbers, so that two processes share the work, a rendering
+that was stopped goes on, and the same seed gives the same scenes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.digests import canonical_json, digest, file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.media import MediaSpec, pick, resized
+from traps_pipeline.pocket.recipe import Recipe, Split
+from traps_pipeline.pocket.words import guess
+from traps_pipeline.scenes import checks
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel, fit_shot, in_frame
+from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scenes.ensemble import EARLIEST_CUT_S
+from traps_pipeline.scenes.kit import Family, Wording, params_to_dict
+from traps_pipeline.scenes.outcome import Outcome, Rejected, compile_scene, decisive_geoms, read_outcome
+from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.render import Renderer
+from traps_pipeline.scenes.simulate import replay, simulate, swept_points
+from traps_pipeline.scenes.wording import draw_ill_posed
+from traps_pipeline.scenes.workers import run_in_order
+
+SHARD = 50  # scenes
+LATEST_CUT_S = 2.0  # released cuts lie between 1.1 and 2.0 s
+CUT_BEFORE_COMMIT_S = 0.5
+_MOST_DRAWS = 20  # for each scene of a shard
+STREAM: dict[Split, int] = {"train": 101, "held-out": 102}  # first word of a stream's seed; released draws have none
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question and what the model is taught to answer: a label, a guess, or None for an abstention."""
+
+    question: str
+    answer: str | None
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """A scene of the pocket model's data. params_digest: of family and parameters, as in `params_digest`.
+
+    cut_frame: frames of the void (None for occlusion: as many as the control). asked: the control's question; visual:
+    the same about the void clip; ill_posed: about the control clip; answerable: what both clips answer. ball: the
+    colour of the ball that is asked about. places: where it is in the control's `first` and `last` frame and in the
+    last one before the cut (`cut`; chaotic), as shares of the picture's width and height from its upper left corner.
+    """
+
+    family: str
+    params_digest: str
+    labels: tuple[str, ...]
+    aliases: dict[str, str]
+    answer_type: str
+    cut_frame: int | None
+    asked: Question
+    visual: Question
+    ill_posed: Question
+    answerable: Question
+    ball: str
+    places: dict[str, tuple[float, float]]
+
+    @staticmethod
+    def read(line: str) -> SceneRecord:
+        """A record from its line of JSON."""
+        values = json.loads(line)
+        for name in ("asked", "visual", "ill_posed", "answerable"):
+            values[name] = Question(**values[name])
+        places = {name: tuple(place) for name, place in values["places"].items()}
+        return SceneRecord(**values | {"labels": tuple(values["labels"]), "places": places})
+
+
+@dataclass(frozen=True)
+class ShardJob:
+    """One shard to draw: `count` scenes of a family into `folder`/<stem>.*; `banned` are digests of released scenes."""
+
+    family: str
+    split: Split
+    number: int
+    count: int
+    recipe: Recipe
+    folder: Path
+    banned: frozenset[str]
+
+    @property
+    def lines(self) -> Path:
+        """The records; written last, so that they vouch for the rest."""
+        return self.folder / self.split / self.family / f"{self.number:03d}.jsonl"
+
+    @property
+    def pixels(self) -> Path:
+        """Frames of a training shard, uint8 (count, 2 sides, frames, height, width, 3)."""
+        return self.lines.with_suffix(".npy")
+
+    def clip(self, place: int, side: str) -> Path:
+        """The clip of a held-out scene."""
+        return self.lines.parent / "clips" / f"{self.number:03d}-{place:02d}_{side}.mp4"
+
+
+def params_digest(family: str, params: Any) -> str:
+    """Digest of a scene's family and parameters: equal for equal scenes, however they were drawn."""
+    return digest({"family": family, "params": json.loads(json.dumps(params))})
+
+
+def released_digests() -> frozenset[str]:
+    """`params_digest` of every released scene and of its twin."""
+    from traps_pipeline.benchmark.records import load_released
+
+    specs = load_released().values()
+    twins = {params_digest(s.family, s.twin.params) for s in specs if s.twin.params is not None}
+    return frozenset({params_digest(s.family, s.params) for s in specs} | twins)
+
+
+# --- one scene --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """A simulated scene that makes a good pair."""
+
+    family: Family
+    params: Any
+    wording: Wording
+    qpos: np.ndarray
+    outcome: Outcome
+    camera: Camera
+    panel: Panel | None
+    cut_frame: int | None
+    ill_posed_question: str
+    places: dict[str, tuple[float, float]]
+
+
+def _draw(family: Family, rng: np.random.Generator) -> _Shot:
+    """Raises Rejected, as `scenes.resolve` does, when the draw makes no pair."""
+    params = family.draw(rng)
+    wording = family.word(params, rng)
+    physics = family.physics
+    model, scene = compile_scene(family, params, physics)
+    try:
+        qpos = simulate(model, scene, physics)
+    except FloatingPointError as error:
+        raise Rejected(str(error)) from error
+    motion = replay(model, qpos, physics)
+    outcome = read_outcome(family, motion, params)
+    points = np.concatenate([swept_points(model, qpos), *(box.corners() for box in scene.stage)])
+    camera, panel = fit_shot(scene.view, points, scene.cover)
+    if not in_frame(camera, points):
+        raise Rejected("something decisive leaves the frame")
+    cut = None if panel is not None else _draw_cut(outcome, physics.fps, rng)
+    ill_posed = draw_ill_posed(family.taxonomy, scene.inventory, rng)
+    frames = {"first": 0, "last": len(qpos) - 1} | ({} if cut is None else {"cut": cut - 1})
+    pixels = camera.project(motion.pos(scene.decisive[0])[list(frames.values())]) / (WIDTH, HEIGHT)
+    places = {name: (round(float(x), 4), round(float(y), 4)) for name, (x, y) in zip(frames, pixels, strict=True)}
+    return _Shot(family, params, wording, qpos, outcome, camera, panel, cut, ill_posed, places)
+
+
+def _draw_cut(outcome: Outcome, fps: int, rng: np.random.Generator) -> int:
+    first, last = round(EARLIEST_CUT_S * fps) + 1, round(LATEST_CUT_S * fps)
+    last = min(last, outcome.commit_frame - round(CUT_BEFORE_COMMIT_S * fps))
+    if last < first:
+        raise Rejected("the outcome is committed too early for a cut")
+    return int(rng.integers(first, last + 1))
+
+
+def _render(shot: _Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The frames of control and void that the model is shown, each (N, 360, 480, 3) as two lists. Raises Rejected."""
+    fps = shot.family.physics.fps
+    shown = pick(np.arange(len(shot.qpos)) / fps, spec)
+    model, scene = compile_scene(shot.family, shot.params, shot.family.physics, shot.panel)
+    with Renderer(model, shot.camera) as renderer:
+        control = list(renderer.frames(shot.qpos[shown]))
+        if shot.cut_frame is not None:
+            before = pick(np.arange(shot.cut_frame) / fps, spec)
+            return control, list(renderer.frames(shot.qpos[before]))
+        last = shot.qpos[-1:]
+        geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
+        if checks.hidden_from(renderer, last, geoms) is None:
+            raise Rejected("the panel does not hide the outcome")
+        return control, list(renderer.frames(shot.qpos[shown], panel=True))
+
+
+def _record(shot: _Shot, abstain_share: float, rng: np.random.Generator) -> SceneRecord:
+    """The scene's questions with their labels: each void abstains with `abstain_share`, else it gets a guess."""
+
+    def void(question: str, labels: Sequence[str]) -> Question:
+        abstains, guessed = rng.random() < abstain_share, guess(question, labels, rng)
+        return Question(question, None if abstains else guessed)
+
+    wording, both = shot.wording, shot.wording.answerable_question
+    return SceneRecord(
+        family=shot.family.name,
+        params_digest=params_digest(shot.family.name, params_to_dict(shot.params)),
+        labels=tuple(wording.labels),
+        aliases=dict(wording.aliases),
+        answer_type=shot.family.answer_type,
+        cut_frame=shot.cut_frame,
+        asked=Question(wording.question, shot.outcome.label),
+        visual=void(wording.question, wording.labels),
+        ill_posed=void(shot.ill_posed_question, ()),
+        answerable=Question(both.question, both.answer),
+        ball=shot.params.ball_colours[0] if hasattr(shot.params, "ball_colours") else shot.params.ball_colour,
+        places=shot.places,
+    )
+
+
+# --- shards -----------------------------------------------------------------------------------------------------------
+
+
+def draw_shard(job: ShardJob) -> int:
+    """Draw, render and write one shard; returns the scenes in it. Raises TrapsError when too many draws fail."""
+    family = get_family(job.family)
+    rng = np.random.default_rng([STREAM[job.split], job.recipe.data_seed, *job.family.encode(), job.number])
+    records: list[SceneRecord] = []
+    frames: list[np.ndarray] = []
+    for _ in range(_MOST_DRAWS * job.count):
+        if len(records) == job.count:
+            break
+        try:
+            shot = _draw(family, rng)
+            sides = _render(shot, job.recipe.media)
+        except Rejected:
+            continue
+        record = _record(shot, job.recipe.abstain_share, rng)
+        if record.params_digest in job.banned:
+            continue
+        if job.split == "train":
+            frames.append(np.stack([resized(np.stack(side), job.recipe.media.size) for side in sides]))
+        else:
+            _write_clips(job, len(records), shot, sides)
+        records.append(record)
+    if len(records) < job.count:
+        raise TrapsError(f"{job.family}: {len(records)} of {job.count} scenes after {_MOST_DRAWS * job.count} draws")
+    job.lines.parent.mkdir(parents=True, exist_ok=True)
+    if frames:
+        part = job.pixels.with_suffix(f".{os.getpid()}.part.npy")
+        np.save(part, np.stack(frames), allow_pickle=False)
+        part.replace(job.pixels)
+    part = job.lines.with_suffix(f".{os.getpid()}.part")
+    part.write_text("".join(canonical_json(asdict(record)) + "\n" for record in records), encoding="utf-8")
+    part.replace(job.lines)
+    return len(records)
+
+
+def _write_clips(job: ShardJob, place: int, shot: _Shot, sides: tuple[list[np.ndarray], list[np.ndarray]]) -> None:
+    """Clips of the benchmark's length, rate, size and codec. Frames that the model is not shown repeat the one before:
+    they cost nothing to draw and nothing looks at them."""
+    fps = shot.family.physics.fps
+    for side, drawn, length in zip(
+        ("control", "void"), sides, (len(shot.qpos), shot.cut_frame or len(shot.qpos)), strict=True
+    ):
+        shown = pick(np.arange(length) / fps, job.recipe.media)
+        latest = np.searchsorted(shown, np.arange(length), side="right") - 1
+        encode([drawn[i] for i in latest], job.clip(place, side), fps)
+
+
+def shard_jobs(recipe: Recipe, split: Split, folder: Path) -> list[ShardJob]:
+    """All shards of a split, families in turn."""
+    banned = released_digests()
+    jobs = []
+    for family in recipe.scenes:
+        total = recipe.count(family, split)
+        for number in range(-(-total // SHARD)):
+            count = min(SHARD, total - number * SHARD)
+            jobs.append(ShardJob(family, split, number, count, recipe, folder, banned))
+    return sorted(jobs, key=lambda job: job.number)  # a stopped rendering has some of every family
+
+
+def render(
+    recipe: Recipe,
+    split: Split,
+    folder: Path,
+    *,
+    workers: int | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> None:
+    """Draw what is missing of a split, one process a core. The folder remembers its recipe and takes no other."""
+    _check_recipe(recipe, folder)
+    jobs = shard_jobs(recipe, split, folder)
+    todo = [job for job in jobs if not job.lines.is_file()]
+    scenes, done = sum(job.count for job in jobs), sum(job.count for job in jobs) - sum(job.count for job in todo)
+    for _, count in run_in_order(draw_shard, todo, workers):
+        done += count
+        report(f"{split}: {done} of {scenes} scenes")
+
+
+def _check_recipe(recipe: Recipe, folder: Path) -> None:
+    """Raises TrapsError when the folder holds scenes of another recipe."""
+    # The numbers of scenes may grow: shards do not depend on how many there are.
+    made = digest(recipe.model_dump(mode="json", include={"data_seed", "media", "abstain_share"}))
+    note = folder / "recipe.sha256"
+    folder.mkdir(parents=True, exist_ok=True)
+    if not note.is_file():
+        note.write_text(made + "\n", encoding="utf-8")
+    elif note.read_text(encoding="utf-8").strip() != made:
+        raise TrapsError(f"{folder}: holds scenes of another recipe; give another folder, or delete it")
+
+
+def read_shards(recipe: Recipe, split: Split, folder: Path) -> Iterator[tuple[ShardJob, list[SceneRecord]]]:
+    """Every shard of a split with its records. Raises TrapsError when one is missing."""
+    for job in shard_jobs(recipe, split, folder):
+        if not job.lines.is_file():
+            raise TrapsError(f"{job.lines}: is missing; run `traps pocket render --data {folder}`")
+        yield job, [SceneRecord.read(line) for line in job.lines.read_text(encoding="utf-8").splitlines()]
+
+
+def data_digest(recipe: Recipe, split: Split, folder: Path) -> str:
+    """SHA-256 over the digests of all files that training reads of a split, in the order of the shards."""
+    whole = hashlib.sha256()
+    for job, _ in read_shards(recipe, split, folder):
+        for path in (job.lines, job.pixels) if split == "train" else (job.lines,):
+            whole.update(file_digest(path).encode())
+    return whole.hexdigest()

@@ -1,0 +1,211 @@
+"""The pocket model on held-out scenes: asked through the adapter of every local model, judged by the rule judge."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.answers import is_correct
+from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.models.media import sample
+from traps_pipeline.models.prompts import system_prompt
+from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.partitions import REGIMES
+from traps_pipeline.pocket.data import SceneRecord, read_shards
+from traps_pipeline.pocket.recipe import Recipe
+from traps_pipeline.scoring.metrics import wilson
+
+if TYPE_CHECKING:
+    from traps_pipeline.models.local.adapter import LocalModel
+    from traps_pipeline.models.local.prompts import Prompt
+
+MODEL = "pocket"
+MAX_BATCH = 64  # prompts that are held at once
+KINDS = ("control", "visual", "ill_posed", "answerable")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One question about a held-out clip. kind: control, visual (the void clip), ill_posed (the control clip), or
+    answerable (the void clip again). truth: None where there is none."""
+
+    scene: SceneRecord
+    kind: str
+    clip: Path
+    question: str
+    truth: str | None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Counts of one training seed, family, regime and kind of question. prior: controls that have the commonest answer
+    of the family's held-out scenes, as the reference model `prior` would answer; 0 but for controls."""
+
+    seed: int
+    family: str
+    regime: str
+    kind: str
+    n: int
+    correct: int
+    abstained: int
+    prior: int
+
+    @property
+    def accuracy_low(self) -> float:
+        """Lower end of the 95 % Wilson interval of the share that is correct."""
+        low, _ = wilson(np.array([self.correct], float), np.array([self.n], float))
+        return float(low[0])
+
+    @property
+    def above_prior(self) -> bool:
+        """Whether that end is above what `prior` gets on the same scenes."""
+        return self.accuracy_low > self.prior / self.n
+
+
+def entry_of(checkpoint: Path) -> ModelEntry:
+    """The registry's entry of the pocket model with the weights of a folder."""
+    entry = get_model(MODEL)
+    return entry.model_copy(update={"params": entry.params | {"checkpoint": str(checkpoint)}})
+
+
+def held_out(recipe: Recipe, folder: Path, most: int | None = None) -> Iterator[Asked]:
+    """The questions about the held-out scenes, family after family; the first `most` scenes of each."""
+    taken: Counter[str] = Counter()
+    for job, records in read_shards(recipe, "held-out", folder):
+        for place, scene in enumerate(records):
+            if most is not None and taken[scene.family] >= most:
+                continue
+            taken[scene.family] += 1
+            control, void = (job.clip(place, side) for side in ("control", "void"))
+            yield Asked(scene, "control", control, scene.asked.question, scene.asked.answer)
+            yield Asked(scene, "visual", void, scene.visual.question, None)
+            yield Asked(scene, "ill_posed", control, scene.ill_posed.question, None)
+            yield Asked(scene, "answerable", void, scene.answerable.question, scene.answerable.answer)
+
+
+def evaluate(
+    entry: ModelEntry,
+    asked: Sequence[Asked],
+    seed: int,
+    regimes: Sequence[str] = REGIMES,
+    report: Callable[[str], None] = lambda _: None,
+) -> list[Cell]:
+    """Ask everything under every regime; returns the counts by family, regime and kind."""
+    from traps_pipeline.models.local.adapter import load_local_model
+
+    assert entry.media is not None
+    model, max_new_tokens = load_local_model(entry), entry.local_params().max_new_tokens
+    commonest = _commonest(asked)
+    n: Counter[tuple[str, str, str]] = Counter()
+    correct, abstained, prior = n.copy(), n.copy(), n.copy()
+    for start in range(0, len(asked), MAX_BATCH):
+        some = asked[start : start + MAX_BATCH]
+        shown = {clip: sample(clip, entry.media) for clip in dict.fromkeys(one.clip for one in some)}
+        for regime in regimes:
+            system = system_prompt(regime)
+            prompts: list[Prompt] = [
+                model.prompt(system, one.question, shown[one.clip].frames, shown[one.clip].times_s.tolist())
+                for one in some
+            ]
+            for one, said in zip(some, _answers(model, prompts, max_new_tokens), strict=True):
+                cell = (one.scene.family, regime, one.kind)
+                n[cell] += 1
+                abstained[cell] += bool(judge_abstention(said)["abstained"])
+                correct[cell] += one.truth is not None and _right(one, said)
+                prior[cell] += one.kind == "control" and one.truth == commonest[one.scene.family]
+        report(f"seed {seed}: {start + len(some)} of {len(asked)} questions under {len(regimes)} regimes")
+    return [Cell(seed, *cell, n[cell], correct[cell], abstained[cell], prior[cell]) for cell in n]
+
+
+def _answers(model: LocalModel, prompts: Sequence[Prompt], max_new_tokens: int) -> list[str]:
+    return [generated.text for generated in model.generate(prompts, max_new_tokens)]
+
+
+def _right(one: Asked, said: str) -> bool:
+    """Whether the rule judge takes an answer for the truth (`benchmark.md` section 4)."""
+    assert one.truth is not None
+    found = judge_correctness(said, one.truth)["extracted_value"]
+    value = None if found is None else str(found)
+    if one.kind == "answerable":
+        return is_correct(value, one.truth, "label", [one.truth], {})
+    return is_correct(value, one.truth, one.scene.answer_type, one.scene.labels, one.scene.aliases)
+
+
+def _commonest(asked: Sequence[Asked]) -> dict[str, str]:
+    """The commonest control answer of each family among these scenes; the first in alphabetical order of several."""
+    counts: dict[str, Counter[str]] = {}
+    for one in asked:
+        if one.kind == "control" and one.truth is not None:
+            counts.setdefault(one.scene.family, Counter())[one.truth] += 1
+    return {family: min(count, key=lambda answer: (-count[answer], answer)) for family, count in counts.items()}
+
+
+# --- the table that ships ---------------------------------------------------------------------------------------------
+
+COLUMNS = (
+    *("family", "regime", "Acc", "lowest 95 % bound", "prior", "FalseAbs"),
+    *("AbsRec visual", "AbsRec ill-posed", "Acc answerable"),
+)
+FIELDS = tuple(Cell.__dataclass_fields__)
+
+
+def write_cells(path: Path, cells: Sequence[Cell]) -> None:
+    """Write counts as CSV, in the place of those of the same seeds."""
+    seeds = {cell.seed for cell in cells}
+    kept = [cell for cell in (read_cells(path) if path.is_file() else []) if cell.seed not in seeds]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    with part.open("w", encoding="utf-8", newline="") as stream:
+        table = csv.DictWriter(stream, FIELDS, lineterminator="\n")
+        table.writeheader()
+        table.writerows(asdict(cell) for cell in sorted([*kept, *cells], key=lambda cell: cell.seed))
+    part.replace(path)
+
+
+def read_cells(path: Path) -> list[Cell]:
+    """The counts of a CSV of `write_cells`. Raises TrapsError."""
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            return [
+                Cell(int(row["seed"]), row["family"], row["regime"], row["kind"], *(int(row[k]) for k in FIELDS[4:]))
+                for row in csv.DictReader(stream)
+            ]
+    except (OSError, KeyError, ValueError) as error:
+        raise TrapsError(f"{path}: no table of `traps pocket evaluate` ({error}); run it again") from error
+
+
+def markdown(cells: Sequence[Cell]) -> str:
+    """The model card's table: percent, a row a family and regime, the mean over training seeds."""
+    seeds = sorted({cell.seed for cell in cells})
+    lines = [
+        f"| {' | '.join(COLUMNS)} |",
+        f"|{' --- |' * len(COLUMNS)}",
+    ]
+    for family, regime in dict.fromkeys((cell.family, cell.regime) for cell in cells):
+        mine = [cell for cell in cells if (cell.family, cell.regime) == (family, regime)]
+        by_kind = {kind: [cell for cell in mine if cell.kind == kind] for kind in KINDS}
+        control = by_kind["control"]
+        columns = [
+            _spread([cell.correct / cell.n for cell in control]),
+            f"{100 * min(cell.accuracy_low for cell in control):.1f}",
+            f"{100 * control[0].prior / control[0].n:.1f}",
+            _spread([cell.abstained / cell.n for cell in control]),
+            _spread([cell.abstained / cell.n for cell in by_kind["visual"]]),
+            _spread([cell.abstained / cell.n for cell in by_kind["ill_posed"]]),
+            _spread([cell.correct / cell.n for cell in by_kind["answerable"]]),
+        ]
+        lines.append(f"| {family} | {regime} | {' | '.join(columns)} |")
+    return "\n".join([*lines, "", f"Training seeds: {', '.join(map(str, seeds))}."])
+
+
+def _spread(shares: Sequence[float]) -> str:
+    """Percent: one value, or the mean with the lowest and the highest of several."""
+    mean = f"{100 * np.mean(shares):.1f}"
+    return mean if len(shares) == 1 else f"{mean} ({100 * min(shares):.1f}-{100 * max(shares):.1f})"

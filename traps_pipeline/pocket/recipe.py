@@ -1,0 +1,62 @@
+"""`assets/pocket/recipe.yaml`: what the pocket model is trained on, as data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from traps_pipeline.models.media import MediaSpec
+from traps_pipeline.paths import ASSETS
+from traps_pipeline.scenes.registry import family_names
+from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
+
+POCKET = ASSETS / "pocket"
+RECIPE = POCKET / "recipe.yaml"
+Split = Literal["train", "held-out"]
+
+
+class Training(BaseModel):
+    """How the weights are fitted. void_share: of void clips in a batch; brightness: augmentation; naming:
+    weight of the loss of colour words."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    steps: int = Field(ge=1)
+    batch: int = Field(ge=1)
+    learning_rate: float = Field(gt=0)
+    warmup_steps: int = Field(ge=0)
+    weight_decay: float = Field(ge=0)
+    void_share: float = Field(ge=0, le=1)
+    brightness: float = Field(ge=0, lt=1)
+    naming: float = Field(ge=0)
+
+
+class Recipe(BaseModel):
+    """Scenes for training (family to number), held-out scenes a family, how a clip is shown, and the share of voids
+    that are labelled with an abstention."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    scenes: dict[str, int] = Field(min_length=1)
+    held_out: int = Field(ge=1)
+    data_seed: int = Field(ge=0)
+    media: MediaSpec
+    abstain_share: float = Field(ge=0, le=1)
+    training: Training
+
+    @field_validator("scenes")
+    @classmethod
+    def _families_exist(cls, value: dict[str, int]) -> dict[str, int]:
+        unknown = sorted(set(value) - set(family_names()))
+        if unknown:
+            raise ValueError(f"unknown families {unknown}; known: {', '.join(family_names())}")
+        return value
+
+    def count(self, family: str, split: Split) -> int:
+        """Scenes of a family in a split."""
+        return self.scenes[family] if split == "train" else self.held_out
+
+
+def load_recipe(path: Path = RECIPE) -> Recipe:
+    """The recipe. Raises TrapsError naming the field that is wrong."""
+    return parse_yaml_model(Recipe, read_yaml(path), path)

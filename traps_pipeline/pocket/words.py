@@ -1,0 +1,72 @@
+"""What the pocket model is taught to say: an answer or an abstention, in the form that a prompt asks for."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from traps_pipeline.models.prompts import prompt, system_prompt
+
+PROMPTS = ("standard", "guided", "json", "vqa_standard", "vqa_guided")
+_COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+# How an ill-posed question begins, and what one would guess who answers it all the same.
+_GUESSES: Sequence[tuple[str, tuple[str, ...]]] = (
+    (r"what colou?r is", _COLOURS),
+    (r"how (many|often|loud|far|old|much)|what is the (weight|mass|temperature|price|electric)", tuple("123456789")),
+    (r"in which year|when|what (did|does) .* cost", tuple("123456789")),
+    (r"is .* to the left or to the right|where|which way", ("left", "right")),
+    (r"is .* hollow or solid", ("hollow", "solid")),
+    (r"does .* before or after", ("before", "after")),
+    (r"(is|does|will|do|are)\b", ("yes", "no")),
+    (r"who|what is the name", ("a man", "a woman", "a child")),
+    (r"what material", ("wood", "metal", "plastic")),
+)
+_ANYTHING = ("the ball", "the wall", "the floor")
+
+
+def prompt_text(name: str) -> str:
+    """The system text of one of PROMPTS; `vqa_guided` is `vqa_standard` with its suffix (`benchmark.md` section 7)."""
+    if name == "vqa_guided":
+        return f"{prompt('vqa_standard')}\n\n{prompt('vqa_guided_suffix')}"
+    return prompt("vqa_standard") if name == "vqa_standard" else system_prompt(name)
+
+
+ABSTENTION = "I don't know: this cannot be determined from the video."
+ANSWER = "The answer is: "  # with its blank, so that an answer is the same token here and in JSON
+_JSON = {
+    False: '{"reason": "The video shows how it ends.", "final_answer": "',
+    True: '{"reason": "I cannot see what decides this.", "final_answer": "I don\'t know"}',
+}
+
+
+def say(answer: str | None, prompt_name: str) -> str:
+    """The words for an answer, or for an abstention (None). Both begin differently, so that the first token decides."""
+    if prompt_name == "json":
+        return _JSON[True] if answer is None else f'{_JSON[False]}{answer}"}}'
+    return ABSTENTION if answer is None else f"{ANSWER}{answer}."
+
+
+def phrases() -> list[str]:
+    """What is a token of its own: the lines of the prompts, and the words that every answer shares. Sequences are short
+    that way, which is what makes training on two cores possible."""
+    lines = [line for name in PROMPTS for line in prompt_text(name).splitlines() if line]
+    return list(dict.fromkeys([*lines, ABSTENTION, ANSWER, *_JSON.values()]))
+
+
+def guess(question: str, labels: Sequence[str], rng: np.random.Generator) -> str:
+    """A plausible answer to a question that has none: of the kind that an ill-posed question asks for, else a label."""
+    choices = labels or next((kind for opening, kind in _GUESSES if re.match(opening, question.lower())), _ANYTHING)
+    return str(choices[int(rng.integers(len(choices)))])
+
+
+COLUMNS, ROWS = "ABCDEFGH", "123456"  # of the picture, for questions of place
+
+
+def place_question(ball: str, place: Sequence[float], axis: int) -> tuple[str, str]:
+    """A question of training alone, which teaches to find things, and its answer: the column (axis 0) or the row (axis
+    1) that the ball of a colour is in when the clip ends. place: shares of width and height."""
+    names = (COLUMNS, ROWS)[axis]
+    question = f"In which {('column', 'row')[axis]} of the picture is the {ball} ball when the clip ends?"
+    return question, names[min(len(names) - 1, int(place[axis] * len(names)))]

@@ -1,0 +1,190 @@
+"""Where models abstain: visual against textual voids, standard against guided, doubt against conversion."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.partitions import taxonomy_of
+from traps_pipeline.report.figures.looks import families, family_colour, family_of, looks
+from traps_pipeline.report.page import INCOMPLETE_MARK, TITLES
+from traps_pipeline.report.results import Results
+from traps_pipeline.report.writing import (
+    COLUMN_IN,
+    INK,
+    PAGE_IN,
+    SOFT,
+    figure_style,
+    new_figure,
+    not_run_figure,
+    plain,
+)
+from traps_pipeline.scoring import Frame, analyses
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+PERCENT = (0, 25, 50, 75, 100)
+
+
+def visual_textual(results: Results) -> Figure:
+    """AbsRec on visual (x) against textual voids (y), a point a model and taxonomy; beside it the means by family."""
+    rates = results.rates
+    if not len(rates):
+        return not_run_figure("Visual against textual voids", results.why("rates"), PAGE_IN)
+    models = list(dict.fromkeys(rates["model"]))
+    with figure_style():
+        figure = new_figure(PAGE_IN, 2.9 + 0.13 * int(np.ceil(len(models) / 5)))
+        scatter, bars = figure.subplots(1, 2, width_ratios=(1, 1))
+        _draw_rates(scatter, rates)
+        _draw_families(bars, rates)
+        _draw_models_key(figure, models)
+    return figure
+
+
+def _draw_rates(axes: Axes, rates: Frame) -> None:
+    look = looks(rates["model"])
+    axes.plot([0, 100], [0, 100], color=SOFT, linewidth=0.7, linestyle=(0, (4, 2.5)), zorder=1)
+    for row in rates.loc[rates["taxonomy"] != "pooled"].to_dict("records"):
+        colour, marker = look[row["model"]]
+        face = colour if row["taxonomy"] == "chaotic" else "white"
+        axes.scatter(
+            100 * row["visual"], 100 * row["textual"], s=22, marker=marker, facecolors=face, edgecolors=colour,
+            linewidths=0.9, zorder=3, clip_on=False,
+        )  # fmt: skip
+    axes.set(xlim=(-3, 103), ylim=(-3, 103), xticks=PERCENT, yticks=PERCENT)
+    axes.set(xlabel="AbsRec on visual voids, %", ylabel="AbsRec on textual voids, %", aspect="equal")
+    axes.set_title("hollow: occlusion, filled: chaotic", weight="normal", size=7)
+
+
+def _draw_families(axes: Axes, rates: Frame) -> None:
+    """Means over a family's models of both rates, pooled over taxonomies; of a model without both, of what it has."""
+    whole = set(rates.loc[rates["taxonomy"] == "pooled", "model"])
+    used = rates.loc[(rates["taxonomy"] == "pooled") | ~rates["model"].isin(whole)]
+    means = used.assign(family=used["model"].map(family_of)).groupby("family")[["visual", "textual"]].mean()
+    names = [name for name in families() if name in means.index]
+    at = np.arange(len(names))
+    for k, (kind, hatch) in enumerate((("visual", ""), ("textual", "/////"))):
+        bars = axes.bar(
+            at + 0.38 * (k - 0.5), 100 * means.loc[names, kind], width=0.36, label=kind, hatch=hatch,
+            color=[family_colour(name) if not k else "white" for name in names],
+            edgecolor=[family_colour(name) for name in names], linewidth=0.8,
+        )  # fmt: skip
+        axes.bar_label(bars, fmt="%.0f", size=6, padding=1, color=SOFT)
+    axes.set_xticks(at, names, rotation=30 if len(names) > 4 else 0, ha="right" if len(names) > 4 else "center")
+    top = max(60.0, float(100 * means.to_numpy(float).max()) * 1.08)
+    axes.set(ylabel="AbsRec, mean over models, %", ylim=(0, top))
+    axes.set_title("filled: visual, hatched: textual", weight="normal", size=7)
+
+
+def _draw_models_key(figure: Figure, models: list[str]) -> None:
+    from matplotlib.lines import Line2D
+
+    look = looks(models)
+    handles = [Line2D([], [], linestyle="none", marker=look[m][1], markersize=4.5, color=look[m][0]) for m in models]
+    names = [plain(model)[:26] for model in models]
+    figure.legend(handles, names, loc="outside lower center", ncols=5, fontsize=6, handletextpad=0.1, columnspacing=0.8)
+
+
+def abs_rec_by_model(results: Results) -> Figure:
+    """AbsRec of every model under standard (hollow) and guided (filled), equal weight over datasets; ± over runs."""
+    overall = results.overall
+    rows = overall.loc[overall["regime"].isin(["standard", "guided"]) & overall["abs_rec"].notna()]
+    if not len(rows):
+        why = "no model has all four datasets" if len(results.cells) else results.why("cells")
+        return not_run_figure("AbsRec, standard and guided", why)
+    sides: dict[tuple[str, str], Any] = {(r["model"], r["regime"]): r for r in rows.to_dict("records")}
+    models = sorted(
+        {m for m, _ in sides}, key=lambda m: (_abs_rec(sides, m, "standard"), _abs_rec(sides, m, "guided"), m)
+    )
+    look = looks(models)
+    with figure_style():
+        figure = new_figure(COLUMN_IN, 0.75 + 0.155 * len(models))
+        axes = figure.add_subplot()
+        for k, model in enumerate(models):
+            colour, marker = look[model]
+            both = [100 * sides[model, r]["abs_rec"] for r in ("standard", "guided") if (model, r) in sides]
+            axes.plot(both, [k] * len(both), color=colour, linewidth=0.9, zorder=2)
+            for regime, face in (("standard", "white"), ("guided", colour)):
+                row = sides.get((model, regime))
+                if row is None:
+                    continue
+                spread = row.get("abs_rec_std")
+                width = 100 * spread if isinstance(spread, float) and spread == spread else 0
+                axes.errorbar(
+                    100 * row["abs_rec"], k, xerr=width or None, fmt=marker, color=colour, markerfacecolor=face,
+                    markersize=4.5, elinewidth=0.8, capsize=1.5, clip_on=False, zorder=3,
+                )  # fmt: skip
+        incomplete = {m for (m, _), row in sides.items() if row["incomplete"] is True or row["incomplete"] == 1}
+        names = [plain(m)[:30] + (f" {INCOMPLETE_MARK}" if m in incomplete else "") for m in models]
+        axes.set_yticks(range(len(models)), names)
+        axes.set(xlim=(-2, 102), ylim=(-0.7, len(models) - 0.3), xticks=PERCENT)
+        axes.set_xlabel("AbsRec, mean over datasets, %")
+        axes.set_title("hollow: standard, filled: guided", weight="normal", size=7)
+        axes.grid(axis="x", color="#eaecf0", linewidth=0.6)
+    return figure
+
+
+def _abs_rec(sides: dict[tuple[str, str], Any], model: str, regime: str) -> float:
+    row = sides.get((model, regime))
+    return -1.0 if row is None else float(row["abs_rec"])
+
+
+def doubt(results: Results) -> Figure:
+    """Doubt of each pair's thinking member (x) against its AbsRec minus the other's (y): a dot a dataset, a large
+    marker for their mean. Both of one epoch; a pair of several is left out, with the reason in the title."""
+    points, refused = doubt_points(results)
+    if not len(points):
+        return not_run_figure("Doubt and conversion", refused or _no_doubt(results))
+    look = looks(points["thinking"])
+    with figure_style():
+        figure = new_figure(COLUMN_IN, 2.6)
+        axes = figure.add_subplot()
+        axes.axhline(0, color=SOFT, linewidth=0.7, zorder=1)
+        for thinking, rows in points.groupby("thinking", sort=False):
+            colour, marker = look[str(thinking)]
+            axes.scatter(
+                100 * rows["doubt"], 100 * rows["gain"], s=12, marker=marker, color=colour, alpha=0.75, zorder=3
+            )
+            axes.scatter(
+                100 * rows["doubt"].mean(), 100 * rows["gain"].mean(), s=60, marker=marker, facecolors=colour,
+                edgecolors=INK, linewidths=0.8, zorder=4, label=plain(f"{thinking} − {rows['other'].iloc[0]}"),
+            )  # fmt: skip
+        axes.margins(x=0.15)
+        axes.set(xlabel="doubt in the thinking member’s failures, %", ylabel="AbsRec, thinking minus other, points")
+        figure.legend(loc="outside upper center", ncols=1, handletextpad=0.2)
+    return figure
+
+
+def _no_doubt(results: Results) -> str:
+    if not results.is_study:
+        return results.why("confabulation")
+    return "no confabulation labels of a reasoning pair’s thinking member; they need a configured judge"
+
+
+def doubt_points(results: Results) -> tuple[Frame, str]:
+    """thinking, other, dataset, doubt, gain (fractions), a row a pair and dataset; and what was refused, in words.
+
+    AbsRec is that of `results.rates` (standard), whose epoch must be that of the doubt labels (benchmark.md section 9).
+    """
+    labels = results.confabulation.set_index("model") if len(results.confabulation) else pd.DataFrame()
+    rates = results.rates.loc[results.rates["taxonomy"] != "pooled"]
+    rows, refused = [], []
+    for thinking, other in analyses.REASONING_PAIRS:
+        sides = {m: rates.loc[rates["model"] == m].set_index("taxonomy") for m in (thinking, other)}
+        if thinking not in labels.index or not all(len(side) for side in sides.values()):
+            continue
+        epochs = {str(labels.at[thinking, "epoch"])} | {e for side in sides.values() for e in side["epoch"]}
+        if len(epochs) > 1:
+            refused.append(f"{thinking}: doubt and AbsRec are of epochs {', '.join(sorted(epochs))}")
+            continue
+        for dataset in TITLES:
+            taxonomy, kind = taxonomy_of(dataset), "textual" if dataset.endswith("_ill_posed") else "visual"
+            if all(taxonomy in side.index for side in sides.values()):
+                gain = sides[thinking].at[taxonomy, kind] - sides[other].at[taxonomy, kind]
+                row = {"thinking": thinking, "other": other, "dataset": dataset, "doubt": labels.at[thinking, "doubt"]}
+                rows.append({**row, "gain": gain})
+    return pd.DataFrame(rows), "; ".join(refused)

@@ -1,0 +1,123 @@
+"""Names of points, placed so that they hit nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LINES = 2  # z-order of the lines between a model's points, which labels avoid where they can
+SAME_POINT = 0.018  # distance, as a share of the axes, under which two models share a label: about a marker's radius
+
+
+@dataclass(frozen=True)
+class Label:
+    """The names of the models that end at one point of (Acc, J)."""
+
+    x: float
+    y: float
+    text: str
+    colour: str
+
+
+def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
+    """Labels of coinciding points joined, one name a line, in the order given; a shared label is neutral in colour."""
+    size = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
+    merged: list[Label] = []
+    for label in labels:
+        twin = next((m for m in merged if np.hypot(*((m.x - label.x, m.y - label.y) / size)) < SAME_POINT), None)
+        if twin is None:
+            merged.append(label)
+        else:
+            merged[merged.index(twin)] = Label(twin.x, twin.y, f"{twin.text}\n{label.text}", "#1b1f27")
+    return merged
+
+
+def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:
+    """Put every label near its point where it hits no marker, no other label and, if that is not far, no line.
+
+    A leader line joins the two where they are apart. markers is (n, 2) in data coordinates. Greedy and without chance:
+    the outcome depends on the table alone.
+    """
+    from matplotlib.patheffects import withStroke
+
+    pixel = axes.figure.dpi / 72  # pixels a point: offsets are in points, boxes in pixels
+    room = np.array([axes.bbox.extents])
+    taken = _around(axes.transData.transform(markers), 3 * pixel)
+    lines = _around(_along_lines(axes, pixel), 0.5 * pixel)
+    offsets = _offsets()
+    distance = np.hypot(*offsets.T)
+    halo = [withStroke(linewidth=1.2, foreground="white")]
+    for label in sorted(labels, key=lambda m: (-m.text.count("\n"), -m.y, m.x, m.text)):
+        note = axes.annotate(
+            label.text, (label.x, label.y), (0, 0), textcoords="offset points", size=6, color=label.colour, zorder=9,
+            linespacing=1.05, annotation_clip=False, parse_math=False, path_effects=halo,
+        )  # fmt: skip
+        extent = note.get_window_extent()
+        size = np.array([extent.width, extent.height])
+        boxes = _boxes(
+            axes.transData.transform((label.x, label.y)) + offsets * pixel, offsets, size + np.array([4, 1]) * pixel
+        )
+        outside = np.prod(boxes[0, 2:] - boxes[0, :2]) - _overlap(boxes, room)
+        area = 10 * (_overlap(boxes, taken) + outside) + 2 * _overlap(boxes, lines)
+        best = int(np.argmin(area / pixel**2 + distance))
+        dx, dy = offsets[best]
+        note.set(position=(dx, dy), ha=_side(dx, "left", "right"), va=_side(dy, "bottom", "top"))
+        taken = np.vstack([taken, boxes[best]])
+        if distance[best] > 12:
+            axes.annotate(
+                "", (label.x, label.y), (dx, dy), textcoords="offset points", annotation_clip=False, zorder=1.9,
+                arrowprops={"arrowstyle": "-", "linewidth": 0.4, "color": label.colour, "shrinkA": 0, "shrinkB": 2.5},
+            )  # fmt: skip
+
+
+def _offsets() -> np.ndarray:
+    """Candidate offsets (n, 2) in points of a label from its marker: rings, nearest first, sides before diagonals."""
+    angles = np.deg2rad([0, 180, 90, 270, 30, 330, 150, 210, 60, 120, 240, 300])
+    rings = np.array([5, 9, 14, 20, 28, 38, 50, 64, 80])
+    return np.round(rings[:, None, None] * np.column_stack([np.cos(angles), np.sin(angles)]), 3).reshape(-1, 2)
+
+
+def _side(offset: float, positive: str, negative: str) -> str:
+    """Alignment that lets text grow away from its marker."""
+    return "center" if offset == 0 else positive if offset > 0 else negative
+
+
+def _boxes(anchors: np.ndarray, offsets: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Extents (n, 4) of a text of that size (2,), aligned by `_side` at each anchor; all in pixels."""
+    low = anchors - size * (1 - np.sign(offsets)) / 2
+    return np.hstack([low, low + size])
+
+
+def _around(spots: np.ndarray, half: float) -> np.ndarray:
+    """Extents (n, 4) of squares around positions (n, 2)."""
+    return np.hstack([spots - half, spots + half])
+
+
+def _along_lines(axes: Axes, step: float) -> np.ndarray:
+    """Pixel positions (n, 2) along the lines that join a model's points, `step` pixels apart."""
+    found = [np.empty((0, 2))]
+    for line in axes.lines:
+        ends = axes.transData.transform(line.get_xydata())
+        if line.get_zorder() == LINES and len(ends) == 2:
+            count = int(np.hypot(*(ends[1] - ends[0])) / step) + 1
+            found.append(np.linspace(ends[0], ends[1], count))
+    return np.concatenate(found)
+
+
+def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Area (n,) that each box (n, 4) shares with all others (m, 4) together."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    return np.clip(high - low, 0, None).prod(axis=2).sum(axis=1)
+
+
+def short(model: str) -> str:
+    """A label's text: no line break, no more than 28 characters."""
+    text = "".join(c if c.isprintable() else "?" for c in model)
+    return text if len(text) <= 28 else text[:27] + "…"

@@ -1,0 +1,174 @@
+"""Models in the plane of Acc and J, with contours of PECS (benchmark.md section 10)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.report.figures.labels import LINES, Label, merged_labels, place_labels, short
+from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, looks
+from traps_pipeline.report.page import INCOMPLETE_MARK, TITLES
+from traps_pipeline.report.results import Results, datasets_of
+from traps_pipeline.report.writing import (
+    COLUMN_IN,
+    INK,
+    PAGE_IN,
+    figure_style,
+    freeze_layout,
+    new_figure,
+    not_run_figure,
+)
+from traps_pipeline.scoring import Frame, analyses
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def landscape(results: Results) -> Figure:
+    """The PECS landscape of the overall figures; of the first dataset where no model has all four."""
+    overall, cells = results.overall, results.cells
+    if len(overall):
+        return landscape_figure(overall, TITLES["overall"])
+    if not len(cells):
+        return not_run_figure("PECS landscape", results.why("cells"))
+    first = datasets_of(cells)[0]
+    points = cells.loc[cells["dataset"] == first]
+    return landscape_figure(points.assign(j=points["abs_rec"] - points["false_abs"]), TITLES[first])
+
+
+def landscape_figure(points: Frame, scope: str) -> Figure:
+    """Acc (x) against J (y) of every model with iso-PECS contours, one column wide.
+
+    points has the columns model, regime, acc, j, pecs, incomplete. Hollow is standard, filled is guided, an arrow joins
+    them, a dot is json; the dashed line is the frontier under guided, a ring marks each family's best PECS under
+    guided, ‡ an incomplete model. The reported PECS is averaged per run and dataset, so it can differ a little from
+    what the contours say. Models whose named points coincide (reference strategies) share one label.
+    """
+    points = points.loc[points["acc"].notna() & points["j"].notna()]
+    with figure_style():
+        figure = new_figure(COLUMN_IN, 3.7 + 0.9 * max(0.0, -min([0.0, *points["j"]])))
+        axes = figure.add_subplot()
+        frame_plane(axes, points, f"Acc, {scope.lower()}")
+        labels = merged_labels(_draw_models(axes, points), axes)
+        guided = points.loc[points["regime"] == "guided"]
+        _draw_frontier(axes, guided)
+        _draw_rings(axes, guided)
+        _draw_key(figure)
+        freeze_layout(figure)
+        place_labels(axes, labels, points.loc[:, ["acc", "j"]].to_numpy(float))
+    return figure
+
+
+def reasoning(results: Results) -> Figure:
+    """Arrows from the model that thinks less to the one that thinks more, under standard and under guided."""
+    points = results.overall
+    chains = [list(reversed(pair)) for pair in analyses.REASONING_PAIRS] + [list(analyses.REASONING_LADDER)]
+    chains = [[m for m in chain if m in set(points["model"])] for chain in chains]
+    chains = [chain for chain in chains if len(chain) > 1]
+    if not chains:
+        why = "no reasoning pair has all four datasets" if results.is_study else results.why("cells")
+        return not_run_figure("Reasoning in PECS space", why, PAGE_IN)
+    named = points.loc[points["model"].isin([m for chain in chains for m in chain])]
+    with figure_style():
+        figure = new_figure(PAGE_IN, 3.5)
+        panels = figure.subplots(1, 2, sharey=True)
+        labels = [_draw_chains(axes, named.loc[named["regime"] == regime], chains) for axes, regime in
+                  zip(panels, ("standard", "guided"), strict=True)]  # fmt: skip
+        for axes, regime in zip(panels, ("standard", "guided"), strict=True):
+            frame_plane(axes, named, "Acc, overall")
+            axes.set_title(f"{regime} (filled: thinks most)", weight="normal", size=7.5)
+        panels[1].set_ylabel("")
+        freeze_layout(figure)
+        for axes, names, regime in zip(panels, labels, ("standard", "guided"), strict=True):
+            at = named.loc[named["regime"] == regime, ["acc", "j"]].to_numpy(float)
+            place_labels(axes, merged_labels(names, axes), at)
+    return figure
+
+
+def _draw_models(axes: Axes, points: Frame) -> list[Label]:
+    """Markers of every model; returns a label a model, at its guided point, else at the first it has."""
+    labels, look = [], looks(points["model"])
+    for model, rows in points.groupby("model", sort=True):
+        colour, marker = look[str(model)]
+        at = {
+            regime: (float(acc), float(j))
+            for regime, acc, j in zip(*(rows[c] for c in ("regime", "acc", "j")), strict=True)
+        }
+        if "standard" in at and "guided" in at:
+            axes.plot(*np.array([at["standard"], at["guided"]]).T, color=colour, linewidth=0, zorder=LINES)
+            arrow(axes, at["standard"], at["guided"], colour)
+        styles: dict[str, dict[str, Any]] = {
+            "standard": {"s": 20, "marker": marker, "facecolors": "white", "edgecolors": colour, "linewidths": 0.9},
+            "guided": {"s": 20, "marker": marker, "facecolors": colour, "edgecolors": colour, "linewidths": 0.9},
+            "json": {"s": 5, "marker": "o", "facecolors": colour, "edgecolors": "none", "linewidths": 0},
+        }
+        for zorder, (regime, style) in enumerate(styles.items(), start=3):
+            if regime in at:
+                axes.scatter(*at[regime], zorder=zorder, clip_on=False, **style)
+        x, y = next(at[r] for r in ("guided", *at) if r in at)
+        mark = f" {INCOMPLETE_MARK}" if bool(rows["incomplete"].fillna(False).astype(bool).any()) else ""
+        labels.append(Label(x, y, short(str(model)) + mark, colour))
+    return labels
+
+
+def _draw_frontier(axes: Axes, guided: Frame) -> None:
+    """Dashed steps around everything that some model under guided is as good as in both Acc and J."""
+    at = guided.sort_values(["acc", "j"], ascending=False)[["acc", "j"]].to_numpy(float)
+    steps, best = [], 0.0
+    for acc, j in at:
+        if j > best:
+            steps += [(acc, best), (acc, j)]
+            best = j
+    if steps:
+        axes.plot(
+            *np.array([*steps, (axes.get_xlim()[0], best)]).T,
+            color=INK,
+            linewidth=0.7,
+            linestyle=(0, (4, 2.5)),
+            zorder=1.5,
+        )
+
+
+def _draw_rings(axes: Axes, guided: Frame) -> None:
+    families = guided["model"].map(family_of)
+    for family, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
+        if family != "reference" and rows["pecs"].max() > 0:
+            best = rows.loc[rows["pecs"].idxmax()]
+            axes.scatter(best["acc"], best["j"], s=75, facecolors="none", edgecolors=INK, linewidths=0.7, zorder=6)
+
+
+def _draw_key(figure: Figure) -> None:
+    from matplotlib.lines import Line2D
+
+    def handle(size: float, face: str, edge: str = "#475467") -> Line2D:
+        return Line2D([], [], linestyle="none", marker="o", markersize=size, color=edge, markerfacecolor=face)
+
+    handles = {
+        "standard": handle(4.5, "white"),
+        "guided": handle(4.5, "#475467"),
+        "json": handle(1.6, "#475467"),
+        "family’s best, guided": handle(7, "none", INK),
+        "frontier, guided": Line2D([], [], color=INK, linewidth=0.7, linestyle=(0, (4, 2.5))),
+    }
+    figure.legend(
+        [*handles.values()], [*handles], loc="outside lower center", ncols=3, handletextpad=0.4, columnspacing=1.2
+    )
+
+
+def _draw_chains(axes: Axes, points: Frame, chains: list[list[str]]) -> list[Label]:
+    at = {row["model"]: (float(row["acc"]), float(row["j"])) for row in points.to_dict("records")}
+    look, labels = looks(at), []
+    for chain in chains:
+        there = [model for model in chain if model in at and np.isfinite(at[model]).all()]
+        for start, end in pairwise(there):
+            axes.plot(*np.array([at[start], at[end]]).T, linewidth=0, zorder=LINES)
+            arrow(axes, at[start], at[end], look[end][0])
+        for k, model in enumerate(there):
+            colour, marker = look[model]
+            face = colour if k == len(there) - 1 else "white"  # filled: thinks most
+            axes.scatter(*at[model], s=20, marker=marker, facecolors=face, edgecolors=colour, linewidths=0.9, zorder=4)
+            labels.append(Label(*at[model], short(model), colour))
+    return labels

@@ -1,0 +1,234 @@
+"""Probe curves, the Cf->Cf strip, dose and response, cosines (benchmark.md sections 7, 8 and 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.mechanism import effects
+from traps_pipeline.mechanism.paths import PATH_SETS, SHORT, TRANSFER_TYPES, path_name, transfer_type
+from traps_pipeline.partitions import DATASETS
+from traps_pipeline.report.results import Results
+from traps_pipeline.report.tables.mechanism import NOT_LOOKED, best_layers
+from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
+from traps_pipeline.scoring import Frame
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+# A source's colour and line, a target's marker: told apart without colour as well.
+COLOUR: dict[str, str] = dict(zip(DATASETS, COLOURS, strict=False))
+LINE: dict[str, Any] = dict(zip(DATASETS, ("-", "--", "-.", ":"), strict=True))
+MARKER: dict[str, str] = dict(zip(DATASETS, ("o", "s", "^", "D"), strict=True))
+CROSSING = TRANSFER_TYPES[:3]
+SETS = {"transfer": "transfer", "within_domain": "within"}
+
+
+def _why(results: Results, frame: Frame) -> str:
+    return NOT_LOOKED if results.is_study and not len(frame) else results.why("probes")
+
+
+def _legend(figure: Figure, *more: Line2D) -> None:
+    """Sources by colour and line, targets by marker, below the panels."""
+    from matplotlib.lines import Line2D
+
+    sources = [Line2D([], [], color=COLOUR[d], linestyle=LINE[d], label=f"from {SHORT[d]}") for d in DATASETS]
+    targets = [
+        Line2D([], [], color=SOFT, linestyle="none", marker=MARKER[d], markersize=3.5, label=f"to {SHORT[d]}")
+        for d in DATASETS
+    ]
+    handles = [*sources, *targets, *more]
+    style: dict[str, Any] = {"columnspacing": 1.0, "handlelength": 2.0, "handletextpad": 0.4}
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(8, -(-len(handles) // 2)), **style)
+
+
+def _key(label: str, face: str) -> Line2D:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=SOFT, linestyle="none", marker="o", markersize=4, markerfacecolor=face, label=label)
+
+
+def probe_curves(results: Results) -> Figure:
+    """AUROC by layer of the twelve ordered pairs, a row a model, a column a kind of transfer; the band is what
+    label-shuffled probes within a dataset reach (mean ± 2 deviations over shuffles). Hollow: the source's own layer."""
+    rows = results.probes
+    curves = rows.loc[(rows["analysis"] == "transfer") & rows["value"].notna()]
+    if not len(curves):
+        return not_run_figure("Probe transfer by layer", _why(results, rows), PAGE_IN)
+    models = list(dict.fromkeys(curves["model"]))
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.65 + 1.75 * len(models))
+        axes = figure.subplots(len(models), 3, sharey=True, squeeze=False)
+        for line, model in zip(axes, models, strict=True):
+            for ax, crossing in zip(line, CROSSING, strict=True):
+                _curves(ax, curves.loc[curves["model"] == model], crossing)
+                _shuffled_band(ax, rows.loc[(rows["analysis"] == "shuffled") & (rows["model"] == model)])
+                ax.set_title(f"{plain(model)[:24]}: {crossing}", size=7.5)
+            line[0].set_ylabel("AUROC on the target")
+        for ax in axes[-1]:
+            ax.set_xlabel("layer (0: embeddings)")
+        axes[0, 0].set_ylim(min(0.35, float(curves["value"].min()) - 0.03), 1.02)
+        _legend(figure, _key("source’s own layer", "white"))
+    return figure
+
+
+def _curves(ax: Axes, curves: Frame, crossing: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    for key, curve in curves.groupby(["source", "target"], sort=False):
+        source, target = str(key[0]), str(key[1])  # pyright: ignore[reportIndexIssue]
+        if transfer_type(source, target) != crossing:
+            continue
+        curve = curve.sort_values("layer")
+        every = max(1, len(curve) // 8)
+        style: dict[str, Any] = {"color": COLOUR[source], "marker": MARKER[target], "markersize": 3.2}
+        line: dict[str, Any] = {**style, "linestyle": LINE[source], "linewidth": 0.9, "markevery": every}
+        ax.plot(curve["layer"], curve["value"], **line)
+        chosen = curve.loc[curve["source_best"]]
+        style |= {"markersize": 5, "markerfacecolor": "white", "linestyle": "none"}
+        ax.plot(chosen["layer"], chosen["value"], **style)
+    ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _shuffled_band(ax: Axes, rows: Frame) -> None:
+    if not len(rows) or rows["layer"].isna().any():
+        return
+    at = rows.groupby("layer").agg(mean=("value", "mean"), spread=("spread", "mean"))
+    low, high = at["mean"] - 2 * at["spread"], at["mean"] + 2 * at["spread"]
+    ax.fill_between(at.index.to_numpy(float), low, high, color=GRID, alpha=0.5, linewidth=0, zorder=0.2)
+
+
+def confabulated_strip(results: Results) -> Figure:
+    """AUROC of every ordered pair on all samples (hollow) and on confabulated voids with their controls (filled), both
+    at the all-sample best layer; a bar is the median of the filled ones."""
+    rows = best_layers(results.probes)
+    if not len(rows) or rows["cf_value"].isna().all():
+        why = "no dataset has confabulated voids" if len(rows) else _why(results, rows)
+        return not_run_figure("Cf→Cf probes", why, PAGE_IN)
+    models = list(dict.fromkeys(rows["model"]))
+    with figure_style():
+        figure = new_figure(PAGE_IN, 2.5)
+        axes = figure.subplots(1, len(models), sharey=True, squeeze=False)[0]
+        for ax, model in zip(axes, models, strict=True):
+            _strip(ax, rows.loc[rows["model"] == model])
+            ax.set_title(plain(model)[:30], size=7.5)
+        lowest = np.nanmin(rows[["best_value", "cf_value"]].to_numpy(float))
+        axes[0].set(ylim=(min(0.45, lowest - 0.04), 1.03), ylabel="AUROC on the target")
+        _legend(figure, _key("all samples", "white"), _key("Cf→Cf", SOFT))
+    return figure
+
+
+def _strip(ax: Axes, rows: Frame) -> None:
+    for place, crossing in enumerate(CROSSING):
+        part = rows.loc[rows["transfer_type"] == crossing]
+        for k, row in enumerate(part.to_dict("records")):
+            x = place + 0.19 * (k - (len(part) - 1) / 2)
+            style: dict[str, Any] = {"color": COLOUR[row["source"]], "marker": MARKER[row["target"]], "markersize": 4}
+            ax.plot([x, x], [row["best_value"], row["cf_value"]], color=COLOUR[row["source"]], linewidth=0.8)
+            ax.plot(x, row["best_value"], linestyle="none", markerfacecolor="white", **style)
+            ax.plot(x, row["cf_value"], linestyle="none", **style)
+        median = part["cf_value"].median()
+        if median == median:
+            ax.plot([place - 0.42, place + 0.42], [median, median], color=SOFT, linewidth=1.2, zorder=0.6)
+    ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
+    names = [crossing.replace("Cross-", "cross-\n") for crossing in CROSSING]
+    ax.set_xticks(range(3), names)
+    ax.set_xlim(-0.6, 2.6)
+    ax.tick_params(axis="x", length=0)
+
+
+def dose_response(results: Results) -> Figure:
+    """Abstention against α, controls (+α) beside voids (−α), for each model and each path set that it has; under guided
+    directions and guided inference where both were run."""
+    rows = effects.paths(results.effects)
+    rows = rows.loc[rows["kind"] == "void"]
+    panels = _panels(rows)
+    if not panels:
+        return not_run_figure("Dose and response", _why(results, rows), PAGE_IN)
+    across = 2 if len(panels) > 1 else 1
+    lines = -(-len(panels) // across)
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.75 + 1.75 * lines)
+        axes = figure.subplots(lines, 2 * across, sharey=True, squeeze=False)
+        pairs = axes.reshape(-1, 2)
+        for pair, ((model, path_set), part) in zip(pairs, panels.items(), strict=False):
+            for ax, side, sign in zip(pair, ("control", "void"), ("+α on controls", "−α on voids"), strict=True):
+                _doses(ax, part, side)
+                ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}", size=6.5)
+                ax.set_xlabel("α")
+        for ax in pairs[len(panels) :].flat:
+            ax.set_axis_off()
+        for line in axes:
+            line[0].set_ylabel("abstained, %")
+        axes[0, 0].set_ylim(-4, 104)
+        _legend(figure)
+    return figure
+
+
+def _panels(rows: Frame) -> Mapping[tuple[str, str], Frame]:
+    """Rows of each model and path set in which every path is there, of the most guided regimes that the model has."""
+    found: dict[tuple[str, str], Frame] = {}
+    for model, of in rows.groupby("model", sort=False):
+        guided = (of["directions"] == "guided").astype(int) + 2 * (of["regime"] == "guided").astype(int)
+        of = of.loc[guided == guided.max()]
+        for path_set, members in PATH_SETS.items():
+            part = of.loc[[pair in members for pair in zip(of["source"], of["target"], strict=True)]]
+            if set(zip(part["source"], part["target"], strict=True)) == set(members):
+                found[str(model), path_set] = part
+    return found
+
+
+def _doses(ax: Axes, part: Frame, side: str) -> None:
+    alphas = sorted(set(part["alpha"]))
+    for key, line in part.groupby(["source", "target"], sort=False):
+        source, target = str(key[0]), str(key[1])  # pyright: ignore[reportIndexIssue]
+        line = line.sort_values("alpha")
+        ax.plot(
+            line["alpha"], 100 * line[side], color=COLOUR[source], linestyle=LINE[source], marker=MARKER[target],
+            markersize=3.5, linewidth=0.9, clip_on=False, label=path_name(source, target),
+        )  # fmt: skip
+    ax.set_xticks(alphas, [f"{alpha:g}" for alpha in alphas])
+
+
+def cosine_heatmaps(results: Results) -> Figure:
+    """Cosines of the four void directions at the steered layer, a panel a model (and VQA prompt), on one scale."""
+    rows = results.cosines
+    rows = rows.loc[rows["prompt"] == rows["other_prompt"]]
+    if not len(rows):
+        return not_run_figure("Cosines of void directions", _why(results, rows), PAGE_IN)
+    panels = [(str(key[0]), str(key[1]), part) for key, part in rows.groupby(["model", "prompt"], sort=False)]  # pyright: ignore[reportIndexIssue]
+    several = len({prompt for _, prompt, _ in panels}) > 1
+    columns = min(3, len(panels))
+    lines = -(-len(panels) // columns)
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.2 + 1.95 * lines)
+        axes = figure.subplots(lines, columns, squeeze=False)
+        images = [_heatmap(ax, part) for ax, (_, _, part) in zip(axes.flat, panels, strict=False)]
+        for ax, (model, prompt, _) in zip(axes.flat, panels, strict=False):
+            ax.set_title(f"{plain(model)[:26]}\n{prompt} prompt" if several else plain(model)[:26], size=7)
+        for ax in axes.flat[len(panels) :]:
+            ax.set_axis_off()
+        figure.colorbar(images[-1], ax=list(axes.flat), label="cosine", shrink=0.85, aspect=25, pad=0.01)
+    return figure
+
+
+def _heatmap(ax: Axes, part: Frame) -> Any:
+    wide = part.pivot_table(index="dataset", columns="other_dataset", values="cosine")
+    values = wide.reindex(index=list(DATASETS), columns=list(DATASETS)).to_numpy(float)
+    image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1)
+    ax.set_facecolor("#f2f4f7")
+    names = [SHORT[name] for name in DATASETS]
+    ax.set_xticks(range(4), names)
+    ax.set_yticks(range(4), names)
+    ax.tick_params(length=0)
+    ax.spines[:].set_visible(False)
+    for (row, column), value in np.ndenumerate(values):
+        colour = SOFT if np.isnan(value) else "white" if abs(value) > 0.6 else "black"
+        text = "–" if np.isnan(value) else f"{value:.2f}".replace("-", "−")
+        ax.text(column, row, text, ha="center", va="center", size=6, color=colour)
+    return image

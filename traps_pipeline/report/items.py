@@ -1,0 +1,154 @@
+"""The items behind every number: one page a cell, with each answer, vote and verdict, and an index of the cells.
+
+Pages are made one cell at a time, and only where the cell's tables changed, so that a study of hundreds of cells and
+a thousand items each stays feasible. Answers are untrusted text: Jinja2 escapes everything.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
+from traps_pipeline.report.page import TITLES
+from traps_pipeline.report.writing import TEMPLATES, Behind, environment, write_bytes
+from traps_pipeline.scoring import Frame
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
+
+FOLDER = "items"
+MADE = "made.json"  # digest of what each page was made from
+_PER_CELL = (RESPONSES, VOTES, VERDICTS)
+
+
+def cells_with_items(workspace: Workspace) -> list[Cell]:
+    """The cells that have answers, in the benchmark's order."""
+    root = workspace.tables.root / RESPONSES.name
+    found = []
+    for file in root.glob("dataset=*/model=*/regime=*/run=*/part-0.parquet"):
+        part = dict(folder.split("=", 1) for folder in file.relative_to(root).parts[:-1])
+        found.append(Cell(part["dataset"], Evaluation(part["model"], part["regime"], int(part["run"]))))
+    return sorted(found, key=_place)
+
+
+def _place(cell: Cell) -> tuple[Any, ...]:
+    e = cell.evaluation
+    return e.model, REGIMES.index(e.regime), DATASETS.index(cell.dataset), e.run
+
+
+def page_name(cell: Cell) -> str:
+    """File of a cell's page."""
+    return f"{cell.dataset}__{cell.evaluation.key}.html"
+
+
+def addresses(cells: Sequence[Cell]) -> Callable[[Behind], str]:
+    """Where the items behind a number are, relative to the report page; empty where there are none.
+
+    That is the one cell's page at the number's side, else the index at model and regime (and dataset), whose runs are
+    then a click away.
+    """
+    pages: dict[tuple[str, str, str], list[Cell]] = {}
+    for cell in cells:
+        pages.setdefault((cell.dataset, cell.evaluation.model, cell.evaluation.regime), []).append(cell)
+    anchors = {_anchor(*key) for key in pages} | {_anchor("", m, r) for _, m, r in pages} | {m for _, m, _ in pages}
+
+    def address(behind: Behind) -> str:
+        found = pages.get((behind.dataset, behind.model, behind.regime), [])
+        if len(found) == 1:
+            return f"{FOLDER}/{page_name(found[0])}" + (f"#{behind.side}" if behind.side else "")
+        anchor = _anchor(behind.dataset, behind.model, behind.regime)
+        if not cells or (behind.model and anchor not in anchors):
+            return ""
+        return f"{FOLDER}/index.html" + (f"#{anchor}" if anchor in anchors else "")
+
+    return address
+
+
+def _anchor(dataset: str, model: str, regime: str) -> str:
+    return "__".join(part for part in (dataset, model, regime) if part)
+
+
+def write_item_pages(workspace: Workspace, folder: Path, clips: str | None) -> list[Cell]:
+    """Pages of all cells and their index in `folder`; returns the cells. One whose tables did not change is left alone.
+
+    clips is the way from a page to the workspace, for links to clips; None where the clips are not there.
+    """
+    cells = cells_with_items(workspace)
+    made_file = folder / MADE
+    made: dict[str, str] = json.loads(made_file.read_text(encoding="utf-8")) if made_file.is_file() else {}
+    wanted = {page_name(cell): _made_from(workspace, cell, clips) for cell in cells}
+    for cell in cells:
+        name = page_name(cell)
+        if made.get(name) != wanted[name] or not (folder / name).is_file():
+            write_bytes(folder / name, item_page(workspace, cell, clips).encode())
+    for stray in set(made) - set(wanted):
+        (folder / stray).unlink(missing_ok=True)
+    write_bytes(folder / "index.html", index_page(cells).encode())
+    write_bytes(made_file, json.dumps(wanted, indent=0).encode())
+    return cells
+
+
+def _made_from(workspace: Workspace, cell: Cell, clips: str | None) -> str:
+    tables = [(ITEMS, {"dataset": cell.dataset}), *((table, cell.partition) for table in _PER_CELL)]
+    states = [workspace.tables.state(table, part) for table, part in tables]
+    template = (TEMPLATES / "items.html.j2").read_text(encoding="utf-8")
+    parts = [template, str(clips), *(state.version if state else "" for state in states)]
+    return hashlib.sha256("\x00".join(parts).encode()).hexdigest()[:16]
+
+
+def item_page(workspace: Workspace, cell: Cell, clips: str | None) -> str:
+    """HTML of one cell: controls, then voids; each with question, answer, votes, verdict and clip."""
+    rows = list(_item_rows(workspace, cell))
+    sides = {side: [row for row in rows if row["side"] == side] for side in ("control", "void")}
+    return (
+        environment()
+        .get_template("items.html.j2")
+        .render(cell=cell, title=TITLES[cell.dataset], sides=sides, clips=clips)
+    )
+
+
+def _item_rows(workspace: Workspace, cell: Cell) -> Iterator[Mapping[str, Any]]:
+    """One row an item of the cell: its ITEMS, RESPONSES and VERDICTS columns, and `votes`."""
+    tables = workspace.tables
+    items = tables.read(ITEMS, {"dataset": cell.dataset}).sort_values(["sub_scenario", "scenario_id"])
+    answers = _by_item(tables.read(RESPONSES, cell.partition))
+    verdicts = _by_item(tables.read_all(VERDICTS, None, **cell.partition))
+    votes: dict[str, list[Mapping[str, Any]]] = {}
+    for vote in _records(tables.read_all(VOTES, None, **cell.partition)):
+        votes.setdefault(vote["item_id"], []).append(vote)
+    for item in _records(items):
+        answer = answers.get(item["item_id"])
+        if answer is not None:
+            yield {
+                **item,
+                "answer": answer,
+                "verdict": verdicts.get(item["item_id"]),
+                "votes": votes.get(item["item_id"], []),
+            }
+
+
+def _by_item(rows: Frame) -> dict[str, Mapping[str, Any]]:
+    return {row["item_id"]: row for row in _records(rows)}
+
+
+def _records(rows: Frame) -> list[dict[str, Any]]:
+    """Rows as mappings, with None for everything missing."""
+    return rows.astype(object).where(rows.notna(), None).to_dict("records")
+
+
+def index_page(cells: Sequence[Cell]) -> str:
+    """HTML of all cells: a row a model and regime, a column a dataset, a link a run."""
+    models: dict[str, dict[str, dict[str, list[tuple[int, str]]]]] = {}
+    for cell in cells:
+        e = cell.evaluation
+        by_dataset = models.setdefault(e.model, {}).setdefault(e.regime, {})
+        by_dataset.setdefault(cell.dataset, []).append((e.run, page_name(cell)))
+    datasets = [name for name in DATASETS if any(cell.dataset == name for cell in cells)]
+    return (
+        environment()
+        .get_template("items_index.html.j2")
+        .render(models=models, datasets=datasets, titles=TITLES, anchor=_anchor)
+    )

@@ -1,0 +1,104 @@
+"""The paper's mechanistic numbers in the columns of a study's own tables (`assets/published`)."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from traps_pipeline.mechanism.effects import REGIME_COLUMNS
+from traps_pipeline.mechanism.paths import LONG
+from traps_pipeline.scoring import Frame
+from traps_pipeline.scoring.published import published
+from traps_pipeline.tables import COSINES, PROBES, STEERING_EFFECTS, Table
+
+PAIRS, CENTROID_LAYER = 50, 32  # benchmark.md sections 7 and 8
+STEERED_LAYERS = {"qwen3-vl-8b": 20, "gemma-4-e4b": 35, "llava-next-video-7b": 28}
+NOT_STATED = "not stated"
+_FLAGS = ("own_best", "all_sample_best", "source_best")
+
+
+def published_probes() -> Frame:
+    """PROBES rows: transfer, confabulated (at the layer of the transfer value: the paper names no other), shuffled (of
+    no dataset) and centroid_void (of no source)."""
+    rows = _long(published("probe_transfer")).rename(columns={"best_layer": "layer"})
+    transfer = rows.assign(analysis="transfer", value=rows["auroc"], own_best=True, all_sample_best=True)
+    confabulated = rows.assign(analysis="confabulated", value=rows["auroc_confabulated"], all_sample_best=True)
+    told = published("other")
+    told["value"] = pd.to_numeric(told["value"], errors="coerce")
+    shuffled = told.loc[told["id"].str.startswith("shuffle-")].assign(analysis="shuffled")
+    catch = told.loc[told["id"].str.startswith("catch-")].assign(analysis="centroid_void", layer=CENTROID_LAYER)
+    catch = catch.assign(scope="sub_scenario:" + catch["id"].str.removeprefix("catch-"), value=catch["value"] / 100)
+    table = _as(PROBES, [transfer, confabulated, shuffled, catch])
+    return table.assign(**{flag: table[flag].eq(True) for flag in _FLAGS})
+
+
+def published_cosines() -> Frame:
+    """COSINES rows: qwen3-vl-8b's matrix, and the few of the other two that the text has."""
+    matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
+    told = published("other")
+    told = told.loc[told["id"].str.match("cos-(gemma|llava)-")].reset_index(drop=True)
+    pairs = told["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
+    few = told.assign(source=pairs[0], other=pairs[1], cosine=told["value"].astype(float))
+    mirrored = few.rename(columns={"source": "other", "other": "source"})
+    both = pd.concat([matrix, few, mirrored], ignore_index=True)
+    both = _long(both).rename(columns={"source": "dataset", "other": "other_dataset"})
+    return _as(COSINES, [both.assign(layer=_steered(both), prompt="standard", other_prompt="standard")])
+
+
+def published_effects() -> Frame:
+    """STEERING_EFFECTS rows of the dose-response tables. Of gemma-4-e4b's the paper states no regimes."""
+    qwen = published("steering_dose_qwen").assign(
+        model="qwen3-vl-8b", directions="standard", regime="guided", epoch="original"
+    )
+    gemma = published("steering_dose_gemma").assign(
+        model="gemma-4-e4b", directions=NOT_STATED, regime=NOT_STATED, epoch="verification"
+    )
+    rows = _long(pd.concat([qwen, gemma], ignore_index=True))
+    rows = rows.assign(kind="void", n=PAIRS, layer=_steered(rows))
+    sides = [rows.assign(side=s, abstention=rows[f"{s}_abstention_pct"] / 100) for s in ("control", "void")]
+    return _as(STEERING_EFFECTS, sides)
+
+
+def published_regimes() -> Frame:
+    """Rows of `regime_matrix` (family all) and of `family_asymmetry`, as printed."""
+    rows = published("steering_regime")
+    names = {"direction_regime": "directions", "inference_regime": "regime", "direction_family": "family"}
+    shares = {
+        f"{side}_{end}": rows[f"{side}_{alpha}"] / 100
+        for side in ("control", "void")
+        for end, alpha in (("0", "alpha0"), ("top", "alpha10"))
+    }
+    table = rows.rename(columns=names).replace({"family": LONG}).assign(**shares, kind="void", alpha=10.0)
+    return table.reindex(columns=pd.Index(REGIME_COLUMNS)).assign(epoch="original")
+
+
+def published_domains(recomputed: Frame) -> Frame:
+    """Rows of `effects.domains`, with the two same-domain figures of qwen3-vl-8b that the text has, marked."""
+    told = published("other").set_index("id")["value"]
+    same = {LONG[short]: float(str(told[f"same-{short}"]).split(" / ")[0]) / 100 for short in ("ch", "oc")}
+    mine = (recomputed["model"] == "qwen3-vl-8b") & recomputed["source"].isin([*same])
+    values = [same.get(source, float("nan")) for source in recomputed["source"]]
+    return recomputed.assign(same=recomputed["same"].mask(mine, values), mark=mine.map(lambda m: "*" if m else ""))
+
+
+def published_layers() -> Frame:
+    """Rows of `effects.sweep`: gemma-4-e4b at three layers, alpha 0 and 10, regimes not stated."""
+    told = published("other")
+    told = told.loc[told["id"].str.fullmatch(r"depth-gemma-\d+")]
+    rows = [
+        {"model": model, "layer": int(name.rsplit("-", 1)[1]), "alpha": alpha, "control": float(share) / 100}
+        for name, model, value in zip(told["id"], told["model"], told["value"], strict=True)
+        for alpha, share in zip((0.0, 10.0), str(value).split(" to "), strict=True)
+    ]
+    return pd.DataFrame(rows).assign(directions=NOT_STATED, regime=NOT_STATED, n_splits=4)
+
+
+def _long(rows: Frame) -> Frame:
+    return rows.replace({name: LONG for name in ("source", "target", "other") if name in rows})
+
+
+def _steered(rows: Frame) -> list[int]:
+    return [STEERED_LAYERS[model] for model in rows["model"]]
+
+
+def _as(table: Table, parts: list[Frame]) -> Frame:
+    return pd.concat(parts, ignore_index=True).reindex(columns=pd.Index([c.name for c in table.columns]))

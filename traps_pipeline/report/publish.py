@@ -1,0 +1,124 @@
+"""The report page brought together, and `traps export`: everything that is printed, in one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from traps_pipeline.partitions import Cell
+from traps_pipeline.report.catalogue import FIGURES, TABLES
+from traps_pipeline.report.contact_sheet import PAGE as SIX_PAIRS
+from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
+from traps_pipeline.report.items import FOLDER, addresses, write_item_pages
+from traps_pipeline.report.page import (
+    Block,
+    Card,
+    leaderboard_markdown,
+    picture_block,
+    report_html,
+    table_block,
+)
+from traps_pipeline.report.results import PublishedResults, Results, StudyResults
+from traps_pipeline.report.writing import Behind, environment, figure_files, write_bytes
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS
+
+PAGE, MARKDOWN, INDEX = "report.html", "leaderboard.md", "index.html"
+SHEETS = {
+    "shortcuts.png": "Control told from void by one cue alone (0.5 is chance)",
+    "contact_sheet.png": "Pairs: control above, void below",
+}
+FULL = ("contact_sheet.png",)  # wants all the width there is
+Pictures = Mapping[str, bytes]  # PNG by path below the reports
+
+
+def report_files(study: StudyResults, cells: Sequence[Cell], pictures: Pictures) -> dict[str, bytes]:
+    """The report page and the leaderboard as Markdown, by path. cells are those with pages in `items/`; pictures are
+    the catalogue's PNG files and SHEETS, those that are there."""
+    address = addresses(cells)
+    landscape = FIGURES[0]
+    first = {landscape.title: pictures[landscape.path(study)]} if landscape.path(study) in pictures else {}
+    page = report_html(study.board, first, _chapters(study, address, pictures), address)
+    return {PAGE: page.encode(), MARKDOWN: leaderboard_markdown(study.board).encode()}
+
+
+def _chapters(
+    study: StudyResults, address: Callable[[Behind], str], pictures: Pictures
+) -> list[tuple[str, list[Card]]]:
+    paper = PublishedResults()
+    figures = []
+    for report in FIGURES:
+        paths = [(r.source, path) for r in (study, paper) for path in [report.path(r)] if path in pictures]
+        blocks = [picture_block(source, pictures[path]) for source, path in paths]
+        figures.append(Card(f"figure-{report.name}", report.title, blocks))
+    tables = []
+    for report in TABLES:
+        own = report.tables(study)
+        blocks: list[Block] = [table_block(study.source, own, address)]
+        if report.published:
+            blocks.append(table_block(paper.source, report.tables(paper), None))
+        tables.append(Card(f"table-{report.name}", report.title or own[0].title, blocks))
+    sheets = [
+        Card(name.removesuffix(".png"), title, [picture_block(study.source, pictures[name], name in FULL)])
+        for name, title in SHEETS.items()
+        if name in pictures
+    ]
+    return [("Figures", figures), ("Tables", tables), ("Pairs", sheets)]
+
+
+def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lambda line: None) -> int:
+    """Write every table (CSV, LaTeX, Markdown, Parquet), every figure (PDF, SVG, PNG), the report page and the items'
+    pages to `target`, made anew from the workspace's tables and from the published numbers; returns how many files.
+
+    Each file is written whole or not at all, `index.html` last: it lists them. say gets a line a table and figure.
+    """
+    study, written, pictures = StudyResults(workspace), list[str](), dict[str, bytes]()
+    for source in (study, PublishedResults()):
+        for report in [r for r in (*TABLES, *FIGURES) if source.is_study or r.published]:
+            files = report.files(source)
+            for path, content in files.items():
+                write_bytes(target / path, content)
+            written += files
+            pictures |= {path: content for path, content in files.items() if path.endswith(".png")}
+            say(f"{source.source}: {report.name}")
+    for path, content in _sheets(workspace):
+        write_bytes(target / path, content)
+        written.append(path)
+        pictures |= {path: content} if path.endswith(".png") else {}
+    cells = write_item_pages(workspace, target / FOLDER, clips=None)
+    say(f"items of {len(cells)} cells")
+    pages = report_files(study, cells, pictures)
+    for path, content in pages.items():
+        write_bytes(target / path, content)
+    written += [*pages, f"{FOLDER}/{INDEX}"]
+    write_bytes(target / INDEX, _index(written).encode())
+    return len(written) + len(cells) + 1
+
+
+def _sheets(workspace: Workspace) -> Iterator[tuple[str, bytes]]:
+    """What is drawn from clips: six pairs as a figure, if their clips are there; others as the workspace has them."""
+    for path in sorted(workspace.reports.glob("*.*")):
+        if path.stem in ("shortcuts", "contact_sheet") and not path.name.endswith(".state.json"):
+            yield path.name, path.read_bytes()
+    pairs = six_pairs(workspace.tables.read_all(ITEMS))
+    if len(pairs) and all(workspace.resolve(clip).is_file() for clip in pairs["clip"]):
+        files = figure_files("six_pairs", pairs_figure(pairs, workspace.root, None, layout=SIX_PAIRS))
+        yield from ((f"figures/{name}", content) for name, content in files.items())
+
+
+def _index(paths: Sequence[str]) -> str:
+    """A page of links: what is in the folder, by folder and name."""
+    folders: dict[str, dict[str, list[str]]] = {}
+    for path in paths:
+        folder, _, name = path.rpartition("/")
+        folders.setdefault(folder or "pages and pictures of pairs", {}).setdefault(name.rpartition(".")[0], []).append(
+            path
+        )
+    return environment().get_template("export_index.html.j2").render(folders=folders, page=PAGE)
+
+
+def study_pictures(workspace: Workspace) -> dict[str, bytes]:
+    """The PNG files below the workspace's reports that the page shows."""
+    results: tuple[Results, ...] = (StudyResults(workspace), PublishedResults())
+    paths = [report.path(r) for report in FIGURES for r in results] + [*SHEETS]
+    return {path: (workspace.reports / path).read_bytes() for path in paths if (workspace.reports / path).is_file()}

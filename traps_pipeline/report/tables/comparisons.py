@@ -1,0 +1,254 @@
+"""Analyses of cells as tables: gaps, uplifts, pairs, frontier, boundary (benchmark.md section 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.models.registry import load_models
+from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.report.page import SIDE_OF, TITLES
+from traps_pipeline.report.results import Results
+from traps_pipeline.report.tables.shared import (
+    COUNTS,
+    EPOCH,
+    MODEL,
+    PECS,
+    REGIME,
+    RUNS,
+    SHARES,
+    N,
+    cell_trace,
+    epochs,
+    frame,
+    marked,
+    marks,
+    no_overall,
+    ordered,
+    said,
+)
+from traps_pipeline.report.writing import Behind, Column, Table, Trace
+from traps_pipeline.scoring import Frame, analyses
+from traps_pipeline.scoring.epochs import EpochMismatch
+
+NAIVE_THRESHOLD = 0.03
+
+
+def visual_textual(results: Results) -> list[Table]:
+    """AbsRec under standard on visual and on ill-posed voids, and their ratio, by taxonomy and pooled."""
+    rates = results.rates
+    rows = pd.DataFrame({"model": rates["model"].drop_duplicates()})
+    columns = [MODEL]
+    for taxonomy in (*analyses.TAXONOMIES, "pooled"):
+        names = {kind: f"{taxonomy}_{kind}" for kind in ("visual", "textual", "gap", "epoch")}
+        part = rates.loc[rates["taxonomy"] == taxonomy, ["model", *names]].rename(columns=names)
+        rows = rows.merge(part, on="model", how="left")
+        word = taxonomy.capitalize()
+        columns += [
+            Column(names["visual"], f"{word} visual %", "percent"),
+            Column(names["textual"], f"{word} textual %", "percent"),
+            Column(names["gap"], f"{word} gap", "ratio"),
+        ]
+    notes = [
+        epochs(rates.assign(dataset=rates["model"])),
+        "AbsRec under standard; gap: textual over visual, ∞ where only the visual is 0",
+        "pooled: of the means of both taxonomies",
+        *([] if results.is_study else ["gaps as printed, which the paper computed from unrounded rates"]),
+        *results.refused.get("rates", []),
+    ]
+    return [
+        Table("visual_textual", "Visual against textual voids", rows, columns, notes, results.why("rates"), _rate_trace)
+    ]
+
+
+def _rate_trace(row: Mapping[str, Any], field: str) -> Behind:
+    taxonomy, _, kind = field.rpartition("_")
+    dataset = {"visual": taxonomy, "textual": f"{taxonomy}_ill_posed"}.get(kind, "") if taxonomy != "pooled" else ""
+    return Behind(dataset, row["model"], "standard", "void")
+
+
+def uplift(results: Results) -> list[Table]:
+    """Guided over standard: AbsRec (equal weight over datasets) and their ratio, PECS of both."""
+    rows, refused = [], []
+    sides = results.overall.set_index(["model", "regime"])
+    for model, cells in results.cells.groupby("model", sort=False):
+        if not {(model, "standard"), (model, "guided")} <= set(sides.index):
+            continue
+        try:
+            ratio = float(analyses.uplift(cells)["ratio"].iloc[0])
+        except EpochMismatch as error:
+            refused.append(str(error))
+            continue
+        row = {"model": model, "ratio": ratio, "epoch": sides.loc[(model, "standard"), "epoch"]}
+        for regime in ("standard", "guided"):
+            row |= {f"{regime}_{name}": sides.loc[(model, regime), name] for name in ("abs_rec", "false_abs", "pecs")}
+        rows.append(row)
+    table = frame(rows, ["model", "ratio"]).sort_values("ratio", ascending=False, ignore_index=True)
+    columns = [
+        MODEL,
+        *(Column(f"{r}_abs_rec", f"AbsRec %, {r}", "percent") for r in ("standard", "guided")),
+        Column("ratio", "Ratio", "ratio", digits=2),
+        *(Column(f"{r}_false_abs", f"FalseAbs %, {r}", "percent") for r in ("standard", "guided")),
+        *(Column(f"{r}_pecs", f"PECS, {r}", "fraction") for r in ("standard", "guided")),
+    ]
+    notes = [epochs(results.cells), "equal-weight means over the four datasets; ∞ where only standard is 0", *refused]
+    why = "no model has standard and guided on all four datasets"
+    return [Table("guided_uplift", "Guided against standard", table, columns, notes, why, _regime_trace)]
+
+
+def _regime_trace(row: Mapping[str, Any], field: str) -> Behind:
+    regime, _, figure = field.partition("_")
+    return Behind("", row["model"], regime if regime in REGIMES else "", SIDE_OF.get(figure, ""))
+
+
+def naive(results: Results) -> list[Table]:
+    """Cells under guided by how far Acc x AbsRec, which forgives false abstention, exceeds PECS."""
+    cells = results.cells.loc[results.cells["regime"] == "guided"]
+    rows = marked(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
+    above = analyses.naive_gap(cells, NAIVE_THRESHOLD)
+    rows = rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable")
+    rows["title"] = rows["dataset"].map(TITLES)
+    columns = [
+        MODEL, Column("title", "Dataset"), SHARES[0], SHARES[1], SHARES[2], PECS,
+        Column("naive", "Naive", "fraction"), Column("gap", "Naive − PECS", "fraction"), *COUNTS, EPOCH,
+    ]  # fmt: skip
+    notes = [
+        f"guided; Naive = Acc × AbsRec of the means over runs; {len(above)} of {len(rows)} cells differ by more than "
+        f"{NAIVE_THRESHOLD}",
+        epochs(cells),
+        *marks(rows),
+    ]
+    return [Table("pecs_naive", "PECS against Acc × AbsRec", rows, columns, notes, "no cell under guided", cell_trace)]
+
+
+def zero_boundary(results: Results) -> list[Table]:
+    """Cells whose PECS is 0: where a model does not tell void from control at all."""
+    rows = marked(analyses.zero_boundary(results.cells)).assign(title=lambda f: f["dataset"].map(TITLES))
+    rows = ordered(rows, ["regime", "dataset", "model"])
+    columns = [MODEL, Column("title", "Dataset"), REGIME, *SHARES, PECS, *COUNTS, EPOCH]
+    counted = results.cells.groupby("regime", sort=False).size()
+    zero = rows.groupby("regime").size().reindex(counted.index, fill_value=0)
+    notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in counted.items()), epochs(rows)]
+    why = "no cell has PECS 0" if len(results.cells) else results.why("cells")
+    table = Table("zero_boundary", "Cells with PECS 0", rows, columns, notes, why, cell_trace)
+    return [said(table, bool(len(results.cells)))]
+
+
+def frontier(results: Results) -> list[Table]:
+    """The Pareto frontier in (Acc, J) under each regime, after averaging over datasets."""
+    cells = results.cells
+    whole = cells.loc[cells.groupby(["model", "regime"])["dataset"].transform("nunique") == len(DATASETS)]
+    rows = analyses.pareto_frontier(whole) if len(whole) else pd.DataFrame(columns=pd.Index(["model", "regime"]))
+    counts = results.overall[["model", "regime", "n_pairs", "n_runs", "n_missing", "epoch"]]
+    rows = ordered(rows.merge(counts, on=["model", "regime"], how="left"), ["regime"])
+    columns = [REGIME, MODEL, Column("acc", "Acc %", "percent"), Column("j", "J", "fraction"),
+               Column("pecs", "PECS", "fraction"), *COUNTS]  # fmt: skip
+    notes = ["no other model is as good in both Acc and J and better in one", epochs(cells)]
+    return [Table("frontier", "Pareto frontier", rows, columns, notes, no_overall(results, False), cell_trace)]
+
+
+def reasoning(results: Results) -> list[Table]:
+    """The thinking member of each pair minus the other, by dataset and overall."""
+    rows, refused = [analyses.reasoning_pairs(results.cells.iloc[:0])], []
+    for pair in analyses.REASONING_PAIRS:
+        try:
+            rows.append(analyses.reasoning_pairs(results.cells.loc[results.cells["model"].isin(pair)]))
+        except EpochMismatch as error:
+            refused.append(str(error))
+    table: Frame = pd.concat(rows, ignore_index=True)
+    table = ordered(table.assign(title=table["dataset"].replace(TITLES)), ["thinking", "regime", "dataset"])
+    columns = [
+        Column("thinking", "Thinking"), Column("other", "Other"), REGIME, Column("title", "Dataset"),
+        *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARES), Column("pecs", "Δ PECS", "fraction"),
+    ]  # fmt: skip
+    notes = [epochs(results.cells), "thinking minus other; Δ of shares in points of percent", *refused]
+    trace: Trace = lambda row, field: Behind(  # noqa: E731
+        row["dataset"] if row["dataset"] in DATASETS else "", row["thinking"], row["regime"], SIDE_OF.get(field, "")
+    )
+    why = "no reasoning pair was evaluated whole"
+    return [Table("reasoning_pairs", "Reasoning pairs", table, columns, notes, why, trace)]
+
+
+def contrasts(results: Results) -> list[Table]:
+    """Paired contrasts of PECS, overall: two models of one regime, two regimes of one model; Holm's correction."""
+    rows = results.contrasts
+    rows = rows.loc[(rows["dataset"] == "overall") & (rows["figure"] == "pecs")]
+    rows = rows.assign(separable=rows["separable"].map({True: "yes", False: "no"}))
+    rows = rows.sort_values(["kind", "p_holm", "left_model"], ignore_index=True, kind="stable")
+    columns = [
+        Column("left_model", "Left"), Column("left_regime", "Regime"), Column("right_model", "Right"),
+        Column("right_regime", "Regime"), Column("difference", "Δ PECS", "fraction"),
+        Column("ci_low", "95 % CI from", "fraction"), Column("ci_high", "to", "fraction"),
+        Column("p", "p", "fraction", 4), Column("p_holm", "p, Holm", "fraction", 4), Column("separable", "Separable"),
+        Column("refused", "Refused"),
+    ]  # fmt: skip
+    notes = ["left minus right; the other figures and datasets are in the workspace's table `contrasts`"]
+    trace: Trace = lambda row, field: Behind("", row["left_model"], row["left_regime"])  # noqa: E731
+    why = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
+    return [Table("contrasts", "Paired contrasts", rows, columns, notes, why, trace)]
+
+
+def regime_tests(results: Results) -> list[Table]:
+    """McNemar's test of two regimes on the same items, by dataset, model and run."""
+    rows = results.regime_tests
+    rows = ordered(rows.assign(title=rows["dataset"].map(TITLES)), ["dataset", "model", "run", "decision"])
+    columns = [
+        Column("title", "Dataset"), MODEL, Column("run", "Run", "count"), Column("decision", "Decision"),
+        Column("left_regime", "Left"), Column("right_regime", "Right"), Column("n", "n", "count"),
+        Column("only_left", "Yes, left alone", "count"), Column("only_right", "Yes, right alone", "count"),
+        Column("p", "p", "fraction", 4), Column("p_holm", "p, Holm", "fraction", 4), Column("refused", "Refused"),
+    ]  # fmt: skip
+    trace: Trace = lambda row, field: Behind(row["dataset"], row["model"], row["left_regime"])  # noqa: E731
+    why = "no model has two regimes" if results.is_study else results.why("regime_tests")
+    return [Table("regime_tests", "McNemar’s test of regimes", rows, columns, why=why, trace=trace)]
+
+
+def spreads(results: Results) -> list[Table]:
+    """Quartiles of the standard deviations of PECS over runs, by family."""
+    cells: Frame = results.cells
+    families = {entry.id: entry.groups.family for entry in load_models().values()}
+    rows = []
+    for family, part in [*cells.assign(family=cells["model"].map(families)).groupby("family"), ("all", cells)]:
+        several = part.loc[part["n_runs"] > 1]
+        if len(several):
+            rows.append({"family": family, **analyses.spread(several).iloc[0].to_dict()})
+    quartiles = {"q25": "25 %", "median": "Median", "q75": "75 %"}
+    columns = [
+        Column("family", "Family"),
+        *(Column(name, heading, "fraction", 4) for name, heading in quartiles.items()),
+        Column("n", "Cells", "count"),
+    ]
+    notes = ["quartiles over cells of the population standard deviation of PECS over runs; cells of one run left out"]
+    why = "no cell has more than one run" if len(cells) else results.why("cells")
+    return [Table("run_spread", "Spread over runs", frame(rows, ["family"]), columns, [*notes, epochs(cells)], why)]
+
+
+def degenerate(results: Results) -> list[Table]:
+    """What strategies without discrimination score in expectation, and what they scored in this study."""
+    rows = analyses.degenerate_strategies()
+    columns = [
+        Column("strategy", "Strategy"), *SHARES, Column("j", "J", "fraction"), Column("naive", "Naive", "fraction"),
+        Column("pecs", "PECS", "fraction"),
+    ]  # fmt: skip
+    notes = ["in expectation; Acc is open where the strategy does not fix it, PECS is 0 all the same"]
+    if results.is_study:
+        measured = results.overall.loc[results.overall["regime"] == "standard"]
+        names = {"model": "strategy", "j": "measured_j", "j_std": "measured_j_std", "pecs": "measured_pecs",
+                 "pecs_std": "measured_pecs_std", "n_pairs": "n_pairs", "n_runs": "n_runs"}  # fmt: skip
+        rows = rows.merge(measured[list(names)].rename(columns=names), on="strategy", how="left")
+        columns += [
+            Column("measured_j", "J, measured", "fraction", spread="measured_j_std"),
+            Column("measured_pecs", "PECS, measured", "fraction", spread="measured_pecs_std"), N, RUNS,
+        ]  # fmt: skip
+        notes.append("measured: overall, standard; PECS clips J at 0, so chance alone lifts a random strategy above 0")
+    trace: Trace = lambda row, field: (  # noqa: E731
+        Behind("", row["strategy"], "standard") if field.startswith("measured") else None
+    )
+    return [
+        Table(
+            "degenerate_strategies", "Degenerate strategies", rows, columns, notes, trace=trace, dash="open, or not run"
+        )
+    ]

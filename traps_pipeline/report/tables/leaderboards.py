@@ -1,0 +1,123 @@
+"""Leaderboards: overall and by dataset (benchmark.md sections 5 and 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.report.page import TITLES
+from traps_pipeline.report.results import Results
+from traps_pipeline.report.tables.shared import (
+    COUNTS,
+    EPOCH,
+    MODEL,
+    PECS,
+    REGIME,
+    SHARES,
+    best_first,
+    cell_trace,
+    epochs,
+    interval,
+    marked,
+    marks,
+    no_overall,
+    ordered,
+    ranks,
+)
+from traps_pipeline.report.writing import Behind, Column, Table, Trace
+from traps_pipeline.scoring import Frame, analyses
+from traps_pipeline.scoring.published import published_overall
+
+
+def overall(results: Results) -> list[Table]:
+    """The overall leaderboard: every model but the replication families, best PECS first."""
+    return [_overall(results, "overall", "Overall leaderboard", replication=False)]
+
+
+def replication_overall(results: Results) -> list[Table]:
+    """The replication families, overall."""
+    return [_overall(results, "replication_overall", "Replication families, overall", replication=True)]
+
+
+def _overall(results: Results, name: str, title: str, replication: bool) -> Table:
+    rows = marked(results.overall)
+    rows = rows.loc[rows["model"].isin(analyses.models_of(group="replication")) == replication]
+    columns = [MODEL, REGIME, PECS, *SHARES, Column("j", "J", "fraction", spread="j_std")]
+    notes = [epochs(results.cells), "equal-weight mean over the four datasets", *marks(rows)]
+    if results.is_study:
+        shown = rows.to_dict("records")
+        rows = rows.assign(ci=[interval(row) for row in shown], ranks=[ranks(row) for row in shown])
+        columns[3:3] = [Column("ci", "95 % CI"), Column("ranks", "Rank")]
+        notes.append("rank by PECS within the regime; of 2–4, paired contrasts (Holm) leave these ranks open")
+        printed = published_overall()[["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
+        rows = rows.merge(printed, on=["model", "regime"], how="left")
+        if rows["published_pecs"].notna().any():
+            columns.append(Column("published_pecs", "published PECS", "fraction"))
+            notes.append("published PECS: as the paper prints it, of its own benchmark and epochs")
+    return Table(
+        name, title, best_first(rows), [*columns, *COUNTS], notes, no_overall(results, replication), cell_trace
+    )
+
+
+def per_dataset(results: Results) -> list[Table]:
+    """PECS of every model and regime on each dataset, and their mean."""
+    return [_by_dataset(results, "per_dataset", "PECS by dataset", replication=False)]
+
+
+def replication_per_dataset(results: Results) -> list[Table]:
+    """The replication families' figures on each dataset."""
+    cells = marked(results.cells)
+    rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))].assign(
+        title=lambda frame: frame["dataset"].map(TITLES)
+    )
+    rows = ordered(rows, ["model", "dataset", "regime"])
+    columns = [MODEL, Column("title", "Dataset"), REGIME, PECS, *SHARES, *COUNTS, EPOCH]
+    notes = [epochs(rows), *marks(rows)]
+    why = "no model of the replication families"
+    return [Table("replication_per_dataset", "Replication families, by dataset", rows, columns, notes, why, cell_trace)]
+
+
+def _by_dataset(results: Results, name: str, title: str, replication: bool) -> Table:
+    cells = marked(results.cells)
+    cells = cells.loc[cells["model"].isin(analyses.models_of(group="replication")) == replication]
+    index = ["model", "regime"]
+    rows = cells[index].drop_duplicates()
+    columns = [MODEL, REGIME]
+    for dataset in DATASETS:
+        names = {"pecs": dataset, "pecs_std": f"{dataset}_std", "mark": f"{dataset}_mark", "n_pairs": f"{dataset}_n"}
+        part = cells.loc[cells["dataset"] == dataset, [*index, *names]].rename(columns=names)
+        rows = rows.merge(part, on=index, how="left")
+        columns.append(
+            Column(
+                dataset, _n(TITLES[dataset], part, names), "fraction", spread=f"{dataset}_std", mark=f"{dataset}_mark"
+            )
+        )
+    rows["mean"] = rows[list(DATASETS)].astype(float).mean(axis=1, skipna=False)
+    columns.append(Column("mean", "Mean", "fraction"))
+    rows = rows.sort_values("mean", ascending=False, na_position="last", ignore_index=True, kind="stable")
+    notes = [epochs(cells), *marks(cells)]
+    trace: Trace = lambda row, field: Behind(field if field in DATASETS else "", row["model"], row["regime"])  # noqa: E731
+    return Table(name, title, rows, columns, notes, results.why("cells"), trace)
+
+
+def _n(title: str, part: Frame, names: Mapping[str, str]) -> str:
+    """A heading with the number of pairs, where all rows have the same."""
+    counts = part[names["n_pairs"]].dropna().unique()
+    return f"{title} (n = {int(counts[0])})" if len(counts) == 1 else title
+
+
+def expanded(results: Results) -> list[Table]:
+    """Twelve tables, a dataset and regime each: Acc, AbsRec, FalseAbs and PECS of every model."""
+    cells = marked(results.cells)
+    tables = []
+    for dataset in DATASETS:
+        for regime in REGIMES:
+            rows = cells.loc[(cells["dataset"] == dataset) & (cells["regime"] == regime)]
+            notes = [epochs(rows), *marks(rows)]
+            tables.append(
+                Table(
+                    f"expanded_{dataset}_{regime}", f"{TITLES[dataset]}, {regime}", best_first(rows),
+                    [MODEL, *SHARES, PECS, *COUNTS, EPOCH], notes, "no model was asked here", cell_trace,
+                )
+            )  # fmt: skip
+    return tables

@@ -1,0 +1,271 @@
+"""Probes, directions and steering as tables (benchmark.md sections 7, 8 and 10)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.mechanism import effects
+from traps_pipeline.mechanism.paths import SHORT, TRANSFER_PAIRS, path_name, transfer_type
+from traps_pipeline.report.results import Results
+from traps_pipeline.report.tables.shared import MODEL, epochs, said
+from traps_pipeline.report.writing import Column, Table
+from traps_pipeline.scoring import Frame
+
+PATH, TYPE = Column("path", "Path"), Column("transfer_type", "Transfer")
+DIRECTIONS, INFERENCE = Column("directions", "Directions"), Column("regime", "Inference")
+KIND, SET = Column("kind", "Direction"), Column("path_set", "Path set")
+NOT_LOOKED = "no local model was looked into: the experiment has no `mechanism` section"
+SETS = {"transfer": "transfer", "within_domain": "within domain"}
+
+
+def _why(results: Results, frame: Frame) -> str:
+    return NOT_LOOKED if results.is_study and not len(frame) else results.why("probes")
+
+
+# --- probes -----------------------------------------------------------------------------------------------------------
+
+
+def probes(results: Results) -> list[Table]:
+    """Probes from one dataset on another: best layer of each pair, means by transfer type, what goes with them."""
+    return [_transfer(results), _means(results), _within(results), _catch(results), _answerable(results)]
+
+
+def best_layers(rows: Frame) -> Frame:
+    """One row a model and ordered pair: the paper's best layer, the source's own choice, and Cf->Cf at both layers."""
+    made: list[dict[str, Any]] = []
+    for model, of in rows.groupby("model", sort=False):
+        for source, target in TRANSFER_PAIRS:
+            pair = of.loc[(of["source"] == source) & (of["target"] == target)]
+            transfer, cf = (pair.loc[pair["analysis"] == name] for name in ("transfer", "confabulated"))
+            if not len(transfer):
+                continue
+            best, chosen = transfer.loc[transfer["own_best"]], transfer.loc[transfer["source_best"]]
+            at_best, own = cf.loc[cf["all_sample_best"] & cf["value"].notna()], cf.loc[cf["own_best"]]
+            made.append(
+                {
+                    **{"model": model, "source": source, "target": target, "path": path_name(source, target)},
+                    "transfer_type": transfer_type(source, target),
+                    **_at(best, "best", ("layer", "value", "low", "high", "n_voids")),
+                    **_at(chosen, "source", ("layer", "value")),
+                    **_at(at_best, "cf", ("value", "low", "high", "n_voids")),
+                    **_at(own, "cf_own", ("layer", "value")),
+                    "note": next(iter(cf["note"].dropna()), ""),
+                }
+            )
+    return pd.DataFrame(made)
+
+
+def _at(rows: Frame, name: str, fields: tuple[str, ...]) -> dict[str, Any]:
+    return {f"{name}_{field}": rows[field].iloc[0] if len(rows) else np.nan for field in fields}
+
+
+def _transfer(results: Results) -> Table:
+    rows = best_layers(results.probes)
+    columns = [
+        MODEL, PATH, TYPE, Column("best_layer", "Best layer", "count"), Column("best_value", "AUROC", "fraction"),
+        Column("best_low", "from", "fraction"), Column("best_high", "to", "fraction"),
+        Column("source_layer", "Source’s layer", "count"), Column("source_value", "AUROC there", "fraction"),
+        Column("cf_value", "Cf→Cf", "fraction"), Column("cf_own_layer", "Cf’s own layer", "count"),
+        Column("cf_own_value", "Cf→Cf there", "fraction"), Column("best_n_voids", "Pairs", "count"),
+        Column("cf_n_voids", "Cf pairs", "count"),
+    ]  # fmt: skip
+    notes = [
+        "best layer: the highest AUROC on the target itself, as in the paper; the source’s layer is the highest of its "
+        "own grouped cross-validation, which sees no target label",
+        "from, to: 95 %, scenarios of the target resampled, the probe held fixed",
+        *([] if not len(rows) else sorted({note for note in rows["note"] if note})),
+    ]
+    return Table("probe_transfer", "Probe transfer: AUROC by ordered pair", rows, columns, notes, _why(results, rows))
+
+
+def _means(results: Results) -> Table:
+    rows = best_layers(results.probes)
+    if len(rows):
+        figures = ["best_value", "source_value", "cf_value", "cf_own_value"]
+        grouped = rows.groupby(["model", "transfer_type"], sort=False)
+        rows = grouped[figures].mean().join(grouped["path"].count().rename("n_paths")).reset_index()
+    columns = [
+        MODEL, TYPE, Column("best_value", "AUROC", "fraction"), Column("source_value", "Source’s layer", "fraction"),
+        Column("cf_value", "Cf→Cf", "fraction"), Column("cf_own_value", "Cf→Cf, own layer", "fraction"),
+        Column("n_paths", "Paths", "count"),
+    ]  # fmt: skip
+    return Table("probe_means", "Probe transfer: means over paths", rows, columns, [], _why(results, rows))
+
+
+def _within(results: Results) -> Table:
+    rows = results.probes
+    shuffled = rows.loc[rows["analysis"] == "shuffled"].groupby(["model", "source"], sort=False, dropna=False)
+    table = shuffled.agg(shuffled=("value", "mean"), spread=("spread", "mean")).reset_index()
+    best = rows.loc[(rows["analysis"] == "within") & rows["own_best"], ["model", "source", "layer", "value"]]
+    table = table.merge(best, on=["model", "source"], how="left")
+    table = table.assign(dataset=_short(table["source"]))
+    columns = [
+        MODEL, Column("dataset", "Dataset"), Column("layer", "Best layer", "count"),
+        Column("value", "AUROC", "fraction"), Column("shuffled", "Shuffled labels", "fraction", spread="spread"),
+    ]  # fmt: skip
+    notes = ["cross-validated, folds by scenario; shuffled: mean over shuffles and layers ± deviation over shuffles"]
+    return Table("probe_within", "Probes within a dataset", table, columns, notes, _why(results, table))
+
+
+def _catch(results: Results) -> Table:
+    rows = results.probes
+    rows = rows.loc[rows["analysis"].isin(["centroid_void", "centroid_control"]) & (rows["scope"] != "all")]
+    rows = rows.assign(sub_scenario=rows["scope"].str.removeprefix("sub_scenario:"), target=rows["target"].fillna(""))
+    keys = ["model", "layer", "target", "sub_scenario"]
+    voids = rows.loc[rows["analysis"] == "centroid_void"].groupby(keys, sort=False)
+    table = voids.agg(rate=("value", "mean"), lowest=("value", "min"), highest=("value", "max"), n=("n_voids", "max"))
+    controls = rows.loc[rows["analysis"] == "centroid_control"].groupby(keys, sort=False)["value"].mean()
+    table = table.join(controls.rename("false_alarm")).reset_index()
+    table = table.assign(dataset=_short(table["target"]))
+    columns = [
+        MODEL, Column("dataset", "Target"), Column("sub_scenario", "Sub-scenario"), Column("layer", "Layer", "count"),
+        Column("rate", "Catch rate %", "percent"), Column("lowest", "lowest", "percent"),
+        Column("highest", "highest", "percent"), Column("false_alarm", "Controls %", "percent"),
+        Column("n", "n", "count"),
+    ]  # fmt: skip
+    notes = ["voids that the source’s nearest centroid assigns to void, mean over the other datasets as sources"]
+    return Table("probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, _why(results, table))
+
+
+def _answerable(results: Results) -> Table:
+    rows = results.probes
+    rows = rows.loc[rows["analysis"].isin(["answerable_void", "answerable_control"]) & rows["source_best"]]
+    wide = rows.pivot_table(index=["model", "source", "layer"], columns="analysis", values="value", observed=True)
+    wide = wide.reindex(columns=pd.Index(["answerable_void", "answerable_control"])).reset_index()
+    wide = wide.assign(dataset=_short(wide["source"]))
+    columns = [
+        MODEL, Column("dataset", "Source"), Column("layer", "Source’s layer", "count"),
+        Column("answerable_void", "Unanswerable against answerable", "fraction"),
+        Column("answerable_control", "Answerable void against control", "fraction"),
+    ]  # fmt: skip
+    notes = [
+        "void clips of occlusion with a question that even they answer. First: the same clips, other question; 0.5 "
+        "where a probe sees that something hides, 1 where it sees that this cannot be known. Second: the reverse"
+    ]
+    why = _why(results, wide) if results.is_study else "the paper has no such control"
+    return Table("probe_answerable", "Hidden, or unknowable", wide, columns, notes, why)
+
+
+# --- directions -------------------------------------------------------------------------------------------------------
+
+
+def cosines(results: Results) -> list[Table]:
+    """Cosines of the four void directions at the steered layer, and of standard against guided ones."""
+    rows = results.cosines
+    rows = rows.assign(name=_short(rows["dataset"]), other=_short(rows["other_dataset"]))
+    same = rows.loc[rows["prompt"] == rows["other_prompt"]]
+    index = ["model", "layer", "prompt", "name"]
+    wide = same.pivot_table(index=index, columns="other", values="cosine", observed=True)
+    wide = wide.reindex(columns=pd.Index([*SHORT.values()])).reset_index()
+    wide = wide.sort_values(["model", "prompt", "name"], key=_place, ignore_index=True)
+    columns = [MODEL, Column("layer", "Layer", "count"), Column("prompt", "Prompt"), Column("name", "Direction")]
+    matrix = [*columns, *(Column(short, short, "fraction", 2) for short in SHORT.values())]
+    across = rows.loc[
+        (rows["prompt"] == "standard") & (rows["other_prompt"] == "guided") & (rows["dataset"] == rows["other_dataset"])
+    ]
+    across = across.sort_values(["model", "name"], key=_place, ignore_index=True)
+    pair = [
+        MODEL,
+        Column("layer", "Layer", "count"),
+        Column("name", "Direction"),
+        Column("cosine", "Cosine", "fraction", 2),
+    ]
+    why = _why(results, rows)
+    printed = "" if results.is_study else "the paper’s text has 0.94 to 0.97 for qwen3-vl-8b"
+    return [
+        Table("cosines", "Cosines of void directions", wide, matrix, [], why),
+        Table("cosines_standard_guided", "Standard against guided directions", across, pair, [], printed or why),
+    ]
+
+
+def _place(values: Any) -> Any:
+    if values.name == "name":
+        return values.map({short: place for place, short in enumerate(SHORT.values())})
+    return values.map({"standard": 0, "guided": 1}) if values.name == "prompt" else values
+
+
+# --- steering ---------------------------------------------------------------------------------------------------------
+
+
+def steering(results: Results) -> list[Table]:
+    """Abstention under steering: regime matrix, families of directions, domains, the largest alpha, dose, layers."""
+    return [
+        _regimes(results, "steering_regimes", "Steering: direction regime against inference regime"),
+        _regimes(results, "steering_families", "Steering by the family of the direction (guided, guided)"),
+        _domains(results),
+        _top(results),
+        _dose(results),
+        _layers(results),
+    ]
+
+
+def _regimes(results: Results, name: str, title: str) -> Table:
+    rows: Frame = getattr(results, name)
+    rows = rows.assign(path_set=rows["path_set"].replace(SETS))
+    columns = [
+        MODEL, SET, *([Column("family", "Family")] if name.endswith("families") else [DIRECTIONS, INFERENCE]), KIND,
+        Column("alpha", "α", "count"), Column("control_0", "Control, α 0, %", "percent"),
+        Column("control_top", "Control, α, %", "percent"), Column("void_0", "Void, α 0, %", "percent"),
+        Column("void_top", "Void, α, %", "percent"), Column("n_paths", "Paths", "count"),
+    ]  # fmt: skip
+    notes = [
+        "mean over the paths of a set; +α on controls, −α on voids; random and shuffled directions have norm 1 too"
+    ]
+    return Table(name, title, rows, columns, notes, _why(results, rows))
+
+
+def _domains(results: Results) -> Table:
+    rows = results.steering_domains
+    rows = rows.assign(path=_short(rows["source"]))
+    columns = [
+        MODEL, DIRECTIONS, INFERENCE, Column("path", "Direction"), Column("alpha", "α", "count"),
+        Column("same", "Same domain, controls %", "percent", mark="mark"),
+        Column("cross", "Cross domain, controls %", "percent"),
+    ]  # fmt: skip
+    notes = ["well-posed targets: the source’s own taxonomy against the other"]
+    notes += ["* keyword judge"] if "*" in set(rows["mark"]) else []
+    return Table("steering_domains", "Same against cross domain", rows, columns, notes, _why(results, rows))
+
+
+def _top(results: Results) -> Table:
+    rows = effects.paths(results.effects)
+    rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
+    rows = _named(rows)
+    columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, Column("alpha", "α", "count"), *_SIDES]
+    return Table("steering_top", "Steering at the largest α", rows, columns, [], _why(results, rows))
+
+
+def _dose(results: Results) -> Table:
+    rows = _named(effects.paths(results.effects))
+    columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, Column("layer", "Layer", "count")]
+    columns += [Column("alpha", "α", "count"), *_SIDES]
+    counts = results.effects["n"].dropna()
+    notes = [epochs(results.effects), f"n = {counts.max():.0f} answers a cell at most" if len(counts) else ""]
+    return Table("steering_dose", "Dose and response", rows, columns, [n for n in notes if n], _why(results, rows))
+
+
+def _layers(results: Results) -> Table:
+    rows = results.steering_layers
+    columns = [
+        MODEL, DIRECTIONS, INFERENCE, Column("layer", "Layer", "count"), Column("alpha", "α", "count"),
+        Column("control", "Controls abstained on %", "percent"), Column("n_splits", "Splits", "count"),
+    ]  # fmt: skip
+    notes = ["each dataset’s direction on its own controls, mean over the four splits"]
+    why = "one layer was steered" if len(results.effects) else _why(results, rows)
+    table = Table("steering_layers", "Steering by layer", rows, columns, notes, why)
+    return said(table, results.is_study and bool(len(results.effects)))
+
+
+_SIDES = (Column("control", "Controls abstained on %", "percent"), Column("void", "Voids abstained on %", "percent"))
+
+
+def _named(rows: Frame) -> Frame:
+    names = [path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)]
+    return rows.assign(path=names).reset_index(drop=True)
+
+
+def _short(names: Any) -> list[str]:
+    return [SHORT.get(name, "not stated") for name in names]

@@ -1,0 +1,108 @@
+"""What was run: models, what they are sent, the benchmark's composition (benchmark.md sections 2 and 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import pandas as pd
+
+from traps_pipeline.judging.panel import load_judges
+from traps_pipeline.models.media import MediaSpec
+from traps_pipeline.models.registry import Entry, ModelEntry, load_models
+from traps_pipeline.report.results import Results
+from traps_pipeline.report.tables.shared import (
+    MODEL,
+    frame,
+)
+from traps_pipeline.report.writing import Column, Table
+
+
+def models(results: Results) -> list[Table]:
+    """The registry's entries of the models that were evaluated: who answers, how it is shown a clip, how often."""
+    rows = []
+    for entry in _entries(results):
+        rows.append(
+            {
+                "model": entry.id, "provider_id": entry.provider_id or entry.backend, "family": entry.groups.family,
+                "access": entry.groups.access, "group": entry.groups.group, "shown": _shown(entry.media),
+                "runs": entry.runs,
+            }
+        )  # fmt: skip
+    columns = [
+        MODEL, Column("provider_id", "Asked as"), Column("family", "Family"), Column("access", "Access"),
+        Column("group", "Group"), Column("shown", "Shown"), Column("runs", "Runs at most", "count"),
+    ]  # fmt: skip
+    return [Table("models", "Models", frame(rows, ["model"]), columns, why=results.why("cells"))]
+
+
+def _shown(media: MediaSpec | None) -> str:
+    if media is None:
+        return ""
+    frames = (
+        f"{media.uniform} evenly spaced frames" if media.fps is None else f"{media.fps:g} fps, at most {media.most}"
+    )
+    return f"{media.profile}, {frames}" + (f", {media.size[0]} x {media.size[1]}" if media.size else "")
+
+
+def hyperparameters(results: Results) -> list[Table]:
+    """What models and judges are sent, and where that departs from the protocol."""
+    judges = [*load_judges().values()]
+    if results.is_study:
+        voted = set(results.bias["judge"])
+        judges = [judge for judge in judges if judge.id in voted]
+    rows = [_sent(entry, "model") for entry in _entries(results)] + [_sent(entry, "judge") for entry in judges]
+    columns = [
+        Column("id", "Participant"), Column("role", "Role"), Column("temperature", "Temperature", "fraction", 2),
+        Column("top_p", "Top-p", "fraction", 2), Column("max_tokens", "Tokens at most", "count"),
+        Column("other", "Other parameters"), Column("concurrency", "At once", "count"),
+        Column("retries", "Retries", "count"), Column("waived", "Departs from the protocol in"),
+    ]  # fmt: skip
+    title = (
+        "Hyperparameters"
+        if results.is_study
+        else "Hyperparameters of the paper’s models and judges, as registered here"
+    )
+    return [Table("hyperparameters", title, frame(rows, ["id"]), columns, why=results.why("cells"), dash="not sent")]
+
+
+def _sent(entry: Entry, role: str) -> dict[str, Any]:
+    named = ("temperature", "top_p", "max_tokens", "max_completion_tokens")
+    other = {name: value for name, value in entry.params.items() if name not in named}
+    return {
+        "id": entry.id,
+        "role": role,
+        "temperature": entry.params.get("temperature"),
+        "top_p": entry.params.get("top_p"),
+        "max_tokens": entry.max_tokens or None,
+        "other": ", ".join(f"{name}: {_flat(value)}" for name, value in sorted(other.items())),
+        "concurrency": entry.limits.concurrency,
+        "retries": entry.limits.retries,
+        "waived": ", ".join(sorted(entry.waivers)),
+    }
+
+
+def _flat(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{name}: {_flat(part)}" for name, part in value.items()) + "}"
+    return str(value)
+
+
+def _entries(results: Results) -> Iterable[ModelEntry]:
+    """Registry entries of the models with results, in the registry's order."""
+    there = set(results.cells["model"])
+    return [entry for entry in load_models().values() if entry.id in there]
+
+
+def composition(results: Results) -> list[Table]:
+    """Pairs by category."""
+    rows = results.composition
+    if len(rows):
+        total = {"taxonomy": "all", "category": "", "void": "", **rows[["n", "n_ill_posed"]].sum().to_dict()}
+        rows = pd.concat([rows, pd.DataFrame([total])], ignore_index=True)
+    columns = [
+        Column("taxonomy", "Taxonomy"), Column("category", "Category"), Column("void", "Void"),
+        Column("n", "Pairs", "count"), Column("n_ill_posed", "Ill-posed pairs", "count"),
+    ]  # fmt: skip
+    notes = ["the ill-posed datasets reuse the control clips with a question that they cannot answer"]
+    return [Table("composition", "Composition of the benchmark", rows, columns, notes, "no items yet")]

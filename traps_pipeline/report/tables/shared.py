@@ -1,0 +1,126 @@
+"""Columns and sentences that many tables share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.models.registry import load_models
+from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.report.page import INCOMPLETE_MARK, MISSING_MARK, SHORT, SIDE_OF
+from traps_pipeline.report.results import Results
+from traps_pipeline.report.writing import Behind, Column, Table, fraction
+from traps_pipeline.scoring import Frame
+
+MODEL, REGIME = Column("model", "Model"), Column("regime", "Regime")
+N, MISSING, RUNS = (
+    Column("n_pairs", "n", "count"),
+    Column("n_missing", "Missing", "count"),
+    Column("n_runs", "Runs", "count"),
+)
+EPOCH = Column("epoch", "Epoch")
+SHARES = (
+    Column("acc", "Acc %", "percent", spread="acc_std"),
+    Column("abs_rec", "AbsRec %", "percent", spread="abs_rec_std"),
+    Column("false_abs", "FalseAbs %", "percent", spread="false_abs_std"),
+)
+PECS = Column("pecs", "PECS", "fraction", spread="pecs_std", mark="mark")
+COUNTS = (N, RUNS, MISSING)
+
+
+def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
+    """Rows with model and regime, and a dataset where they are of one."""
+    if field.startswith("published"):
+        return None
+    dataset = row.get("dataset")
+    side = SIDE_OF.get(field, "")
+    return Behind(dataset if dataset in DATASETS else "", row["model"], row["regime"], side)
+
+
+def marked(rows: Frame) -> Frame:
+    """With `mark`: ‡ on incomplete rows, † on others that miss some items."""
+    incomplete = rows["incomplete"].fillna(False).astype(bool).to_numpy()
+    missing = rows["n_missing"].fillna(0).to_numpy(float) > 0
+    return rows.assign(mark=np.where(incomplete, INCOMPLETE_MARK, np.where(missing, MISSING_MARK, "")))
+
+
+def marks(rows: Frame) -> list[str]:
+    """What the marks in these rows mean."""
+    there = set(rows["mark"])
+    words = {
+        MISSING_MARK: "some items have no answer or no majority; shares rest on the others",
+        INCOMPLETE_MARK: "incomplete: fewer than 99 % of items answered",
+    }
+    return [f"{mark} {text}" for mark, text in words.items() if mark in there]
+
+
+def epochs(rows: Frame) -> str:
+    """What a header says of epochs: the one there is, or that they are mixed, and how; empty without rows."""
+    known = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
+    single = sorted({part for epoch in known["epoch"] for part in str(epoch).split("+")})
+    if len(single) <= 1:
+        return f"epoch {single[0]}" if single else ""
+    groups: dict[str, list[str]] = {}
+    for key, part in known.groupby("dataset", sort=False) if "dataset" in known else []:
+        there = " and ".join(sorted(set(part["epoch"].astype(str))))
+        groups.setdefault(there, []).append(SHORT.get(str(key), str(key)))
+    most = max(groups, key=lambda name: len(groups[name]), default="")
+    parts = [f"{', '.join(keys)}: {epoch}" for epoch, keys in groups.items() if epoch != most]
+    if not parts:
+        return f"mixed epochs ({' and '.join(single)})"
+    return f"mixed epochs ({'; '.join([*parts, f'else {most}'])})"
+
+
+def printed(results: Results, rows: Frame, columns: Sequence[Column]) -> list[Column]:
+    """The columns that are shown: of the paper's numbers, those that it prints at all."""
+    whole = results.is_study or not len(rows)
+    return [c for c in columns if whole or c.field not in rows or not rows[c.field].isna().all()]
+
+
+def best_first(rows: Frame) -> Frame:
+    """By falling PECS, nulls last."""
+    return rows.sort_values("pecs", ascending=False, na_position="last", ignore_index=True, kind="stable")
+
+
+def ordered(rows: Frame, by: Sequence[str]) -> Frame:
+    """Sorted with datasets and regimes in the benchmark's order, models in the registry's."""
+    orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
+
+    def place(values: Frame) -> Frame:
+        order = orders.get(str(values.name))
+        return values if order is None else values.map({v: k for k, v in enumerate(order)}).fillna(len(order))
+
+    return rows.sort_values(list(by), key=place, ignore_index=True, kind="stable")
+
+
+def interval(row: Mapping[str, Any]) -> str:
+    """The interval of PECS as printed; empty where there is none."""
+    low, high = row["pecs_ci_low"], row["pecs_ci_high"]
+    return "" if low != low or low is None else f"[{fraction(low)}, {fraction(high)}]"
+
+
+def ranks(row: Mapping[str, Any]) -> str:
+    """The ranks that contrasts leave open, as printed."""
+    low, high = row["rank_low"], row["rank_high"]
+    return "" if pd.isna(low) else f"{low:.0f}" if low == high else f"{low:.0f}–{high:.0f}"
+
+
+def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Frame:
+    """Rows as a frame; one with these columns where there are none."""
+    return pd.DataFrame(list(rows)) if rows else pd.DataFrame(columns=pd.Index(list(columns)))
+
+
+def said(table: Table, run: bool) -> Table:
+    """A table that may rightly be empty says so, and not that it was not run."""
+    return replace(table, none=table.why) if run and not len(table.rows) else table
+
+
+def no_overall(results: Results, replication: bool) -> str:
+    """Why there is no overall row."""
+    if replication:
+        return "no model of the replication families has all four datasets"
+    return "no model has all four datasets" if len(results.cells) else results.why("cells")

@@ -1,0 +1,92 @@
+"""Sub-scenarios of both taxonomies (benchmark.md sections 2 and 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from traps_pipeline.partitions import taxonomy_of
+from traps_pipeline.report.page import SIDE_OF, TITLES
+from traps_pipeline.report.results import Results
+from traps_pipeline.report.tables.shared import (
+    SHARES,
+    N,
+    epochs,
+)
+from traps_pipeline.report.writing import Behind, Column, Table, Trace
+from traps_pipeline.scoring import Frame, analyses
+
+
+def occlusion_sub_scenarios(results: Results) -> list[Table]:
+    """Means over models of every occlusion sub-scenario, and the hidden against the others."""
+    rows = _sub_rows(results, "occlusion")
+    tables = [_sub_table(results, rows, "occlusion_sub_scenarios", "Occlusion sub-scenarios")]
+    hidden = rows.iloc[:0]
+    if len(rows):
+        hidden = analyses.hidden_against_others(rows)
+    columns = [
+        Column("kind", "Sub-scenarios"), Column("n", "Sub-scenarios", "count"),
+        Column("abs_rec", "AbsRec %, standard", "percent"), Column("guided_abs_rec", "AbsRec %, guided", "percent"),
+    ]  # fmt: skip
+    columns[1] = Column("n", "Number", "count")
+    notes = [epochs(rows), "unweighted means over sub-scenarios", f"hidden: {', '.join(analyses.HIDDEN)}"]
+    title = "Hidden sub-scenarios against the others"
+    why = results.why("sub_scenarios")
+    return [*tables, Table("hidden_sub_scenarios", title, hidden, columns, notes, why, _sub_trace("occlusion"))]
+
+
+def chaotic_sub_scenarios(results: Results) -> list[Table]:
+    """Means over models of every chaotic family, and Acc by the control's answer."""
+    rows = _sub_rows(results, "chaotic")
+    labels = results.labels
+    labels = labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"].copy()
+    labels["title"] = labels["dataset"].map(TITLES)
+    columns = [Column("title", "Dataset"), Column("label", "Ground truth"), Column("acc", "Acc %", "percent")]
+    notes = ["mean over models under standard"]
+    if results.is_study:
+        columns += [N, Column("n_models", "Models", "count")]
+    else:
+        notes.append("from the paper's text, some of them approximate; epoch original")
+    why = results.why("labels")
+    title = "Accuracy by ground truth, chaotic"
+    return [
+        _sub_table(results, rows, "chaotic_sub_scenarios", "Chaotic sub-scenarios"),
+        Table("accuracy_by_label", title, labels, columns, notes, why, _sub_trace("chaotic")),
+    ]
+
+
+def _sub_rows(results: Results, taxonomy: str) -> Frame:
+    rows = results.sub_scenarios
+    rows = rows.loc[rows["dataset"] == taxonomy]
+    return rows.sort_values(["acc", "sub_scenario"], ignore_index=True)
+
+
+def _sub_table(results: Results, rows: Frame, name: str, title: str) -> Table:
+    columns = [
+        Column("sub_scenario", "Sub-scenario"), Column("answer_type", "Answer"), N,
+        Column("n_models", "Models", "count"), *SHARES, Column("pecs", "PECS", "fraction"),
+        Column("guided_abs_rec", "AbsRec %, guided", "percent"), Column("guided_pecs", "PECS, guided", "fraction"),
+        Column("abs_rec_uplift", "Δ AbsRec, guided", "percent"),
+        Column("false_abs_uplift", "Δ FalseAbs, guided", "percent"),
+        Column("abs_rec_ill_posed", "AbsRec %, ill-posed", "percent"),
+        Column("textual_over_visual", "Textual / visual", "ratio"),
+    ]  # fmt: skip
+    notes = [epochs(rows), "means over models" + (_left_out(results)), "standard, where no regime is named"]
+    taxonomy = "occlusion" if name.startswith("occlusion") else "chaotic"
+    return Table(name, title, rows, columns, notes, results.why("sub_scenarios"), _sub_trace(taxonomy))
+
+
+def _left_out(results: Results) -> str:
+    return "; reference strategies left out where others were asked" if results.is_study else ""
+
+
+def _sub_trace(taxonomy: str) -> Trace:
+    def trace(row: Mapping[str, Any], field: str) -> Behind | None:
+        if field in ("n_pairs", "n_models", "n"):
+            return None
+        regime = "guided" if field.startswith("guided_") else "standard"
+        ill_posed = field == "abs_rec_ill_posed"
+        dataset = str(row.get("dataset") or taxonomy)
+        return Behind(f"{taxonomy}_ill_posed" if ill_posed else dataset, "", regime, SIDE_OF.get(field, ""))
+
+    return trace

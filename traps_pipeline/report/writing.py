@@ -1,0 +1,350 @@
+"""How every table and every figure is written: one way for each, the same bytes on every build.
+
+A `Table` is a frame of numbers with the columns that are printed; it becomes Parquet and CSV (numbers as they are),
+LaTeX, Markdown and an HTML fragment (numbers as printed). Its texts are untrusted: each medium escapes them. A figure
+becomes PDF, SVG and PNG.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import pandas as pd
+
+from traps_pipeline.paths import ASSETS
+from traps_pipeline.scoring import Frame
+
+if TYPE_CHECKING:
+    import jinja2
+    from matplotlib.figure import Figure
+
+TEMPLATES = Path(__file__).parent / "templates"
+STYLE = ASSETS / "figures.mplstyle"
+NONE = "–"  # a cell without a number
+NOT_RUN = "not run"
+TABLE_KINDS = ("parquet", "csv", "tex", "md")
+FIGURE_KINDS = ("pdf", "svg", "png")
+
+COLUMN_IN, PAGE_IN = 3.3, 6.8  # widths of a figure of one column, and of two
+# Okabe and Ito's palette without its yellow, which is too light for a hollow marker, and with its black as grey.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#4D4D4D")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "p", ">", "h")  # 7 colours x 11 shapes: 77 models stay distinct
+INK, SOFT, GRID = "#1b1f27", "#667085", "#d0d5dd"
+
+Unit = Literal["text", "count", "percent", "fraction", "ratio"]
+DIGITS: Mapping[str, int] = {"percent": 1, "fraction": 3, "ratio": 1, "count": 0}
+
+
+@dataclass(frozen=True)
+class Behind:
+    """Which items a number is made of: those of this dataset, model, regime and side, of all where it is empty."""
+
+    dataset: str = ""
+    model: str = ""
+    regime: str = ""
+    side: str = ""
+
+
+Trace = Callable[[Mapping[str, Any], str], Behind | None]  # row and field -> the items behind that number
+
+
+# --- numbers as printed -----------------------------------------------------------------------------------------------
+
+
+def fraction(value: float | None, digits: int = 3) -> str:
+    """A figure as printed, with a true minus sign; a dash for null."""
+    if value is None or pd.isna(value):
+        return NONE
+    if value in (float("inf"), float("-inf")):
+        return "∞" if value > 0 else "−∞"
+    text = f"{value:.{digits}f}"
+    return text.replace("-", "−") if float(text) else text.removeprefix("-")
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """A share (0 to 1) in percent, without the sign."""
+    return NONE if value is None or pd.isna(value) else fraction(100 * value, digits)
+
+
+def plain(text: object) -> str:
+    """Text on one line that cannot steer a terminal."""
+    return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in str(text))
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Column:
+    """A printed column: the frame's field, its heading, and how its values are printed.
+
+    Shares are fractions in the frame; `percent` prints them times 100. `spread` names the field of a standard deviation
+    printed behind ±, `mark` a field of text (a dagger, say) that hangs behind the number.
+    """
+
+    field: str
+    heading: str
+    unit: Unit = "text"
+    digits: int | None = None
+    spread: str = ""
+    mark: str = ""
+
+    @property
+    def is_number(self) -> bool:
+        """Whether values stand to the right."""
+        return self.unit != "text"
+
+    def text(self, row: Mapping[str, Any]) -> str:
+        """The cell as printed; a dash where there is no number."""
+        value = row.get(self.field)
+        if not self.is_number:
+            return "" if value is None or value is pd.NA or value != value else plain(value)
+        shown = self._number(value)
+        if self.spread and shown != NONE:
+            spread = self._number(row.get(self.spread))
+            shown += f" ± {spread}" if spread != NONE else ""
+        mark = row.get(self.mark) if self.mark else ""
+        return f"{shown} {mark}" if isinstance(mark, str) and mark else shown
+
+    def _number(self, value: Any) -> str:
+        digits = DIGITS[self.unit] if self.digits is None else self.digits
+        return percent(value, digits) if self.unit == "percent" else fraction(value, digits)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table for people: a frame, what of it is printed, and what a reader must know (epoch, n, what is missing).
+
+    A table without rows says that it was not run, and `why`; or `none`, where it was run and is rightly empty. `trace`
+    tells which items stand behind a number, where any do; `dash` is what a dash means.
+    """
+
+    name: str
+    title: str
+    rows: Frame
+    columns: Sequence[Column]
+    notes: Sequence[str] = ()
+    why: str = ""
+    trace: Trace | None = None
+    none: str = ""
+    dash: str = f"{NOT_RUN}, or undefined for want of decided items"
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """Printed cells (rows, columns)."""
+        return [[column.text(row) for column in self.columns] for row in self.records]
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """The rows as mappings."""
+        return self.rows.to_dict("records")  # pyright: ignore[reportReturnType]
+
+    @property
+    def absence(self) -> str:
+        """What stands in place of rows where there are none; else empty."""
+        return "" if len(self.rows) else self.none or (f"{NOT_RUN}: {self.why}" if self.why else NOT_RUN)
+
+    @property
+    def remarks(self) -> list[str]:
+        """The notes, with what a dash means where there is one."""
+        shown = [c for row in self.records for c in (column.text(row) for column in self.columns if column.is_number)]
+        dashes = [f"{NONE} {self.dash}"] if any(cell.startswith(NONE) for cell in shown) else []
+        spreads = ["± population standard deviation over runs"] if any("±" in cell for cell in shown) else []
+        return [*(note for note in self.notes if note), *spreads, *dashes]
+
+    @property
+    def data(self) -> Frame:
+        """The numbers behind what is printed: fields of the columns and their spreads, then what else the rows hold."""
+        printed = [field for column in self.columns for field in (column.field, column.spread) if field]
+        fields = dict.fromkeys([*printed, *map(str, self.rows.columns)])
+        return self.rows.reindex(columns=pd.Index(list(fields)))
+
+
+def table_files(table: Table) -> dict[str, bytes]:
+    """The table as `name.parquet`, `name.csv` (shares as fractions), `name.tex` (booktabs) and `name.md`."""
+    files = {
+        "parquet": _parquet(table),
+        "csv": table.data.to_csv(index=False).encode(),
+        "tex": table_latex(table).encode(),
+        "md": table_markdown(table).encode(),
+    }
+    return {f"{table.name}.{kind}": files[kind] for kind in TABLE_KINDS}
+
+
+def table_markdown(table: Table) -> str:
+    """Title, table, notes; texts escaped."""
+    lines = [f"**{markdown(table.title)}**", ""]
+    if table.absence:
+        lines += [markdown(table.absence)]
+    else:
+        rule = ["---:" if column.is_number else "---" for column in table.columns]
+        header = [markdown(column.heading) for column in table.columns]
+        body = [[markdown(cell) for cell in row] for row in table.cells]
+        lines += ["| " + " | ".join(cells) + " |" for cells in (header, rule, *body)]
+    notes = [markdown(note) for note in table.remarks]
+    return "\n".join([*lines, *([""] if notes else []), *(f"- {note}" for note in notes)]) + "\n"
+
+
+def table_latex(table: Table) -> str:
+    """A floating `table` environment with booktabs rules (`\\usepackage{booktabs}`); notes stand in the caption."""
+    caption = latex(". ".join([table.title.rstrip("."), *(n.rstrip(".") for n in table.remarks)]) + ".")
+    cells = [[latex(table.absence)]] if table.absence else [[latex(cell) for cell in row] for row in table.cells]
+    headings = [""] if table.absence else [latex(column.heading) for column in table.columns]
+    frame = pd.DataFrame(cells, columns=pd.RangeIndex(len(headings)))
+    styler = frame.style.hide(axis="index").format_index(lambda k: headings[int(k)], axis=1)
+    text = styler.to_latex(  # pyright: ignore[reportAttributeAccessIssue] - the stubs lose the Styler in a chain
+        hrules=True,
+        caption=caption,
+        label=f"tab:{table.name}",
+        position="t",
+        position_float="centering",
+        column_format="l" if table.absence else "".join("r" if c.is_number else "l" for c in table.columns),
+    )
+    return str(text)
+
+
+def table_html(table: Table, address: Callable[[Behind], str] | None = None) -> str:
+    """An HTML fragment: the table in a scrolling box, notes below; escaped. With `address`, every number that has items
+    behind it is a link to them."""
+
+    def link(row: Mapping[str, Any], column: Column) -> str | None:
+        shown = column.is_number and not column.text(row).startswith(NONE)
+        behind = table.trace(row, column.field) if shown and table.trace and address else None
+        return address(behind) if behind and address else None
+
+    return environment().get_template("table.html.j2").render(table=table, link=link)
+
+
+@cache
+def environment() -> jinja2.Environment:
+    """Jinja2 as every page is made: everything escaped, an unknown name an error. Templates are compiled once."""
+    import jinja2
+
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def markdown(text: object) -> str:
+    """Text that is neither HTML nor markup, and stays in its table cell."""
+    return re.sub(r"([\\`*_{}\[\]()#+!|~$])", r"\\\1", html.escape(plain(text), quote=False))
+
+
+_LATEX = str.maketrans(
+    {
+        **{c: f"\\{c}" for c in "&%$#_{}"},
+        "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
+        "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}",
+        "−": "$-$", "±": r"$\pm$", "×": r"$\times$", "∞": r"$\infty$", "≤": r"$\le$", "≥": r"$\ge$", "→": r"$\to$",
+        "–": "--", "†": r"\dag{}", "‡": r"\ddag{}", "’": "'", "…": r"\ldots{}", "κ": r"$\kappa$", "α": r"$\alpha$",
+    }
+)  # fmt: skip
+
+
+def latex(text: object) -> str:
+    """Text that no character of is a command; the signs that our tables use become commands."""
+    return plain(text).translate(_LATEX)
+
+
+def _parquet(table: Table) -> bytes:
+    """Every text column as text, so that the file's schema does not depend on what happens to be missing."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    data = table.data
+    texts = {c.field for c in table.columns if not c.is_number}
+    loose = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and str(kind) == "object"]
+    numeric = {name for name in loose if name not in texts and not any(isinstance(v, str) for v in data[name])}
+    data = data.astype({name: "Float64" if name in numeric else "string" for name in loose})
+    arrow = pa.Table.from_pandas(data, preserve_index=False)
+    about = {"title": table.title, "notes": "\n".join(table.remarks), "absence": table.absence}
+    stream = io.BytesIO()
+    pq.write_table(arrow.replace_schema_metadata(about), stream, compression="zstd")
+    return stream.getvalue()
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def figure_style() -> Iterator[None]:
+    """The house style, for drawing and for saving: some of it (the SVG salt) counts only then."""
+    import matplotlib.style
+
+    with matplotlib.style.context(STYLE):
+        yield
+
+
+def new_figure(width: float, height: float, dpi: float | None = None) -> Figure:
+    """An empty figure (inches) with a canvas of its own and constrained layout; draw inside `figure_style`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def not_run_figure(what: str, why: str, width: float = COLUMN_IN) -> Figure:
+    """What stands in place of a figure that has no data: its name, `not run`, and why."""
+    import textwrap
+
+    with figure_style():
+        figure = new_figure(width, 1.1)
+        axes = figure.add_subplot()
+        axes.set_axis_off()
+        lines = textwrap.wrap(plain(f"{NOT_RUN}: {why}"), int(width * 17))
+        place: dict[str, Any] = {"ha": "center", "transform": axes.transAxes, "parse_math": False}
+        axes.text(0.5, 0.62, plain(what), weight="bold", va="bottom", **place)
+        axes.text(0.5, 0.5, "\n".join(lines), color=SOFT, va="top", **place)
+    return figure
+
+
+def freeze_layout(figure: Figure) -> None:
+    """Run the layout engine once and switch it off: it would move things again, differently, on every save."""
+    with figure_style():
+        figure.canvas.draw()
+    figure.set_layout_engine("none")
+
+
+def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
+    """The figure as a PDF, SVG or PNG file, without a date; the same bytes on every call."""
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {"Software": None}}
+    with figure_style():
+        if figure.get_layout_engine() is not None:
+            freeze_layout(figure)
+        stream = io.BytesIO()
+        figure.savefig(stream, format=kind, metadata=undated[kind])  # pyright: ignore[reportArgumentType]
+    return stream.getvalue()
+
+
+def figure_files(name: str, figure: Figure) -> dict[str, bytes]:
+    """The figure as `name.pdf`, `name.svg` and `name.png`."""
+    return {f"{name}.{kind}": figure_bytes(figure, kind) for kind in FIGURE_KINDS}
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all, its folders too."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(content)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

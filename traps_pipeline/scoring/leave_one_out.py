@@ -1,0 +1,56 @@
+"""PECS without one judge: how much a figure owes to any one seat of the panel (`benchmark.md` sections 4 and 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.judging.ratings import ABSTENTION, CORRECTNESS, decided, majority, ratings
+from traps_pipeline.scoring.bootstrap import ENTRY
+from traps_pipeline.scoring.leaderboard import standings
+from traps_pipeline.scoring.metrics import CELL, cell_metrics
+from traps_pipeline.tables import LEAVE_ONE_OUT
+
+_COLUMNS = pd.Index([c.name for c in LEAVE_ONE_OUT.columns])
+
+
+def leave_one_out(
+    verdicts: pd.DataFrame, votes: pd.DataFrame, board: pd.DataFrame, judges: Sequence[str] | None = None
+) -> pd.DataFrame:
+    """LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells, and the LEADERBOARD rows made of them.
+
+    PECS of the two others is scored as PECS of the panel is: per run, then averaged; overall over the four datasets.
+    Only entries of the board are in it, and only cells on which these judges (default: all) voted.
+    """
+    panel = board.rename(columns={"pecs": "pecs_panel", "n_missing": "n_missing_panel"})
+    panel = panel.loc[:, [*ENTRY, "pecs_panel", "n_missing_panel"]]
+    frames = [
+        _scored(two).merge(panel, on=ENTRY, how="inner", validate="one_to_one").assign(without=judge)
+        for judge, two in two_judge_verdicts(verdicts, votes, judges)
+    ]
+    if not frames:
+        return pd.DataFrame(columns=_COLUMNS)
+    rows = pd.concat(frames, ignore_index=True)
+    rows["difference"] = rows["pecs"] - rows["pecs_panel"]
+    return rows.loc[:, _COLUMNS]
+
+
+def two_judge_verdicts(
+    verdicts: pd.DataFrame, votes: pd.DataFrame, judges: Sequence[str] | None = None
+) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Each judge, and the VERDICTS rows as the others decide without it: where both votes are valid and agree; 1-1 is
+    undecided. An item without an answer stays without a decision."""
+    cast = ratings(votes, judges)
+    verdicts = verdicts.merge(cast.answers[CELL].drop_duplicates(), on=CELL)
+    (abstention, _), (correctness, _) = cast.on(verdicts, ABSTENTION), cast.on(verdicts, CORRECTNESS)
+    for seat, judge in enumerate(cast.judges):
+        abstained, correct = (majority(np.delete(votes_on, seat, axis=1)) for votes_on in (abstention, correctness))
+        yield judge, verdicts.assign(abstained=decided(abstained), correct=decided(correct))
+
+
+def _scored(verdicts: pd.DataFrame) -> pd.DataFrame:
+    """The standings of verdicts."""
+    cells = [cell_metrics(rows, {}) for _, rows in verdicts.groupby("dataset", sort=True)]
+    return standings(pd.concat(cells, ignore_index=True))

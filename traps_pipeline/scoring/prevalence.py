@@ -1,0 +1,46 @@
+"""How often each axis of confabulation applies to a model's void failures (`benchmark.md` section 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.judging.confabulation import AXES
+from traps_pipeline.scoring.metrics import joined_epochs, wilson
+from traps_pipeline.tables import CONFABULATION_PREVALENCE
+
+# Column of CONFABULATION_PREVALENCE to the axes that must all apply.
+SHARES: Mapping[str, tuple[str, ...]] = {
+    "hp": AXES[:1],
+    "ii": AXES[1:2],
+    "hp_and_ii": AXES[:2],
+    "es": AXES[2:3],
+    "doubt": AXES[3:],
+}
+
+
+def prevalence(labels: pd.DataFrame) -> pd.DataFrame:
+    """CONFABULATION_PREVALENCE rows of CONFABULATION rows: shares of validly labelled failures, with Wilson intervals;
+    null where a model has none. A model without a sampled failure has no row: not run is not 0."""
+    rows = [_row(str(model), group) for model, group in labels.groupby("model", sort=True)]
+    return pd.DataFrame(rows, columns=pd.Index([c.name for c in CONFABULATION_PREVALENCE.columns]))
+
+
+def _row(model: str, group: pd.DataFrame) -> dict[str, Any]:
+    valid = group.loc[group["valid"].to_numpy(bool), [*AXES]].astype(bool)
+    row: dict[str, Any] = {
+        "model": model,
+        "n_failures": int(group["n_failures"].to_numpy().max()),
+        "n_sampled": len(group),
+        "n": len(valid),
+        "epoch": joined_epochs(group["epoch"]),
+    }
+    for name, axes in SHARES.items():
+        yes = np.array([valid[[*axes]].to_numpy().all(axis=1).sum()], float)
+        (low,), (high,) = wilson(yes, np.array([len(valid)], float))
+        row |= {name: yes[0] / len(valid) if len(valid) else np.nan, f"{name}_low": low, f"{name}_high": high}
+    joined = {"evidence": "+", "judge": "+", "benchmark_version": " + "}
+    return row | {name: by.join(sorted(set(group[name]))) for name, by in joined.items()}
