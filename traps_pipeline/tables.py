@@ -369,7 +369,7 @@ CONTRASTS = Table(
     ci_low float? 95 % percentile interval of the paired difference, cluster bootstrap over scenarios
     ci_high float? 95 % percentile interval of the paired difference
     p float? two-sided, from the share of resamples on either side of 0
-    p_holm float? corrected by Holm over the family: the rows of the same kind, dataset and figure (and regime, of models)
+    p_holm float? corrected by Holm over the rows of the same kind, dataset and figure (and regime, of models)
     separable bool whether p_holm is below 0.05
     refused str? why the two may not be compared
 """

@@ -36,7 +36,7 @@ FEW = 2  # scenes
 def recipe() -> Recipe:
     """The shipped recipe with two scenes of one family, and three steps."""
     shipped = load_recipe()
-    training = shipped.training.model_copy(update={"steps": 3, "batch": 2})
+    training = shipped.training.model_copy(update={"steps": 3, "batch": 2, "naming_steps": 1})
     return shipped.model_copy(update={"scenes": {"drop_split": FEW}, "held_out": 1, "training": training})
 
 
@@ -124,7 +124,7 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
     from torch.nn.functional import cross_entropy
 
     from traps_pipeline.pocket.model import make_model, train_tokenizer
-    from traps_pipeline.pocket.train import Batches, Look, Scenes, losses, name_tokens
+    from traps_pipeline.pocket.train import Batches, Look, Scenes, answer_loss, look_at
 
     scenes = Scenes(recipe, data)
     model, processor = make_model(train_tokenizer(scenes.records), seed=1)
@@ -133,7 +133,7 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
     look = Look(1, 0, (record.asked, record.ill_posed))
     batch = Batches(scenes, model, processor, recipe.training, 1).make([look], "guided", frames[None])
     with torch.no_grad():
-        found = losses(model, batch, name_tokens(processor.tokenizer))[0].item()
+        found = answer_loss(model, look_at(model, batch), batch).item()
     expected = 0.0
     for question in look.questions:
         turns = [

@@ -19,7 +19,7 @@ Split = Literal["train", "held-out"]
 
 class Training(BaseModel):
     """How the weights are fitted. void_share: of void clips in a batch; brightness: augmentation; naming:
-    weight of the loss of colour words."""
+    weight of the loss of names; naming_steps: steps of it alone, before any answer."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     steps: int = Field(ge=1)
@@ -30,6 +30,7 @@ class Training(BaseModel):
     void_share: float = Field(ge=0, le=1)
     brightness: float = Field(ge=0, lt=1)
     naming: float = Field(ge=0)
+    naming_steps: int = Field(ge=0)
 
 
 class Recipe(BaseModel):

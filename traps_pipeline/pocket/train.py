@@ -256,22 +256,38 @@ def augmented(frames: np.ndarray, brightness: float, rng: np.random.Generator) -
 # --- the loop ---------------------------------------------------------------------------------------------------------
 
 
-def losses(model: Any, batch: Batch, words: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Two losses, each a mean over the batch's rows or tokens.
+def look_at(model: Any, batch: Batch) -> Any:
+    """What the vision tower makes of a batch's clips."""
+    return model.model.get_video_features(batch.pixels, batch.grid, return_dict=True)
 
-    The first is the negative log-likelihood of a row's answers (nats, summed over their tokens). The second asks that a
-    clip's token, as it enters the language model, lie along the embeddings of the words for what is in its square of
-    the picture: without it the words of a question find what they name only after very long. words: `name_tokens`.
+
+def name_loss(model: Any, seen: Any, batch: Batch, words: torch.Tensor) -> torch.Tensor:
+    """How far the clips' tokens, as they enter the language model, are from lying along the embeddings of the words for
+    what is in their square of the picture, and of no others (binary cross-entropies, nats).
+
+    Every word that names anything of a clip weighs the same, in however few squares it holds: a ball has one, and would
+    else be drowned by boards and bins. words: `name_tokens`.
     """
     import torch
-    from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
+    from torch.nn.functional import binary_cross_entropy_with_logits
+
+    along = torch.cat(tuple(seen.pooler_output)) @ model.get_input_embeddings().weight[words].T - RARE
+    loss = binary_cross_entropy_with_logits(along, batch.names, reduction="none")
+    wrongly = (loss * (1 - batch.names)).sum() / len(loss)
+    clips = (len(batch.ids), -1, len(words))
+    rightly, squares = (loss * batch.names).view(clips).sum(1), batch.names.view(clips).sum(1)
+    return wrongly + (rightly / squares.clamp(min=1)).sum() / (squares > 0).sum()
+
+
+def answer_loss(model: Any, seen: Any, batch: Batch) -> torch.Tensor:
+    """Negative log-likelihood of a row's answers (nats, summed over their tokens), mean over the rows."""
+    from torch.nn.functional import cross_entropy
 
     length, rows = len(batch.head), len(batch.ids)
     begun = model.model.language_model(
         input_ids=batch.head[None], position_ids=batch.positions[:, :1, :length], use_cache=True
     ).past_key_values
     begun.batch_repeat_interleave(rows)
-    seen = model.model.get_video_features(batch.pixels, batch.grid, return_dict=True)
     hidden = model.model(
         input_ids=batch.ids,
         attention_mask=batch.sees,
@@ -283,18 +299,21 @@ def losses(model: Any, batch: Batch, words: torch.Tensor) -> tuple[torch.Tensor,
     wanted = batch.labels[:, 1:]
     said = wanted != IGNORED
     logits = model.lm_head(hidden[:, :-1][said])  # of the answers alone: the vocabulary is as wide as the model
-    answers = cross_entropy(logits, wanted[said], reduction="sum") / rows
-    along = torch.cat(tuple(seen.pooler_output)) @ model.get_input_embeddings().weight[words].T
-    names = binary_cross_entropy_with_logits(along - RARE, batch.names, reduction="sum") / len(along)
-    return answers, names
+    return cross_entropy(logits, wanted[said], reduction="sum") / rows
+
+
+def loss_at(step: int, model: Any, batch: Batch, words: torch.Tensor, training: Training) -> torch.Tensor:
+    """What is minimised at a step: names alone at first, since nothing can be answered of what is not seen yet."""
+    seen = look_at(model, batch)
+    names = training.naming * name_loss(model, seen, batch, words)
+    return names if step < training.naming_steps else names + answer_loss(model, seen, batch)
 
 
 def learning_rate(step: int, training: Training) -> float:
-    """Linear warm-up, then a half cosine to zero."""
-    if step < training.warmup_steps:
-        return training.learning_rate * (step + 1) / training.warmup_steps
-    through = (step - training.warmup_steps) / max(1, training.steps - training.warmup_steps)
-    return training.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, through)))
+    """Half a cosine to zero over all steps, with a linear warm-up before names and again before answers."""
+    since = step - training.naming_steps if step >= training.naming_steps else step
+    warm = min(1.0, (since + 1) / max(1, training.warmup_steps))
+    return training.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / training.steps))
 
 
 class _State:
@@ -372,25 +391,24 @@ def train(
     step = state.load()
     last = training.steps if stop_after is None else min(stop_after, training.steps)
     told = kept = began = time.monotonic()
-    first, seen = step, []
+    first, lately = step, []
     model.train()
     try:
         while step < last:
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(step, training)
-            answers, names = losses(model, batches[step], words)
-            loss = answers + training.naming * names
+            loss = loss_at(step, model, batches[step], words, training)
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
             optimizer.step()
-            seen.append(answers.item())
+            lately.append(loss.item())
             step += 1
             now = time.monotonic()
             if now - told > PROGRESS_S or step == last:
                 left = (now - began) / (step - first) * (training.steps - step) / 60
-                report(f"step {step} of {training.steps}, answers {np.mean(seen):.3f}, {left:.0f} min left")
-                told, seen = now, []
+                report(f"step {step} of {training.steps}, loss {np.mean(lately):.3f}, {left:.0f} min left")
+                told, lately = now, []
             if now - kept > CHECKPOINT_S:
                 state.save(step)
                 kept = now
