@@ -74,6 +74,10 @@ class Checkout:
         """Run a `traps` command."""
         return self.run(sys.executable, "-m", "traps_pipeline.cli", *arguments)
 
+    def score(self, experiment: str | Path) -> Finished:
+        """`traps run` up to the leaderboard: most tests have nothing to see in the figures and pages after it."""
+        return self.traps("run", experiment, "--until", "leaderboard")
+
     def dagster(self, *arguments: str | Path) -> Finished:
         """Run a `dagster` command."""
         return self.run(sys.executable, "-m", "dagster", *arguments)
@@ -158,13 +162,15 @@ def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], str]
     return shared / name
 
 
-def run_once(factory: pytest.TempPathFactory, name: str, experiment: str | Path, clips: Path | None = None) -> Checkout:
+def run_once(
+    factory: pytest.TempPathFactory, name: str, experiment: str | Path, clips: Path | None = None, *more: str
+) -> Checkout:
     """A study of this checkout, run once. Clips of another study may be taken over: their names are their content."""
 
     def make(workspace: Path) -> str:
         if clips:
             shutil.copytree(clips, workspace / "clips")
-        finished = Checkout(ROOT, workspace).traps("run", experiment)
+        finished = Checkout(ROOT, workspace).traps("run", experiment, *more)
         assert finished.code == 0, finished.out + finished.err
         return finished.out
 
@@ -222,8 +228,9 @@ def forget_answers(study: Checkout) -> Checkout:
 
 @pytest.fixture(scope="session")
 def one_regime(demo: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Checkout:
-    """The demo's study under one regime, run without a disturbance. Read only."""
-    return run_once(tmp_path_factory, "one_regime", SMALL.with_name("one_regime.yaml"), demo.workspace / "clips")
+    """The demo's study under one regime, scored without a disturbance. Read only."""
+    clips, until = demo.workspace / "clips", ("--until", "leaderboard")
+    return run_once(tmp_path_factory, "one_regime", SMALL.with_name("one_regime.yaml"), clips, *until)
 
 
 @pytest.fixture

@@ -353,14 +353,14 @@ def _differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterable[st
 
 
 def write_report_state(workspace: Workspace, name: str, version: str, inputs: Mapping[str, str]) -> None:
-    """What a report (which is no table) was made from, beside it."""
+    """What a report (which is no table) was made from, in a folder beside it."""
     state = State(version, dict(inputs), rows=0, failed=0)
-    write_text(workspace.reports / f"{name}.state.json", json.dumps(asdict(state)))
+    write_text(workspace.reports / ".state" / f"{name}.json", json.dumps(asdict(state)))
 
 
 def read_report_state(workspace: Workspace, name: str) -> State | None:
     """The state that `write_report_state` wrote; None if the report was never made."""
-    path = workspace.reports / f"{name}.state.json"
+    path = workspace.reports / ".state" / f"{name}.json"
     if not path.is_file():
         return None
     try:

@@ -79,14 +79,14 @@ def test_a_corrected_ill_posed_question_asks_one_item_again(study: Checkout) -> 
     study.correct("plinko-0002", ill_posed_question="What does the triangle at the bottom weigh?")
     why = study.traps("why", "chaotic_ill_posed:plinko-0002:void").out
     assert why.count("still stands") == EVALUATIONS  # nothing is made from the correction yet
-    run = study.traps("run", EXPERIMENT)
+    run = study.score(EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts() == {"answers": EVALUATIONS, "votes": 3 * EVALUATIONS, "frames": 0}
 
 
 def test_versions_change_where_the_correction_reaches_and_nowhere_else(study: Checkout) -> None:
     study.correct("plinko-0002", ill_posed_question="What does the triangle at the bottom weigh?")
-    assert study.traps("run", EXPERIMENT).code == 0
+    assert study.score(EXPERIMENT).code == 0
     tables = Workspace.open(study.workspace).tables
     versions = tables.read_all(ITEMS).groupby("dataset")["benchmark_version"].unique()
     corrected = versions.pop("chaotic_ill_posed")
@@ -111,7 +111,7 @@ def test_dagster_shows_exactly_the_touched_partitions_stale_stage_by_stage(study
     # Votes, verdicts and metrics are made from items as well as from what is before them.
     stale = [f"{stage}/{cell}" for stage in ("responses", "verdicts", "votes") for cell in touched]
     assert stale_in_dagster(study) == sorted([*stale, "metrics/occlusion", "metrics/occlusion_ill_posed"])
-    run = study.traps("run", EXPERIMENT)
+    run = study.score(EXPERIMENT)
     assert run.counts() == {"answers": 3 * EVALUATIONS, "votes": 15 * EVALUATIONS, "frames": 0}
     assert stale_in_dagster(study) == []
 
@@ -130,7 +130,7 @@ def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> N
     before = {path: path.stat().st_mtime_ns for path in clips.rglob("*.mp4")}
     azimuth = json.loads(_released(study, "domino_chain-0002"))["params"]["azimuth_deg"]
     study.correct("domino_chain-0002", params={"azimuth_deg": azimuth + 2.0})
-    run = study.traps("run", EXPERIMENT)
+    run = study.score(EXPERIMENT)
     assert run.code == 0, run.err
     # Both items of `occlusion` and both of `occlusion_ill_posed` show new clips. Judges see no clip: a vote is asked
     # again only where the new answer reads otherwise, which is so for the random strategy at most.
@@ -145,14 +145,14 @@ def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> N
         ("domino_chain-0002", "void"),
         ("domino_chain-0002", "twin"),
     }
-    again = study.traps("run", EXPERIMENT)
+    again = study.score(EXPERIMENT)
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
 
 
 def test_a_discarded_scenario_leaves_every_table_and_keeps_its_answers(study: Checkout) -> None:
     rows = study.ledger_rows("answers")
     study.correct("tumbling_dice-0003", action="discard")
-    run = study.traps("run", EXPERIMENT)
+    run = study.score(EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts()["frames"] == 0
     before = {row["key"] for row in rows}
@@ -190,13 +190,13 @@ def test_an_added_scenario_joins_and_a_copy_is_told_by_every_run_until_it_is_gon
     shutil.copytree(demo.workspace / "clips", study.workspace / "clips")
     whole = whole_benchmark(study, tmp_path)
     for _ in range(2):  # the second run finds everything fresh, and still says so
-        run = whole.traps("run", tmp_path / "whole.yaml")
+        run = whole.score(tmp_path / "whole.yaml")
         assert run.code == 1
         assert "check clips_distinct of videos/hidden does not pass" in run.err
     assert len(Workspace.open(whole.workspace).tables.read_all(RESPONSES)) == 2 * (8 + 6 + 1)
     assert "check clips_distinct of videos hidden does not pass" in whole.traps("status").out
     study.correct("hidden_race-9001", params={"azimuth_deg": params["azimuth_deg"] + 3.0})
-    run = whole.traps("run", tmp_path / "whole.yaml")
+    run = whole.score(tmp_path / "whole.yaml")
     assert run.code == 0, run.err
     assert run.counts()["frames"] == 150
 

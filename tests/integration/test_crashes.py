@@ -38,7 +38,7 @@ def rows_written(study: Checkout, kind: str) -> int:
 
 
 def start(study: Checkout) -> subprocess.Popen[str]:
-    return study.start(sys.executable, "-m", "traps_pipeline.cli", "run", ONE_REGIME)
+    return study.start(sys.executable, "-m", "traps_pipeline.cli", "run", ONE_REGIME, "--until", "leaderboard")
 
 
 def wait_for_rows(study: Checkout, process: subprocess.Popen[str], kind: str, count: int) -> None:
@@ -57,7 +57,7 @@ def test_three_kills_while_answering_leave_the_same_tables_and_no_call_is_made_t
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
         assert rows_written(unasked, "answers") < ANSWERS  # killed in the middle, not after the end
-    finished = unasked.traps("run", ONE_REGIME)
+    finished = unasked.score(ONE_REGIME)
     assert finished.code == 0, finished.err
     for kind, wanted in (("answers", ANSWERS), ("votes", VOTES)):
         keys = [row["key"] for row in unasked.ledger_rows(kind)]
@@ -70,7 +70,7 @@ def test_a_kill_while_voting_leaves_the_same_tables(unasked: Checkout, one_regim
     wait_for_rows(unasked, process, "votes", 1500)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
-    finished = unasked.traps("run", ONE_REGIME)
+    finished = unasked.score(ONE_REGIME)
     assert finished.code == 0, finished.err
     assert len({row["key"] for row in unasked.ledger_rows("votes")}) == len(unasked.ledger_rows("votes")) == VOTES
     assert_same_tables(unasked.workspace, one_regime.workspace)
@@ -108,7 +108,7 @@ def test_a_kill_while_rendering_leaves_whole_clips_that_are_not_drawn_again(stud
     time.sleep(1.5)  # a worker looks for its parent every second
     done = len(list((study.workspace / "clips").glob("domino_chain-000[123]/*.json")))
     assert 0 < done < 9
-    finished = study.traps("run", EXPERIMENT)
+    finished = study.score(EXPERIMENT)
     assert finished.code == 0, finished.err
     assert finished.counts()["frames"] == 50 * (9 - done)
     assert sorted(
@@ -124,7 +124,7 @@ def test_ctrl_c_drains_and_the_same_command_goes_on(unasked: Checkout, one_regim
     assert process.returncode == 130, err
     assert "interrupted" in err and "Traceback" not in err
     assert 300 <= rows_written(unasked, "answers") < ANSWERS
-    finished = unasked.traps("run", ONE_REGIME)
+    finished = unasked.score(ONE_REGIME)
     assert finished.code == 0, finished.err
     assert len(unasked.ledger_rows("answers")) == ANSWERS
     assert_same_tables(unasked.workspace, one_regime.workspace)

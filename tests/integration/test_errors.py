@@ -78,7 +78,7 @@ def test_a_truncated_clip_is_noticed_and_rendered_anew_once_deleted(study: Check
     clip.write_bytes(whole[: len(whole) // 2])
     assert_refused(study.traps("run", EXPERIMENT), str(clip), "truncated or altered", "delete it and run again")
     clip.unlink()
-    again = study.traps("run", EXPERIMENT)
+    again = study.score(EXPERIMENT)
     assert again.code == 0, again.err
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 50}
     assert clip.read_bytes() == whole
@@ -90,7 +90,7 @@ def test_a_torn_ledger_line_is_reported_and_its_answer_alone_asked_again(study: 
     segment.write_bytes(b"".join(lines[:-1]) + lines[-1][:40])
     for table in (study.workspace / "tables" / "responses").rglob("model=oracle/regime=json/**/*.parquet"):
         table.unlink()
-    run = study.traps("run", EXPERIMENT)
+    run = study.score(EXPERIMENT)
     assert run.code == 0, run.err
     assert f"{segment}:{len(lines)}: torn last line ignored" in run.out
     assert run.counts()["answers"] == 1
@@ -159,7 +159,7 @@ def test_a_full_disk_ends_in_a_sentence_and_the_same_command_goes_on(study: Chec
     subprocess.run(["cp", "-r", f"{small_disk}/.", more], check=True)
     ledger.unlink()
     ledger.symlink_to(more, target_is_directory=True)
-    finished = study.traps("run", EXPERIMENT)
+    finished = study.score(EXPERIMENT)
     assert finished.code == 0, finished.err
     rows = study.ledger_rows("answers")
     assert len({row["key"] for row in rows}) == len(rows) == 288  # 3 models x 2 regimes x 48 items
@@ -175,7 +175,7 @@ def test_a_history_that_cannot_be_written_ends_in_a_sentence_too(study: Checkout
 def test_failed_calls_are_told_counted_as_missing_and_asked_again(study: Checkout, tmp_path: Path) -> None:
     text = (study.root / EXPERIMENT).read_text().replace("[oracle, random-50, prior]", "[flaky]")
     (tmp_path / "flaky.yaml").write_text(text)
-    run = study.traps("run", tmp_path / "flaky.yaml")
+    run = study.score(tmp_path / "flaky.yaml")
     assert run.code == 1
     assert "calls failed" in run.err
     rows = Workspace.open(study.workspace).tables.read_all(RESPONSES, model="flaky")
@@ -186,7 +186,7 @@ def test_failed_calls_are_told_counted_as_missing_and_asked_again(study: Checkou
     assert cells["n_missing"].sum() == outcomes["empty"] + outcomes["refused"] + outcomes["error"]
     assert cells["n_refused"].sum() == outcomes["refused"]
     assert (cells["acc"] == 1.0).all()  # an oracle behind a bad provider: what is missing is not wrong
-    again = study.traps("run", tmp_path / "flaky.yaml")
+    again = study.score(tmp_path / "flaky.yaml")
     assert again.code == 1
     assert again.counts()["answers"] == outcomes["error"]  # those that failed, and no other
 

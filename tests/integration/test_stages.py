@@ -90,7 +90,7 @@ def test_a_failing_step_exits_with_one_and_names_the_file(study: Checkout) -> No
 def test_a_table_that_was_deleted_is_made_again_from_the_ledger(study: Checkout) -> None:
     shutil.rmtree(study.workspace / "tables" / "responses")
     shutil.rmtree(study.workspace / "tables" / "verdicts")
-    run = study.traps("run", EXPERIMENT)
+    run = study.score(EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts() == {"answers": 0, "votes": 0, "frames": 0}
 

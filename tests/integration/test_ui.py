@@ -112,7 +112,7 @@ def materialize_and_wait(study: Checkout, page: Page, server: str, stage: str, k
     if stage in TABLES:
         file = Workspace.open(study.workspace).tables.path(TABLES[stage], partition_of(stage, key))
     else:
-        file = study.workspace / "reports" / f"{stage}.state.json"
+        file = study.workspace / "reports" / ".state" / f"{stage}.json"
     before = file.stat().st_mtime_ns
     materialize(page, server, stage, *(key.split("|") if key else ()))
     wait_until(lambda: file.stat().st_mtime_ns > before, RUN_SECONDS, f"{stage} {key} is made from the UI")

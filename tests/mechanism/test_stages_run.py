@@ -34,12 +34,15 @@ MECHANISM = {
 }
 
 
-def with_mechanism(study: Checkout, **changes: object) -> str:
-    """The small study's experiment, asking for a look into a tiny model besides."""
+def with_mechanism(study: Checkout) -> str:
+    """The small study's experiment on two of its datasets, asking for a look into a tiny model besides."""
     with (study.root / "assets" / "models.yaml").open("a") as stream:
         stream.write(ENTRY)
     build_tiny("qwen3-vl", study.root / "tiny")
-    experiment = yaml.safe_load((study.root / EXPERIMENT).read_text()) | {"mechanism": MECHANISM | changes}
+    experiment = yaml.safe_load((study.root / EXPERIMENT).read_text()) | {
+        "datasets": ["chaotic", "chaotic_ill_posed"],
+        "mechanism": MECHANISM,
+    }
     (study.root / "inside.yaml").write_text(yaml.safe_dump(experiment))
     return "inside.yaml"
 
@@ -52,7 +55,7 @@ def counted(finished: Finished) -> tuple[int, ...]:
     return tuple(map(int, found.groups()))
 
 
-def test_traps_run_looks_into_a_model_once_and_a_correction_touches_its_scenario_alone(study: Checkout) -> None:
+def test_traps_run_looks_into_a_model_once(study: Checkout) -> None:
     name = with_mechanism(study)
     run: Callable[[], Finished] = lambda: study.traps("run", name, "--until", INSIDE[-1])  # noqa: E731
     extracted, answers, votes = counted(run())
@@ -60,9 +63,6 @@ def test_traps_run_looks_into_a_model_once_and_a_correction_touches_its_scenario
     judged, effects = tables.read_all(STEERING_VOTES), tables.read(STEERING_EFFECTS, {})
     assert extracted > 0 and answers > 0 and votes == 3 * answers
     assert len(judged) > answers  # controls stand in two datasets
-    assert len(effects.groupby(["source", "target"])) == 14
+    assert len(effects.groupby(["source", "target"])) == 4  # the paths between the two
     assert tables.read_all(PROBES)["note"].notna().any()  # tiny was not asked under standard: no Cf->Cf, and why
     assert counted(run()) == (0, 0, 0)
-    study.correct("plinko-0001", question="Which bucket does the ball drop into in the end: 1, 2, 3, 4 or 5?")
-    again = counted(run())
-    assert again[0] == 3  # control and void of chaotic, the control of chaotic_ill_posed

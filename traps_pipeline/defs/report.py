@@ -204,7 +204,7 @@ report_page = _report(
 )
 ASSETS = [contact_sheet, gallery, shortcuts, printed, report_page]
 
-_CHECKED = ("leaderboard", *JUDGED, *REPORTS)
+_CHECKED = ("leaderboard", *JUDGED, "cosines", "steering_effects", *REPORTS)
 
 
 @dg.multi_asset_check(

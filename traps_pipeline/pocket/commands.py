@@ -6,6 +6,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Mapping
+from importlib.metadata import version
 
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
@@ -15,6 +16,7 @@ from traps_pipeline.pocket.recipe import POCKET, RECIPE, Recipe, Split, load_rec
 
 EVALUATION = POCKET / "evaluation.csv"
 CARD = POCKET / "README.md"
+THREADS = 1  # sums then come in one order on any number of cores; layers this small gain little by a second one
 WEIGHTS = "weights"  # in the folder of a seed: what `checkpoint:` names
 FACTS = "training.json"  # beside them
 BEGIN, END = "<!-- evaluation: written by `traps pocket card` -->", "<!-- end of evaluation -->"
@@ -35,30 +37,33 @@ def render_data(arguments: argparse.Namespace) -> None:
         _render(arguments, split)
 
 
-def _render(arguments: argparse.Namespace, split: Split) -> float:
-    """Draws what is missing of a split; returns the minutes it took."""
+def _render(arguments: argparse.Namespace, split: Split) -> None:
+    """Draw what is missing of a split."""
     began = time.monotonic()
     render(_recipe(arguments), split, arguments.data, workers=arguments.workers, report=_say)
-    return (time.monotonic() - began) / 60
+    _say(f"{split}: rendered in {(time.monotonic() - began) / 60:.1f} minutes")
 
 
 def train(arguments: argparse.Namespace) -> None:
-    """Render what is missing, train, and note what was done in `training.json`."""
+    """Render what is missing, train, and note in `training.json` what the weights came from."""
+    import torch
+
     from traps_pipeline.pocket.train import train as fit
 
     recipe, out = _recipe(arguments), arguments.out
-    rendering, began = _render(arguments, "train"), time.monotonic()
+    _render(arguments, "train")
+    began = time.monotonic()
+    torch.set_num_threads(THREADS)
     weights = fit(recipe, arguments.data, out, arguments.seed, report=_say)
     facts = {
         "seed": arguments.seed,
         "recipe": digest(recipe.model_dump(mode="json")),
         "data": data_digest(recipe, "train", arguments.data),
         "weights": file_digest(weights / "model.safetensors"),
-        "scenes": sum(recipe.scenes.values()),
-        "minutes": {"rendering": round(rendering, 1), "training": round((time.monotonic() - began) / 60, 1)},
+        "versions": {name: version(name) for name in ("mujoco", "tokenizers", "torch", "transformers")},
     }
     (out / FACTS).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-    _say(f"{weights}: {facts['minutes']} minutes, of this call alone where it went on")
+    _say(f"{weights}: trained in {(time.monotonic() - began) / 60:.1f} minutes")
 
 
 def evaluate(arguments: argparse.Namespace) -> None:

@@ -15,6 +15,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,7 @@ def params_digest(family: str, params: Any) -> str:
     return digest({"family": family, "params": json.loads(json.dumps(params))})
 
 
+@cache
 def released_digests() -> frozenset[str]:
     """`params_digest` of every released scene and of its twin."""
     from traps_pipeline.benchmark.records import load_released
