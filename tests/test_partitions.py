@@ -17,6 +17,7 @@ from traps_pipeline.partitions import (
     evaluations,
     is_ill_posed,
     taxonomy_of,
+    transfer_type,
 )
 
 
@@ -82,3 +83,10 @@ def test_a_category_belongs_to_its_taxonomys_two_datasets() -> None:
     assert datasets_of_category("plinko") == ("chaotic", "chaotic_ill_posed")
     assert [taxonomy_of(d) for d in DATASETS] == ["occlusion", "occlusion", "chaotic", "chaotic"]
     assert [is_ill_posed(d) for d in DATASETS] == [False, True, False, True]
+
+
+def test_transfer_types_follow_the_definitions() -> None:
+    assert transfer_type("occlusion", "occlusion_ill_posed") == "Cross-modality"
+    assert transfer_type("occlusion_ill_posed", "chaotic_ill_posed") == "Cross-domain"
+    assert transfer_type("occlusion", "chaotic_ill_posed") == "Cross-both"
+    assert transfer_type("chaotic", "chaotic") == "Within"

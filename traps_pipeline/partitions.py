@@ -23,6 +23,8 @@ CHAOTIC_CATEGORIES = ("pachinko_waterfall", "plinko", "seesaw_sorter", "tumbling
 CATEGORIES = OCCLUSION_CATEGORIES + CHAOTIC_CATEGORIES
 
 DATASETS = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
+SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
+LONG = {short: dataset for dataset, short in SHORT.items()}
 REGIMES = ("standard", "guided", "json")
 ANSWERABLE = "occlusion_answerable"  # of the mechanistic stages alone: occlusion's voids, with a question they answer
 PROBED_DATASETS = (*DATASETS, ANSWERABLE)
@@ -41,6 +43,15 @@ def taxonomy_of(dataset: str) -> str:
 def is_ill_posed(dataset: str) -> bool:
     """Whether the void of a pair is the control's clip with an unanswerable question."""
     return dataset.endswith("_ill_posed")
+
+
+def transfer_type(source: str, target: str) -> str:
+    """What a path between datasets crosses (benchmark.md section 7): the modality of the void, the domain, both, neither."""
+    domain = taxonomy_of(source) != taxonomy_of(target)
+    modality = is_ill_posed(source) != is_ill_posed(target)
+    return {(True, True): "Cross-both", (True, False): "Cross-domain", (False, True): "Cross-modality"}.get(
+        (domain, modality), "Within"
+    )
 
 
 def datasets_of_category(category: str) -> tuple[str, str]:

@@ -10,7 +10,7 @@ from sklearn.metrics import roc_auc_score
 from sklearn.preprocessing import StandardScaler
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.mechanism.paths import LONG, STEERING_PATHS, TRANSFER_PAIRS, transfer_type
+from traps_pipeline.mechanism.paths import STEERING_PATHS, TRANSFER_PAIRS
 from traps_pipeline.mechanism.probes import (
     Split,
     auroc,
@@ -25,7 +25,7 @@ from traps_pipeline.mechanism.probes import (
 )
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
 from traps_pipeline.mechanism.settings import ProbeSettings
-from traps_pipeline.partitions import ANSWERABLE, DATASETS
+from traps_pipeline.partitions import ANSWERABLE, DATASETS, LONG, transfer_type
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.scoring.published import published
 

@@ -3,7 +3,7 @@
 import pytest
 
 from traps_pipeline.cli import main
-from traps_pipeline.scoring.audit import audit, transfer_type
+from traps_pipeline.scoring.audit import audit
 from traps_pipeline.scoring.claims import CLAIMS
 from traps_pipeline.scoring.published import published
 
@@ -39,12 +39,6 @@ def test_the_cell_behind_it_is_the_only_one_whose_factors_do_not_give_its_pecs(f
 def test_two_printed_transfer_types_contradict_the_definitions(findings):
     types = findings[(findings["group"] == "transfer types") & (findings["verdict"] == "differs")]
     assert [s.rsplit("of ")[-1] for s in types["statement"]] == ["oc_ip to oc", "ch_ip to ch"]
-
-
-def test_transfer_types_follow_the_definitions():
-    assert transfer_type("oc", "oc_ip") == "Cross-modality"
-    assert transfer_type("oc_ip", "ch_ip") == "Cross-domain"
-    assert transfer_type("oc", "ch_ip") == "Cross-both"
 
 
 def test_the_command_prints_claims_and_discrepancies_and_writes_all_findings(tmp_path, capsys):

@@ -11,8 +11,8 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.mechanism.paths import FAMILIES, PATH_SETS, transfer_type
-from traps_pipeline.partitions import DATASETS, is_ill_posed, taxonomy_of
+from traps_pipeline.mechanism.paths import FAMILIES, PATH_SETS
+from traps_pipeline.partitions import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 
 Frame = pd.DataFrame
 CELL = ["model", "directions", "regime"]
@@ -81,7 +81,8 @@ def domains(effects: Frame) -> Frame:
     """Control abstention at the largest alpha along each source's direction, on the well-posed dataset of its own
     taxonomy (same) against that of the other (cross). Columns CELL, source, alpha, same, cross."""
     rows = paths(effects)
-    rows = rows.loc[(rows["kind"] == "void") & ~rows["target"].map(is_ill_posed)]
+    well_posed = [name for name in DATASETS if not is_ill_posed(name)]
+    rows = rows.loc[(rows["kind"] == "void") & rows["target"].isin(well_posed)]
     rows = rows.loc[rows["alpha"] == rows.groupby(CELL)["alpha"].transform("max")]
     same = rows["source"].map(taxonomy_of) == rows["target"].map(taxonomy_of)
     wide = rows.assign(domain=same.map({True: "same", False: "cross"})).pivot_table(

@@ -5,13 +5,11 @@ from __future__ import annotations
 from itertools import permutations, product
 from typing import Literal
 
-from traps_pipeline.partitions import DATASETS, is_ill_posed, taxonomy_of
+from traps_pipeline.partitions import DATASETS, LONG, SHORT, taxonomy_of
 
 Path = tuple[str, str]  # source and target dataset
 PathSet = Literal["transfer", "within_domain"]
 
-SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
-LONG = {short: dataset for dataset, short in SHORT.items()}
 FAMILIES = ("occlusion", "chaotic")  # a direction's family is its source's taxonomy
 
 
@@ -30,15 +28,6 @@ STEERING_PATHS = tuple(dict.fromkeys(TRANSFER + WITHIN_DOMAIN))  # 14
 TRANSFER_PAIRS = tuple(permutations(DATASETS, 2))  # the twelve ordered pairs of the probes
 
 TRANSFER_TYPES = ("Cross-modality", "Cross-domain", "Cross-both", "Within")
-
-
-def transfer_type(source: str, target: str) -> str:
-    """What a path crosses: the modality of the void (visual, ill-posed), the domain (taxonomy), both, or neither."""
-    domain = taxonomy_of(source) != taxonomy_of(target)
-    modality = is_ill_posed(source) != is_ill_posed(target)
-    return {(True, True): "Cross-both", (True, False): "Cross-domain", (False, True): "Cross-modality"}.get(
-        (domain, modality), "Within"
-    )
 
 
 def path_name(source: str, target: str) -> str:

@@ -27,7 +27,6 @@ from traps_pipeline.mechanism.directions import (
     steered_scenarios,
     vector_digest,
 )
-from traps_pipeline.mechanism.paths import transfer_type
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
 from traps_pipeline.mechanism.steering import UNSTEERED
 from traps_pipeline.mechanism.versions import quantisation_of, states_folder
@@ -41,6 +40,7 @@ from traps_pipeline.partitions import (
     Extraction,
     StatesCell,
     is_ill_posed,
+    transfer_type,
 )
 from traps_pipeline.scoring.metrics import wilson
 from traps_pipeline.storage.workspace import Workspace

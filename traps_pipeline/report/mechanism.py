@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 
 from traps_pipeline.mechanism.effects import REGIME_COLUMNS
-from traps_pipeline.mechanism.paths import LONG
+from traps_pipeline.partitions import LONG
 from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.published import published
 from traps_pipeline.tables import COSINES, PROBES, STEERING_EFFECTS, Table

@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
 from traps_pipeline.report.writing import (
     NONE,
     Behind,
@@ -43,7 +43,6 @@ TITLES = {
     "chaotic": "Chaotic",
     "chaotic_ill_posed": "Chaotic, ill-posed",
 }
-SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
 LEGEND = {
     "Acc": "share of control items answered correctly",
     "AbsRec": "abstention recall: share of void items, which cannot be answered, that the model abstains on",

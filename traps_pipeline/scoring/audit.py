@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.partitions import LONG, transfer_type
 from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.analyses import SHARES, overall
 from traps_pipeline.scoring.claims import CLAIMS, DOSE_AGAINST_REGIME
@@ -210,20 +211,11 @@ def probe_means() -> Iterator[Finding]:
         yield Finding("probe means", name, f"at most {stated:g}", f"{shift:.3f}", verdict, reason)
 
 
-def transfer_type(source: str, target: str) -> str:
-    """What a transfer crosses, by the definitions (benchmark.md section 7): Cross-modality, -domain or -both."""
-    domain = source.removesuffix("_ip") != target.removesuffix("_ip")
-    modality = source.endswith("_ip") != target.endswith("_ip")
-    return {(True, True): "Cross-both", (True, False): "Cross-domain", (False, True): "Cross-modality"}.get(
-        (domain, modality), "Same"
-    )
-
-
 def transfer_types() -> Iterator[Finding]:
     """Printed transfer types against the definitions."""
     for name in ("probe_transfer", "steering_alpha10_qwen"):
         for row in published(name).to_dict("records"):
-            ours, printed = transfer_type(row["source"], row["target"]), str(row["transfer_type"])
+            ours, printed = transfer_type(LONG[row["source"]], LONG[row["target"]]), str(row["transfer_type"])
             where = f"{name}: type of {row['source']} to {row['target']}" + (
                 f", {row['model']}" if "model" in row else ""
             )

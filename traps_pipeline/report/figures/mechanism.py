@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.mechanism import effects
-from traps_pipeline.mechanism.paths import PATH_SETS, SHORT, TRANSFER_TYPES, path_name, transfer_type
-from traps_pipeline.partitions import DATASETS
+from traps_pipeline.mechanism.paths import PATH_SETS, TRANSFER_TYPES, path_name
+from traps_pipeline.partitions import DATASETS, SHORT, transfer_type
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.mechanism import NOT_LOOKED, best_layers
 from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain

@@ -8,7 +8,8 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.mechanism import effects
-from traps_pipeline.mechanism.paths import SHORT, TRANSFER_PAIRS, path_name, transfer_type
+from traps_pipeline.mechanism.paths import TRANSFER_PAIRS, path_name
+from traps_pipeline.partitions import SHORT, transfer_type
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import MODEL, epochs, said
 from traps_pipeline.report.writing import Column, Table

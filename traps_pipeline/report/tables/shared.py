@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.partitions import DATASETS, REGIMES
-from traps_pipeline.report.page import INCOMPLETE_MARK, MISSING_MARK, SHORT, SIDE_OF
+from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
+from traps_pipeline.report.page import INCOMPLETE_MARK, MISSING_MARK, SIDE_OF
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.writing import Behind, Column, Table, fraction
 from traps_pipeline.scoring import Frame
