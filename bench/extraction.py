@@ -41,7 +41,7 @@ VISION = {"hidden_size": 96, "intermediate_size": 256, "depth": 4, "num_heads": 
 def the_model(name: str | None, folder: Path) -> LocalModel:
     """The model to measure."""
     models = load_models()
-    if name is None and "pocket" in models and (ASSETS / "pocket" / "model.safetensors").exists():
+    if name is None and "pocket" in models and (ASSETS / "pocket" / "weights" / "model.safetensors").exists():
         name = "pocket"
     if name is not None:
         entry = models[name]

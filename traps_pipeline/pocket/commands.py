@@ -68,6 +68,9 @@ def train(arguments: argparse.Namespace) -> None:
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """Ask the weights of a seed about the held-out scenes; prints the table and adds the counts to the CSV."""
+    import torch
+
+    torch.set_num_threads(THREADS)
     recipe = _recipe(arguments)
     _render(arguments, "held-out")
     asked = list(evaluation.held_out(recipe, arguments.data, arguments.scenes))
