@@ -376,10 +376,10 @@ def status(arguments: argparse.Namespace) -> int:
     wanted = {stage: wanted_keys(workspace, experiment, stage) for stage in STAGES} if experiment else None
     with dagster_history(workspace) as instance:
         observe_sources(instance, workspace)  # so that Dagster's UI shows the same partitions stale
-    print(f"workspace {workspace.root}\n{'stage':<18} {'fresh':>6} {'stale':>6} {'missing':>8}")
+    print(f"workspace {workspace.root}\n{'stage':<24} {'fresh':>6} {'stale':>6} {'missing':>8}")
     for row in stage_statuses(workspace, wanted):
         missing = f"{row.missing:>8}" if wanted else f"{'-':>8}"
-        print(f"{row.stage:<18} {row.fresh:>6} {len(row.stale):>6} {missing}")
+        print(f"{row.stage:<24} {row.fresh:>6} {len(row.stale):>6} {missing}")
         for key, reasons in list(row.stale.items())[:SHOWN]:
             print(f"    {key}: {'; '.join(reasons[:3])}{' ...' if len(reasons) > 3 else ''}")
         if len(row.stale) > SHOWN:

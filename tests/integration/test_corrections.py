@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import EXPERIMENT, Checkout
-from traps_pipeline.lineage import STAGES
+from traps_pipeline.lineage import steps
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, METRICS, RESPONSES, SCENE_SPECS, TABLES, VIDEOS
 
@@ -121,8 +121,8 @@ def test_a_rematerialization_that_changes_nothing_makes_nothing_stale(study: Che
     materialize(study, "items", "occlusion")
     materialize(study, "responses", "occlusion|oracle__standard__run1")
     assert stale_in_dagster(study) == []
-    rows = re.findall(r"^\w+ +\d+ +(\d+) +(\d+)$", study.traps("status", EXPERIMENT).out, re.MULTILINE)
-    assert rows == [("0", "0")] * len(STAGES)  # stale and missing
+    rows = re.findall(r"^[a-z_ ]+ +\d+ +(\d+) +(\d+)$", study.traps("status", EXPERIMENT).out, re.MULTILINE)
+    assert rows == [("0", "0")] * len(steps())  # stale and missing
 
 
 def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> None:
