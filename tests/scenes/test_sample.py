@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -31,8 +32,16 @@ def test_the_quota_of_an_answer(count: int, labels: int, quota: int) -> None:
     assert answer_quota(count, labels) * labels >= count  # the quotas can be filled
 
 
-def test_a_stopped_sampling_goes_on_and_gives_the_same_scenarios(tmp_path: Path) -> None:
-    sample_family("hidden_race", 2, 11, tmp_path / "whole", workers=1)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenarios of hidden_race, drawn in one go."""
+    folder = tmp_path_factory.mktemp("whole")
+    tally = sample_family("hidden_race", 2, 11, folder, workers=1)
+    assert (tally.seed, tally.wanted, tally.draws >= 2) == (11, 2, True)
+    return folder
+
+
+def test_a_stopped_sampling_goes_on_and_gives_the_same_scenarios(tmp_path: Path, whole: Path) -> None:
     said: list[str] = []
 
     def stop(line: str) -> None:
@@ -48,10 +57,8 @@ def test_a_stopped_sampling_goes_on_and_gives_the_same_scenarios(tmp_path: Path)
     sample_family("hidden_race", 2, 11, tmp_path / "halves", workers=1, report=said.append)
     assert [line.split(":")[0] for line in said] == ["hidden_race-0001", "hidden_race-0002"]
     for name in ("hidden_race.jsonl", "draws.json"):
-        assert (tmp_path / "halves" / name).read_text(encoding="utf-8") == (tmp_path / "whole" / name).read_text(
-            encoding="utf-8"
-        )
-    specs = load_released(tmp_path / "whole").values()
+        assert (tmp_path / "halves" / name).read_text(encoding="utf-8") == (whole / name).read_text(encoding="utf-8")
+    specs = load_released(whole).values()
     load_released.cache_clear()
     assert len({spec.ill_posed_question for spec in specs}) == 2
     for spec in specs:
@@ -60,14 +67,13 @@ def test_a_stopped_sampling_goes_on_and_gives_the_same_scenarios(tmp_path: Path)
         load_trajectory(path, spec.twin.trajectory_sha256, "twin")
 
 
-def test_another_seed_replaces_what_is_there(tmp_path: Path) -> None:
-    tally = sample_family("hidden_race", 1, 11, tmp_path, workers=1)
-    assert (tally.seed, tally.wanted, tally.draws >= 1) == (11, 1, True)
-    before = (tmp_path / "hidden_race.jsonl").read_text(encoding="utf-8")
-    sample_family("hidden_race", 1, 12, tmp_path, workers=1)
-    after = (tmp_path / "hidden_race.jsonl").read_text(encoding="utf-8")
+def test_another_seed_replaces_what_is_there(tmp_path: Path, whole: Path) -> None:
+    shutil.copytree(whole, tmp_path / "released")
+    sample_family("hidden_race", 1, 12, tmp_path / "released", workers=1)
+    after = (tmp_path / "released" / "hidden_race.jsonl").read_text(encoding="utf-8")
     assert len(after.splitlines()) == 1
-    assert after != before
+    assert after not in (whole / "hidden_race.jsonl").read_text(encoding="utf-8")
+    assert [path.stem for path in (tmp_path / "released" / "trajectories").iterdir()] == ["hidden_race-0001"]
 
 
 def test_families_are_found_by_file_and_an_unknown_one_is_answered_with_the_known() -> None:

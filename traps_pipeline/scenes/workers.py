@@ -34,7 +34,7 @@ def run_in_order(
 
 
 def _one_pool(function: Callable[[Job], Result], batch: Iterator[Job], workers: int) -> Iterator[tuple[Job, Result]]:
-    first = list(islice(batch, 3 * workers))
+    first = list(islice(batch, 2 * workers - 1))  # a job begun cannot be cancelled: one worker never runs ahead
     if not first:
         return False
     context = get_context("spawn")
