@@ -56,7 +56,7 @@ def visual_textual(results: Results) -> list[Table]:
         epochs(rates.assign(dataset=rates["model"])),
         "AbsRec under standard; gap: textual over visual, ∞ where only the visual is 0",
         "pooled: of the means of both taxonomies",
-        *([] if results.is_study else ["gaps as printed, which the paper computed from unrounded rates"]),
+        *([] if results.is_study else ["gaps as printed: from unrounded rates, many to whole numbers only"]),
         *results.refused.get("rates", []),
     ]
     return [
