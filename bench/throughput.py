@@ -2,7 +2,7 @@
 and concurrency allow, in one process. The whole run counts, from the first call that is made to the last answer that is
 in the ledger. As in a study all models go through the same clips in the same order.
 
-python bench/throughput.py [--answers 240]
+python bench/throughput.py [--answers 404]
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main() -> None:
     from traps_pipeline.storage.workspace import Study
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--answers", type=int, default=10 * CONNECTIONS, help="of each model")
+    parser.add_argument("--answers", type=int, default=404, help="of each model; the smallest cell has 404")
     arguments = parser.parse_args()
     os.environ["BENCH_KEY"] = "k"
     spec = MediaSpec(profile="images", fps=5, most=25)

@@ -124,13 +124,14 @@ def copy_workspace(source: Path, target: Path, checkout: Path) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """One worker starts with the demo, which others wait for; the other takes what needs no study meanwhile. Of those
     files that need one the longest go first: a file is one worker's, and the last must not leave the other idle."""
-    needs_study = {"demo", "small", "study", "demo_study", "unasked", "one_regime"}
-    longest = ("test_corrections.py", "test_network.py", "test_crashes.py", "test_ui.py")
+    studies = {"demo", "small", "study", "demo_study", "unasked", "one_regime"}
+    waiting = {item.path for item in items if studies & set(getattr(item, "fixturenames", ()))}
+    longest = ("test_corrections.py", "test_network.py", "test_crashes.py", "test_ui.py", "test_readme.py")
 
     def turn(item: pytest.Item) -> int:
-        if "test_demo.py" in item.nodeid:
+        if item.path.name == "test_demo.py":
             return 0
-        if not needs_study & set(getattr(item, "fixturenames", ())):
+        if item.path not in waiting:
             return 1
         return 2 if item.path.name in longest else 3
 

@@ -127,6 +127,8 @@ def test_unknown_names_are_answered_with_the_known_ones(study: Checkout, tmp_pat
     assert_refused(study.traps("plan", experiment), "unknown model 'orakel'", "oracle, always-abstain")
     experiment.write_text("name: typo\nmodels: [oracle]\nregimes: [polite]\n")
     assert_refused(study.traps("plan", experiment), str(experiment), "regimes", "choose from standard, guided, json")
+    mistyped = study.traps("run", EXPERIMENT, "--until", "leaderbord")
+    assert_refused(mistyped, "--until leaderbord: no such stage", "leaderboard")
     assert_refused(study.traps("why", "occlusion:nothing-0001:void"), "is unknown", "an item is dataset:scenario:side")
 
 
