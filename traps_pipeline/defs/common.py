@@ -111,7 +111,7 @@ def provenance_of_each(context: dg.AssetExecutionContext, workspace: Workspace) 
         raise TrapsError(
             f"DAGSTER_HOME={home} is not of the workspace {workspace.root}: set it to {workspace.dagster_home}"
         )
-    observe_sources(context.instance, workspace)
+    _observe_changed_sources(context.instance, workspace)
 
     @cache
     def newest(parent: dg.AssetKey) -> dict[str, str]:
@@ -127,6 +127,18 @@ def provenance_of_each(context: dg.AssetExecutionContext, workspace: Workspace) 
         for key, parents in context.assets_def.asset_deps.items()
         if key in selected
     }
+
+
+_OBSERVED: dict[Path, list[str]] = {}  # workspace to the versions of its sources when this process last observed them
+
+
+def _observe_changed_sources(instance: dg.DagsterInstance, workspace: Workspace) -> None:
+    """`observe_sources`, unless nothing changed since this process did so: a `traps run` makes many Dagster runs."""
+    lineage = Lineage(workspace)
+    versions = [str(lineage.version(source, key)) for source in SOURCES for key in keys_of(source)]
+    if _OBSERVED.get(workspace.root) != versions:
+        observe_sources(instance, workspace)
+        _OBSERVED[workspace.root] = versions
 
 
 def observe_sources(instance: dg.DagsterInstance, workspace: Workspace) -> list[Node]:
