@@ -46,7 +46,7 @@ def main() -> None:
     resampled = timed(f"{arguments.resamples:,} resamples", lambda: resample(verdicts, arguments.resamples))
     found = timed("intervals", lambda: intervals(resampled))
     ours = time.process_time() - drawn
-    compared = timed("contrasts", lambda: contrasts(resampled, metrics))
+    compared = timed("contrasts", lambda: contrasts(resampled, metrics, verdicts))
     board = timed("leaderboard", lambda: leaderboard(metrics, found, compared))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(f"all: {time.perf_counter() - began:.1f} s (target 30), peak {peak:.2f} GB (target 2), {len(board)} rows")

@@ -36,6 +36,12 @@ ALIASES = {
         ("the third", False),
         ("2 or 3", False),
         ("", False),
+        ("-3", False),
+        ("−3 balls", False),  # a true minus sign
+        (".3", False),
+        ("bucket-3", True),
+        ("no.3", True),
+        ("- 3", True),  # an item of a list
         ("none", False),
         (None, False),
     ],
@@ -81,6 +87,8 @@ def test_a_number_inside_a_range_is_not_the_range(said: str) -> None:
         ("an  answer\n(a)", "answer"),
         ("it’s", "it s"),
         ("3 to 5 to 7", "3-5-7"),
+        ("(-1.50)", "-1.50"),
+        ("-.5 or .5", "-.5 or .5"),
     ],
 )
 def test_normal_form(text: str, normal: str) -> None:
@@ -88,17 +96,13 @@ def test_normal_form(text: str, normal: str) -> None:
 
 
 def test_normal_form_is_its_own_normal_form() -> None:
-    for text in ("The Left-hand Bin!", "0 – 2", "3.50.", "A-1 to 2", "x--y..z", "an a the"):
+    for text in ("The Left-hand Bin!", "0 – 2", "3.50.", "A-1 to 2", "x--y..z", "an a the", "--.5 -1- 2"):
         assert normalise(normalise(text)) == normalise(text)
 
 
 def test_a_value_names_one_number_one_label_or_nothing() -> None:
-    assert (to_number("about twelve"), to_number("1.5 or so"), to_number("1, 2"), to_number("many")) == (
-        12,
-        1.5,
-        None,
-        None,
-    )
+    numbers = {"about twelve": 12, "1.5 or so": 1.5, "1, 2": None, "many": None, "-1": -1, ".5": 0.5, "-.5": -0.5}
+    assert {text: to_number(text) for text in numbers} == numbers
     assert (to_label("Blue bin", SIDES, ALIASES), to_label("green bin", SIDES, ALIASES)) == ("right", None)
 
 

@@ -30,6 +30,7 @@ from traps_pipeline.judging.confabulation import (
     parse_labels,
     render,
     sample_failures,
+    sample_id,
     void_kind,
 )
 from traps_pipeline.judging.panel import JudgeEntry
@@ -149,6 +150,14 @@ def test_only_void_failures_are_sampled_and_only_when_all_datasets_are_judged(
     assert {failure.n_failures for failure in failures} == {8}  # neither abstentions nor the undecided one
     assert {failure.item["item_id"].split(":")[1] for failure in failures} <= {"s-0000", "s-0001"}
     assert sample_failures(workspace, judge_at(JUDGE), SPEAKS) == {}  # three datasets are not judged yet
+
+
+def test_a_failures_id_is_of_its_answer_and_of_the_trace_that_the_judge_sees() -> None:
+    at = cell("chaotic", THINKS)
+    same = sample_id(at, "chaotic:s-0000:void", "It goes left.", None)
+    assert sample_id(at, "chaotic:s-0000:void", "It goes left.", "") == same
+    others = [("It goes right.", None), ("It goes left.", "Hm."), (None, None)]
+    assert len({same, *(sample_id(at, "chaotic:s-0000:void", *other) for other in others)}) == 4
 
 
 # --- what the judge is shown ------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from statsmodels.stats.inter_rater import cohens_kappa
 from tests.judging.conftest import answered_study
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.confabulation import AXES
+from traps_pipeline.judging.confabulation import AXES, sample_id
 from traps_pipeline.judging.validation import (
     LABEL_COLUMNS,
     HumanLabels,
@@ -26,7 +26,7 @@ from traps_pipeline.judging.validation import (
 )
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import CONFABULATION, JUDGE_VALIDATION
+from traps_pipeline.tables import CONFABULATION, ITEMS, JUDGE_VALIDATION, RESPONSES
 
 MODEL = "qwen3-vl-think"
 
@@ -149,14 +149,14 @@ def labelled_study(root: Path, texts: Sequence[str]) -> Workspace:
         dict.fromkeys((c.name for c in CONFABULATION.columns), "x")
         | cell.partition
         | {
-            "sample_id": f"id{k}",
+            "sample_id": sample_id(cell, f"chaotic:s-{k:04d}:void", text.rpartition("<think>")[2], None),
             "item_id": f"chaotic:s-{k:04d}:void",
             "n_failures": 9,
             "created_at": datetime.now(UTC),
         }
         | {"void_kind": "truncation", "evidence": "output", "valid": True}
         | {axis: axis == "hallucinated_premise" for axis in AXES}
-        for k in range(len(texts))
+        for k, text in enumerate(texts)
     ]
     workspace.tables.write(CONFABULATION, {}, rows, {})
     return workspace
@@ -190,6 +190,21 @@ def test_a_sheet_is_written_filled_in_and_compared_by_the_commands(
     assert "hallucinated_premise        8  1.000  1.000  1.000  1.000  1.000  1.000    1.000 degenerate" in out
     kept = workspace.tables.read(JUDGE_VALIDATION, {}).set_index("axis")
     assert kept["accuracy"].tolist() == [1.0] * 5
+
+
+@pytest.mark.parametrize("gone", ["the answer", "the item"])
+def test_labels_of_an_earlier_answer_are_not_put_before_people(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], gone: str
+) -> None:
+    workspace = labelled_study(tmp_path / "study", ["It goes left."])
+    cell = Cell("chaotic", Evaluation(MODEL, "standard", 1))
+    table, partition = (RESPONSES, cell.partition) if gone == "the answer" else (ITEMS, {"dataset": "chaotic"})
+    rows = workspace.tables.read(table, partition)
+    workspace.tables.write(table, partition, rows.assign(text="Right.") if gone == "the answer" else rows[:0], {})
+    sheet = tmp_path / "sheet.csv"
+    assert main(["confabulation", "sheet", str(sheet), "--workspace", str(workspace.root)]) == 1
+    assert "are of earlier answers (of chaotic:s-0000:void, for one); materialize" in capsys.readouterr().err
+    assert not sheet.exists()
 
 
 def test_without_a_labelled_failure_there_is_nothing_to_compare(

@@ -16,12 +16,13 @@ from traps_pipeline.scoring.analyses import (
     reasoning_pairs,
     scoped_cells,
     spread,
+    study_cells,
     sub_scenarios,
     uplift,
     visual_textual_gap,
     zero_boundary,
 )
-from traps_pipeline.scoring.epochs import EpochMismatch, epoch_note
+from traps_pipeline.scoring.epochs import EpochMismatch
 from traps_pipeline.scoring.published import published, published_cells
 
 
@@ -62,6 +63,20 @@ def test_uplift_from_nothing_is_infinite():
     assert uplift(frame)["ratio"].tolist() == [np.inf]
 
 
+def test_a_mean_of_which_a_dataset_has_no_figure_is_null_and_so_is_what_is_made_of_it():
+    # In one dataset every void of the standard regime went unanswered: the other three are no mean over the four.
+    rates = {"standard": (0.2, 0.2, np.nan, 0.9), "guided": (0.4, 0.4, 0.4, 0.9)}
+    frame = cells(
+        *(cell(dataset=d, regime=r, abs_rec=x) for r in rates for d, x in zip(DATASETS, rates[r], strict=True))
+    )
+    means = overall(frame).set_index("regime")["abs_rec"]
+    assert np.isnan(means["standard"])
+    assert means["guided"] == pytest.approx(0.525)
+    table = uplift(frame)
+    assert table["model"].tolist() == ["m"]
+    assert table["ratio"].isna().all()
+
+
 def test_a_ratio_across_epochs_is_refused_and_names_model_dataset_and_epochs():
     frame = cells(cell(), cell(regime="guided", epoch="e2"))
     with pytest.raises(
@@ -73,7 +88,6 @@ def test_a_ratio_across_epochs_is_refused_and_names_model_dataset_and_epochs():
 def test_a_mean_may_mix_epochs_where_both_sides_mix_them_alike():
     frame = cells(*(cell(dataset=d, regime=r, epoch=f"e-{d}") for d in DATASETS for r in ("standard", "guided")))
     assert uplift(frame)["ratio"].tolist() == [1.0]
-    assert epoch_note(frame).startswith("epochs: occlusion e-occlusion, occlusion_ill_posed e-occlusion_ill_posed")
 
 
 def test_the_papers_own_chaotic_gap_is_refused_and_its_occlusion_gap_is_not():
@@ -103,6 +117,11 @@ def test_the_frontier_keeps_equals_and_drops_whoever_is_beaten_in_one_and_not_be
         cell("twin", acc=0.5, abs_rec=0.9), cell("d", acc=0.4, abs_rec=0.8),
     )  # fmt: skip
     assert list(pareto_frontier(frame)["model"]) == ["a", "c", "twin"]
+
+
+def test_a_model_without_acc_is_not_on_the_frontier():
+    frame = cells(cell("a", acc=0.9), cell("silent", acc=np.nan, abs_rec=0.9))
+    assert list(pareto_frontier(frame)["model"]) == ["a"]
 
 
 def test_the_naive_gap_counts_cells_strictly_above_the_threshold():
@@ -136,16 +155,35 @@ def test_reasoning_pairs_subtract_the_other_from_the_thinking_member():
     )
 
 
+def test_a_dataset_without_a_figure_leaves_no_overall_difference():
+    frame = cells(
+        *(cell(m, d, acc=np.nan if (m, d) == ("qwen3-vl-think", "chaotic") else 0.5)
+          for m in ("qwen3-vl-think", "qwen3-vl-instruct") for d in DATASETS)
+    )  # fmt: skip
+    change = reasoning_pairs(frame).set_index("dataset")
+    assert change["acc"].isna()[["chaotic", "overall"]].all()
+    assert change.loc["overall", "abs_rec"] == 0.0
+
+
+def test_a_single_run_has_no_deviation_rather_than_one_of_0():
+    runs = {"n_pairs": 9, "n_missing": 0, "incomplete": False, **dict.fromkeys(("acc_std", "abs_rec_std"), 0.1)}
+    board = cells(
+        cell("one") | runs | {"n_runs": 1, "false_abs_std": 0.0, "pecs_std": 0.0},
+        cell("three") | runs | {"n_runs": 3, "false_abs_std": 0.2, "pecs_std": 0.04},
+    )
+    assert spread(study_cells(board)).iloc[0].tolist() == pytest.approx([0.04, 0.04, 0.04, 1])
+
+
 def test_every_degenerate_strategy_scores_zero():
     table = degenerate_strategies()
     assert len(table) == 6
     assert (table["pecs"] == 0).all()
 
 
-def scoped(scope, regime, dataset, abs_rec, run=1):
+def scoped(scope, regime, dataset, abs_rec, run=1, **other):
     return {
         **cell(dataset=dataset, regime=regime, abs_rec=abs_rec), "run": run, "scope": scope,
-        "n_pairs": 10, "n_missing": 0,
+        "n_pairs": 10, "n_missing": 0, **other,
     }  # fmt: skip
 
 
@@ -165,6 +203,35 @@ def test_sub_scenarios_average_runs_and_compare_regimes_and_datasets():
         [0.2, 0.5, 0.3, 4.0]
     )
     assert accuracy_by_label(scoped_cells(metrics, "label"))[["label", "acc"]].values.tolist() == [["red", 0.5]]
+
+
+def test_both_sides_of_a_sub_scenarios_ratio_are_of_the_same_models():
+    part, dice = "sub_scenario:dice", {"standard": "chaotic", "textual": "chaotic_ill_posed"}
+    metrics = pd.DataFrame(
+        [
+            scoped(part, "standard", dice["standard"], 0.1, model="a"),
+            scoped(part, "standard", dice["textual"], 0.2, model="a", n_missing=3),
+            scoped(part, "standard", dice["standard"], np.nan, model="b", n_missing=10),
+            scoped(part, "standard", dice["textual"], 0.8, model="b"),
+        ]
+    )
+    row = sub_scenarios(scoped_cells(metrics, "sub_scenario")).iloc[0]
+    assert row["textual_over_visual"] == pytest.approx(2.0)  # 0.5 / 0.1 is of two models over one
+    assert row[["n_models", "ill_posed_n_models", "guided_n_models", "n_missing"]].tolist() == [1, 1, 0, 3]
+    labels = [scoped("label:red", "standard", "chaotic", 0.1, model=m, acc=a) for m, a in (("a", 0.4), ("b", np.nan))]
+    table = accuracy_by_label(scoped_cells(pd.DataFrame(labels), "label"))
+    assert table[["acc", "n_models"]].values.tolist() == [[0.4, 1]]
+
+
+def test_runs_of_several_epochs_name_each_of_them_once():
+    runs = [scoped("label:red", "standard", "chaotic", 0.1, run=k, epoch=e) for k, e in ((1, "e1"), (2, "e1+e2"))]
+    assert scoped_cells(pd.DataFrame(runs), "label")["epoch"].tolist() == ["e1+e2"]
+
+
+def test_a_sub_scenario_without_a_figure_leaves_no_mean_of_its_kind():
+    table = pd.DataFrame({"sub_scenario": ["hidden_drop", "hidden_race", "catch"], "abs_rec": [0.2, np.nan, 0.4]})
+    means = hidden_against_others(table, ["abs_rec"]).set_index("kind")
+    assert means["abs_rec"].isna().to_dict() == {"hidden": True, "other": False}
 
 
 def test_hidden_sub_scenarios_against_the_others_as_published():

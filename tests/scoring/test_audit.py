@@ -1,9 +1,11 @@
 """The audit of the published tables: what agrees, and the arithmetic of what does not."""
 
+from pathlib import Path
+
 import pytest
 
 from traps_pipeline.cli import main
-from traps_pipeline.scoring.audit import audit
+from traps_pipeline.scoring.audit import _same_words, audit
 from traps_pipeline.scoring.claims import CLAIMS
 from traps_pipeline.scoring.published import published
 
@@ -11,6 +13,27 @@ from traps_pipeline.scoring.published import published
 @pytest.fixture(scope="module")
 def findings():
     return audit()
+
+
+def test_the_counts_are_the_documented_ones(findings):
+    assert findings["verdict"].value_counts().to_dict() == {"agrees": 431, "within rounding": 69, "differs": 16}
+    documented = (Path(__file__).parents[2] / "docs" / "scoring.md").read_text()
+    assert "prints 516 statements" in documented
+    assert "500 agree" in documented
+
+
+def test_a_statement_agrees_only_with_the_same_numbers_and_the_same_names():
+    assert _same_words("gemini-3.1-pro 0.568", "gemini-3.1-pro 0.5683")
+    assert not _same_words("gemini-3.1-pro 0.568", "gemini-3.1-pro-r-low 0.568")
+    assert not _same_words("gemini-3.1-pro-r-low 0.568", "gemini-3.1-pro 0.568")
+    assert not _same_words("gpt-5-pro", "gpt-5-pro; gpt-5-mini")
+
+
+def test_the_shift_of_confabulated_items_is_held_against_the_model_that_it_is_stated_of(findings):
+    shifts = findings[findings["group"] == "probe means"]
+    assert len(shifts) == 3
+    assert shifts["statement"].str.contains("qwen3-vl-8b").all()
+    assert (shifts["verdict"] == "agrees").all()
 
 
 def test_every_published_claim_is_decided(findings):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import erfc, sqrt
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,7 +11,10 @@ from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
 
-from traps_pipeline.partitions import DATASETS
+from tests.judging.conftest import item_row
+from traps_pipeline.cli import main
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     intervals,
@@ -19,9 +24,10 @@ from traps_pipeline.scoring.bootstrap import (
     scenario_weights,
 )
 from traps_pipeline.scoring.contrasts import contrasts, holm, regime_tests, version_contrasts
-from traps_pipeline.scoring.epochs import EpochMismatch
 from traps_pipeline.scoring.leaderboard import leaderboard
 from traps_pipeline.scoring.metrics import cell_metrics, wilson
+from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.tables import ITEMS, VERDICTS
 
 
 def pairs_with(n, acc, false_abs, abs_rec):
@@ -33,7 +39,7 @@ def scored(*parts, resamples=400):
     verdicts = pd.concat(parts, ignore_index=True)
     metrics = pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset")], ignore_index=True)
     resampled = resample(verdicts, resamples=resamples)
-    return metrics, resampled, contrasts(resampled, metrics)
+    return metrics, resampled, contrasts(resampled, metrics, verdicts)
 
 
 def only(table, **values):
@@ -54,7 +60,36 @@ def test_a_paired_contrast_takes_out_what_the_scenarios_share(rows):
     assert (row["ci_low"], row["ci_high"]) == pytest.approx(tuple(np.quantile(by_hand, [0.025, 0.975])))
     each = intervals(resampled).set_index(["dataset", "model"]).loc["occlusion"]
     assert row["ci_high"] - row["ci_low"] < 0.7 * (each.loc["m", "pecs_ci_high"] - each.loc["m", "pecs_ci_low"])
-    assert row["p"] == pytest.approx(2 / 401)
+    # No resample lies beyond 0, so p is the normal tail: 2 / 401 is all that counting could say.
+    tail = erfc(by_hand.mean() / by_hand.std() / sqrt(2))
+    assert tail < 2 / 401
+    assert row["p"] == pytest.approx(tail)
+
+
+def test_p_counts_the_resamples_beyond_0_where_there_are_any(rows):
+    m, n = pairs_with(100, 60, 0, 100), [*pairs_with(99, 56, 0, 99), (True, False, True)]  # 4 for m, 1 for n
+    _, _, table = scored(rows(m, model="m"), rows(n, model="n"))
+    weights = scenario_weights(100, 400, [20260101, 0])
+    by_hand = weights[:, 56:60].sum(axis=1) - weights[:, 99]
+    beyond = int((by_hand <= 0).sum())
+    assert 0 < beyond < 200
+    assert only(table, dataset="occlusion", figure="pecs")["p"] == pytest.approx(2 * (beyond + 1) / 401)
+
+
+def test_one_pair_that_all_resamples_repeat_proves_nothing(rows):
+    _, _, table = scored(rows([(True, False, True)], model="m"), rows([(False, False, True)], model="n"), resamples=20)
+    assert only(table, dataset="occlusion", figure="pecs")["p"] == pytest.approx(2 / 21)
+
+
+def test_twenty_three_models_that_lie_well_apart_are_all_told_apart(rows):
+    # 253 pairs: 2 / (resamples + 1), the least that counting can say, times 253 would be above 0.05 even for 10,000.
+    parts = [rows(pairs_with(460, 20 * k, 0, 460), model=f"m{k:02d}") for k in range(23)]
+    metrics, resampled, table = scored(*parts, resamples=200)
+    pecs = table[(table["kind"] == "models") & (table["figure"] == "pecs")]
+    assert (len(pecs), int(pecs["separable"].sum())) == (253, 253)
+    assert not table.loc[table["figure"] == "j", "separable"].any()  # J is 1 of all of them
+    board = leaderboard(metrics, intervals(resampled), table)
+    assert (board["rank_low"] == board["rank_high"]).all()
 
 
 def test_equal_models_are_not_separable_and_share_all_ranks(rows):
@@ -99,7 +134,59 @@ def test_a_contrast_across_epochs_is_refused_with_the_reason_and_no_figure(rows)
     assert set(refused["dataset"]) == {"chaotic", "overall"}
     assert refused[["difference", "p", "p_holm"]].isna().all(axis=None)
     assert not refused["separable"].any()
-    assert refused["refused"].iloc[0].startswith("chaotic: epoch old against epoch new")
+    assert (
+        refused["refused"]
+        .iloc[0]
+        .startswith("chaotic: chaotic:s0:control and 19 more items are of epoch old against epoch new")
+    )
+
+
+def swapped(rows, **other):
+    """Eight pairs of either side in two epochs, each side the other way round: alike in number and names of epochs."""
+    first, second = ({"epoch": e} for e in ("e1", "e2"))
+    pairs = pairs_with(8, 5, 0, 5)
+
+    def side(sets, **about):
+        whole = [rows(pairs, **(about | epoch)) for epoch in sets]
+        first_of_two = whole[0]["pair_id"] != "occlusion:s7"
+        return pd.concat([whole[0][first_of_two], whole[1][~first_of_two]], ignore_index=True)
+
+    return side((first, second)), side((second, first), **other)
+
+
+def test_epochs_are_compared_item_by_item(rows):
+    table = scored(*swapped(rows, model="n"), resamples=20)[2]
+    assert (
+        table["refused"].str.contains("occlusion:s0:control and 15 more items are of epoch e1 against epoch e2").all()
+    )
+    assert table["difference"].isna().all()
+    tests = regime_tests(pd.concat(swapped(rows, regime="guided"), ignore_index=True))
+    assert tests["refused"].notna().all() and tests["p"].isna().all()
+    versions = version_contrasts(*swapped(rows), resamples=20)
+    assert versions["refused"].notna().all() and versions["difference"].isna().all()
+
+
+def test_items_mixed_alike_on_both_sides_are_compared(rows):
+    one, _ = swapped(rows)
+    table = scored(one, one.assign(model="n"), resamples=20)[2]
+    assert table["refused"].isna().all()
+    assert (table["difference"] == 0).all()
+
+
+def test_a_contrast_of_different_items_is_refused_with_the_reason(rows):
+    table = scored(rows(pairs_with(8, 5, 0, 5)), rows(pairs_with(3, 3, 0, 3), model="n"), resamples=20)[2]
+    assert table["refused"].str.startswith("occlusion: occlusion:s3:control and 9 more items are answered on one").all()
+    assert table["p"].isna().all()
+
+
+def test_an_entry_without_all_four_datasets_is_in_no_overall_contrast(rows):
+    pairs = pairs_with(4, 2, 0, 2)
+    parts = [rows(pairs, dataset=d, model=m) for m in "mn" for d in DATASETS]
+    table = scored(*parts, rows(pairs, model="partial"), resamples=20)[2]
+    assert table["refused"].isna().all()
+    overall = table[table["dataset"] == "overall"]
+    assert set(overall["left_model"]) | set(overall["right_model"]) == {"m", "n"}
+    assert len(table[(table["dataset"] == "occlusion") & (table["figure"] == "j")]) == 3
 
 
 def test_holms_correction_is_the_textbooks_and_statsmodels():
@@ -191,6 +278,49 @@ def test_versions_are_compared_on_what_both_hold(rows):
     assert row["difference"] == pytest.approx(1 - (20 / 30) ** 2)
 
 
-def test_versions_of_different_epochs_are_refused(rows):
-    with pytest.raises(EpochMismatch, match="versions: m/occlusion/standard has epoch then from epoch 'e1'"):
-        version_contrasts(rows([(True, False, True)]), rows([(True, False, True)], epoch="e2"))
+def test_versions_of_different_epochs_are_refused_row_by_row(rows):
+    pairs = pairs_with(10, 5, 0, 5)
+    then = pd.concat([rows(pairs), rows(pairs, dataset="chaotic")], ignore_index=True)
+    now = pd.concat([rows(pairs), rows(pairs, dataset="chaotic", epoch="e2")], ignore_index=True)
+    table = version_contrasts(then, now.assign(benchmark_version="v2"), resamples=20)
+    fine, refused = only(table, dataset="occlusion", figure="j"), only(table, dataset="chaotic", figure="j")
+    assert fine["difference"] == 0
+    assert pd.isna(fine["refused"])
+    assert "epoch e1 against epoch e2" in refused["refused"]
+    assert np.isnan([refused["difference"], refused["p"], refused["p_holm"]]).all()
+    assert (refused["then"], refused["now"]) == (0.5, 0.5)
+    assert (refused["epoch_then"], refused["epoch_now"]) == ("e1", "e2")
+    assert (fine["benchmark_version_then"], fine["benchmark_version_now"]) == ("v1", "v2")
+
+
+def test_versions_are_compared_on_whole_pairs_and_say_what_is_missing(rows):
+    then = rows([(True, False, True)] * 4)
+    now = rows([(True, False, True), (True, False, None), (True, False, True), (True, False, True)])
+    now = now[now["item_id"] != "occlusion:s3:void"]
+    row = only(version_contrasts(then, now, resamples=20), figure="j")
+    assert (row["n_pairs"], row["n_missing_then"], row["n_missing_now"]) == (3, 0, 1)
+
+
+def test_the_command_compares_what_both_benchmarks_still_hold(rows, tmp_path, capsys):
+    studies = []
+    for name, scenarios in (("then", 4), ("now", 3)):  # one was discarded since; its verdict is still there
+        workspace = Workspace.create(tmp_path / name, Study(epoch="e1"))
+        places = [(number, side) for number in range(scenarios) for side in ("control", "void")]
+        items = [item_row("occlusion", *at) | {"item_id": f"occlusion:s{at[0]}:{at[1]}"} for at in places]
+        workspace.tables.write(ITEMS, {"dataset": "occlusion"}, items, {})
+        verdicts = rows([(True, False, True)] * 4)
+        cell = Cell("occlusion", Evaluation("m", "standard", 1))
+        workspace.tables.write(VERDICTS, cell.partition, verdicts, {})
+        studies.append(str(workspace.root))
+    then, now = studies
+    assert main(["compare", then, "--workspace", now, "--csv", str(tmp_path / "out.csv")]) == 0
+    written = pd.read_csv(tmp_path / "out.csv")
+    assert written["n_pairs"].tolist() == [3, 3]
+    assert written["difference"].tolist() == [0, 0]
+    assert {"n_missing_now", "epoch_then", "benchmark_version_now", "refused"} <= set(written.columns)
+    assert "occlusion" in capsys.readouterr().out
+
+
+def test_studies_that_share_nothing_are_not_compared(rows):
+    with pytest.raises(TrapsError, match="share no whole pair"):
+        version_contrasts(rows([(True, False, True)]), rows([(True, False, True)], model="n"))

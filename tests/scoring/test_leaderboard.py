@@ -21,7 +21,7 @@ def board_of(verdicts):
     parts = [cell_metrics(rows) for _, rows in verdicts.groupby("dataset")] or [cell_metrics(verdicts)]
     metrics = pd.concat(parts, ignore_index=True)
     resampled = resample(verdicts, resamples=100)
-    return leaderboard(metrics, intervals(resampled), contrasts(resampled, metrics))
+    return leaderboard(metrics, intervals(resampled), contrasts(resampled, metrics, verdicts))
 
 
 def entry(board, dataset="occlusion", model="m", regime="standard"):

@@ -8,14 +8,16 @@ from collections.abc import Mapping, Sequence
 NUMERIC_TOLERANCE = 0.5
 _WORDS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 NUMBER_WORDS = {word: str(n) for n, word in enumerate(_WORDS)}
-_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
+_NUMBER = re.compile(r"(?:(?<![\w.])-)?(?:\d+(?:\.\d+)?|\.\d+)")
+# What is kept: hyphen or point inside a number or range, a minus or point that begins a number. All else goes.
+_PUNCTUATION = re.compile(r"(?<=\d)[.\-](?=\d)|(?<![\w.])-(?=\.?\d)|(?<![\w.])\.(?=\d)|([^\w\s])")
 
 
 def normalise(text: str) -> str:
-    """Lower case, no articles, no punctuation but the hyphen and point inside a number or range, single spaces."""
-    text = text.lower().replace("–", "-").replace("—", "-").replace("’", "'")
+    """Lower case, no articles, no punctuation but what belongs to a number or range, single spaces."""
+    text = re.sub("[–—−]", "-", text.lower())
     text = re.sub(r"(?<=\d)\s*(?:-|to)\s*(?=\d)", "-", text)
-    text = re.sub(r"(?<!\d)[.\-]|[.\-](?!\d)|[^\w\s.\-]", " ", text)
+    text = _PUNCTUATION.sub(lambda found: " " if found[1] else found[0], text)
     return " ".join(word for word in text.split() if word not in ("a", "an", "the"))
 
 

@@ -37,6 +37,9 @@ from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
 PROTOCOL_FILE = ASSETS / "confabulation.yaml"
 TASK, PROMPT = "confabulation", "judge_confabulation"
 AXES = ("hallucinated_premise", "invalid_inference", "epistemic_surrender", "doubt_in_reasoning")
+# What the id of a failure is made of, and with it the people's labels: another answer is another failure. A part of
+# the protocol's digest, so that ids made otherwise are made anew.
+SAMPLED = ("cell", "item", "answer", "trace that the judge sees")
 SCHEMA = structured(TASK, **{axis: {"type": "boolean"} for axis in AXES}, rationale={"type": "string"})
 TRACE_AND_OUTPUT, OUTPUT = "trace_and_output", "output"
 Evidence = Literal["trace_and_output", "output"]
@@ -101,7 +104,7 @@ def protocol_digest(panel: str) -> str:
     protocol = load_protocol()
     judge = protocol.judge(panel)
     asked = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(PROMPT), VOID_KINDS] if judge else None
-    return digest([protocol.model_dump(exclude={"judges"}), asked])[:16]
+    return digest([protocol.model_dump(exclude={"judges"}), asked, SAMPLED])[:16]
 
 
 # --- the sample -------------------------------------------------------------------------------------------------------
@@ -128,6 +131,11 @@ def void_kind(dataset: str) -> str:
 def drawn(seed: int, n: int, keys: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     """A seeded sample without replacement of n of these keys, all if they are fewer, whatever their order."""
     return sorted(keys, key=lambda key: digest([seed, *key]))[:n]
+
+
+def sample_id(cell: Cell, item_id: str, answer: str | None, trace: str | None) -> str:
+    """What stands for a failure before its annotators: it tells neither model nor item, and changes with the answer."""
+    return digest([cell.key, item_id, answer, trace or None])[:12]
 
 
 def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict[Cell, list[Failure]]:
@@ -249,7 +257,7 @@ def _label_row(cell: Cell, failure: Failure, row: Row) -> dict[str, Any]:
     valid = isinstance(labels, Labels)
     item_id = failure.item["item_id"]
     return {
-        "sample_id": digest([cell.key, item_id])[:12],
+        "sample_id": sample_id(cell, item_id, failure.text, failure.trace),
         "item_id": item_id,
         **cell.partition,
         "void_kind": void_kind(cell.dataset),

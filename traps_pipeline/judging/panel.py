@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, StrictBool, ValidationError
+from pydantic import BaseModel, ConfigDict, StrictBool, StrictFloat, StrictInt, StrictStr, ValidationError
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
@@ -150,7 +150,7 @@ class CorrectnessVote(BaseModel):
 
     model_config = ConfigDict(extra="ignore")
     correct: StrictBool
-    extracted_value: str | int | float | None
+    extracted_value: StrictStr | StrictInt | StrictFloat | None
     reasoning: str
 
 

@@ -18,7 +18,15 @@ import pandas as pd
 from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.agreement import cohen_kappa
-from traps_pipeline.judging.confabulation import AXES, TRACE_AND_OUTPUT, VOID_KINDS, drawn, load_protocol
+from traps_pipeline.judging.confabulation import (
+    AXES,
+    TRACE_AND_OUTPUT,
+    VOID_KINDS,
+    drawn,
+    load_protocol,
+    sample_id,
+)
+from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import CONFABULATION, ITEMS, JUDGE_VALIDATION, RESPONSES
 
@@ -45,7 +53,7 @@ class HumanLabels:
 
 def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
     """What an annotator fills in: SHEET_COLUMNS by failure, in an order that tells nothing. Raises TrapsError if no
-    failure of the models to validate was labelled."""
+    failure of the models to validate was labelled, or one is of an answer that is no longer the model's."""
     protocol = load_protocol()
     labels = _judged(workspace)
     labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
@@ -56,23 +64,30 @@ def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
 
 
 def _sheet_row(workspace: Workspace, sample: str, label: Mapping[str, Any]) -> dict[str, str]:
-    cell = {name: label[name] for name in RESPONSES.partition_by}
-    response = _row_of(workspace.tables.read(RESPONSES, cell, ["item_id", "text", "reasoning"]), label["item_id"])
-    item = _row_of(
-        workspace.tables.read(ITEMS, {"dataset": label["dataset"]}, ["item_id", "question"]), label["item_id"]
-    )
+    evaluation, item_id = Evaluation(label["model"], label["regime"], int(label["run"])), label["item_id"]
+    cell = Cell(label["dataset"], evaluation)
+    response = _row_of(workspace.tables.read(RESPONSES, cell.partition, ["item_id", "text", "reasoning"]), item_id)
+    item = _row_of(workspace.tables.read(ITEMS, {"dataset": cell.dataset}, ["item_id", "question"]), item_id)
+    trace = response.get("reasoning") if label["evidence"] == TRACE_AND_OUTPUT else None
+    if not item or sample_id(cell, item_id, response.get("text"), trace) != sample:
+        raise TrapsError(
+            f"{workspace.root}: the labels of {cell.key} are of earlier answers (of {item_id}, for one); materialize "
+            "confabulation, then write the sheet anew"
+        )
     shown = {
         "question": item["question"],
         "why_unanswerable": VOID_KINDS[label["void_kind"]],
-        "reasoning_trace": response["reasoning"] if label["evidence"] == TRACE_AND_OUTPUT else "",
+        "reasoning_trace": trace or "",
         "response": response["text"],
     }
     empty = dict.fromkeys(LABEL_COLUMNS, "")
     return empty | {"sample_id": sample} | {name: _no_formula(str(text)) for name, text in shown.items()}
 
 
-def _row_of(frame: pd.DataFrame, item_id: str) -> dict[str, Any]:
-    return frame.loc[frame["item_id"] == item_id].iloc[0].to_dict()
+def _row_of(frame: pd.DataFrame, item_id: str) -> dict[Any, Any]:
+    """The texts of an item's row; nothing where there is none."""
+    rows = frame.loc[frame["item_id"] == item_id].to_dict("records")
+    return {name: value for row in rows for name, value in row.items() if isinstance(value, str)}
 
 
 def _no_formula(text: str) -> str:

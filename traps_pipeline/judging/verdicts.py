@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pandas as pd
 
@@ -20,10 +23,18 @@ from traps_pipeline.judging.ratings import (
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.partitions import Cell
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
+from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES, Table
 
 ITEM_COLUMNS = ["item_id", "scenario_id", "category", "sub_scenario", "control_answer", "benchmark_version"]
 RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "epoch"]
+
+
+def current(workspace: Workspace, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pd.DataFrame:
+    """The rows of a table (partition columns as in `equal`) on items that are still in the benchmark: cells that nobody
+    has evaluated since a correction may hold others. What is counted is counted over these."""
+    rows = workspace.tables.read_all(table, columns, **equal)
+    there = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
+    return rows.loc[rows["item_id"].isin(there)].reset_index(drop=True)
 
 
 def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:

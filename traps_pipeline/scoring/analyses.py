@@ -3,7 +3,8 @@
 `cells` has one row a (model, dataset, regime), averaged over runs, with the columns model, dataset, regime, acc,
 abs_rec, false_abs, pecs (fractions) and epoch; `study_cells` makes it of a study, `published.published_cells` of the
 paper. The input may hold further columns and is never changed. A ratio or gap whose two sides are of different epochs
-raises `epochs.EpochMismatch`; a mean over datasets takes every dataset's own epoch, alike on both sides.
+raises `epochs.EpochMismatch`; a mean over datasets takes every dataset's own epoch, alike on both sides. A mean of
+which one value is null is null, and a mean over models is over those that have all that it is of.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from traps_pipeline.models.registry import load_models
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.epochs import require_one_epoch
+from traps_pipeline.scoring.metrics import joined_epochs, mean
 
 SHARES = ["acc", "abs_rec", "false_abs", "pecs"]
 TAXONOMIES = ("occlusion", "chaotic")
@@ -38,11 +40,17 @@ _EQUAL = 12  # decimals at which two means count as equal: below any printed dig
 
 def study_cells(leaderboard: Frame) -> Frame:
     """Cells of a study from its LEADERBOARD rows, with `_std` over runs, n_pairs, n_runs, n_missing and incomplete."""
-    rows = leaderboard.loc[leaderboard["dataset"] != "overall"]
+    rows = of_several_runs(leaderboard.loc[leaderboard["dataset"] != "overall"])
     spread = [f"{share}_std" for share in SHARES]
     return rows[[*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]].reset_index(
         drop=True
     )
+
+
+def of_several_runs(rows: Frame) -> Frame:
+    """Rows without deviations over runs where there was one run only: none was measured."""
+    spreads = [name for name in rows if name.endswith("_std")]
+    return rows.assign(**{name: rows[name].where(rows["n_runs"] > 1) for name in spreads})
 
 
 def scoped_cells(metrics: Frame, scope: str) -> Frame:
@@ -53,9 +61,9 @@ def scoped_cells(metrics: Frame, scope: str) -> Frame:
     parts = metrics["scope"].str.partition(":")
     rows = metrics.assign(scope=parts[2]).loc[parts[0] == scope]
     groups = rows.groupby([*_ENTRY, "scope"], sort=True)
-    cells = groups[SHARES].agg(lambda values: float(np.mean(values.to_numpy(float))))
+    cells = groups[SHARES].agg(mean)
     cells["n_pairs"], cells["n_missing"] = groups["n_pairs"].max(), groups["n_missing"].sum()
-    cells["n_runs"], cells["epoch"] = groups["run"].nunique(), groups["epoch"].agg(lambda e: "+".join(sorted(set(e))))
+    cells["n_runs"], cells["epoch"] = groups["run"].nunique(), groups["epoch"].agg(joined_epochs)
     return cells.reset_index()
 
 
@@ -80,20 +88,22 @@ def overall(cells: Frame) -> Frame:
     cells = _checked(cells)
     groups = cells.groupby(["model", "regime"], sort=False)
     whole = cells[groups["dataset"].transform("nunique") == cells["dataset"].nunique()]
-    return whole.groupby(["model", "regime"], sort=False)[SHARES].mean().reset_index()
+    return whole.groupby(["model", "regime"], sort=False)[SHARES].agg(mean).reset_index()
 
 
-def uplift(cells: Frame) -> Frame:
-    """Guided over standard AbsRec, each averaged over datasets: columns model, ratio.
+def uplift(cells: Frame, means: Frame | None = None) -> Frame:
+    """Guided over standard AbsRec, each averaged over datasets: columns model, ratio; a row a model that has both.
 
-    Infinite where standard is 0 and guided is not. A model needs both regimes on every dataset of `cells`.
+    means: a study's own rows of `overall`, which leave out runs without all datasets; else those of `cells`. Infinite
+    where standard is 0 and guided is not, null where either is.
     """
     cells = _checked(cells)
     cells = cells[cells["regime"].isin(["standard", "guided"])]
     require_one_epoch(cells.pivot(index=["model", "dataset"], columns="regime", values="epoch"), "uplift")
-    means = overall(cells).pivot(index="model", columns="regime", values="abs_rec")
-    means = means.reindex(columns=["standard", "guided"], index=cells["model"].unique()).dropna()
-    return pd.DataFrame({"model": means.index, "ratio": ratio(means["guided"], means["standard"])})
+    rows = overall(cells) if means is None else means
+    guided, standard = (rows[rows["regime"] == r].set_index("model")["abs_rec"] for r in ("guided", "standard"))
+    both = [model for model in rows["model"].unique() if model in guided.index and model in standard.index]
+    return pd.DataFrame({"model": both, "ratio": ratio(guided.loc[both], standard.loc[both])})
 
 
 def spread(cells: Frame, column: str = "pecs_std") -> Frame:
@@ -111,15 +121,23 @@ def spread(cells: Frame, column: str = "pecs_std") -> Frame:
 
 
 def pareto_frontier(cells: Frame) -> Frame:
-    """The models that no other model of the same regime beats in both Acc and J, after averaging over datasets.
+    """The models on the frontier in (Acc, J) after averaging over datasets: `frontier` of `overall`, with the column j.
 
-    Rows of `overall` with the column j, by falling Acc; a model equal to another in one and better in the other beats
-    it, equal models are both on the frontier. It orders models and makes no ratio or gap, so epochs may differ.
+    It orders models and makes no ratio or gap, so epochs may differ.
     """
     means = overall(cells)
-    means["j"] = means["abs_rec"] - means["false_abs"]
-    frontier = [group[~_dominated(group)] for _, group in means.groupby("regime", sort=False)]
-    return pd.concat(frontier or [means]).sort_values(["regime", "acc"], ascending=[True, False], ignore_index=True)
+    return frontier(means.assign(j=means["abs_rec"] - means["false_abs"]))
+
+
+def frontier(means: Frame) -> Frame:
+    """The rows that no other row of the same regime beats in both acc and j, by falling Acc.
+
+    A model equal to another in one and better in the other beats it, equal models are both on the frontier, one
+    without Acc or J is not.
+    """
+    means = means.dropna(subset=["acc", "j"])
+    best = [group[~_dominated(group)] for _, group in means.groupby("regime", sort=False)]
+    return pd.concat(best or [means]).sort_values(["regime", "acc"], ascending=[True, False], ignore_index=True)
 
 
 def _dominated(points: Frame) -> np.ndarray:
@@ -204,6 +222,14 @@ def reasoning_pairs(cells: Frame) -> Frame:
     `overall` is the mean over the datasets of `cells`, where both members have all of them.
     """
     cells = _checked(cells)
+    epochs = cells.groupby(["model", "regime"])["epoch"].agg(joined_epochs).reset_index()
+    means = overall(cells).merge(epochs, on=["model", "regime"]).assign(dataset="overall")
+    return pair_differences(pd.concat([cells, means], ignore_index=True))
+
+
+def pair_differences(cells: Frame) -> Frame:
+    """`reasoning_pairs` of the rows that are there and no others; they may be of the dataset `overall`."""
+    cells = _checked(cells, datasets=(*DATASETS, "overall"))
     by_model = cells.set_index(_ENTRY)
     rows = []
     for thinking, other in REASONING_PAIRS:
@@ -212,10 +238,8 @@ def reasoning_pairs(cells: Frame) -> Frame:
         sides = {name: by_model.loc[name] for name in (thinking, other)}
         epochs = pd.DataFrame({name: side["epoch"] for name, side in sides.items()}).dropna()
         require_one_epoch(epochs, f"{thinking} against {other}")
-        change = (sides[thinking][SHARES] - sides[other][SHARES]).dropna(how="all").reset_index()
-        whole = change.groupby("regime").filter(lambda g: len(g) == cells["dataset"].nunique())
-        mean = whole.groupby("regime")[SHARES].mean().reset_index().assign(dataset="overall")
-        rows.append(pd.concat([change, mean], ignore_index=True).assign(thinking=thinking, other=other))
+        change = (sides[thinking][SHARES] - sides[other][SHARES]).loc[epochs.index].reset_index()
+        rows.append(change.assign(thinking=thinking, other=other))
     columns = ["thinking", "other", "regime", "dataset", *SHARES]
     return pd.concat(rows, ignore_index=True)[columns] if rows else pd.DataFrame(columns=pd.Index(columns))
 
@@ -226,52 +250,57 @@ def reasoning_pairs(cells: Frame) -> Frame:
 def sub_scenarios(cells: Frame) -> Frame:
     """Means over models of every sub-scenario of the visual datasets, from `scoped_cells(metrics, "sub_scenario")`.
 
-    Columns dataset, sub_scenario, n_pairs, n_models; acc, false_abs, abs_rec, pecs under standard; the same with the
-    prefix guided_; abs_rec_uplift and false_abs_uplift (guided minus standard); abs_rec_ill_posed (standard) and
-    textual_over_visual. Null where a regime or dataset was not run. Only models with both regimes enter an uplift.
+    Columns dataset, sub_scenario, n_pairs; acc, false_abs, abs_rec, pecs under standard, of n_models; the same with the
+    prefix guided_, of guided_n_models; abs_rec_uplift and false_abs_uplift (guided minus standard), of uplift_n_models
+    with both; abs_rec_ill_posed (standard) and textual_over_visual, of ill_posed_n_models with both; n_missing: items
+    missing over the cells that enter. A model of which a figure is null is in none of the means that it belongs
+    to; null where a regime or dataset was not run.
     """
     cells = _checked(cells, more=["scope"])
     rows = []
     for (taxonomy, scope), group in cells.groupby([cells["dataset"].str.removesuffix("_ill_posed"), "scope"]):
         visual, textual = group[group["dataset"] == taxonomy], group[group["dataset"] != taxonomy]
         by_regime = {r: visual[visual["regime"] == r].set_index("model") for r in ("standard", "guided")}
-        standard, guided = by_regime["standard"], by_regime["guided"]
-        asked = textual[textual["regime"] == "standard"].set_index("model")
+        standard, guided = (by_regime[r].dropna(subset=SHARES) for r in ("standard", "guided"))
+        asked = textual[textual["regime"] == "standard"].set_index("model").dropna(subset=["abs_rec"])
         epochs = pd.DataFrame({"standard": standard["epoch"], "guided": guided["epoch"], "ill-posed": asked["epoch"]})
         require_one_epoch(epochs, f"sub-scenario {scope} of {taxonomy}")
-        both = standard.index.intersection(guided.index)
+        both, common = (standard.index.intersection(side.index) for side in (guided, asked))
         change = (guided.loc[both, SHARES] - standard.loc[both, SHARES]).mean()
         row = {"dataset": taxonomy, "sub_scenario": scope, "n_pairs": visual["n_pairs"].max()}
         row |= {"n_models": len(standard)} | standard[SHARES].mean().to_dict()
+        row |= {"guided_n_models": len(guided), "uplift_n_models": len(both), "ill_posed_n_models": len(common)}
         row |= guided[SHARES].mean().add_prefix("guided_").to_dict()
         row |= {f"{share}_uplift": change[share] for share in ("abs_rec", "false_abs")}
-        common = standard.index.intersection(asked.index)
-        means = pd.Series([asked.loc[common, "abs_rec"].mean()]), pd.Series([standard.loc[common, "abs_rec"].mean()])
+        means = [pd.Series([side.loc[common, "abs_rec"].mean()]) for side in (asked, standard)]
         row |= {"abs_rec_ill_posed": means[0][0], "textual_over_visual": float(ratio(*means)[0])}
+        row["n_missing"] = sum(int(side["n_missing"].sum()) for side in (standard, guided, asked.loc[common]))
         rows.append(row)
     return pd.DataFrame(rows)
 
 
 def hidden_against_others(table: Frame, columns: Sequence[str] = ("abs_rec", "guided_abs_rec")) -> Frame:
-    """Unweighted means over the hidden sub-scenarios and over the others: columns kind, n, and `columns`.
+    """Unweighted means over the hidden sub-scenarios and over the others: columns kind, n, and `columns`; n_pairs and
+    n_missing are sums, where table has them.
 
     table has a row an occlusion sub-scenario with the column sub_scenario, as `sub_scenarios` returns it.
     """
     kind = np.where(table["sub_scenario"].isin(HIDDEN), "hidden", "other")
     groups = table.groupby(kind)
-    return groups[list(columns)].mean().assign(n=groups.size()).rename_axis("kind").reset_index()
+    sums = {name: groups[name].sum(min_count=1) for name in ("n_pairs", "n_missing") if name in table}
+    return groups[list(columns)].agg(mean).assign(n=groups.size(), **sums).rename_axis("kind").reset_index()
 
 
 def accuracy_by_label(cells: Frame) -> Frame:
-    """Mean Acc over models by the control's answer, under standard, from `scoped_cells(metrics, "label")`.
+    """Mean Acc over the models that have one by the control's answer, under standard, from `scoped_cells(metrics,
+    "label")`.
 
-    Columns dataset, label, acc, n_pairs, n_models.
+    Columns dataset, label, acc, n_pairs, n_models, n_missing (items of both sides, over these models).
     """
     rows = _checked(cells, more=["scope"])
-    groups = rows[rows["regime"] == "standard"].groupby(["dataset", "scope"])
-    table = pd.DataFrame(
-        {"acc": groups["acc"].mean(), "n_pairs": groups["n_pairs"].max(), "n_models": groups["model"].nunique()}
-    )
+    groups = rows[rows["regime"] == "standard"].dropna(subset=["acc"]).groupby(["dataset", "scope"])
+    columns = {"acc": groups["acc"].mean(), "n_pairs": groups["n_pairs"].max(), "n_models": groups["model"].nunique()}
+    table = pd.DataFrame(columns | {"n_missing": groups["n_missing"].sum()})
     return table.reset_index().rename(columns={"scope": "label"})
 
 
@@ -285,7 +314,7 @@ def ratio(numerator: Any, denominator: Any) -> np.ndarray:
         return top / bottom
 
 
-def _checked(cells: Frame, more: Sequence[str] = ()) -> Frame:
+def _checked(cells: Frame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> Frame:
     """A copy. Raises ValueError where a column is missing or a cell has two rows."""
     missing = [name for name in (*_ENTRY, *SHARES, "epoch", *more) if name not in cells]
     if missing:
@@ -296,7 +325,7 @@ def _checked(cells: Frame, more: Sequence[str] = ()) -> Frame:
         raise ValueError(
             f"cells have two rows for {first['model']}, {first['dataset']}, {first['regime']}: average runs first"
         )
-    unknown = sorted(set(cells["dataset"]) - set(DATASETS))
+    unknown = sorted(set(cells["dataset"]) - set(datasets))
     if unknown:
-        raise ValueError(f"cells of unknown datasets {unknown}; known: {', '.join(DATASETS)}")
+        raise ValueError(f"cells of unknown datasets {unknown}; known: {', '.join(datasets)}")
     return cells.reset_index(drop=True)

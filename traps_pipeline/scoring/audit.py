@@ -88,13 +88,17 @@ def claims() -> Iterator[Finding]:
 
 
 def _same_words(printed: str, recomputed: str) -> bool:
-    """Whether the numbers agree at the printed digits and all else that the printed words name is there too."""
+    """Whether the numbers agree at the printed digits and both name the same things."""
     ours, theirs = _numbers(recomputed), _numbers(printed)
     if len(ours) != len(theirs):
         return False
     close = all(abs(float(a) - float(b)) <= _half_unit(b) + _SLACK for a, b in zip(ours, theirs, strict=True))
-    names = set(re.findall(r"[a-z][\w.-]*\w", _NUMBER.sub(" ", printed))) - {"to", "and", "of"}
-    return close and all(name in recomputed for name in names)
+    return close and _names(printed) == _names(recomputed)
+
+
+def _names(words: str) -> set[str]:
+    """Whole names: a model is not named by one whose id begins like its own."""
+    return set(re.findall(r"[a-z][\w.-]*\w", _NUMBER.sub(" ", words))) - {"to", "and", "of"}
 
 
 def _numbers(words: str) -> list[str]:
@@ -198,17 +202,15 @@ def gaps() -> Iterator[Finding]:
 
 
 def probe_means() -> Iterator[Finding]:
-    """Every shift that confabulated items alone make, by transfer type, against the largest that the paper states."""
+    """Every shift that confabulated items alone make, by transfer type, against the largest that the paper states; it
+    states it of qwen3-vl-8b alone."""
     stated = float(published("claims").set_index("id").loc["probe-cf-shift", "published"])
-    rows = published("probe_transfer")
-    means = rows.groupby(["model", "transfer_type"])[["auroc", "auroc_confabulated"]].mean()
-    for (model, kind), row in means.iterrows():
+    rows = published("probe_transfer").query("model == 'qwen3-vl-8b'")
+    for kind, row in rows.groupby("transfer_type")[["auroc", "auroc_confabulated"]].mean().iterrows():
         shift = float(row["auroc"] - row["auroc_confabulated"])
-        small = shift <= stated + 0.005 + _SLACK
-        reason = "" if small else "the statement is made of qwen3-vl-8b; it does not hold for this model"
-        name = f"four-path mean AUROC, all minus confabulated only, {model}, {kind}"
-        verdict: Verdict = AGREES if small else DIFFERS
-        yield Finding("probe means", name, f"at most {stated:g}", f"{shift:.3f}", verdict, reason)
+        verdict: Verdict = AGREES if shift <= stated + 0.005 + _SLACK else DIFFERS
+        name = f"four-path mean AUROC, all minus confabulated only, qwen3-vl-8b, {kind}"
+        yield Finding("probe means", name, f"at most {stated:g}", f"{shift:.3f}", verdict)
 
 
 def transfer_types() -> Iterator[Finding]:

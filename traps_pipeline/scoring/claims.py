@@ -39,7 +39,8 @@ def _best(regime: str) -> Recomputed:
 
 
 def _uplifts(models: Sequence[str]) -> Any:
-    return uplift(published_cells()).set_index("model")["ratio"].loc[list(models)]
+    cells = published_cells()
+    return uplift(cells).set_index("model")["ratio"].loc[list(models)]
 
 
 def _video_native() -> list[str]:

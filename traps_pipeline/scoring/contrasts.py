@@ -1,14 +1,16 @@
 """Paired comparisons: model against model, regime against regime (benchmark.md section 5), with Holm's correction.
 
 Two entries of the leaderboard share their resamples (`bootstrap`), so the difference of their draws is that of a paired
-design, with whatever the scenarios have in common taken out. McNemar's test compares two regimes item by item. Across
-epochs nothing is compared (`epochs`): the row says why and holds no figure.
+design, with whatever the scenarios have in common taken out. McNemar's test compares two regimes item by item. Answers
+to different items, or to one item in different epochs, are not compared (`epochs`): the row says why and holds no
+difference.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
+from math import erfc, inf, sqrt
 
 import numpy as np
 import pandas as pd
@@ -16,37 +18,41 @@ import pandas as pd
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import DATASETS, REGIMES
 from traps_pipeline.scoring import Frame
-from traps_pipeline.scoring.bootstrap import RESAMPLES, Resampled, percentiles, resample
-from traps_pipeline.scoring.epochs import require_one_epoch
-from traps_pipeline.scoring.leaderboard import means_over_runs
-from traps_pipeline.scoring.metrics import cell_metrics, joined_epochs
+from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED, RESAMPLES, Resampled, percentiles, resample
+from traps_pipeline.scoring.epochs import answered, refusal
+from traps_pipeline.scoring.leaderboard import means_over_runs, standings
+from traps_pipeline.scoring.metrics import CELL, cell_metrics
 from traps_pipeline.tables import CONTRASTS, REGIME_TESTS
 
 FIGURES = ("pecs", "j")
 SEPARABLE_BELOW = 0.05
+VERSION_SIDES = ("n_missing", "epoch", "benchmark_version")  # what `version_contrasts` tells of either side
 _FAMILY = ["kind", "dataset", "figure", "_regime"]
 _SIDES = ["left_model", "left_regime", "right_model", "right_regime"]
 _Side = tuple[str, str]  # model, regime
 
 
-def contrasts(resampled: Resampled, metrics: Frame) -> Frame:
-    """CONTRASTS rows from the bootstrap and the METRICS rows that it resamples (for their figures and epochs).
+def contrasts(resampled: Resampled, metrics: Frame, verdicts: Frame) -> Frame:
+    """CONTRASTS rows from the bootstrap, the METRICS rows that it resamples (for their figures) and the VERDICTS rows
+    that both are made of (for their items and epochs).
 
-    Every pair of models under each regime, every pair of regimes of each model; PECS and J; each dataset and overall.
+    Every pair of models under each regime, every pair of regimes of each model; PECS and J; each dataset, and overall
+    where both sides have a run of all four.
     """
     places = {entry: row for row, entry in enumerate(resampled.entries)}
-    epochs = _epochs(metrics)
+    asked = answered(verdicts)
     means = means_over_runs(metrics)[list(FIGURES)].to_dict("index")
     rows = []
-    for kind, dataset, left, right in _pairs(resampled.entries):
-        refused = refusal(epochs, left, right, dataset)
+    for kind, dataset, left, right in _pairs([entry for entry in resampled.entries if entry in asked]):
+        items = asked[(*left, dataset)]
+        refused = refusal(items, asked[(*right, dataset)])
         for figure in FIGURES:
             row = {"kind": kind, "dataset": dataset, "figure": figure, "_regime": left[1] if kind == "models" else ""}
             row |= dict(zip(_SIDES, (*left, *right), strict=True)) | {"refused": refused}
             if refused is None:
                 draws = [resampled.figure(figure)[places[(*side, dataset)]] for side in (left, right)]
                 observed = [means.get((*side, dataset), {}).get(figure, np.nan) for side in (left, right)]
-                row |= _difference(draws[0] - draws[1], observed[0] - observed[1])
+                row |= _difference(draws[0] - draws[1], observed[0] - observed[1], len(items) // 2)
             rows.append(row)
     table = pd.DataFrame(rows, columns=pd.Index([*(c.name for c in CONTRASTS.columns), "_regime"]))
     table["p_holm"] = _holm_by(table, _FAMILY)
@@ -57,36 +63,49 @@ def contrasts(resampled: Resampled, metrics: Frame) -> Frame:
 def version_contrasts(then: Frame, now: Frame, resamples: int = RESAMPLES) -> Frame:
     """What changed between two studies, such as two versions of the benchmark: now minus then, on what both hold.
 
-    then and now are VERDICTS rows; pairs and cells that only one of them has are left out. Columns model, regime,
-    dataset, figure, n_pairs, then, now, difference, ci_low, ci_high, p, p_holm. Raises EpochMismatch where a model and
-    regime was evaluated in different epochs on a dataset, TrapsError where the two share nothing.
+    then and now are VERDICTS rows; pairs, runs and cells that only one of them has whole are left out. Columns model,
+    regime, dataset (and `overall`), figure, n_pairs (a run), then, now, difference, ci_low, ci_high, p, p_holm,
+    VERSION_SIDES with the suffixes _then and _now, and refused: why there is no difference, where an item was answered
+    in different epochs. Raises TrapsError where the two share nothing.
     """
-    key = ["dataset", "model", "regime", "run", "item_id"]
-    common = then[[*key, "epoch"]].merge(now[[*key, "epoch"]], on=key, suffixes=(" then", " now"))
-    if common.empty:
-        raise TrapsError("the two studies share no verdict on the same item, model, regime and run")
-    by_cell = common.groupby(["model", "dataset", "regime"])[["epoch then", "epoch now"]].agg(joined_epochs)
-    require_one_epoch(by_cell, "versions")
-    sides = [rows.merge(common[key], on=key) for rows in (then, now)]
-    drawn = [resample(rows, resamples) for rows in sides]
-    means = [
-        means_over_runs(pd.concat([cell_metrics(part, {}) for _, part in rows.groupby("dataset")])) for rows in sides
-    ]
-    places = {entry: row for row, entry in enumerate(drawn[0].entries)}
-    pairs = common.groupby(["model", "regime", "dataset"])["item_id"].nunique() // 2
+    sides = _whole_pairs_of_both(then, now)
+    if sides[0].empty:
+        raise TrapsError("the two studies share no whole pair of the same model, regime and run")
+    boards = [_standings(rows).add_suffix(suffix) for rows, suffix in zip(sides, ("_then", "_now"), strict=True)]
+    board = boards[0].join(boards[1], how="inner").rename(columns={"n_pairs_now": "n_pairs"})
+    asked, drawn = [answered(rows) for rows in sides], [resample(rows, resamples) for rows in sides]
+    draws = [dict(zip(found.entries, found.values, strict=True)) for found in drawn]
     rows = []
-    for row, entry in enumerate(drawn[1].entries):
+    for entry, about in board.to_dict("index").items():
+        refused = refusal(asked[0][entry], asked[1][entry])
         for figure in FIGURES:
-            if entry not in places or entry not in means[1].index:
-                continue
-            before, after = (float(mean.loc[entry, figure]) for mean in means)
-            found = dict(zip(["model", "regime", "dataset"], entry, strict=True), figure=figure, then=before, now=after)
-            found["n_pairs"] = int(pairs.loc[entry[:2]].sum() if entry[2] == "overall" else pairs[entry])
-            draws = drawn[1].figure(figure)[row] - drawn[0].figure(figure)[places[entry]]
-            rows.append(found | _difference(draws, after - before))
-    table = pd.DataFrame(rows)
+            values = {f"{name}_{side}": about[f"{name}_{side}"] for name in VERSION_SIDES for side in ("then", "now")}
+            values |= {side: about[f"{figure}_{side}"] for side in ("then", "now")}
+            row = dict(zip(ENTRY, entry, strict=True)) | {"figure": figure, "n_pairs": about["n_pairs"], **values}
+            if refused is None:
+                before, after = (found[entry][RESAMPLED.index(figure)] for found in draws)
+                row |= _difference(after - before, row["now"] - row["then"], row["n_pairs"])
+            rows.append(row | {"refused": refused})
+    columns = [*ENTRY, "figure", "n_pairs", "then", "now", "difference", "ci_low", "ci_high", "p", "p_holm"]
+    columns += [f"{name}_{side}" for name in VERSION_SIDES for side in ("then", "now")] + ["refused"]
+    table = pd.DataFrame(rows, columns=pd.Index(columns))
     table["p_holm"] = _holm_by(table, ["dataset", "figure"])
     return table
+
+
+def _whole_pairs_of_both(then: Frame, now: Frame) -> list[Frame]:
+    """The rows of each on the pairs (of a model, regime and run) of which both have control and void."""
+    key = [*CELL, "pair_id"]
+    common = then[[*key, "item_id"]].merge(now[[*key, "item_id"]], on=[*key, "item_id"])
+    pairs = common.groupby(key).size()
+    whole = pairs[pairs == 2].reset_index()[key]
+    return [rows.merge(whole, on=key) for rows in (then, now)]
+
+
+def _standings(verdicts: Frame) -> Frame:
+    """`leaderboard.standings` of verdicts, indexed by ENTRY."""
+    cells = [cell_metrics(part, {}) for _, part in verdicts.groupby("dataset")]
+    return standings(pd.concat(cells, ignore_index=True)).set_index(ENTRY)[["n_pairs", *FIGURES, *VERSION_SIDES]]
 
 
 def regime_tests(verdicts: Frame) -> Frame:
@@ -102,14 +121,15 @@ def regime_tests(verdicts: Frame) -> Frame:
         mine = verdicts[verdicts["side"] == side]
         for (dataset, model, run), group in mine.groupby(["dataset", "model", "run"], sort=True):
             said = group.pivot(index="item_id", columns="regime", values=column).astype("boolean")
-            asked = group.groupby("regime")["epoch"].agg(joined_epochs)
+            epochs = group.pivot(index="item_id", columns="regime", values="epoch")
             for left, right in combinations([r for r in REGIMES if r in said], 2):
                 both = said[[left, right]].dropna().astype(bool)
                 only_left, only_right = int((both[left] & ~both[right]).sum()), int((~both[left] & both[right]).sum())
                 row = {"dataset": dataset, "model": model, "run": run, "decision": decision}
                 row |= {"left_regime": left, "right_regime": right, "n": len(both)}
                 row |= {"only_left": only_left, "only_right": only_right}
-                row["refused"] = _mixed(asked[left], asked[right])
+                asked = epochs.loc[both.index]
+                row["refused"] = refusal(asked[left].to_dict(), asked[right].to_dict())
                 if row["refused"] is None and len(both):
                     discordant = only_left + only_right
                     row["p"] = binomtest(only_left, discordant, 0.5).pvalue if discordant else 1.0
@@ -129,21 +149,6 @@ def holm(p: np.ndarray) -> np.ndarray:
     return corrected
 
 
-def refusal(epochs: dict[tuple[str, str, str], str], left: _Side, right: _Side, dataset: str) -> str | None:
-    """Why two entries may not be compared on a dataset (or on all four, for `overall`); None if they may."""
-    for name in DATASETS if dataset == "overall" else (dataset,):
-        reason = _mixed(epochs.get((*left, name)), epochs.get((*right, name)))
-        if reason:
-            return f"{name}: {reason}"
-    return None
-
-
-def _mixed(left: str | None, right: str | None) -> str | None:
-    if left == right:
-        return None
-    return f"epoch {left} against epoch {right}; figures of different epochs are never put in one contrast"
-
-
 def _pairs(entries: Sequence[tuple[str, str, str]]) -> Iterator[tuple[str, str, _Side, _Side]]:
     """kind, dataset, left, right of every comparison, each once."""
     for dataset in (*DATASETS, "overall"):
@@ -156,17 +161,26 @@ def _pairs(entries: Sequence[tuple[str, str, str]]) -> Iterator[tuple[str, str, 
                 yield "regimes", dataset, left, right
 
 
-def _difference(draws: np.ndarray, observed: float) -> dict[str, float]:
-    """A paired difference with its interval and two-sided p from its resamples; nothing where these are null.
+def _difference(draws: np.ndarray, observed: float, pairs: int) -> dict[str, float]:
+    """A paired difference on so many pairs with its interval and two-sided p from its resamples; nothing where these
+    are null.
 
-    p is twice the smaller share of resamples on one side of 0, each side counting 0 and one more: never 0 itself.
+    p is twice the smaller share of resamples on one side of 0, each side counting 0 and one more. That is never below
+    2 / (resamples + 1), which Holm's correction over many models could never keep; so where no resample lies beyond 0,
+    p is the tail beyond 0 of a normal distribution with their mean and standard error, if that is smaller, but not
+    below 2^(1 - pairs), the least that flipping the signs of all pairs can show.
     """
     valid = draws[~np.isnan(draws)]
     if not len(valid):
         return {}
     low, high = percentiles(valid)
-    tail = min(int((valid <= 0).sum()), int((valid >= 0).sum())) + 1
-    return {"difference": observed, "ci_low": low, "ci_high": high, "p": min(1.0, 2 * tail / (len(valid) + 1))}
+    beyond = min(int((valid <= 0).sum()), int((valid >= 0).sum()))
+    p = 2 * (beyond + 1) / (len(valid) + 1)
+    if not beyond:
+        error = float(valid.std())
+        tail = erfc(abs(float(valid.mean())) / error / sqrt(2) if error else inf)
+        p = min(p, max(tail, 2.0 ** (1 - pairs)))
+    return {"difference": observed, "ci_low": low, "ci_high": high, "p": min(1.0, p)}
 
 
 def _holm_by(table: Frame, family: Sequence[str]) -> np.ndarray:
@@ -174,8 +188,3 @@ def _holm_by(table: Frame, family: Sequence[str]) -> np.ndarray:
     for rows in table.groupby(list(family)).indices.values():
         corrected[rows] = holm(table["p"].to_numpy(float)[rows])
     return corrected
-
-
-def _epochs(metrics: Frame) -> dict[tuple[str, str, str], str]:
-    whole = metrics[metrics["scope"] == "all"].groupby(["model", "regime", "dataset"])["epoch"]
-    return whole.agg(joined_epochs).to_dict()

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring import Frame
+from traps_pipeline.scoring.metrics import joined_epochs
+
+Answered = Mapping[str, str]  # item to the campaigns of its answers, joined by +
 
 
 class EpochMismatch(TrapsError):
@@ -29,13 +35,35 @@ def require_one_epoch(epochs: Frame, what: str) -> None:
     )
 
 
-def epoch_note(cells: Frame) -> str:
-    """What a table's header must say of its epochs: empty where all of its cells are of one.
+def answered(verdicts: Frame) -> dict[tuple[str, str, str], Answered]:
+    """What every (model, regime, dataset) answered, and in which campaigns, over its runs; `overall` is over the runs
+    that have all four datasets, and is not there without one."""
+    whole = verdicts.groupby(["model", "regime", "run"])["dataset"].transform("nunique") == len(DATASETS)
+    columns = ["model", "regime", "dataset", "item_id", "epoch"]
+    found: dict[tuple[str, str, str], dict[str, str]] = {}
+    for *cell, item, epoch, in_overall in (
+        verdicts[columns].assign(whole=whole).drop_duplicates().itertuples(index=False, name=None)
+    ):
+        model, regime, dataset = cell
+        for scope in (dataset, "overall") if in_overall else (dataset,):
+            items = found.setdefault((model, regime, scope), {})
+            items[item] = joined_epochs([items.get(item, ""), epoch])
+    return dict(found)
 
-    cells has the columns dataset and epoch. A dataset that differs from the commonest epoch is named.
-    """
-    by_dataset = cells.groupby("dataset", sort=False)["epoch"].unique()
-    if cells["epoch"].nunique() <= 1:
-        return ""
-    parts = [f"{dataset} {' and '.join(sorted(epochs))}" for dataset, epochs in by_dataset.items()]
-    return "epochs: " + ", ".join(parts)
+
+def refusal(left: Answered, right: Answered) -> str | None:
+    """Why two sides may not be compared item by item: not the same items, or an item of different campaigns."""
+    if left == right:
+        return None
+    alone = sorted(left.keys() ^ right.keys())
+    if alone:
+        return f"{_named(alone)} answered on one side alone; both sides of a contrast are of the same items"
+    mixed = sorted(item for item, epoch in left.items() if right[item] != epoch)
+    epochs = f"epoch {left[mixed[0]]} against epoch {right[mixed[0]]}"
+    return f"{_named(mixed)} of {epochs}; figures of different epochs are never put in one contrast"
+
+
+def _named(items: list[str]) -> str:
+    """The dataset of the first of these items, it, and how many there are."""
+    dataset, more = items[0].partition(":")[0], len(items) - 1
+    return f"{dataset}: {items[0]}" + (f" and {more} more items are" if more else " is")

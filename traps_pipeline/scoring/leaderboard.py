@@ -11,7 +11,7 @@ import pandas as pd
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
-from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, OUTCOMES, decision_counts, joined_epochs
+from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, OUTCOMES, decision_counts, joined_epochs, mean
 from traps_pipeline.tables import LEADERBOARD
 
 # An entry is incomplete where fewer of its items than this have a text. With 1 % of the items missing, the worst and
@@ -37,8 +37,8 @@ def standings(metrics: Frame) -> Frame:
     `n_runs` says. Items without a text count in no figure; where they are too many, the entry is `incomplete`.
     """
     groups = _runs(metrics).groupby(ENTRY, sort=True)
-    means, deviations = (groups[FIGURES].agg(f) for f in (_mean, _deviation))
-    bounds, sums = groups[BOUNDS].agg(_mean), cast(pd.DataFrame, groups[_SUMMED].sum())
+    means, deviations = (groups[FIGURES].agg(f) for f in (mean, _deviation))
+    bounds, sums = groups[BOUNDS].agg(mean), cast(pd.DataFrame, groups[_SUMMED].sum())
     board = means.join([deviations.add_suffix("_std"), bounds, sums])
     board["n_runs"] = groups["run"].nunique()
     board["n_pairs"] = groups["n_pairs"].max()
@@ -51,7 +51,7 @@ def standings(metrics: Frame) -> Frame:
 
 def means_over_runs(metrics: Frame) -> Frame:
     """FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
-    return _runs(metrics).groupby(ENTRY, sort=True)[FIGURES].agg(_mean)
+    return _runs(metrics).groupby(ENTRY, sort=True)[FIGURES].agg(mean)
 
 
 def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
@@ -85,7 +85,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     groups = cells.groupby(_RUN, sort=True)
     whole = cells[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
     counts = cast(pd.DataFrame, whole[["n_pairs", *_SUMMED]].sum())
-    overall = whole[[*FIGURES, *BOUNDS]].agg(_mean).join(counts)
+    overall = whole[[*FIGURES, *BOUNDS]].agg(mean).join(counts)
     overall["epoch"] = whole["epoch"].agg(joined_epochs)
     overall["benchmark_version"] = whole["benchmark_version"].agg(_joined_versions)
     return overall.reset_index().assign(dataset="overall")
@@ -96,10 +96,6 @@ def _incomplete(board: pd.DataFrame) -> pd.Series:
     below = cast(pd.Series, board["answered"] < INCOMPLETE_BELOW)
     anywhere = cast(pd.Series, below.groupby(level=["model", "regime"]).transform("any")).astype(bool)
     return below | (anywhere & (board.index.get_level_values("dataset") == "overall"))
-
-
-def _mean(values: pd.Series) -> float:
-    return float(np.mean(values.to_numpy(float)))
 
 
 def _deviation(values: pd.Series) -> float:

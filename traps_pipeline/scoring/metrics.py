@@ -72,6 +72,11 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_B
     )
 
 
+def mean(values: pd.Series) -> float:
+    """Null where any value is: no mean rests on fewer values than it says."""
+    return float(np.mean(values.to_numpy(float)))
+
+
 def joined_epochs(epochs: Iterable[str]) -> str:
     """The distinct campaigns, sorted and joined by `+`; an epoch may itself be such a join."""
     return "+".join(sorted({part for epoch in set(epochs) for part in epoch.split("+") if part}))
