@@ -149,7 +149,7 @@ def _add_pocket(commands: Any) -> None:
         ("render", "draw the scenes that the pocket model is trained and tested on; goes on where it was stopped"),
         ("train", "train the pocket model from scratch (renders what is missing); goes on where it was stopped"),
         ("evaluate", "ask trained weights about the held-out scenes, and write the counts"),
-        ("card", "write the counts into the model card"),
+        ("card", "write the counts, and what was found inside, into the model card"),
     ):
         sub = pocket.add_parser(name, help=text, description=text)
         sub.set_defaults(command=pocket_command, pocket=name)
@@ -164,6 +164,15 @@ def _add_pocket(commands: Any) -> None:
             sub.add_argument("--scenes", type=int, help="so many held-out scenes a family (default: all)")
         if name in ("evaluate", "card"):
             sub.add_argument("--csv", type=Path, help="the counts (default: assets/pocket/evaluation.csv)")
+        if name == "card":
+            sub.add_argument(
+                "--mechanism",
+                type=Path,
+                nargs="+",
+                default=[],
+                metavar="WORKSPACE",
+                help="finished by `traps run mechanism`, one a seed: their figures go into assets/pocket/mechanism.csv",
+            )
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------
@@ -196,16 +205,18 @@ def audit_published(arguments: argparse.Namespace) -> int:
 
 def compare_studies(arguments: argparse.Namespace) -> int:
     """See `traps compare --help`."""
+    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.contrasts import version_contrasts
     from traps_pipeline.storage.workspace import Workspace
     from traps_pipeline.tables import VERDICTS
 
     studies = Workspace.open(arguments.other), Workspace.open(_root(arguments))
-    then, now = (study.tables.read_all(VERDICTS) for study in studies)
+    then, now = (current(study, VERDICTS) for study in studies)
     table = version_contrasts(then, now)
     if arguments.csv:
         table.to_csv(arguments.csv, index=False)
-    print(table.to_string(index=False, float_format=lambda value: f"{value:.4f}"))
+    shown = table.assign(refused=table["refused"].fillna(""))
+    print(shown.to_string(index=False, na_rep="-", float_format=lambda value: f"{value:.4f}"))
     return OK
 
 

@@ -54,6 +54,7 @@ AGGREGATES = {
     "cosines": "directions/",
     "steering": "directions/",
     "steering_effects": "steering_votes/",
+    "steering_shares": "steering_votes/",
     "mechanism_report": "",
 }
 PID_TAG = "traps/pid"

@@ -24,6 +24,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
 from traps_pipeline.judging.panel import SCHEMAS, load_judges, load_panel
 from traps_pipeline.mechanism.versions import (
+    directions_are_there,
     extraction_version,
     probing_version,
     states_are_there,
@@ -74,7 +75,7 @@ EVALUATED = (
 )
 JUDGED = ("agreement", "judge_bias", "leave_one_out", "confabulation", "confabulation_prevalence")
 PROBED = ("probe_items", "hidden_states", "probes", "directions", "cosines")
-STEERED = ("steering", "steering_votes", "steering_effects")
+STEERED = ("steering", "steering_votes", "steering_effects", "steering_shares")
 INSIDE = (*PROBED, *STEERED)  # of experiments that look into models; others leave them out
 STAGES = (*EVALUATED, *JUDGED, *INSIDE, *REPORTS)
 SOURCES = ("released_specs", "corrections", "models", "prompts", "judges", "published")
@@ -185,7 +186,7 @@ def upstream(stage: str, key: str | None) -> list[Node]:
             return [("items", cell.dataset), *every, ("steering_settings", cell.run)]
         case "steering_votes":
             return [("items", SteeringCell.parse(str(key)).dataset), ("steering", key), ("judges", None)]
-        case "steering_effects":
+        case "steering_effects" | "steering_shares":
             return [(stage, key) for stage in ("steering", "steering_votes") for key in keys_of("steering")]
         case "contact_sheet":
             return [("items", d) for d in DATASETS]
@@ -283,6 +284,8 @@ class Lineage:
             reasons += [f"clip {path} is gone or damaged" for path in missing_clips(self._workspace, str(key))]
         if stage == "hidden_states" and not states_are_there(self._workspace, StatesCell.parse(str(key))):
             reasons += ["its states are gone"]
+        if stage == "directions" and not directions_are_there(self._workspace, Extraction.parse(str(key))):
+            reasons += ["its directions are gone"]
         return Status("stale", tuple(reasons), state.failed) if reasons or state.failed else Status("fresh")
 
     def _state(self, stage: str, key: str | None) -> State | None:

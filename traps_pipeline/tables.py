@@ -368,7 +368,7 @@ CONTRASTS = Table(
     difference float? left minus right, means over runs; null where refused
     ci_low float? 95 % percentile interval of the paired difference, cluster bootstrap over scenarios
     ci_high float? 95 % percentile interval of the paired difference
-    p float? two-sided, from the share of resamples on either side of 0
+    p float? two-sided, from the share of resamples on either side of 0; where none lies beyond it, from a normal tail
     p_holm float? corrected by Holm over the rows of the same kind, dataset and figure (and regime, of models)
     separable bool whether p_holm is below 0.05
     refused str? why the two may not be compared
@@ -482,7 +482,7 @@ CONFABULATION = Table(
     ("model", "item_id"),
     _columns(
         """
-    sample_id str what a human annotator sees in the place of model and item: tells neither
+    sample_id str what a human annotator sees in the place of model and item: tells neither, changes with the answer
     item_id str dataset:scenario_id:void
 """
         + _CELL
@@ -652,6 +652,7 @@ HIDDEN_STATES = Table(
     checkpoint_digest str digest of the weights
     dtype str precision
     quantisation str none or nf4
+    device str device that made them, of a GPU with its name; states in one folder may be of several
     pooling str last (token) or mean
     n_layers int blocks; states are of layers 0 (embeddings) to this
     width int numbers a state
@@ -668,7 +669,7 @@ PROBES = Table(
     _columns(
         _LOOKED_INTO
         + """
-    analysis str transfer, confabulated, within, shuffled, answerable_void or _control, centroid_void or _control
+    analysis str transfer, held_out, confabulated, within, shuffled, answerable_void, answerable_control or centroid_..
     source str dataset that the probe or the centroids were fitted on
     target str dataset that they were applied to
     layer int counted as in hidden_states; -1 where there is no figure
@@ -794,7 +795,7 @@ STEERING_EFFECTS = Table(
     alpha float strength; 0 is the model as it is
     alpha_relative float? alpha over the mean length of the states at that layer
     side str control or void
-    n int decided answers
+    n int decided answers, one a scenario
     n_missing int answers missing or undecided
     abstained int of the decided
     abstention float? share of the decided
@@ -805,8 +806,35 @@ STEERING_EFFECTS = Table(
     ),
 )
 
+STEERING_SHARES = Table(
+    "steering_shares",
+    "abstention on one side at one strength, over the paths of a set, one regime or all",
+    (),
+    ("model", "path_set", "directions", "regime", "kind", "layer", "alpha", "side"),
+    _columns(
+        """
+    model str id in assets/models.yaml
+    path_set str transfer, within_domain, or all of both
+    directions str VQA prompt that the directions were extracted under, or all
+    regime str system prompt of the steered answers, or all
+    kind str void, random or shuffled
+    layer int steered block
+    alpha float strength; 0 is the model as it is
+    side str control or void
+    n_paths int paths that are there
+    n int decided answers over paths and regimes, one that stands in several counted in each
+    n_answers int different answers among them, by ledger key
+    n_scenarios int scenarios that they are about
+    abstention float mean over paths and regimes of the share of the decided
+    low float? 95 % percentile interval, scenarios resampled; of width 0 where all scenarios say the same
+    high float? 95 % percentile interval
+    epoch str campaigns of the answers, joined by +
+"""
+    ),
+)
+
 _EVALUATED = (SCENE_SPECS, VIDEOS, ITEMS, RESPONSES, VOTES, VERDICTS, METRICS, CONTRASTS, REGIME_TESTS, LEADERBOARD)
 _JUDGED = (AGREEMENT, JUDGE_BIAS, LEAVE_ONE_OUT, CONFABULATION, CONFABULATION_PREVALENCE)
 _PROBED = (PROBE_ITEMS, HIDDEN_STATES, PROBES, DIRECTIONS, COSINES)
-_STEERED_TABLES = (STEERING, STEERING_VOTES, STEERING_EFFECTS)
+_STEERED_TABLES = (STEERING, STEERING_VOTES, STEERING_EFFECTS, STEERING_SHARES)
 TABLES = {t.name: t for t in (*_EVALUATED, *_JUDGED, *_PROBED, *_STEERED_TABLES)}

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from safetensors import safe_open
@@ -129,11 +130,31 @@ def test_another_precision_or_pooling_is_another_extraction(tmp_path: Path) -> N
     record = read_record(tmp_path)
     assert (record["dtype"], record["pooling"], record["n_layers"], record["d_model"]) == ("bfloat16", "last", 4, 64)
     assert record["checkpoint_digest"] == of.checkpoint.digest
-    assert "bfloat16 on cpu" in record["served_model"]
     with safe_open(tmp_path / "shard-00002.safetensors", framework="pt") as shard:
         assert shard.get_tensor("layer_001").dtype == torch.bfloat16
     expected = half.forward_states(work(half, 1)[0].prompt()).raw[1]
     assert (read_layer(tmp_path, 1)[1][0] == expected).all()  # 16 bits hold what a model in 16 bits gives
+
+
+def test_states_made_on_another_device_say_so_item_by_item(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    of = model("llava-next-video")
+    extract(of, work(of, 2), tmp_path)
+    assert "made on" not in capsys.readouterr().err
+    monkeypatch.setattr(LocalModel, "device_name", "cuda:0 (some GPU)")
+    extract(of, work(of, 4), tmp_path)
+    assert list(read_layer(tmp_path, 1)[0]["device"]) == ["cpu"] * 2 + ["cuda:0 (some GPU)"] * 2
+    assert "its states were made on cpu and cuda:0 (some GPU)" in capsys.readouterr().err
+
+
+def test_states_of_before_devices_were_recorded_are_not_made_again(tmp_path: Path) -> None:
+    of = model("llava-next-video")
+    extract(of, work(of, 2), tmp_path)
+    table = tmp_path / "shard-00000.parquet"
+    pd.read_parquet(table).drop(columns="device").to_parquet(table, index=False)
+    assert extract(of, work(of, 2), tmp_path).n_new == 0
+    assert set(read_layer(tmp_path, 1)[0]["device"]) == {"not recorded"}
 
 
 def test_of_two_extractions_at_once_one_makes_the_states_and_the_other_finds_them(tmp_path: Path) -> None:

@@ -234,6 +234,27 @@ def test_a_target_label_never_influences_a_fit() -> None:
     assert (of_target["source_best"] == of_target["source_best_after"]).all()  # the source's choice saw no target label
 
 
+def test_shared_controls_flatter_pairs_of_one_taxonomy_unless_their_scenario_is_held_out() -> None:
+    """Pure noise, the same control items in both datasets of a taxonomy, fewer rows than columns."""
+    items, states = study(pairs=15)
+    rng = np.random.default_rng(5)
+    for dataset in (*DATASETS, ANSWERABLE):
+        states[dataset, 0] = rng.normal(size=(len(states[dataset, 0]), 200))
+    for dataset in ("occlusion", "chaotic"):
+        states[f"{dataset}_ill_posed", 0][::2] = states[dataset, 0][::2]
+    assert set(items.loc[items["dataset"] == "chaotic", "side"].iloc[::2]) == {"control"}
+    settings = ProbeSettings(folds=5, shuffles=20, resamples=100)
+    run = ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, settings, 7)
+    found = pd.DataFrame(run.layer_rows(0))
+    value = {name: rows.set_index(["source", "target"])["value"] for name, rows in found.groupby("analysis")}
+    pairs = [(s, t) for s, t in TRANSFER_PAIRS if s.split("_")[0] == t.split("_")[0]]
+    assert sorted(value["held_out"].index) == sorted(pairs) and len(pairs) == 4
+    assert value["transfer"][pairs].min() > 0.9
+    assert abs(value["held_out"].mean() - 0.5) < 0.15  # four pairs of 30 items
+    across = [pair for pair in TRANSFER_PAIRS if pair not in pairs]
+    assert abs(value["transfer"][across].mean() - 0.5) < 0.15
+
+
 def test_answerable_questions_tell_what_hides_from_what_cannot_be_known(rows: pd.DataFrame) -> None:
     at = rows[(rows["layer"] == PLANTED) & (rows["target"] == ANSWERABLE)].set_index(["analysis", "source"])["value"]
     for source in DATASETS:  # the planted signal is of voids, and the answerable items do not have it

@@ -13,10 +13,12 @@ import pytest
 
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_items, write_verdicts
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.lineage import Lineage
 from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.directions import vector_digest
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.settings import MechanismSettings
+from traps_pipeline.mechanism.shares import effect_rows
 from traps_pipeline.mechanism.steering import (
     UNSTEERED,
     collect_steered,
@@ -111,12 +113,72 @@ def test_states_stand_in_the_order_of_their_table(study: Workspace) -> None:
     assert len(ill_posed) == 2 * PAIRS and states.n_layers == 5
 
 
+def test_two_items_with_the_same_clip_and_question_have_the_same_states(own: Workspace) -> None:
+    items = own.tables.read(ITEMS, {"dataset": "chaotic"}).to_dict("records")
+    first, twin = (next(r for r in items if r["item_id"] == f"chaotic:plinko-{n}:void") for n in (0, 1))
+    twin |= {name: first[name] for name in ("clip", "media_digest", "question")}
+    own.tables.write(ITEMS, {"dataset": "chaotic"}, items, {})
+    extract_all(own)
+    states = stages.States.of(own, STANDARD)
+    at = dict(zip(states.dataset("chaotic")["item_id"], states.read("chaotic", 3), strict=True))
+    assert (at[first["item_id"]] == at[twin["item_id"]]).all()
+    assert (at[first["item_id"]] != at["chaotic:plinko-2:void"]).any()
+    assert set(states.dataset("chaotic")["device"]) == {"cpu"}
+
+
 def test_states_that_are_gone_are_told(own: Workspace) -> None:
     shutil.rmtree(own.root / "states" / "tiny" / "standard" / "chaotic")
     with pytest.raises(TrapsError, match="hidden states are not there or not finished; materialize hidden_states"):
         stages.direction_rows(own, STANDARD)
     with pytest.raises(TrapsError, match="no hidden states of tiny__guided"):
         stages.direction_rows(own, Extraction("tiny", "guided"))
+
+
+@pytest.mark.parametrize("lost", ["shard-00000.safetensors", "shard-00000.parquet", "ids.parquet"])
+def test_lost_states_are_stale_and_made_again_as_they_were(own: Workspace, lost: str) -> None:
+    cell = StatesCell("chaotic", STANDARD)
+    assert states_of(own, cell) == ()
+    before = stages.States.of(own, STANDARD).read("chaotic", 3)
+    (own.root / "states" / "tiny" / "standard" / "chaotic" / lost).unlink()
+    assert "its states are gone" in states_of(own, cell)
+    stages.extract_states(own, cell)
+    assert states_of(own, cell) == ()
+    assert (stages.States.of(own, STANDARD).read("chaotic", 3) == before).all()
+
+
+def states_of(workspace: Workspace, cell: StatesCell) -> tuple[str, ...]:
+    """What is wrong with the files of a partition, its inputs aside: the study's were written without any."""
+    reasons = Lineage(workspace).status("hidden_states", cell.key).reasons
+    return tuple(reason for reason in reasons if "gone" in reason)
+
+
+def test_a_damaged_index_of_states_is_written_again(own: Workspace) -> None:
+    cell = StatesCell("chaotic", STANDARD)
+    (own.root / "states" / "tiny" / "standard" / "chaotic" / "ids.parquet").write_bytes(b"torn")
+    with pytest.raises(TrapsError, match="the next `traps run` writes it again"):
+        stages.States.of(own, STANDARD).read("chaotic", 3)
+    assert "its states are gone" in states_of(own, cell)
+    assert stages.extract_states(own, cell)[1] == 0
+    assert states_of(own, cell) == ()
+
+
+@pytest.mark.parametrize("ending", [".safetensors", ".json"])
+def test_lost_or_damaged_directions_are_made_again_as_they_were(own: Workspace, ending: str) -> None:
+    def gone() -> bool:
+        return "its directions are gone" in Lineage(own).status("directions", STANDARD.key).reasons
+
+    before = own.tables.read(DIRECTIONS, STANDARD.partition)
+    file = own.root / "directions" / "tiny" / "standard" / f"chaotic{ending}"
+    file.write_bytes(file.read_bytes()[:-9])
+    with pytest.raises(TrapsError, match="delete it, then `traps run` makes it again"):
+        stages.saved_directions(own, STANDARD)
+    assert not gone()
+    file.unlink()
+    with pytest.raises(TrapsError, match="`traps run` makes both from the states"):
+        stages.saved_directions(own, STANDARD)
+    assert gone()
+    again = pd.DataFrame(stages.direction_rows(own, STANDARD))
+    assert set(again["direction_digest"]) == set(before["direction_digest"]) and not gone()
 
 
 def test_directions_are_what_the_states_say(study: Workspace) -> None:
@@ -248,9 +310,7 @@ def test_the_panel_judges_every_answer_with_a_text(steered: Workspace) -> None:
 
 
 def test_effects_put_the_model_as_it_is_into_every_path(steered: Workspace) -> None:
-    effects = pd.DataFrame(
-        stages.effect_rows(steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES))
-    )
+    effects = pd.DataFrame(effect_rows(steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES)))
     main = effects.query("kind == 'void' and layer == 2")
     assert len(main.groupby(["source", "target"])) == 14
     assert set(main["alpha"]) == {0, 2, 8} and (main["n"] + main["n_missing"] == 2).all()

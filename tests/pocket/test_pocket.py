@@ -10,13 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.mechanism.study import filled
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.models.local.checkpoint import folder_digest
 from traps_pipeline.models.media import sample
 from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.pocket.commands import BEGIN, CARD, END, EVALUATION, FACTS, WEIGHTS
+from traps_pipeline.pocket import inside
+from traps_pipeline.pocket.commands import CARD, EVALUATION, FACTS, INSIDE, INSIDE_MARKS, MARKS, WEIGHTS
 from traps_pipeline.pocket.data import (
     STREAM,
     SceneRecord,
@@ -29,6 +32,8 @@ from traps_pipeline.pocket.data import (
 from traps_pipeline.pocket.evaluate import MODEL, Asked, entry_of, evaluate, markdown, read_cells, write_cells
 from traps_pipeline.pocket.recipe import POCKET, Recipe, load_recipe
 from traps_pipeline.pocket.words import PROMPTS, say
+from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 
 FEW = 2  # scenes
 
@@ -116,6 +121,24 @@ def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -
         render(none.model_copy(update={"abstain_share": 0.4}), "train", tmp_path)
 
 
+def test_other_numbers_of_scenes_draw_what_is_missing_and_read_what_is_wanted(
+    recipe: Recipe, data: Path, tmp_path: Path
+) -> None:
+    from traps_pipeline.pocket.data import data_digest, read_shards, render
+    from traps_pipeline.pocket.train import Scenes
+
+    fewer = recipe.model_copy(update={"scenes": {"drop_split": FEW - 1}})
+    render(fewer, "train", tmp_path, workers=1)
+    alone, whole = data_digest(fewer, "train", tmp_path), data_digest(recipe, "train", data)
+    with pytest.raises(TrapsError, match=f"has {FEW - 1} of {FEW} scenes; run `traps pocket render"):
+        list(read_shards(recipe, "train", tmp_path))
+    render(recipe, "train", tmp_path, workers=1)  # more than before: the last shard is drawn again
+    assert data_digest(recipe, "train", tmp_path) == whole
+    render(fewer, "train", tmp_path, workers=1)  # fewer again: it stays, and its first scenes are read
+    assert len(Scenes(fewer, tmp_path).records) == FEW - 1
+    assert data_digest(fewer, "train", tmp_path) == alone != whole
+
+
 @pytest.mark.parametrize("prompt_name", PROMPTS)
 def test_what_it_is_taught_to_say_is_read_by_the_rule_judge(prompt_name: str) -> None:
     for answer in ("left", "elsewhere", "4", "purple"):
@@ -179,6 +202,27 @@ def test_training_that_was_stopped_goes_on_bit_for_bit(recipe: Recipe, data: Pat
         train(recipe, data, tmp_path / "stopped", 2)
 
 
+def test_training_interrupted_inside_a_step_goes_on_from_the_step_before(
+    recipe: Recipe, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import torch
+
+    from traps_pipeline.pocket.train import train
+
+    train(recipe, data, tmp_path, 1, stop_after=1)
+    kept = (tmp_path / "state.safetensors").read_bytes()
+
+    def half_a_step(self: torch.optim.AdamW, *_: object) -> None:
+        with torch.no_grad():
+            self.param_groups[0]["params"][0].add_(1.0)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch.optim.AdamW, "step", half_a_step)
+    with pytest.raises(KeyboardInterrupt):
+        train(recipe, data, tmp_path, 1, stop_after=2)
+    assert (tmp_path / "state.safetensors").read_bytes() == kept
+
+
 # --- what ships -------------------------------------------------------------------------------------------------------
 
 
@@ -197,10 +241,14 @@ def test_the_shipped_weights_are_small_and_are_those_of_the_facts() -> None:
     assert f"`{facts['data']}`" in CARD.read_text()
 
 
+def in_card(marks: tuple[str, str]) -> str:
+    return CARD.read_text().partition(marks[0])[2].partition(marks[1])[0].strip()
+
+
 def test_the_card_shows_the_shipped_counts() -> None:
     cells = read_cells(EVALUATION)
-    card = CARD.read_text()
-    assert card.partition(BEGIN)[2].partition(END)[0].strip() == markdown(cells)
+    assert in_card(MARKS) == markdown(cells)
+    assert in_card(INSIDE_MARKS) == inside.markdown(inside.read_figures(INSIDE))
     recipe = load_recipe()
     assert {(cell.family, cell.regime) for cell in cells} == {
         (family, regime) for family in recipe.scenes for regime in ("standard", "guided", "json")
@@ -230,3 +278,57 @@ def test_it_reads_a_held_out_clip_through_the_adapter(recipe: Recipe, data: Path
 def test_the_card_command_needs_its_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["pocket", "card", "--csv", str(tmp_path / "none.csv")]) == 1
     assert "traps pocket evaluate" in capsys.readouterr().err
+
+
+# --- what was found inside, over seeds --------------------------------------------------------------------------------
+
+
+def looked_into(root: Path, seed: int, area: float, share: float) -> Workspace:
+    """A finished workspace of one seed: its weights with their facts, and the tables that the card reads."""
+    weights = root / f"seed{seed}" / WEIGHTS
+    weights.mkdir(parents=True)
+    (weights / "model.safetensors").write_bytes(bytes([seed]))
+    (weights.parent / FACTS).write_text(json.dumps({"seed": seed, "weights": f"{seed}" * 64}))
+    workspace, extraction = Workspace.create(root / f"inside{seed}", Study()), {"model": MODEL, "prompt": "standard"}
+    states = filled(HIDDEN_STATES, dataset="chaotic", **extraction, checkpoint=str(weights),
+                    checkpoint_digest=folder_digest(weights))  # fmt: skip
+    workspace.tables.write(HIDDEN_STATES, {"dataset": "chaotic", **extraction}, [states], {})
+    common = {**extraction, "scope": "all", "source": "occlusion", "target": "chaotic"}
+    probes = [
+        filled(PROBES, **common, analysis="transfer", layer=layer, value=value, own_best=layer == 2,
+               source_best=layer == 1)
+        for layer, value in ((1, area - 0.1), (2, area))
+    ]  # fmt: skip
+    workspace.tables.write(PROBES, extraction, probes, {})
+    shares = [
+        filled(STEERING_SHARES, model=MODEL, path_set="all", directions="all", regime=regime, kind="void", layer=3,
+               alpha=alpha, side="void", abstention=value, low=value - 0.1, high=value + 0.2, n_answers=28,
+               n_scenarios=10)
+        for regime, alpha, value in (("all", 0.0, 0.75), ("all", 10.0, share), ("guided", 10.0, 0.01))
+    ]  # fmt: skip
+    workspace.tables.write(STEERING_SHARES, {}, shares, {})
+    return workspace
+
+
+def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Path) -> None:
+    table = tmp_path / "mechanism.csv"
+    for seed, area, share in ((1, 1.0, 0.5), (2, 0.8, 0.25)):
+        made = looked_into(tmp_path, seed, area, share)
+        inside.write_figures(table, inside.figures_of(made))
+        inside.write_figures(table, inside.figures_of(made))  # the same seed again takes its own place
+    found = inside.read_figures(table)
+    assert [figure.seed for figure in found] == [1] * 4 + [2] * 4
+    lines = inside.markdown(found).splitlines()
+    assert "| Cross-domain | 0.900 (0.800-1.000) | 2 | 0.800 (0.700-0.900) | 1 |" in lines
+    assert "| voids, void directions | 75.0 (75.0-75.0) | 37.5 (25.0-50.0) | 15.0-70.0 | 28 | 10 |" in lines
+    assert lines[-1] == "Training seeds: 1, 2."
+
+
+def test_figures_of_weights_that_lie_there_no_more_are_refused(tmp_path: Path) -> None:
+    workspace = looked_into(tmp_path, 3, 1.0, 0.5)
+    (tmp_path / "seed3" / FACTS).unlink()
+    with pytest.raises(TrapsError, match="does not say which seed"):
+        inside.figures_of(workspace)
+    (tmp_path / "seed3" / WEIGHTS / "model.safetensors").write_bytes(b"others")
+    with pytest.raises(TrapsError, match="other weights or none lie there now"):
+        inside.figures_of(workspace)

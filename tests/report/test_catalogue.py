@@ -10,17 +10,19 @@ import pandas as pd
 import pytest
 from matplotlib.image import imread
 
+from tests.report.test_items import row
 from tests.report.test_report import board_of, board_row
 from tests.report.test_writing import latex_cells
 from traps_pipeline.cli import main
 from traps_pipeline.lineage import REPORTS, upstream
+from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report import publish
 from traps_pipeline.report.catalogue import FIGURES, OF_PAPER, OF_STUDY, PRINTED, TABLES, workspace_files
 from traps_pipeline.report.figures.abstention import doubt_points
 from traps_pipeline.report.results import PublishedResults, StudyResults
-from traps_pipeline.report.writing import figure_files, freeze_layout, table_files
+from traps_pipeline.report.writing import figure_files, freeze_layout, table_files, table_latex
 from traps_pipeline.storage.workspace import Study, Workspace
-from traps_pipeline.tables import LEADERBOARD
+from traps_pipeline.tables import CONTRASTS, JUDGE_BIAS, JUDGE_VALIDATION, LEADERBOARD
 
 PAPER = PublishedResults()
 BY_NAME = {table.name: table for report in TABLES if report.published for table in report.tables(PAPER)}
@@ -47,6 +49,120 @@ def partial(tmp_path_factory):
     board = board_of(*rows, board_row("gemini-2.5-pro", dataset="chaotic", **lost))
     workspace.tables.write(LEADERBOARD, {}, board, {})
     return StudyResults(workspace)
+
+
+THINKS, SPEAKS, BROKEN = "qwen3-vl-think", "qwen3-vl-instruct", "gemini-2.5-pro"
+NOTHING = {
+    **dict.fromkeys(("acc", "abs_rec", "false_abs", "j", "pecs", "naive"), np.nan),
+    **{"n_missing": 2808, "n_errors": 2808, "answered": 0.0, "incomplete": True, "pecs_low": 0.0, "pecs_high": 1.0},
+}
+
+
+@pytest.fixture(scope="module")
+def broken(tmp_path_factory):
+    """Two models whole under standard and guided, and one whose every call failed. Of the first two the overall
+    contrast under guided is refused, and of the second one that of its regimes."""
+    workspace = Workspace.create(tmp_path_factory.mktemp("broken") / "study", Study(scenarios=["plinko-0001"]))
+    board = board_of(
+        *(
+            board_row(m, regime, d, (0.5, 0.1, 0.6 if m == THINKS else 0.3), **(NOTHING if m == BROKEN else {}))
+            | {"n_missing": {THINKS: 2, SPEAKS: 0, BROKEN: 2808}[m], "n_pairs": 1404 if d == "overall" else 351}
+            for m in (THINKS, SPEAKS, BROKEN)
+            for regime in ("standard", "guided")
+            for d in (*DATASETS, "overall")
+        )
+    )
+    overall = {"dataset": "overall", "figure": "pecs", "left_model": SPEAKS, "separable": False}
+    guided = {"left_regime": "guided", "right_regime": "guided", "right_model": THINKS}
+    contrasts = [
+        row(CONTRASTS, kind="models", **overall, **guided, refused="chaotic: of epoch e1 against epoch e2"),
+        row(CONTRASTS, kind="models", difference=-0.1, p=0.01, p_holm=0.02, **overall, **guided)
+        | {"left_regime": "standard", "right_regime": "standard"},
+        row(CONTRASTS, kind="regimes", refused="chaotic: 3 items", **overall, **guided) | {"right_model": SPEAKS}
+        | {"left_regime": "standard"},
+    ]  # fmt: skip
+    validated = dict.fromkeys(("precision", "recall", "f1", "human_kappa"), 0.9)
+    workspace.tables.write(LEADERBOARD, {}, board, {})
+    workspace.tables.write(CONTRASTS, {}, contrasts, {})
+    workspace.tables.write(JUDGE_BIAS, {}, [row(JUDGE_BIAS, dataset="chaotic", task="void_abstention", yes=0.5)], {})
+    workspace.tables.write(JUDGE_VALIDATION, {}, [row(JUDGE_VALIDATION, **validated)], {})
+    return StudyResults(workspace)
+
+
+@pytest.fixture(scope="module")
+def broken_tables(broken):
+    return {table.name: table for report in TABLES for table in report.tables(broken)}
+
+
+def shown(table, **values):
+    """The one row of a table with these values, by heading."""
+    [at] = [k for k, row in enumerate(table.records) if all(row[name] == value for name, value in values.items())]
+    return dict(zip([column.heading for column in table.columns], table.cells[at], strict=True))
+
+
+def test_a_model_whose_every_call_failed_is_a_row_of_dashes_and_breaks_no_page(broken, broken_tables):
+    uplift = broken_tables["guided_uplift"]
+    row = shown(uplift, model=BROKEN)
+    assert (row["Ratio"], row["PECS, guided"], row["Missing"]) == ("– ‡", "– ‡", "5616")
+    assert shown(uplift, model=THINKS)["Ratio"] == "1.00 †"
+    assert BROKEN not in set(broken_tables["frontier"].rows["model"])
+    page = publish.report_files(broken, [], {})["report.html"].decode()
+    assert "– ‡" in page
+    assert not re.search(r"\bnan\b", page)
+    for table in broken_tables.values():
+        assert table_latex(table).isascii(), table.name
+
+
+@pytest.mark.parametrize("name", ["pecs_landscape", "abs_rec", "visual_textual", "reasoning_arrows"])
+def test_a_model_whose_every_call_failed_breaks_no_figure(broken, name):
+    figure = next(report for report in FIGURES if report.name == name).make(broken)
+    assert overhang(figure) < 0.01
+
+
+def test_comparisons_say_how_many_pairs_they_rest_on_and_what_is_missing(broken_tables):
+    reasoning = shown(broken_tables["reasoning_pairs"], regime="standard", dataset="overall")
+    assert (reasoning["Δ AbsRec %"], reasoning["Δ PECS"]) == ("30.0", "0.150 †")
+    assert [reasoning[name] for name in ("n", "Runs", "Missing")] == ["1404", "3", "2"]
+    contrast = shown(broken_tables["contrasts"], left_regime="standard", right_regime="standard")
+    assert [contrast[name] for name in ("Δ PECS", "n", "Missing")] == ["−0.100 †", "1404", "2"]
+    gap = shown(broken_tables["visual_textual"], model=THINKS)
+    assert [gap[name] for name in ("Pooled gap", "n", "Runs", "Missing")] == ["1.0 †", "1404", "3", "8"]
+    for name in ("frontier", "guided_uplift", "zero_boundary", "degenerate_strategies", "leave_one_judge_out"):
+        assert {"n_pairs", "n_missing"} <= {column.field for column in broken_tables[name].columns}, name
+
+
+def test_what_the_contrasts_refuse_item_by_item_is_in_no_other_comparison(broken_tables):
+    reasoning, uplift = broken_tables["reasoning_pairs"], broken_tables["guided_uplift"]
+    overall = reasoning.rows[reasoning.rows["dataset"] == "overall"]
+    assert overall["regime"].tolist() == ["standard"]
+    assert "chaotic: of epoch e1 against epoch e2" in reasoning.notes
+    assert set(uplift.rows["model"]) == {THINKS, BROKEN}
+    assert f"{SPEAKS}: chaotic: 3 items" in uplift.notes
+
+
+def test_figures_over_all_datasets_are_of_the_runs_that_have_them_all(tmp_path):
+    # A second run of `chaotic` alone moves that cell, and no figure that is overall.
+    workspace = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
+    rows = [board_row(THINKS, r, d, (0.5, 0.1, 0.6)) for r in ("standard", "guided") for d in (*DATASETS, "overall")]
+    for cell in rows:
+        if (cell["dataset"], cell["regime"]) == ("chaotic", "guided"):
+            cell |= board_row(THINKS, "guided", "chaotic", (0.9, 0.1, 1.0), n_runs=4)
+    workspace.tables.write(LEADERBOARD, {}, board_of(*rows), {})
+    tables = {table.name: table for report in TABLES for table in report.tables(StudyResults(workspace))}
+    assert shown(tables["guided_uplift"], model=THINKS)["Ratio"] == "1.00"
+    assert shown(tables["per_dataset"], regime="guided")["Mean"] == "0.250 ± 0.010"
+    assert shown(tables["frontier"], regime="guided")["Acc %"] == "50.0 ± 1.0"
+
+
+def test_every_number_of_a_study_leads_to_the_items_behind_it(broken_tables):
+    without_items = {"models", "hyperparameters", "composition"}  # settings, and counts of the benchmark itself
+    expected = {"acc", "abs_rec", "false_abs", "j", "naive", "pecs"}  # of degenerate strategies, by arithmetic
+    for table in broken_tables.values():
+        numbers = [column.field for column in table.columns if column.is_number]
+        for record in table.records if table.name not in without_items else ():
+            assert table.trace is not None, table.name
+            lost = {field for field in numbers if table.trace(record, field) is None}
+            assert lost <= (expected if table.name == "degenerate_strategies" else {"published_pecs"}), table.name
 
 
 def texts(table):
@@ -86,6 +202,7 @@ def test_every_published_table_is_well_formed_in_every_medium():
     for table in BY_NAME.values():
         files = table_files(table)
         width = 1 if table.absence else len(table.columns)
+        assert files[f"{table.name}.tex"].isascii()  # else pdflatex stops at the sign
         assert {len(row) for row in latex_cells(files[f"{table.name}.tex"].decode())} == {width}
         assert len(pd.read_parquet(io.BytesIO(files[f"{table.name}.parquet"]))) == len(table.rows)
         assert not re.search(r"\bnan\b|<NA>", files[f"{table.name}.md"].decode())

@@ -68,6 +68,8 @@ def test_a_page_shows_question_answer_votes_verdict_and_clip_as_text(workspace):
     assert "invalid (not JSON)" in page
     assert 'answered, <span class="none">undecided</span>' in page  # the control: abstention decided, correctness not
     assert '<span class="none">refused</span>' in page
+    assert page.count("undecided") == 1
+    assert '<td><span class="none">not judged</span></td>' in page  # the refused void: nobody was asked to judge it
     assert '<a href="../../clips/plinko-0001/void.mp4">clip</a>' in page
     assert "default-src 'none'" in page
     assert '<a href="../../clips' not in item_page(workspace, CELL, None)

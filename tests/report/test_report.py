@@ -298,6 +298,18 @@ def test_html_shows_every_dataset_version_epoch_n_and_the_legend(board):
     assert page.count("Benchmark version v1.") == page.count("Epoch e1.") == 5
 
 
+def test_every_number_of_the_leaderboard_is_a_link_to_its_items():
+    rows = [*cells_with_gaps(), board_row("part", dataset="chaotic", n_pairs=77, n_missing=5)]
+    page = report_html(board_of(*rows), address=lambda behind: f"to-{behind.dataset}-{behind.model}-{behind.side}")
+    bare = re.sub(r"<a href=[^>]*>[^<]*</a>|<style>.*?</style>", "", page, flags=re.DOTALL)
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", bare, flags=re.DOTALL)
+    assert cells
+    shown = [re.sub(r"<span class=\"(sd|bar)\".*?</span>", "", cell) for cell in cells]
+    assert not [cell for cell in shown if re.search(r"\d", re.sub(r"<[^>]*>", "", cell))]
+    for text, to in (("0.250–0.250", "to--gaps-"), ("1404", "to--gaps-"), ("61 †", "to--gaps-"), ("77", "to--part-")):
+        assert f'<a href="{to}">{text}</a>' in page
+
+
 def test_html_names_the_epoch_in_each_row_where_rows_differ():
     page = report_html(board_of(board_row("a"), board_row("b", epoch="e2")))
     assert '<th class="word">Epoch</th>' in page

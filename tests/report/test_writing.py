@@ -60,6 +60,13 @@ def test_cells_are_printed_in_their_units_with_spread_and_mark():
     assert second[1:] == ["–", "0.250", "–", "202"]
 
 
+def test_a_p_value_is_never_printed_as_0():
+    column = Column("p", "p", "p")
+    assert [column.text({"p": p}) for p in (0.0, 0.00009, 0.0001, 0.5, None, np.nan)] == [
+        "< 0.0001", "< 0.0001", "0.0001", "0.5000", "–", "–",
+    ]  # fmt: skip
+
+
 def test_a_dash_and_a_spread_are_explained_where_they_occur():
     assert table().remarks == [
         "epoch e1",
@@ -72,6 +79,7 @@ def test_a_dash_and_a_spread_are_explained_where_they_occur():
 
 def test_every_latex_character_of_a_text_is_printed_and_commands_nothing():
     assert latex("a_b & 5 % $x$ #{}") == r"a\_b \& 5 \% \$x\$ \#\{\}"
+    assert latex('Δ "so"') == r"$\Delta$ ''so''"
     assert latex("\\~^") == r"\textbackslash{}\textasciitilde{}\textasciicircum{}"
     text = table_files(table())["results.tex"].decode()
     assert r"\input" not in text

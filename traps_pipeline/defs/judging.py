@@ -1,6 +1,5 @@
 """The judging group: how far the panel agrees, which way its judges lean, and what is wrong with void failures."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import dagster as dg
@@ -19,13 +18,11 @@ from traps_pipeline.tables import (
     AGREEMENT,
     CONFABULATION,
     CONFABULATION_PREVALENCE,
-    ITEMS,
     JUDGE_BIAS,
     LEADERBOARD,
     LEAVE_ONE_OUT,
     VERDICTS,
     VOTES,
-    Table,
 )
 
 if TYPE_CHECKING:
@@ -56,19 +53,12 @@ def _panel(workspace: Workspace) -> list[str]:
     return [judge.id for judge in load_panel(workspace.study.panel)]
 
 
-def _current(workspace: Workspace, table: Table, columns: Sequence[str] | None = None) -> "pd.DataFrame":
-    """All rows on items that are still in the benchmark: cells that nobody has evaluated since a correction may hold
-    others."""
-    rows = workspace.tables.read_all(table, columns)
-    current = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
-    return rows.loc[rows["item_id"].isin(current)].reset_index(drop=True)
-
-
 def _votes(workspace: Workspace, stage: str) -> "pd.DataFrame":
     """The votes of the study's panel. Raises TrapsError if there is none."""
     from traps_pipeline.judging.ratings import VOTE_COLUMNS
+    from traps_pipeline.judging.verdicts import current
 
-    votes = _current(workspace, VOTES, VOTE_COLUMNS)
+    votes = current(workspace, VOTES, VOTE_COLUMNS)
     votes = votes.loc[votes["judge"].isin(_panel(workspace))]
     if votes.empty:
         raise TrapsError(f"{stage}: no votes yet; materialize votes for a cell first")
@@ -88,10 +78,11 @@ def _judge_bias(workspace: Workspace) -> "pd.DataFrame":
 
 
 def _leave_one_out(workspace: Workspace) -> "pd.DataFrame":
+    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.leave_one_out import leave_one_out
 
     votes, board = _votes(workspace, "leave_one_out"), workspace.tables.read(LEADERBOARD, {})
-    return leave_one_out(_current(workspace, VERDICTS), votes, board, _panel(workspace))
+    return leave_one_out(current(workspace, VERDICTS), votes, board, _panel(workspace))
 
 
 def _prevalence(workspace: Workspace) -> "pd.DataFrame":

@@ -30,6 +30,7 @@ from traps_pipeline.tables import (
     PROBES,
     STEERING,
     STEERING_EFFECTS,
+    STEERING_SHARES,
     STEERING_VOTES,
     Table,
 )
@@ -227,12 +228,24 @@ def steering_votes(context: dg.AssetExecutionContext) -> Events:
 def _effects(workspace: Workspace) -> "pd.DataFrame":
     import pandas as pd
 
-    from traps_pipeline.mechanism.stages import effect_rows
+    from traps_pipeline.mechanism.shares import effect_rows
 
+    return pd.DataFrame(effect_rows(*_judged(workspace, STEERING_EFFECTS)))
+
+
+def _shares(workspace: Workspace) -> "pd.DataFrame":
+    import pandas as pd
+
+    from traps_pipeline.mechanism.shares import share_rows
+
+    return pd.DataFrame(share_rows(*_judged(workspace, STEERING_SHARES)))
+
+
+def _judged(workspace: Workspace, table: Table) -> "tuple[pd.DataFrame, pd.DataFrame]":
     answers, votes = workspace.tables.read_all(STEERING), workspace.tables.read_all(STEERING_VOTES)
     if votes.empty:
-        raise TrapsError("steering_effects: no votes yet; materialize steering and steering_votes first")
-    return pd.DataFrame(effect_rows(answers, votes))
+        raise TrapsError(f"{table.name}: no votes yet; materialize steering and steering_votes first")
+    return answers, votes
 
 
 steering_effects = common.table_asset(
@@ -242,6 +255,14 @@ steering_effects = common.table_asset(
     [steering, steering_votes],
     _effects,
 )
+steering_shares = common.table_asset(
+    STEERING_SHARES,
+    GROUP,
+    "Abstention over the paths of a set, with intervals by scenario.",
+    [steering, steering_votes],
+    _shares,
+)
 
 SOURCES = [extraction_settings, probing_settings, steering_settings]
-ASSETS = [probe_items, hidden_states, probes, directions, cosines, steering, steering_votes, steering_effects]
+_STEERED = [steering, steering_votes, steering_effects, steering_shares]
+ASSETS = [probe_items, hidden_states, probes, directions, cosines, *_STEERED]

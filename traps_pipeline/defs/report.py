@@ -204,7 +204,7 @@ report_page = _report(
 )
 ASSETS = [contact_sheet, gallery, shortcuts, printed, report_page]
 
-_CHECKED = ("leaderboard", *JUDGED, "cosines", "steering_effects", *REPORTS)
+_CHECKED = ("leaderboard", *JUDGED, "cosines", "steering_effects", "steering_shares", *REPORTS)
 
 
 @dg.multi_asset_check(

@@ -14,7 +14,7 @@ from traps_pipeline.lineage import Lineage
 from traps_pipeline.progress import Tally
 from traps_pipeline.scoring import Frame
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import CONTRASTS, ITEMS, LEADERBOARD, METRICS, REGIME_TESTS, VERDICTS
+from traps_pipeline.tables import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS, VERDICTS
 
 GROUP = "scoring"
 
@@ -37,15 +37,13 @@ GROUP = "scoring"
 )
 def metrics(context: dg.AssetExecutionContext) -> Events:
     """Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset, by scope (`benchmark.md` section 5)."""
+    from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.metrics import cell_metrics, wrong_figures
 
     workspace, dataset = Workspace.open(), context.partition_key
     provenance = common.provenance(context, workspace)
     inputs = Lineage(workspace).inputs("metrics", dataset)
-    judged = workspace.tables.read_all(VERDICTS, dataset=dataset)
-    # Cells that nobody has evaluated since a correction may still hold an item that was discarded.
-    current = workspace.tables.read(ITEMS, {"dataset": dataset}, ["item_id"])["item_id"]
-    judged = judged.loc[judged["item_id"].isin(current)]
+    judged = current(workspace, VERDICTS, dataset=dataset)
     if judged.empty:
         raise TrapsError(f"metrics {dataset}: no verdicts yet; materialize verdicts for a cell of this dataset first")
     frame = cell_metrics(judged)
@@ -63,7 +61,7 @@ def _contrasts(workspace: Workspace) -> Frame:
     from traps_pipeline.scoring.contrasts import contrasts as paired
 
     cells, judged = _scored(workspace, "contrasts")
-    return paired(resample(judged), cells)
+    return paired(resample(judged), cells, judged)
 
 
 def _regime_tests(workspace: Workspace) -> Frame:
@@ -82,11 +80,12 @@ def _leaderboard(workspace: Workspace) -> Frame:
 
 def _scored(workspace: Workspace, stage: str) -> tuple[Frame, Frame]:
     """All METRICS rows, and the VERDICTS rows that they are made of."""
+    from traps_pipeline.judging.verdicts import current
+
     cells = workspace.tables.read_all(METRICS)
     if cells.empty:
         raise TrapsError(f"{stage}: no metrics yet; materialize metrics for a dataset first")
-    judged, current = workspace.tables.read_all(VERDICTS), workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
-    return cells, judged.loc[judged["item_id"].isin(current)]
+    return cells, current(workspace, VERDICTS)
 
 
 def _told_apart(table: Frame) -> dict[str, Any]:

@@ -131,9 +131,9 @@ def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
             raise ValueError("its digest is another")
         tensors = load_file(path)
     except FileNotFoundError:
-        raise TrapsError(f"{path}: not there; materialize directions first") from None
+        raise TrapsError(f"{path}: it or its JSON file is not there; `traps run` makes both from the states") from None
     except (OSError, ValueError, KeyError, SafetensorError) as error:
-        raise TrapsError(f"{path}: damaged ({error}); delete it and materialize directions again") from error
+        raise TrapsError(f"{path}: damaged ({error}); delete it, then `traps run` makes it again") from error
     vectors = {kind: tensors[kind] for kind in KINDS}
     return Directions(vectors, {kind: tensors[f"norms.{kind}"] for kind in KINDS}, tensors["residual_norms"]), said
 

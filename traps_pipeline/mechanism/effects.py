@@ -29,11 +29,17 @@ def on_both_sides(effects: Frame) -> Frame:
 
 
 def paths(effects: Frame) -> Frame:
-    """One row a path and strength at the steered layer: control and void abstention side by side, transfer_type."""
+    """One row a path and strength at the steered layer: abstention of control and void side by side, where effects have
+    intervals `control_low` and so on, transfer_type."""
     keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
-    rows = on_both_sides(effects)
-    wide = rows.pivot_table(index=keys, columns="side", values="abstention", dropna=False, observed=True)
-    wide = wide.dropna(how="all").reset_index().reindex(columns=pd.Index([*keys, "control", "void"]))
+    rows, columns = on_both_sides(effects), keys.copy()
+    parts: list[Frame] = []
+    for value, suffix in (("abstention", ""), ("low", "_low"), ("high", "_high")):
+        if value in rows:
+            wide = rows.pivot_table(index=keys, columns="side", values=value, dropna=False, observed=True)
+            parts.append(wide.dropna(how="all").reindex(columns=pd.Index(["control", "void"])).add_suffix(suffix))
+            columns += [f"control{suffix}", f"void{suffix}"]
+    wide = parts[0].join(parts[1:]).reset_index().reindex(columns=pd.Index(columns))
     types = [transfer_type(s, t) for s, t in zip(wide["source"], wide["target"], strict=True)]
     return _in_order(wide.assign(transfer_type=types))
 

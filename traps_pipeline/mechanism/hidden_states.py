@@ -1,12 +1,12 @@
 """Extraction: the hidden states of many items, in shards that a crash leaves whole (`benchmark.md` section 7).
 
     done = extract(model, items, folder, pooling="last")
-    ids, states = read_layer(folder, 20)                # item_id, side, key; (n, d) float32 in the same order
+    ids, states = read_layer(folder, 20)                # item_id, side, key, device; (n, d) float32 in the same order
 
 A folder holds `shard-NNNNN.safetensors` (one key a layer, `layer_000` = embeddings, and `normed`), `.parquet` beside it
-(which item is in which row), and `ids.parquet`, which is written last and names the rows in force. A shard's table is
-written after its tensors and vouches for them: what is killed half-way goes on after its last shard. An item's key is
-a digest of all that decides its states, so a corrected item alone is extracted again.
+(which item is in which row, and which device made it), and `ids.parquet`, which is written last and names the rows in
+force. A shard's table is written after its tensors and vouches for them: what is killed half-way goes on after its last
+shard. An item's key is a digest of all that decides its states, so a corrected item alone is extracted again.
 
 Last-token states are stored in the model's own precision, which loses nothing; means in float32.
 """
@@ -42,7 +42,8 @@ PREPARED_AHEAD = 2  # prompts that are decoded while the model works
 NORMED = "normed"
 _IDS = "ids.parquet"
 _RECORD = b"traps"
-_COLUMNS = ("item_id", "side", "key", "shard", "row")
+_COLUMNS = ("item_id", "side", "key", "shard", "row", "device")
+_UNTOLD = "not recorded"  # by versions before this one
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class Extracted:
 
 
 _Made = tuple[Item, str, "States"]  # an item, its key, its states
+_Place = tuple[str, int, str]  # of an item's states: shard, row, device
 
 
 def clip_item(model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], clip: Path, system: str) -> Item:
@@ -104,17 +106,22 @@ def extract(
     """
     with _alone(folder):
         keys = [states_key(model, item, pooling) for item in items]
-        known = {key: (shard, row) for shard, table in _shards(folder) for row, key in enumerate(table["key"])}
+        known = {
+            key: (shard, row, device)
+            for shard, table in _shards(folder)
+            for row, (key, device) in enumerate(zip(table["key"], table["device"], strict=True))
+        }
         missing = [(item, key) for item, key in zip(items, keys, strict=True) if key not in known]
         _make(model, missing, folder, pooling, shard_size, what, known)
         _write_ids(folder, items, keys, known, _record(model, pooling))
         _sweep(folder, {known[key][0] for key in keys})
+        _tell_devices(folder, sorted({known[key][2] for key in keys}))
     version = digest([[item.item_id, item.side, key] for item, key in zip(items, keys, strict=True)])
     return Extracted(folder, len(items), len(missing), version)
 
 
 def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFrame, np.ndarray]:
-    """The items of a finished extraction (item_id, side, key) and their states at one layer, (n, d_model) float32.
+    """The items of a finished extraction (item_id, side, key, device) and their states at one layer, (n, d) float32.
 
     layer: 0 (embeddings) to n_layers (the last block's output), or `normed` (that after the final norm). Raises
     TrapsError for an extraction that is not finished, a layer that is not there, a damaged shard.
@@ -133,7 +140,7 @@ def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFra
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """What was extracted from, and how: checkpoint and digest, class, precision, device, pooling, n_layers, d_model.
+    """What was extracted from, and how: checkpoint and digest, class, precision, pooling, n_layers, d_model.
 
     Raises TrapsError for an extraction that is not finished.
     """
@@ -163,7 +170,7 @@ def _make(
     pooling: Pooling,
     shard_size: int,
     what: str,
-    known: dict[str, tuple[str, int]],
+    known: dict[str, _Place],
 ) -> None:
     """One pass an item; shards are written as they fill, the last one whatever ends it."""
     number = 1 + max((int(path.stem.split("-")[1]) for path in folder.glob("shard-*.safetensors")), default=-1)
@@ -203,7 +210,7 @@ def _flush(
     shard: Sequence[_Made],
     model: LocalModel,
     pooling: Pooling,
-    known: dict[str, tuple[str, int]],
+    known: dict[str, _Place],
 ) -> int:
     """Write a shard, tensors first, and note where its items are; the next shard's number."""
     if not shard:
@@ -219,9 +226,9 @@ def _flush(
     tensors[NORMED] = torch.from_numpy(np.stack([states.normed for _, _, states in shard])).to(dtype)
     _write(folder / f"{name}.safetensors", lambda part: part.write_bytes(save(tensors)))
     rows = [(item.item_id, item.side, key) for item, key, _ in shard]
-    table = pd.DataFrame(rows, columns=["item_id", "side", "key"])
+    table = pd.DataFrame(rows, columns=["item_id", "side", "key"]).assign(device=model.device_name)
     _write(folder / f"{name}.parquet", lambda part: table.to_parquet(part, index=False))
-    known.update({key: (name, row) for row, (_, _, key) in enumerate(rows)})
+    known.update({key: (name, row, model.device_name) for row, (_, _, key) in enumerate(rows)})
     return number + 1
 
 
@@ -237,14 +244,14 @@ def _shards(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
             progress.current().note(f"{path}: damaged ({error}); its items are extracted again")
             continue
         if rows == len(table):
-            yield path.stem, table
+            yield path.stem, table if "device" in table else table.assign(device=_UNTOLD)
 
 
 def _write_ids(
     folder: Path,
     items: Sequence[Item],
     keys: Sequence[str],
-    known: Mapping[str, tuple[str, int]],
+    known: Mapping[str, _Place],
     record: Mapping[str, Any],
 ) -> None:
     import pandas as pd
@@ -266,9 +273,7 @@ def _ids(folder: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     except FileNotFoundError:
         raise TrapsError(f"{folder}: hidden states are not there or not finished; materialize hidden_states") from None
     except (OSError, ValueError, KeyError) as error:
-        raise TrapsError(
-            f"{folder / _IDS}: cannot be read ({error}); delete it and materialize hidden_states"
-        ) from error
+        raise TrapsError(f"{folder / _IDS}: cannot be read ({error}); the next `traps run` writes it again") from error
     return table.to_pandas(), record
 
 
@@ -276,7 +281,6 @@ def _record(model: LocalModel, pooling: Pooling) -> dict[str, Any]:
     return {
         **model.identity,
         "checkpoint": model.checkpoint.name,
-        "served_model": model.served_model,
         "pooling": pooling,
         "n_layers": model.n_layers,
         "d_model": model.d_model,
@@ -291,7 +295,9 @@ def _tensor(file: Path, name: str) -> np.ndarray:
         with safe_open(file, framework="pt") as shard:
             return shard.get_tensor(name).float().numpy()
     except (OSError, SafetensorError) as error:
-        raise TrapsError(f"{file}: cannot be read ({error}); delete it and materialize hidden_states again") from error
+        raise TrapsError(
+            f"{file}: cannot be read ({error}); delete it, then `traps run` extracts its items again"
+        ) from error
 
 
 def _sweep(folder: Path, needed: set[str]) -> None:
@@ -299,6 +305,14 @@ def _sweep(folder: Path, needed: set[str]) -> None:
     for path in folder.glob("shard-*"):
         if path.name.split(".")[0] not in needed:
             path.unlink()
+
+
+def _tell_devices(folder: Path, devices: Sequence[str]) -> None:
+    if len(devices) > 1:
+        progress.current().note(
+            f"{folder}: its states were made on {' and '.join(devices)} (column `device` of hidden_states), whose "
+            "rounding differs; to have all of one device, delete the folder and run again"
+        )
 
 
 def _write(path: Path, write: Callable[[Path], object]) -> None:

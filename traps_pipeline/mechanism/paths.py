@@ -27,6 +27,9 @@ PATH_SETS: dict[PathSet, tuple[Path, ...]] = {"transfer": TRANSFER, "within_doma
 STEERING_PATHS = tuple(dict.fromkeys(TRANSFER + WITHIN_DOMAIN))  # 14
 TRANSFER_PAIRS = tuple(permutations(DATASETS, 2))  # the twelve ordered pairs of the probes
 
+# Analyses of probes that have a value at every layer (`probing`); they are part of the version of probes.
+CURVES = ("transfer", "held_out", "confabulated", "within", "shuffled", "answerable_void", "answerable_control")
+
 TRANSFER_TYPES = ("Cross-modality", "Cross-domain", "Cross-both", "Within")
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.mechanism.paths import TRANSFER_PAIRS, Path
+from traps_pipeline.mechanism.paths import CURVES, TRANSFER_PAIRS, Path
 from traps_pipeline.mechanism.probes import (
     Split,
     auroc,
@@ -32,7 +32,6 @@ from traps_pipeline.mechanism.settings import ProbeSettings
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import scenario_weights
 
-CURVES = ("transfer", "confabulated", "within", "shuffled", "answerable_void", "answerable_control")
 MOST_WORKERS = 4
 Result = TypeVar("Result")
 Row = dict[str, Any]
@@ -133,11 +132,14 @@ class ProbeRun:
         """Every row of one layer, read here and forgotten."""
         splits = {name: self._split(name, layer) for name in self._datasets}
         rows = self.transfer(layer, splits) + self.confabulated_transfer(layer, splits)
-        rows += self.within(layer, splits) + self.answerable(layer, splits)
+        unseen = {source: self._unseen_scores(source, splits) for source in self._own}
+        rows += self.within(layer, splits) + self.held_out(layer, splits, unseen)
+        rows += self.answerable(layer, splits, unseen)
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
 
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """The twelve ordered pairs, all samples."""
+        """The twelve ordered pairs, all samples. The two datasets of a taxonomy share their control items, so that half
+        of a cross-modality target are rows of the fit (`held_out`)."""
         scores = transfer_scores(splits, self._pairs, self.settings.solver)
         return [self._scored("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
@@ -161,7 +163,16 @@ class ProbeRun:
             rows.append(_row("shuffled", (name, name), layer, shuffled.mean(), split, spread=shuffled.std()))
         return rows
 
-    def answerable(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
+    def held_out(
+        self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
+    ) -> list[Row]:
+        """The pairs of one taxonomy under probes that were fitted without the scenario that they score."""
+        pairs = [(s, t) for s, t in self._pairs if taxonomy_of(s) == taxonomy_of(t)]
+        return [self._scored("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
+
+    def answerable(
+        self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
+    ) -> list[Row]:
         """Void clips with a question that even they answer, under the probes of each dataset.
 
         answerable_void: void items against the same clips with the answerable question; 0.5 for a probe that sees that
@@ -172,12 +183,11 @@ class ProbeRun:
             return []
         rows = []
         for source in self._own:
-            scores = self._held_out_scores(source, splits)
             for analysis, positive, negative in (
                 ("answerable_void", ("occlusion", True), (ANSWERABLE, None)),
                 ("answerable_control", (ANSWERABLE, None), ("occlusion", False)),
             ):
-                chosen = [self._side(splits, scores, *side) for side in (positive, negative)]
+                chosen = [self._side(splits, unseen[source], *side) for side in (positive, negative)]
                 labels = np.repeat([True, False], [len(values) for values, _ in chosen])
                 values = np.concatenate([values for values, _ in chosen])
                 scenario = np.concatenate([places for _, places in chosen])
@@ -192,20 +202,22 @@ class ProbeRun:
         mask = np.full(len(splits[name].void), True) if void is None else splits[name].void == void
         return scores[name][mask], splits[name].scenario[mask]
 
-    def _held_out_scores(self, source: str, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
-        """Scores of occlusion's and the answerable items under probes that were not fitted on their scenarios."""
-        split, targets = splits[source], ("occlusion", ANSWERABLE)
-        if taxonomy_of(source) != "occlusion":
+    def _unseen_scores(self, source: str, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
+        """Scores of the items of the source's taxonomy, of occlusion and the answerable ones, under probes that were
+        not fitted on their scenarios: of another taxonomy one probe, of the source's own one a fold."""
+        split, own = splits[source], [name for name in splits if self._index[name] is self._index[source]]
+        others = [name for name in ("occlusion", ANSWERABLE) if name in splits and name not in own]
+        scores = {name: np.empty(len(splits[name].void)) for name in own}
+        if others:
             probe = fit_probe(split.states, split.void, self.settings.solver)
-            return {name: probe.scores(splits[name].states) for name in targets}
-        every = np.unique(np.concatenate([splits[name].scenario for name in (source, *targets)]))
+            scores |= {name: probe.scores(splits[name].states) for name in others}
+        every = np.unique(np.concatenate([splits[name].scenario for name in own]))
         fold_of = dict(zip(every, scenario_folds(every, self.settings.folds, self.seed), strict=True))
-        folds = {name: np.array([fold_of[s] for s in splits[name].scenario]) for name in (source, *targets)}
-        scores = {name: np.empty(len(splits[name].void)) for name in targets}
+        folds = {name: np.array([fold_of[s] for s in splits[name].scenario]) for name in own}
         for fold in range(self.settings.folds):
             train = split.rows(folds[source] != fold)
             probe = fit_probe(train.states, train.void, self.settings.solver)
-            for name in targets:
+            for name in own:
                 scores[name][folds[name] == fold] = probe.scores(splits[name].states[folds[name] == fold])
         return scores
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,9 +27,9 @@ from traps_pipeline.mechanism.directions import (
     steered_scenarios,
     vector_digest,
 )
+from traps_pipeline.mechanism.paths import CURVES
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
-from traps_pipeline.mechanism.steering import UNSTEERED
-from traps_pipeline.mechanism.versions import quantisation_of, states_folder
+from traps_pipeline.mechanism.versions import states_folder
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
 from traps_pipeline.partitions import (
@@ -40,9 +40,7 @@ from traps_pipeline.partitions import (
     Extraction,
     StatesCell,
     is_ill_posed,
-    transfer_type,
 )
-from traps_pipeline.scoring.metrics import wilson
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import DIRECTIONS, HIDDEN_STATES, ITEMS, PROBE_ITEMS, PROBES, SCENE_SPECS, VERDICTS, VIDEOS
 
@@ -110,7 +108,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[Rows, int]:
     entry, settings = looked_into(workspace, cell.extraction.model), workspace.mechanism
     assert entry.media is not None, "local entries have media"
     items = workspace.tables.read(PROBE_ITEMS, {"dataset": cell.dataset}).to_dict("records")
-    model, system = load_local_model(entry, quantisation_of(entry)), vqa_prompt(cell.extraction.prompt)
+    model, system = load_local_model(entry, inside=True), vqa_prompt(cell.extraction.prompt)
     _check_layers(workspace, entry.id, model.n_layers)
     folder = states_folder(workspace, cell)
     wanted = [
@@ -119,7 +117,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[Rows, int]:
     ]
     done = extract(model, wanted, folder, pooling=settings.pooling, what=f"items of {cell.key}")
     record, (ids, _) = read_record(folder), read_layer(folder, 0)
-    keys = dict(zip(ids["item_id"], ids["key"], strict=True))
+    keys, devices = (dict(zip(ids["item_id"], ids[name], strict=True)) for name in ("key", "device"))
     said = {name: record[name] for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")}
     copied = ("item_id", "scenario_id", "side", "sub_scenario", "benchmark_version")
     rows = [
@@ -127,7 +125,8 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[Rows, int]:
             **cell.partition,
             **{name: item[name] for name in copied},
             **said,
-            **{"states_key": keys[item["item_id"]], "folder": workspace.relative(folder)},
+            **{"states_key": keys[item["item_id"]], "device": devices[item["item_id"]]},
+            "folder": workspace.relative(folder),
             **{"n_layers": record["n_layers"], "width": record["d_model"]},
         }
         for item in items
@@ -195,8 +194,9 @@ class States:
         cell = StatesCell(dataset, self.extraction)
         ids, states = read_layer(states_folder(self.workspace, cell), layer)
         wanted = self.dataset(dataset)
-        places = pd.Index(ids["key"]).get_indexer(pd.Index(wanted["states_key"]))
-        if (places < 0).any():
+        # By item, not by key: two items with the same clip and question share one.
+        places = pd.Index(ids["item_id"]).get_indexer(pd.Index(wanted["item_id"]))
+        if (places < 0).any() or (ids["key"].to_numpy()[places] != wanted["states_key"].to_numpy()).any():
             raise TrapsError(
                 f"hidden states {cell.key}: not of the table's items; materialize hidden_states for it again"
             )
@@ -217,7 +217,7 @@ def probe_rows(workspace: Workspace, extraction: Extraction) -> Rows:
             states.digest,
             {name: sorted(found) for name, found in confabulated.scenarios.items()},
             dict(confabulated.problems),
-            [settings.probes.model_dump(mode="json"), layers.centroid, settings.seed],
+            [settings.probes.model_dump(mode="json"), layers.centroid, settings.seed, CURVES],
         ]
     )[:16]
     known = _known_rows(workspace, extraction, made_of)
@@ -327,9 +327,7 @@ def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, 
         directions, said = load_directions(workspace.resolve(path))
         rows = table.loc[(table["path"] == path) & (table["kind"] == "void")].sort_values("layer")
         if [vector_digest(vector) for vector in directions.vectors["void"]] != list(rows["direction_digest"]):
-            raise TrapsError(
-                f"{path}: not the directions of the table; materialize directions for {extraction.key} again"
-            )
+            raise TrapsError(f"{path}: not the directions of the table; delete it, then `traps run` makes it again")
         found[said["dataset"]] = directions
     return found
 
@@ -359,39 +357,4 @@ def cosine_rows(workspace: Workspace) -> Rows:
             ]
     if not rows:
         raise TrapsError("cosines: no directions yet; materialize directions first")
-    return rows
-
-
-# --- what steering does -----------------------------------------------------------------------------------------------
-
-
-def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> Rows:
-    """Abstention by path, kind, layer, alpha and side, from STEERING and STEERING_VOTES rows; the model as it is
-    (alpha 0) stands in every path's row."""
-    keys = ["dataset", "model", "directions", "regime", "source", "kind", "layer", "alpha", "item_id"]
-    joined = answers[[*keys, "side", "alpha_relative", "epoch"]].merge(
-        votes[[*keys, "abstained"]], on=keys, how="left", validate="one_to_one"
-    )
-    cell = ["model", "directions", "regime", "dataset"]
-    steered = joined.loc[joined["kind"] != UNSTEERED]
-    plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=["source", "kind", "layer"])
-    paths = steered[[*cell, "source", "kind", "layer", "side"]].drop_duplicates()
-    whole = pd.concat([steered, plain.merge(paths, on=[*cell, "side"])], ignore_index=True)
-    rows: Rows = []
-    for key, group in whole.groupby([*cell, "source", "kind", "layer", "alpha", "side"], sort=True):
-        model, directions, regime, target, source, kind, layer, alpha, side = cast(tuple[Any, ...], key)
-        decided = group["abstained"].dropna().to_numpy(bool)
-        n, yes = len(decided), int(np.count_nonzero(decided))
-        low, high = wilson(np.array([yes]), np.array([n]))
-        relative = group["alpha_relative"].dropna()
-        rows.append(
-            {
-                **{"model": model, "directions": directions, "regime": regime, "source": source, "target": target},
-                **{"transfer_type": transfer_type(str(source), str(target)), "kind": kind, "layer": layer},
-                **{"alpha": alpha, "alpha_relative": float(relative.iloc[0]) if len(relative) else None},
-                **{"side": side, "n": n, "n_missing": len(group) - n, "abstained": yes},
-                **{"abstention": yes / n if n else None, "low": float(low[0]), "high": float(high[0])},
-                "epoch": "+".join(sorted(set(group["epoch"]))),
-            }
-        )
     return rows

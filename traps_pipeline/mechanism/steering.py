@@ -21,7 +21,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.paths import sources_of
 from traps_pipeline.mechanism.settings import Layers, MechanismSettings, SteeringSettings
-from traps_pipeline.mechanism.versions import loaded_params, quantisation_of
+from traps_pipeline.mechanism.versions import loaded_params
 from traps_pipeline.models.answers import FinishedCell
 from traps_pipeline.models.ask import Participants, Row, Work, run_work
 from traps_pipeline.models.budget import spending
@@ -228,7 +228,7 @@ class SteeredBackend(LocalBackend):
     def _model(self) -> Any:
         from traps_pipeline.models.local.adapter import load_local_model
 
-        return load_local_model(self._entry, quantisation_of(self._entry))
+        return load_local_model(self._entry, inside=True)
 
     def _make_prompt(self, clip: Any, digest: str, system: str, user: str) -> Prompt:
         """A processed prompt; `digest` says which frames, so that a re-rendered clip is another one."""

@@ -6,27 +6,24 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline.digests import digest
-from traps_pipeline.models.local.settings import Quantisation
+from traps_pipeline.mechanism.paths import CURVES
 from traps_pipeline.models.media import profile_digest
 from traps_pipeline.models.prompts import system_prompt, vqa_prompt
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.partitions import Extraction, StatesCell
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import DIRECTIONS
 
 SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
-
-
-def quantisation_of(entry: ModelEntry) -> Quantisation:
-    """The quantisation that a model is looked into with: of `mechanism:` of its entry, else that it answers with."""
-    own = entry.mechanism.quantisation if entry.mechanism else None
-    return own or entry.local_params().quantisation
 
 
 def loaded_params(entry: ModelEntry) -> dict[str, Any]:
     """What decides a local model's states: its parameters without those of sampling, in the precision that it is looked
     into with."""
-    params = {name: value for name, value in effective_params(entry, "standard").items() if name not in SAMPLING}
-    return params | {"quantisation": quantisation_of(entry)}
+    inside, left_out = entry.inside_params(), (*SAMPLING, "nf4_skip")
+    params = {name: value for name, value in effective_params(entry, "standard").items() if name not in left_out}
+    skipped = {"nf4_skip": [*inside.nf4_skip]} if inside.nf4_skip else {}
+    return params | {"quantisation": inside.quantisation} | skipped
 
 
 def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
@@ -35,8 +32,22 @@ def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
 
 
 def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
-    """Whether an extraction was finished there and not removed since."""
-    return (states_folder(workspace, cell) / "ids.parquet").is_file()
+    """Whether an extraction was finished there and none of its files removed since."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    folder = states_folder(workspace, cell)
+    try:
+        shards = set(pq.ParquetFile(folder / "ids.parquet").read(columns=["shard"])["shard"].to_pylist())
+    except (OSError, pa.ArrowException):
+        return False
+    return all((folder / f"{shard}{ending}").is_file() for shard in shards for ending in (".safetensors", ".parquet"))
+
+
+def directions_are_there(workspace: Workspace, extraction: Extraction) -> bool:
+    """Whether the files that the directions table of an extraction names are there."""
+    paths = {workspace.resolve(path) for path in workspace.tables.read(DIRECTIONS, extraction.partition)["path"]}
+    return all(path.is_file() and path.with_suffix(".json").is_file() for path in paths)
 
 
 def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
@@ -55,7 +66,7 @@ def probing_version(workspace: Workspace, extraction: Extraction) -> str:
     steering = settings.steering
     pairs = [steering.well_posed_pairs, steering.ill_posed_pairs, steering.pairs] if steering else []
     layers = settings.models[extraction.model]
-    return digest([settings.probes.model_dump(mode="json"), layers.centroid, pairs, settings.seed])[:16]
+    return digest([settings.probes.model_dump(mode="json"), layers.centroid, pairs, settings.seed, CURVES])[:16]
 
 
 def steering_version(workspace: Workspace, run: str) -> str:

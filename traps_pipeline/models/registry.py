@@ -19,7 +19,8 @@ from traps_pipeline.partitions import VQA_PROMPTS, Evaluation, Extraction, check
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
 
-MODELS_FILE = ASSETS / "models.yaml"
+MODELS_VARIABLE = "TRAPS_MODELS"  # names another registry
+MODELS_FILE = Path(os.environ.get(MODELS_VARIABLE) or ASSETS / "models.yaml").absolute()
 # What the protocol sends (`benchmark.md` section 3): parameter to the names it goes under and its value. An entry that
 # sends something else, or nothing, says why under `waivers`.
 Protocol = Mapping[str, tuple[tuple[str, ...], Any]]
@@ -218,6 +219,11 @@ class ModelEntry(Entry):
         """`params` of backend local, checked. Raises pydantic's ValidationError."""
         return LocalParams.model_validate(self.params)
 
+    def inside_params(self) -> LocalParams:
+        """The parameters that the model is looked into with: those of `params`, or as `mechanism` has it."""
+        params = self.local_params()
+        return self.mechanism.inside(params) if self.mechanism else params
+
     def _check_media(self, media: MediaSpec) -> None:
         if (media.profile == "frames") != (self.backend == LOCAL):
             raise ValueError("media.profile: frames goes to local models, video or images over the network")
@@ -263,11 +269,11 @@ def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
 
 def effective_params(entry: ModelEntry, regime: str) -> dict[str, Any]:
     """What is sent under a regime: the entry's parameters, in the JSON regime the schema where the entry has it, and of
-    a checkpoint in a folder the digest of its content (a hub id's content is that of its revision)."""
+    a checkpoint the digest of its weights (`declared_digest`)."""
     if entry.backend == LOCAL:
         from traps_pipeline.models.local.checkpoint import declared_digest
 
-        content = declared_digest(entry.local_params().checkpoint)
+        content = declared_digest(entry.local_params())
         return entry.params | ({"checkpoint_digest": content} if content else {})
     structured = entry.backend == NETWORK and entry.json_schema and regime == "json"
     return entry.params | ({"response_format": JSON_ANSWER} if structured else {})

@@ -11,15 +11,19 @@ from importlib.metadata import version
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.pocket import evaluate as evaluation
+from traps_pipeline.pocket import inside
 from traps_pipeline.pocket.data import data_digest, render
+from traps_pipeline.pocket.inside import FACTS
 from traps_pipeline.pocket.recipe import POCKET, RECIPE, Recipe, Split, load_recipe
+from traps_pipeline.storage.workspace import Workspace
 
 EVALUATION = POCKET / "evaluation.csv"
+INSIDE = POCKET / "mechanism.csv"
 CARD = POCKET / "README.md"
 THREADS = 1  # sums then come in one order on any number of cores; layers this small gain little by a second one
 WEIGHTS = "weights"  # in the folder of a seed: what `checkpoint:` names
-FACTS = "training.json"  # beside them
-BEGIN, END = "<!-- evaluation: written by `traps pocket card` -->", "<!-- end of evaluation -->"
+MARKS = "<!-- evaluation: written by `traps pocket card` -->", "<!-- end of evaluation -->"
+INSIDE_MARKS = "<!-- inside: written by `traps pocket card` -->", "<!-- end of inside -->"
 
 
 def _say(line: str) -> None:
@@ -80,14 +84,24 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 
 def card(arguments: argparse.Namespace) -> None:
-    """Put the table of the CSV between the marks of the model card."""
+    """Take the figures of finished workspaces into their CSV, and put the tables of both CSVs into the model card."""
+    figures = [figure for folder in arguments.mechanism for figure in inside.figures_of(Workspace.open(folder))]
+    if figures:
+        inside.write_figures(INSIDE, figures)
+    tables = {
+        MARKS: evaluation.markdown(evaluation.read_cells(arguments.csv or EVALUATION)),
+        INSIDE_MARKS: inside.markdown(inside.read_figures(INSIDE)),
+    }
     text = CARD.read_text(encoding="utf-8")
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise TrapsError(f"{CARD}: has no place for the table ({BEGIN!r} to {END!r}); restore it from git")
-    table = evaluation.markdown(evaluation.read_cells(arguments.csv or EVALUATION))
-    CARD.write_text(f"{before}{BEGIN}\n\n{table}\n\n{END}{after}", encoding="utf-8")
+    for (begin, end), table in tables.items():
+        before, begun, rest = text.partition(begin)
+        _, ended, after = rest.partition(end)
+        if not begun or not ended:
+            raise TrapsError(f"{CARD}: has no place for a table ({begin!r} to {end!r}); restore it from git")
+        text = f"{before}{begin}\n\n{table}\n\n{end}{after}"
+    CARD.write_text(text, encoding="utf-8")
+    for table in tables.values():
+        _say(table)
 
 
 Command = Callable[[argparse.Namespace], None]

@@ -11,6 +11,7 @@ that was stopped goes on, and the same seed gives the same scenes.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -102,6 +103,11 @@ class ShardJob:
     def lines(self) -> Path:
         """The records; written last, so that they vouch for the rest."""
         return self.folder / self.split / self.family / f"{self.number:03d}.jsonl"
+
+    @property
+    def drawn(self) -> int:
+        """The scenes that are there. More than `count` where the recipe had more: their first are those of this one."""
+        return len(self.lines.read_bytes().splitlines()) if self.lines.is_file() else 0
 
     @property
     def pixels(self) -> Path:
@@ -293,7 +299,7 @@ def render(
     """Draw what is missing of a split, one process a core. The folder remembers its recipe and takes no other."""
     _check_recipe(recipe, folder)
     jobs = shard_jobs(recipe, split, folder)
-    todo = [job for job in jobs if not job.lines.is_file()]
+    todo = [job for job in jobs if job.drawn < job.count]
     scenes, done = sum(job.count for job in jobs), sum(job.count for job in jobs) - sum(job.count for job in todo)
     for _, count in run_in_order(draw_shard, todo, workers):
         done += count
@@ -302,7 +308,7 @@ def render(
 
 def _check_recipe(recipe: Recipe, folder: Path) -> None:
     """Raises TrapsError when the folder holds scenes of another recipe."""
-    # The numbers of scenes may grow: shards do not depend on how many there are.
+    # The numbers of scenes may change: a shard's first scenes do not depend on how many there are.
     made = digest(recipe.model_dump(mode="json", include={"data_seed", "media", "abstain_share"}))
     note = folder / "recipe.sha256"
     folder.mkdir(parents=True, exist_ok=True)
@@ -313,17 +319,31 @@ def _check_recipe(recipe: Recipe, folder: Path) -> None:
 
 
 def read_shards(recipe: Recipe, split: Split, folder: Path) -> Iterator[tuple[ShardJob, list[SceneRecord]]]:
-    """Every shard of a split with its records. Raises TrapsError when one is missing."""
+    """Every shard of a split with its records. Raises TrapsError when scenes are missing."""
     for job in shard_jobs(recipe, split, folder):
-        if not job.lines.is_file():
-            raise TrapsError(f"{job.lines}: is missing; run `traps pocket render --data {folder}`")
-        yield job, [SceneRecord.read(line) for line in job.lines.read_text(encoding="utf-8").splitlines()]
+        if job.drawn < job.count:
+            raise TrapsError(
+                f"{job.lines}: has {job.drawn} of {job.count} scenes; run `traps pocket render --data {folder}`"
+            )
+        lines = job.lines.read_text(encoding="utf-8").splitlines()[: job.count]
+        yield job, [SceneRecord.read(line) for line in lines]
 
 
 def data_digest(recipe: Recipe, split: Split, folder: Path) -> str:
-    """SHA-256 over the digests of all files that training reads of a split, in the order of the shards."""
+    """SHA-256 over the digests of all files that training reads of a split, in the order of the shards; of a shard that
+    has more scenes than the recipe, of the files that it would have."""
     whole = hashlib.sha256()
     for job, _ in read_shards(recipe, split, folder):
         for path in (job.lines, job.pixels) if split == "train" else (job.lines,):
-            whole.update(file_digest(path).encode())
+            of_file = file_digest(path) if job.drawn == job.count else hashlib.sha256(_first(job, path)).hexdigest()
+            whole.update(of_file.encode())
     return whole.hexdigest()
+
+
+def _first(job: ShardJob, path: Path) -> bytes:
+    """What a file of a shard would hold if no more scenes than `count` had been drawn."""
+    if path == job.lines:
+        return b"".join(path.read_bytes().splitlines(keepends=True)[: job.count])
+    stream = io.BytesIO()
+    np.save(stream, np.load(path, mmap_mode="r", allow_pickle=False)[: job.count], allow_pickle=False)
+    return stream.getvalue()

@@ -370,7 +370,8 @@ def train(
 ) -> Path:
     """Train the model of a seed and save it to `folder`/weights; returns that folder.
 
-    State is kept in `folder`/state.safetensors every two minutes and on Ctrl-C; the same call goes on from there.
+    State is kept in `folder`/state.safetensors every two minutes and on Ctrl-C; the same call goes on from there (if it
+    was stopped inside a step, with weights half updated, from the state that was kept before).
     stop_after: do no step beyond that one.
     """
     import torch
@@ -391,7 +392,7 @@ def train(
     step = state.load()
     last = training.steps if stop_after is None else min(stop_after, training.steps)
     told = kept = began = time.monotonic()
-    first, lately = step, []
+    first, lately, whole = step, [], True
     model.train()
     try:
         while step < last:
@@ -401,9 +402,11 @@ def train(
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+            whole = False
             optimizer.step()
-            lately.append(loss.item())
             step += 1
+            whole = True
+            lately.append(loss.item())
             now = time.monotonic()
             if now - told > PROGRESS_S or step == last:
                 left = (now - began) / (step - first) * (training.steps - step) / 60
@@ -413,7 +416,8 @@ def train(
                 state.save(step)
                 kept = now
     finally:
-        state.save(step)
+        if whole:
+            state.save(step)
     if step == training.steps:
         save(model.eval(), processor, weights)
     return weights

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.models.request import JUDGED
 from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.report.page import TITLES
 from traps_pipeline.report.writing import TEMPLATES, Behind, environment, write_bytes
@@ -106,7 +107,7 @@ def item_page(workspace: Workspace, cell: Cell, clips: str | None) -> str:
     return (
         environment()
         .get_template("items.html.j2")
-        .render(cell=cell, title=TITLES[cell.dataset], sides=sides, clips=clips)
+        .render(cell=cell, title=TITLES[cell.dataset], sides=sides, clips=clips, judged=JUDGED)
     )
 
 

@@ -25,6 +25,7 @@ from traps_pipeline.report.mechanism import (
 )
 from traps_pipeline.scoring import Frame, analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
+from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.published import PUBLISHED, published, published_cells
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import (
@@ -41,6 +42,7 @@ from traps_pipeline.tables import (
     PROBES,
     REGIME_TESTS,
     STEERING_EFFECTS,
+    STEERING_SHARES,
     Table,
 )
 
@@ -48,9 +50,12 @@ CELL_COLUMNS = (
     *("model", "dataset", "regime", "epoch", "n_pairs", "n_runs", "n_missing", "incomplete"),
     *("acc", "acc_std", "abs_rec", "abs_rec_std", "false_abs", "false_abs_std", "pecs", "pecs_std"),
 )
-RATE_COLUMNS = ("model", "taxonomy", "visual", "textual", "gap", "epoch")
+RATE_COLUMNS = (
+    *("model", "taxonomy", "visual", "textual", "gap", "epoch", "n_pairs", "n_runs", "n_missing", "incomplete"),
+)
 SUB_COLUMNS = (
-    *("dataset", "sub_scenario", "n_pairs", "n_models", "acc", "false_abs", "abs_rec", "pecs", "guided_abs_rec"),
+    *("dataset", "sub_scenario", "n_pairs", "n_missing", "n_models", "guided_n_models", "uplift_n_models"),
+    *("ill_posed_n_models", "acc", "false_abs", "abs_rec", "pecs", "guided_abs_rec"),
     *("guided_false_abs", "guided_pecs", "abs_rec_uplift", "false_abs_uplift", "abs_rec_ill_posed"),
     *("textual_over_visual", "answer_type", "epoch"),
 )
@@ -150,6 +155,11 @@ class Results:
         raise NotImplementedError
 
     @cached_property
+    def shares(self) -> Frame:
+        """STEERING_SHARES rows."""
+        raise NotImplementedError
+
+    @cached_property
     def steering_regimes(self) -> Frame:
         """Rows of `mechanism.effects.regime_matrix`."""
         return effects.regime_matrix(self.effects)
@@ -168,6 +178,17 @@ class Results:
     def steering_layers(self) -> Frame:
         """Rows of `mechanism.effects.sweep`."""
         return effects.sweep(self.effects)
+
+    def refusal(self, dataset: str, left: tuple[str, str], right: tuple[str, str]) -> str | None:
+        """Why two (model, regime) may not be compared on a dataset or `overall`, as the contrasts found item by item;
+        None where they may."""
+        return self._refusals.get((dataset, frozenset((left, right))))
+
+    @cached_property
+    def _refusals(self) -> dict[tuple[str, frozenset[tuple[str, str]]], str]:
+        rows = self.contrasts.dropna(subset=["refused"]).to_dict("records")
+        sides = [frozenset((r[f"{side}_model"], r[f"{side}_regime"]) for side in ("left", "right")) for r in rows]
+        return {(row["dataset"], pair): row["refused"] for row, pair in zip(rows, sides, strict=True)}
 
     @cached_property
     def refused(self) -> dict[str, list[str]]:
@@ -198,7 +219,7 @@ class StudyResults(Results):
     @cached_property
     def cells(self) -> Frame:
         """See `Results.cells`."""
-        return _of_several_runs(analyses.study_cells(self.board).reindex(columns=pd.Index(CELL_COLUMNS)))
+        return analyses.study_cells(self.board).reindex(columns=pd.Index(CELL_COLUMNS))
 
     @cached_property
     def overall(self) -> Frame:
@@ -208,7 +229,8 @@ class StudyResults(Results):
         ]
         more = ["j", "j_std", *intervals, "rank", "rank_low", "rank_high"]
         wanted = [name for name in (*CELL_COLUMNS, *more) if name != "dataset"]
-        return _of_several_runs(self.board.loc[self.board["dataset"] == "overall", wanted].reset_index(drop=True))
+        rows = self.board.loc[self.board["dataset"] == "overall", wanted]
+        return analyses.of_several_runs(rows.reset_index(drop=True))
 
     @cached_property
     def rates(self) -> Frame:
@@ -227,7 +249,9 @@ class StudyResults(Results):
         except EpochMismatch as error:
             self.refused.setdefault("rates", []).append(str(error))
             return pd.DataFrame()
-        return gaps.assign(epoch="+".join(sorted(set(rows["epoch"]))))
+        counts = {name: rows[name].sum() for name in ("n_pairs", "n_missing")}
+        counts |= {"n_runs": rows["n_runs"].min(), "incomplete": bool(rows["incomplete"].any())}
+        return gaps.assign(epoch=joined_epochs(rows["epoch"]), **counts)
 
     @cached_property
     def _metrics(self) -> Frame:
@@ -253,7 +277,7 @@ class StudyResults(Results):
         found = []
         for _, cells in self.sub_cells.groupby("scope", sort=True):
             try:
-                found.append(analyses.sub_scenarios(cells).assign(epoch="+".join(sorted(set(cells["epoch"])))))
+                found.append(analyses.sub_scenarios(cells).assign(epoch=joined_epochs(cells["epoch"])))
             except EpochMismatch as error:
                 self.refused.setdefault("sub_scenarios", []).append(str(error))
         table = _joined(found).reindex(columns=pd.Index(SUB_COLUMNS))
@@ -328,6 +352,11 @@ class StudyResults(Results):
         """See `Results.effects`."""
         return self.tables.read_all(STEERING_EFFECTS)
 
+    @cached_property
+    def shares(self) -> Frame:
+        """See `Results.shares`."""
+        return self.tables.read_all(STEERING_SHARES)
+
 
 class PublishedResults(Results):
     """The paper's numbers, as shipped in `assets/published`."""
@@ -346,11 +375,10 @@ class PublishedResults(Results):
     def overall(self) -> Frame:
         """See `Results.overall`; recomputed from the printed per-dataset cells."""
         cells = self.cells
-        means = analyses.overall(cells)
+        means = analyses.overall(cells).assign(j=lambda rows: rows["abs_rec"] - rows["false_abs"])
         counts = cells.groupby(["model", "regime"]).agg(
-            n_pairs=("n_pairs", "sum"), n_runs=("n_runs", "min"), epoch=("epoch", lambda e: "+".join(sorted(set(e))))
+            n_pairs=("n_pairs", "sum"), n_runs=("n_runs", "min"), epoch=("epoch", joined_epochs)
         )
-        means["j"] = means["abs_rec"] - means["false_abs"]
         return means.merge(counts.reset_index(), on=["model", "regime"]).assign(n_missing=np.nan, incomplete=False)
 
     @cached_property
@@ -368,7 +396,8 @@ class PublishedResults(Results):
         table = _joined([*parts, pooled.assign(taxonomy="pooled")])
         table["gap"] = table["gap"].astype(float)
         replication = table["model"].isin(analyses.models_of(group="replication"))
-        return table.assign(epoch=np.where(replication, "verification", "original"))[list(RATE_COLUMNS)]
+        table["epoch"] = np.where(replication, "verification", "original")
+        return table.reindex(columns=pd.Index(RATE_COLUMNS))
 
     @cached_property
     def sub_cells(self) -> Frame:
@@ -458,6 +487,11 @@ class PublishedResults(Results):
         return published_effects()
 
     @cached_property
+    def shares(self) -> Frame:
+        """See `Results.shares`: the paper has none, since it prints no answers."""
+        return pd.DataFrame(columns=pd.Index([c.name for c in STEERING_SHARES.columns]))
+
+    @cached_property
     def steering_regimes(self) -> Frame:
         """See `Results.steering_regimes`; the printed table."""
         rows = published_regimes()
@@ -502,12 +536,6 @@ def _printed(name: str) -> Frame:
 
 def _ill_posed(frame: Frame) -> Frame:
     return frame["dataset"].str.endswith("_ill_posed")
-
-
-def _of_several_runs(rows: Frame) -> Frame:
-    """Without deviations over runs where there was one run only: none was measured."""
-    spreads = [name for name in rows if name.endswith("_std")]
-    return rows.assign(**{name: rows[name].where(rows["n_runs"] > 1) for name in spreads})
 
 
 def _without_references(rows: Frame) -> Frame:

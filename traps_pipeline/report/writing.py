@@ -40,8 +40,9 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#4
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "p", ">", "h")  # 7 colours x 11 shapes: 77 models stay distinct
 INK, SOFT, GRID = "#1b1f27", "#667085", "#d0d5dd"
 
-Unit = Literal["text", "count", "percent", "fraction", "ratio"]
-DIGITS: Mapping[str, int] = {"percent": 1, "fraction": 3, "ratio": 1, "count": 0}
+# A range is two numbers that are text already: it stands and links as a number does.
+Unit = Literal["text", "range", "count", "percent", "fraction", "ratio", "p"]
+DIGITS: Mapping[str, int] = {"percent": 1, "fraction": 3, "ratio": 1, "count": 0, "p": 4}
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class Column:
     def text(self, row: Mapping[str, Any]) -> str:
         """The cell as printed; a dash where there is no number."""
         value = row.get(self.field)
-        if not self.is_number:
+        if self.unit in ("text", "range"):
             return "" if value is None or value is pd.NA or value != value else plain(value)
         shown = self._number(value)
         if self.spread and shown != NONE:
@@ -117,6 +118,8 @@ class Column:
 
     def _number(self, value: Any) -> str:
         digits = DIGITS[self.unit] if self.digits is None else self.digits
+        if self.unit == "p" and value is not None and value < 10**-digits:
+            return f"< {10**-digits:.{digits}f}"
         return percent(value, digits) if self.unit == "percent" else fraction(value, digits)
 
 
@@ -217,7 +220,7 @@ def table_html(table: Table, address: Callable[[Behind], str] | None = None) -> 
     behind it is a link to them."""
 
     def link(row: Mapping[str, Any], column: Column) -> str | None:
-        shown = column.is_number and not column.text(row).startswith(NONE)
+        shown = column.is_number and not column.text(row).startswith(NONE) and column.text(row) != ""
         behind = table.trace(row, column.field) if shown and table.trace and address else None
         return address(behind) if behind and address else None
 
@@ -247,9 +250,10 @@ _LATEX = str.maketrans(
     {
         **{c: f"\\{c}" for c in "&%$#_{}"},
         "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
-        "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}",
+        "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': "''",
         "−": "$-$", "±": r"$\pm$", "×": r"$\times$", "∞": r"$\infty$", "≤": r"$\le$", "≥": r"$\ge$", "→": r"$\to$",
         "–": "--", "†": r"\dag{}", "‡": r"\ddag{}", "’": "'", "…": r"\ldots{}", "κ": r"$\kappa$", "α": r"$\alpha$",
+        "Δ": r"$\Delta$",
     }
 )  # fmt: skip
 
@@ -265,7 +269,7 @@ def _parquet(table: Table) -> bytes:
     import pyarrow.parquet as pq
 
     data = table.data
-    texts = {c.field for c in table.columns if not c.is_number}
+    texts = {c.field for c in table.columns if c.unit in ("text", "range")}
     loose = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and str(kind) == "object"]
     numeric = {name for name in loose if name not in texts and not any(isinstance(v, str) for v in data[name])}
     data = data.astype({name: "Float64" if name in numeric else "string" for name in loose})

@@ -30,6 +30,7 @@ from tests.local_models import (
 )
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.versions import loaded_params
 from traps_pipeline.models.local import adapter
 from traps_pipeline.models.local import model as local_model
 from traps_pipeline.models.local.adapter import Sampling, load_local_model
@@ -37,7 +38,9 @@ from traps_pipeline.models.local.checkpoint import folder_digest, weight_bytes
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompts import batches, collate
 from traps_pipeline.models.local.sampling import SeededNucleus
+from traps_pipeline.models.local.settings import MechanismSpec
 from traps_pipeline.models.local.tiny import build_tiny, make_tokenizer
+from traps_pipeline.models.registry import ModelEntry
 
 CLASSES = {
     "qwen3-vl": "Qwen3VLForConditionalGeneration",
@@ -227,6 +230,25 @@ def test_in_four_bits_it_loads_extracts_and_is_steered(family: Family) -> None:
     assert tokens(of.generate([prompt], 6, steering=push)) != tokens(of.generate([prompt], 6))
     assert of.identity != whole.identity
     assert "nf4/float32 on cpu" in of.served_model
+
+
+def test_what_answers_whole_can_be_looked_into_in_four_bits_but_for_some_modules() -> None:
+    pytest.importorskip("bitsandbytes")
+
+    def with_skip(*skipped: str) -> ModelEntry:
+        spec = MechanismSpec(quantisation="nf4", nf4_skip=skipped)
+        return entry("qwen3-vl").model_copy(update={"mechanism": spec})
+
+    of = with_skip(*NF4_SKIP)
+    inside, answering = load_local_model(of, inside=True), load_local_model(of)
+    assert inside.identity["nf4_skip"] == NF4_SKIP
+    four_bits = [name for name, m in inside.network.named_modules() if type(m).__name__ == "Linear4bit"]
+    assert four_bits and not [name for name in four_bits if "visual" in name]
+    assert answering.quantisation == "none"
+    assert loaded_params(of)["nf4_skip"] == NF4_SKIP  # so it is in keys of steered answers and versions of states
+    assert "nf4_skip" not in loaded_params(with_skip()) and loaded_params(with_skip())["quantisation"] == "nf4"
+    with pytest.raises(TrapsError, match=r"under nf4_skip beside .* \(in params or in mechanism\)"):
+        load_local_model(with_skip(), inside=True)
 
 
 def test_modules_too_narrow_for_four_bits_on_a_cpu_are_named() -> None:

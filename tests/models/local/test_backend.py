@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +18,12 @@ from tests.local_models import QUESTIONS, SIX_FRAMES, SYSTEM, Family, checkpoint
 from traps_pipeline.cli import main
 from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.versions import loaded_params
 from traps_pipeline.models import registry
 from traps_pipeline.models.ask import Participants, Row, Work, run_work
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import Budget
-from traps_pipeline.models.local.adapter import LocalModel
+from traps_pipeline.models.local.adapter import LocalModel, load_local_model
 from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.media import MediaStore
@@ -140,6 +144,40 @@ def test_a_hub_id_needs_no_weights_to_be_planned(tmp_path: Path) -> None:
     assert request(of, MediaStore(tmp_path), QUESTIONS[0]).params == of.params
 
 
+def downloaded(cache: Path, commit: str) -> None:
+    """What `hf download some/model` leaves in the hub's cache."""
+    of_model = cache / "models--some--model"
+    shutil.copytree(checkpoint("llava-next-video"), of_model / "snapshots" / commit)
+    (of_model / "refs").mkdir(exist_ok=True)
+    (of_model / "refs" / "main").write_text(commit)
+
+
+def test_another_commit_of_a_hub_id_without_a_revision_is_another_call(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    of, pinned = (entry("llava-next-video", "some/model", **given) for given in ({}, {"revision": "1" * 40}))
+    media = MediaStore(tmp_path / "media")
+    found = {}
+    for commit in ("1" * 40, "2" * 40):
+        planned, fixed = request(of, media, QUESTIONS[0]), request(pinned, media, QUESTIONS[0])
+        downloaded(tmp_path, commit)
+        asked = request(of, media, QUESTIONS[0])
+        assert asked.params["checkpoint_digest"] == commit == load_local_model(of).checkpoint.digest
+        assert asked.key != planned.key and request(pinned, media, QUESTIONS[0]).key == fixed.key
+        found[commit] = asked.key, loaded_params(of)
+    assert found["1" * 40] != found["2" * 40]  # what is looked into is another model, too
+
+
+def test_another_registry_is_named_by_a_variable(tmp_path: Path) -> None:
+    shipped = registry.MODELS_FILE.read_text()
+    (tmp_path / "mine.yaml").write_text(shipped.replace("assets/pocket/weights", str(checkpoint("llava-next-video"))))
+    ask = "from traps_pipeline.models.registry import get_model; print(get_model('pocket').params['checkpoint'])"
+    mine = os.environ | {registry.MODELS_VARIABLE: str(tmp_path / "mine.yaml")}
+    done = subprocess.run([sys.executable, "-c", ask], env=mine, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == str(checkpoint("llava-next-video"))
+
+
 def test_missing_weights_are_told_before_anything_is_asked(tmp_path: Path) -> None:
     with pytest.raises(TrapsError, match="hf download nobody/nothing"):
         make_backend(entry("qwen3-vl", "nobody/nothing"))
@@ -206,6 +244,10 @@ PARAMS = "checkpoint: a/b, dtype: float32, quantisation: none, do_sample: false,
         (f"{LOCAL}, device: cpu, params: {{{PARAMS.replace('false', 'true')}}}", "params: do_sample: true needs"),
         (f"{LOCAL}, device: cpu, params: {{{PARAMS}, nf4_skip: [lm_head]}}", "params: nf4_skip goes with"),
         ("backend: reference, device: cpu, params: {strategy: oracle}", "device, mechanism: only backend local"),
+        (
+            f"{LOCAL}, device: cpu, params: {{{PARAMS}}}, mechanism: {{nf4_skip: [lm_head]}}",
+            "mechanism: nf4_skip goes with",
+        ),
     ],
 )
 def test_a_wrong_entry_is_named_with_its_field(tmp_path: Path, text: str, complaint: str) -> None:

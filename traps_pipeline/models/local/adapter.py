@@ -22,7 +22,7 @@ from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import Generated, LocalModel, States
 from traps_pipeline.models.local.prompts import Prompt
 from traps_pipeline.models.local.sampling import Sampling
-from traps_pipeline.models.local.settings import LocalParams, Quantisation
+from traps_pipeline.models.local.settings import LocalParams
 from traps_pipeline.models.registry import ModelEntry
 
 __all__ = ["Generated", "LocalModel", "Prompt", "Sampling", "States", "load_local_model", "require_device"]
@@ -32,15 +32,13 @@ _LOADED: dict[str, LocalModel] = {}
 _LOADING = Lock()
 
 
-def load_local_model(entry: ModelEntry, quantisation: Quantisation | None = None) -> LocalModel:
+def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
     """The entry's checkpoint in memory, as the entry says; loaded once a process.
 
-    quantisation: in the place of the entry's, for looking inside (`mechanism:` of the entry). Raises TrapsError when
-    weights, device, memory or library are missing, or when the checkpoint is of no class that fits.
+    inside: as it is looked into (`mechanism:` of the entry), not as it answers. Raises TrapsError when weights, device,
+    memory or library are missing, or when the checkpoint is of no class that fits.
     """
-    params = entry.local_params()
-    if quantisation is not None and quantisation != params.quantisation:
-        params = params.model_copy(update={"quantisation": quantisation, "nf4_skip": ()})
+    params = entry.inside_params() if inside else entry.local_params()
     device = entry.device or "cpu"
     require_device(device)
     checkpoint = find_checkpoint(params)
@@ -117,7 +115,8 @@ def _require_packable(network: Any, name: str) -> None:
     if odd:
         raise TrapsError(
             f"checkpoint {name}: NF4 on a CPU wants modules {NF4_CPU_BLOCK} weights wide or a multiple of it, and "
-            f"{len(odd)}, {odd[0]} first, are not: name them, or what holds them, under nf4_skip, or use a GPU"
+            f"{len(odd)}, {odd[0]} first, are not: name them, or what holds them, under nf4_skip beside the "
+            "entry's quantisation: nf4 (in params or in mechanism), or use a GPU"
         )
 
 

@@ -19,6 +19,7 @@ from traps_pipeline.paths import CHECKOUT
 
 _FILES = (".json", ".jinja", ".model", ".safetensors", ".txt")  # of a folder, what decides what the model says
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
+_COMMIT = re.compile(r"[0-9a-f]{40}")
 _ITEM_BYTES: dict[Dtype, int] = {"float32": 4, "bfloat16": 2, "float16": 2}
 _NF4_BYTES = 0.6  # a weight in 4 bits and its share of the scales and of what is not quantised
 
@@ -45,20 +46,31 @@ def find_checkpoint(params: LocalParams) -> Checkpoint:
         _require_whole(folder, params.checkpoint, f"set checkpoint: to a folder saved by save_pretrained ({folder})")
         return Checkpoint(params.checkpoint, folder, folder_digest(folder))
     snapshot = _cached_snapshot(params)
+    if snapshot is None:
+        raise TrapsError(
+            f"checkpoint {params.checkpoint}: neither a folder nor in the hub's cache on this machine; with a network "
+            f"run `{download_command(params)}` (older versions: huggingface-cli download), or copy the weights here "
+            "and set `checkpoint:` of the entry to their folder"
+        )
     _require_whole(snapshot, params.checkpoint, f"run `{download_command(params)}` again to complete it")
     return Checkpoint(params.checkpoint, snapshot, snapshot.name)
 
 
-def declared_digest(checkpoint: str) -> str | None:
-    """What stands for a folder's weights in the ledger key; None for a hub id, whose revision stands in the entry.
+def declared_digest(params: LocalParams) -> str | None:
+    """What stands for the weights in the ledger key, beside the entry: of a folder the digest of its content, of a hub
+    id the commit that is in the hub's cache.
 
-    Raises TrapsError when the folder is not there.
+    None for a hub id whose `revision` is a commit, and for one that is not downloaded: it can be planned, and is not
+    asked before it is here (`find_checkpoint`). Raises TrapsError when the folder is not there.
     """
-    folder = as_folder(checkpoint)
-    if folder is None:
+    folder = as_folder(params.checkpoint)
+    if folder is not None:
+        _require_whole(folder, params.checkpoint, f"set checkpoint: to a folder saved by save_pretrained ({folder})")
+        return folder_digest(folder)
+    if params.revision is not None and _COMMIT.fullmatch(params.revision):
         return None
-    _require_whole(folder, checkpoint, f"set checkpoint: to a folder saved by save_pretrained ({folder})")
-    return folder_digest(folder)
+    snapshot = _cached_snapshot(params)
+    return None if snapshot is None else snapshot.name
 
 
 def download_command(params: LocalParams) -> str:
@@ -67,18 +79,16 @@ def download_command(params: LocalParams) -> str:
     return f"hf download {params.checkpoint}{at}"
 
 
-def _cached_snapshot(params: LocalParams) -> Path:
-    from huggingface_hub import snapshot_download
+def _cached_snapshot(params: LocalParams) -> Path | None:
+    """The folder of a hub id in the hub's cache, named by its commit; None when it is not there."""
+    from huggingface_hub import try_to_load_from_cache
     from huggingface_hub.errors import HFValidationError
 
     try:
-        return Path(snapshot_download(params.checkpoint, revision=params.revision, local_files_only=True))
-    except (OSError, HFValidationError) as error:
-        raise TrapsError(
-            f"checkpoint {params.checkpoint}: neither a folder nor in the hub's cache on this machine; with a network "
-            f"run `{download_command(params)}` (older versions: huggingface-cli download), or copy the weights here "
-            "and set `checkpoint:` of the entry to their folder"
-        ) from error
+        config = try_to_load_from_cache(params.checkpoint, "config.json", revision=params.revision)
+    except (OSError, HFValidationError):
+        return None
+    return Path(config).parent if isinstance(config, str) else None
 
 
 def _require_whole(folder: Path, name: str, remedy: str) -> None:

@@ -111,7 +111,16 @@ class LocalModel:
     def served_model(self) -> str:
         """What answered, for the ledger: checkpoint and digest, precision, and the device that it ran on."""
         precision = self.dtype if self.quantisation == "none" else f"{self.quantisation}/{self.dtype}"
-        return f"{self.checkpoint.name}@{self.checkpoint.digest[:12]} {precision} on {_device_name(self.device)}"
+        return f"{self.checkpoint.name}@{self.checkpoint.digest[:12]} {precision} on {self.device_name}"
+
+    @property
+    def device_name(self) -> str:
+        """The device as the entry says, of a GPU with its name."""
+        if not self.device.startswith("cuda"):
+            return self.device
+        import torch
+
+        return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
 
     def block(self, layer: int) -> Module:
         """The block whose output is hidden_states[layer]. Raises TrapsError for a layer that is out of range."""
@@ -337,11 +346,3 @@ def _decoder_parts(network: Any, name: str) -> tuple[Any, Any]:
             "cannot look inside it"
         )
     return blocks, norm
-
-
-def _device_name(device: str) -> str:
-    if not device.startswith("cuda"):
-        return device
-    import torch
-
-    return f"{device} ({torch.cuda.get_device_name(device)})"

@@ -48,8 +48,21 @@ class LocalParams(BaseModel):
 class MechanismSpec(BaseModel):
     """How a model is loaded to look inside (`benchmark.md` sections 7 and 8), where that differs from how it answers.
 
-    quantisation: None is that of `params`.
+    quantisation, with its nf4_skip: None is that of `params`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     quantisation: Quantisation | None = None
+    nf4_skip: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _skips_are_of_nf4(self) -> MechanismSpec:
+        if self.nf4_skip and self.quantisation != "nf4":
+            raise ValueError("nf4_skip goes with quantisation: nf4 in the same section")
+        return self
+
+    def inside(self, params: LocalParams) -> LocalParams:
+        """The parameters that the model is looked into with."""
+        if self.quantisation in (None, params.quantisation) and not self.nf4_skip:
+            return params
+        return params.model_copy(update={"quantisation": self.quantisation, "nf4_skip": self.nf4_skip})

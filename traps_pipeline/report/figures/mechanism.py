@@ -144,7 +144,8 @@ def _strip(ax: Axes, rows: Frame) -> None:
 
 def dose_response(results: Results) -> Figure:
     """Abstention against α, controls (+α) beside voids (−α), for each model and each path set that it has; under guided
-    directions and guided inference where both were run."""
+    directions and guided inference where both were run. Grey: the mean over the paths with its 95 % interval,
+    scenarios resampled."""
     rows = effects.paths(results.effects)
     rows = rows.loc[rows["kind"] == "void"]
     panels = _panels(rows)
@@ -158,6 +159,7 @@ def dose_response(results: Results) -> Figure:
         pairs = axes.reshape(-1, 2)
         for pair, ((model, path_set), part) in zip(pairs, panels.items(), strict=False):
             for ax, side, sign in zip(pair, ("control", "void"), ("+α on controls", "−α on voids"), strict=True):
+                _mean_band(ax, _of_panel(results.shares, part, path_set, side))
                 _doses(ax, part, side)
                 ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}", size=6.5)
                 ax.set_xlabel("α")
@@ -166,8 +168,26 @@ def dose_response(results: Results) -> Figure:
         for line in axes:
             line[0].set_ylabel("abstained, %")
         axes[0, 0].set_ylim(-4, 104)
-        _legend(figure)
+        _legend(figure, *([_band_key()] if len(results.shares) else []))
     return figure
+
+
+def _of_panel(shares: Frame, part: Frame, path_set: str, side: str) -> Frame:
+    """The shares over a panel's paths along void directions, by alpha."""
+    mine = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
+    return mine.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
+
+
+def _mean_band(ax: Axes, shares: Frame) -> None:
+    alphas, percent = shares["alpha"].to_numpy(float), 100 * shares[["low", "high", "abstention"]].astype(float)
+    ax.fill_between(alphas, percent["low"], percent["high"], color=GRID, alpha=0.7, linewidth=0, zorder=0.2)
+    ax.plot(alphas, percent["abstention"], color=SOFT, linewidth=2.2, zorder=0.3)
+
+
+def _band_key() -> Line2D:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=SOFT, linewidth=2.2, label="mean, 95 % by scenario")
 
 
 def _panels(rows: Frame) -> Mapping[tuple[str, str], Frame]:

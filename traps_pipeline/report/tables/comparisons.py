@@ -13,15 +13,16 @@ from traps_pipeline.partitions import DATASETS, REGIMES
 from traps_pipeline.report.page import SIDE_OF, TITLES
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
+    COUNTED,
     COUNTS,
     EPOCH,
     MODEL,
     PECS,
     REGIME,
-    RUNS,
     SHARES,
-    N,
     cell_trace,
+    counted,
+    entries,
     epochs,
     frame,
     marked,
@@ -29,6 +30,7 @@ from traps_pipeline.report.tables.shared import (
     no_overall,
     ordered,
     said,
+    together,
 )
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
 from traps_pipeline.scoring import Frame, analyses
@@ -39,23 +41,25 @@ NAIVE_THRESHOLD = 0.03
 
 def visual_textual(results: Results) -> list[Table]:
     """AbsRec under standard on visual and on ill-posed voids, and their ratio, by taxonomy and pooled."""
-    rates = results.rates
-    rows = pd.DataFrame({"model": rates["model"].drop_duplicates()})
+    rates = marked(results.rates)
+    rows = rates.drop_duplicates("model", keep="last")[["model", *COUNTED, "mark"]]  # the pooled row is a model's last
     columns = [MODEL]
     for taxonomy in (*analyses.TAXONOMIES, "pooled"):
-        names = {kind: f"{taxonomy}_{kind}" for kind in ("visual", "textual", "gap", "epoch")}
+        names = {kind: f"{taxonomy}_{kind}" for kind in ("visual", "textual", "gap", "epoch", "mark")}
         part = rates.loc[rates["taxonomy"] == taxonomy, ["model", *names]].rename(columns=names)
         rows = rows.merge(part, on="model", how="left")
         word = taxonomy.capitalize()
         columns += [
             Column(names["visual"], f"{word} visual %", "percent"),
             Column(names["textual"], f"{word} textual %", "percent"),
-            Column(names["gap"], f"{word} gap", "ratio"),
+            Column(names["gap"], f"{word} gap", "ratio", mark=names["mark"]),
         ]
+    columns += COUNTS
     notes = [
         epochs(rates.assign(dataset=rates["model"])),
         "AbsRec under standard; gap: textual over visual, ∞ where only the visual is 0",
         "pooled: of the means of both taxonomies",
+        *marks(rates),
         *([] if results.is_study else ["gaps as printed: from unrounded rates, many to whole numbers only"]),
         *results.refused.get("rates", []),
     ]
@@ -65,6 +69,8 @@ def visual_textual(results: Results) -> list[Table]:
 
 
 def _rate_trace(row: Mapping[str, Any], field: str) -> Behind:
+    if field in COUNTED:
+        return Behind("", row["model"], "standard")
     taxonomy, _, kind = field.rpartition("_")
     dataset = {"visual": taxonomy, "textual": f"{taxonomy}_ill_posed"}.get(kind, "") if taxonomy != "pooled" else ""
     return Behind(dataset, row["model"], "standard", "void")
@@ -72,29 +78,35 @@ def _rate_trace(row: Mapping[str, Any], field: str) -> Behind:
 
 def uplift(results: Results) -> list[Table]:
     """Guided over standard: AbsRec (equal weight over datasets) and their ratio, PECS of both."""
-    rows, refused = [], []
-    sides = results.overall.set_index(["model", "regime"])
-    for model, cells in results.cells.groupby("model", sort=False):
-        if not {(model, "standard"), (model, "guided")} <= set(sides.index):
+    rows, refused, both = [], [], ("standard", "guided")
+    for model, means in marked(results.overall).groupby("model", sort=False):
+        sides = {row["regime"]: row for row in means.to_dict("records") if row["regime"] in both}
+        if len(sides) < len(both):
             continue
         try:
-            ratio = float(analyses.uplift(cells)["ratio"].iloc[0])
+            (ratio,) = analyses.uplift(results.cells.loc[results.cells["model"] == model], means)["ratio"]
         except EpochMismatch as error:
             refused.append(str(error))
             continue
-        row = {"model": model, "ratio": ratio, "epoch": sides.loc[(model, "standard"), "epoch"]}
-        for regime in ("standard", "guided"):
-            row |= {f"{regime}_{name}": sides.loc[(model, regime), name] for name in ("abs_rec", "false_abs", "pecs")}
+        reason = results.refusal("overall", (str(model), "standard"), (str(model), "guided"))
+        if reason is not None:
+            refused.append(f"{model}: {reason}")
+            continue
+        row = {"model": model, "ratio": ratio, "epoch": sides["standard"]["epoch"], **together([*sides.values()])}
+        for regime, side in sides.items():
+            row |= {f"{regime}_{name}": side[name] for name in ("abs_rec", "false_abs", "pecs", "mark")}
         rows.append(row)
-    table = frame(rows, ["model", "ratio"]).sort_values("ratio", ascending=False, ignore_index=True)
+    table = marked(frame(rows, ["model", "ratio", *COUNTED])).sort_values("ratio", ascending=False, ignore_index=True)
     columns = [
         MODEL,
-        *(Column(f"{r}_abs_rec", f"AbsRec %, {r}", "percent") for r in ("standard", "guided")),
-        Column("ratio", "Ratio", "ratio", digits=2),
-        *(Column(f"{r}_false_abs", f"FalseAbs %, {r}", "percent") for r in ("standard", "guided")),
-        *(Column(f"{r}_pecs", f"PECS, {r}", "fraction") for r in ("standard", "guided")),
+        *(Column(f"{r}_abs_rec", f"AbsRec %, {r}", "percent") for r in both),
+        Column("ratio", "Ratio", "ratio", digits=2, mark="mark"),
+        *(Column(f"{r}_false_abs", f"FalseAbs %, {r}", "percent") for r in both),
+        *(Column(f"{r}_pecs", f"PECS, {r}", "fraction", mark=f"{r}_mark") for r in both),
+        *COUNTS,
     ]
-    notes = [epochs(results.cells), "equal-weight means over the four datasets; ∞ where only standard is 0", *refused]
+    notes = [epochs(results.cells), "equal-weight means over the four datasets; ∞ where only standard is 0"]
+    notes += [*marks(table), *refused]
     why = "no model has standard and guided on all four datasets"
     return [Table("guided_uplift", "Guided against standard", table, columns, notes, why, _regime_trace)]
 
@@ -129,9 +141,10 @@ def zero_boundary(results: Results) -> list[Table]:
     rows = marked(analyses.zero_boundary(results.cells)).assign(title=lambda f: f["dataset"].map(TITLES))
     rows = ordered(rows, ["regime", "dataset", "model"])
     columns = [MODEL, Column("title", "Dataset"), REGIME, *SHARES, PECS, *COUNTS, EPOCH]
-    counted = results.cells.groupby("regime", sort=False).size()
-    zero = rows.groupby("regime").size().reindex(counted.index, fill_value=0)
-    notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in counted.items()), epochs(rows)]
+    asked = results.cells.groupby("regime", sort=False).size()
+    zero = rows.groupby("regime").size().reindex(asked.index, fill_value=0)
+    notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in asked.items()), epochs(rows)]
+    notes += marks(rows)
     why = "no cell has PECS 0" if len(results.cells) else results.why("cells")
     table = Table("zero_boundary", "Cells with PECS 0", rows, columns, notes, why, cell_trace)
     return [said(table, bool(len(results.cells)))]
@@ -139,32 +152,37 @@ def zero_boundary(results: Results) -> list[Table]:
 
 def frontier(results: Results) -> list[Table]:
     """The Pareto frontier in (Acc, J) under each regime, after averaging over datasets."""
-    cells = results.cells
-    whole = cells.loc[cells.groupby(["model", "regime"])["dataset"].transform("nunique") == len(DATASETS)]
-    rows = analyses.pareto_frontier(whole) if len(whole) else pd.DataFrame(columns=pd.Index(["model", "regime"]))
-    counts = results.overall[["model", "regime", "n_pairs", "n_runs", "n_missing", "epoch"]]
-    rows = ordered(rows.merge(counts, on=["model", "regime"], how="left"), ["regime"])
-    columns = [REGIME, MODEL, Column("acc", "Acc %", "percent"), Column("j", "J", "fraction"),
-               Column("pecs", "PECS", "fraction"), *COUNTS]  # fmt: skip
-    notes = ["no other model is as good in both Acc and J and better in one", epochs(cells)]
+    rows = ordered(marked(analyses.frontier(results.overall)), ["regime"])
+    columns = [REGIME, MODEL, SHARES[0], Column("j", "J", "fraction", spread="j_std"), PECS, *COUNTS]
+    notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *marks(rows)]
     return [Table("frontier", "Pareto frontier", rows, columns, notes, no_overall(results, False), cell_trace)]
 
 
 def reasoning(results: Results) -> list[Table]:
     """The thinking member of each pair minus the other, by dataset and overall."""
-    rows, refused = [analyses.reasoning_pairs(results.cells.iloc[:0])], []
+    cells = entries(results)
+    rows, refused = [analyses.pair_differences(cells.iloc[:0])], []
     for pair in analyses.REASONING_PAIRS:
         try:
-            rows.append(analyses.reasoning_pairs(results.cells.loc[results.cells["model"].isin(pair)]))
+            rows.append(analyses.pair_differences(cells.loc[cells["model"].isin(pair)]))
         except EpochMismatch as error:
             refused.append(str(error))
     table: Frame = pd.concat(rows, ignore_index=True)
+    reasons = [
+        results.refusal(row["dataset"], *((row[member], row["regime"]) for member in ("thinking", "other")))
+        for row in table.to_dict("records")
+    ]
+    refused += sorted({reason for reason in reasons if reason})
+    table = table.loc[[reason is None for reason in reasons]].reset_index(drop=True)
+    table = counted(table, cells, [(member, "regime", "dataset") for member in ("thinking", "other")])
     table = ordered(table.assign(title=table["dataset"].replace(TITLES)), ["thinking", "regime", "dataset"])
     columns = [
         Column("thinking", "Thinking"), Column("other", "Other"), REGIME, Column("title", "Dataset"),
-        *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARES), Column("pecs", "Δ PECS", "fraction"),
+        *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARES),
+        Column("pecs", "Δ PECS", "fraction", mark="mark"), *COUNTS,
     ]  # fmt: skip
-    notes = [epochs(results.cells), "thinking minus other; Δ of shares in points of percent", *refused]
+    notes = [epochs(results.cells), "thinking minus other; Δ of shares in points of percent; missing: of both"]
+    notes += [*marks(table), *refused]
     trace: Trace = lambda row, field: Behind(  # noqa: E731
         row["dataset"] if row["dataset"] in DATASETS else "", row["thinking"], row["regime"], SIDE_OF.get(field, "")
     )
@@ -178,14 +196,16 @@ def contrasts(results: Results) -> list[Table]:
     rows = rows.loc[(rows["dataset"] == "overall") & (rows["figure"] == "pecs")]
     rows = rows.assign(separable=rows["separable"].map({True: "yes", False: "no"}))
     rows = rows.sort_values(["kind", "p_holm", "left_model"], ignore_index=True, kind="stable")
+    rows = counted(rows, entries(results), [(f"{s}_model", f"{s}_regime", "dataset") for s in ("left", "right")])
     columns = [
         Column("left_model", "Left"), Column("left_regime", "Regime"), Column("right_model", "Right"),
-        Column("right_regime", "Regime"), Column("difference", "Δ PECS", "fraction"),
+        Column("right_regime", "Regime"), Column("difference", "Δ PECS", "fraction", mark="mark"),
         Column("ci_low", "95 % CI from", "fraction"), Column("ci_high", "to", "fraction"),
-        Column("p", "p", "fraction", 4), Column("p_holm", "p, Holm", "fraction", 4), Column("separable", "Separable"),
-        Column("refused", "Refused"),
+        Column("p", "p", "p"), Column("p_holm", "p, Holm", "p"), Column("separable", "Separable"),
+        *COUNTS, Column("refused", "Refused"),
     ]  # fmt: skip
     notes = ["left minus right; the other figures and datasets are in the workspace's table `contrasts`"]
+    notes += ["missing: of both", *marks(rows)] if len(rows) else []
     trace: Trace = lambda row, field: Behind("", row["left_model"], row["left_regime"])  # noqa: E731
     why = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
     return [Table("contrasts", "Paired contrasts", rows, columns, notes, why, trace)]
@@ -199,7 +219,7 @@ def regime_tests(results: Results) -> list[Table]:
         Column("title", "Dataset"), MODEL, Column("run", "Run", "count"), Column("decision", "Decision"),
         Column("left_regime", "Left"), Column("right_regime", "Right"), Column("n", "n", "count"),
         Column("only_left", "Yes, left alone", "count"), Column("only_right", "Yes, right alone", "count"),
-        Column("p", "p", "fraction", 4), Column("p_holm", "p, Holm", "fraction", 4), Column("refused", "Refused"),
+        Column("p", "p", "p"), Column("p_holm", "p, Holm", "p"), Column("refused", "Refused"),
     ]  # fmt: skip
     trace: Trace = lambda row, field: Behind(row["dataset"], row["model"], row["left_regime"])  # noqa: E731
     why = "no model has two regimes" if results.is_study else results.why("regime_tests")
@@ -223,7 +243,9 @@ def spreads(results: Results) -> list[Table]:
     ]
     notes = ["quartiles over cells of the population standard deviation of PECS over runs; cells of one run left out"]
     why = "no cell has more than one run" if len(cells) else results.why("cells")
-    return [Table("run_spread", "Spread over runs", frame(rows, ["family"]), columns, [*notes, epochs(cells)], why)]
+    rows = frame(rows, ["family"])
+    trace: Trace = lambda row, field: Behind()  # noqa: E731
+    return [Table("run_spread", "Spread over runs", rows, columns, [*notes, epochs(cells)], why, trace)]
 
 
 def degenerate(results: Results) -> list[Table]:
@@ -236,16 +258,17 @@ def degenerate(results: Results) -> list[Table]:
     notes = ["in expectation; Acc is open where the strategy does not fix it, PECS is 0 all the same"]
     if results.is_study:
         measured = results.overall.loc[results.overall["regime"] == "standard"]
-        names = {"model": "strategy", "j": "measured_j", "j_std": "measured_j_std", "pecs": "measured_pecs",
-                 "pecs_std": "measured_pecs_std", "n_pairs": "n_pairs", "n_runs": "n_runs"}  # fmt: skip
-        rows = rows.merge(measured[list(names)].rename(columns=names), on="strategy", how="left")
+        names = {"model": "strategy", **{name: f"measured_{name}" for name in ("j", "j_std", "pecs", "pecs_std")}}
+        measured = measured[[*names, *COUNTED]].rename(columns=names)
+        rows = marked(rows.merge(measured, on="strategy", how="left"))
         columns += [
             Column("measured_j", "J, measured", "fraction", spread="measured_j_std"),
-            Column("measured_pecs", "PECS, measured", "fraction", spread="measured_pecs_std"), N, RUNS,
+            Column("measured_pecs", "PECS, measured", "fraction", spread="measured_pecs_std", mark="mark"), *COUNTS,
         ]  # fmt: skip
         notes.append("measured: overall, standard; PECS clips J at 0, so chance alone lifts a random strategy above 0")
+        notes += marks(rows)
     trace: Trace = lambda row, field: (  # noqa: E731
-        Behind("", row["strategy"], "standard") if field.startswith("measured") else None
+        Behind("", row["strategy"], "standard") if field.startswith("measured") or field in COUNTED else None
     )
     return [
         Table(

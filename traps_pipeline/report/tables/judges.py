@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from traps_pipeline.report.page import TITLES
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
@@ -32,10 +35,12 @@ def agreement(results: Results) -> list[Table]:
         Column("n_undecided", "Undecided", "count"),
     ]  # fmt: skip
     notes = [epochs(rows), *_undefined(rows), "unanimous and κ over answers with three valid votes"]
-    trace: Trace = lambda row, field: Behind(  # noqa: E731
-        row["dataset"], "", "", "void" if row["task"] == "void_abstention" else "control"
-    )
-    return [Table("judge_agreement", "Agreement of the judges", rows, columns, notes, results.why("agreement"), trace)]
+    why = results.why("agreement")
+    return [Table("judge_agreement", "Agreement of the judges", rows, columns, notes, why, _task_trace)]
+
+
+def _task_trace(row: Mapping[str, Any], field: str) -> Behind:
+    return Behind(row["dataset"], "", "", "void" if row["task"] == "void_abstention" else "control")
 
 
 def _undefined(rows: Frame) -> list[str]:
@@ -62,9 +67,10 @@ def judge_bias(results: Results) -> list[Table]:
         Column("difference", "Difference", "fraction"), N, RUNS, MISSING,
     ]  # fmt: skip
     notes = ["two judges: one against one is undecided and counts as missing", epochs(left)]
+    why = results.why("bias")
     return [
-        Table("judge_bias", "Each judge against the panel", bias, columns, [epochs(bias)], results.why("bias")),
-        Table("leave_one_judge_out", "PECS without one judge", left, without, notes, results.why("bias"), cell_trace),
+        Table("judge_bias", "Each judge against the panel", bias, columns, [epochs(bias)], why, _task_trace),
+        Table("leave_one_judge_out", "PECS without one judge", left, without, notes, why, cell_trace),
     ]
 
 
@@ -88,6 +94,7 @@ def validation(results: Results) -> list[Table]:
             columns,
             notes,
             why,
+            lambda row, field: Behind("", "", "standard", "void"),
             dash="undefined",
         )
     ]

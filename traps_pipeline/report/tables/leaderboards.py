@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import pandas as pd
+
 from traps_pipeline.partitions import DATASETS, REGIMES
 from traps_pipeline.report.page import TITLES
 from traps_pipeline.report.results import Results
@@ -47,7 +49,7 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Tabl
     if results.is_study:
         shown = rows.to_dict("records")
         rows = rows.assign(ci=[interval(row) for row in shown], ranks=[ranks(row) for row in shown])
-        columns[3:3] = [Column("ci", "95 % CI"), Column("ranks", "Rank")]
+        columns[3:3] = [Column("ci", "95 % CI", "range"), Column("ranks", "Rank", "range")]
         notes.append("rank by PECS within the regime; of 2–4, paired contrasts (Holm) leave these ranks open")
         printed = published_overall()[["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
         rows = rows.merge(printed, on=["model", "regime"], how="left")
@@ -60,7 +62,7 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Tabl
 
 
 def per_dataset(results: Results) -> list[Table]:
-    """PECS of every model and regime on each dataset, and their mean."""
+    """PECS of every model and regime on each dataset, and overall."""
     return [_by_dataset(results, "per_dataset", "PECS by dataset", replication=False)]
 
 
@@ -92,10 +94,12 @@ def _by_dataset(results: Results, name: str, title: str, replication: bool) -> T
                 dataset, _n(TITLES[dataset], part, names), "fraction", spread=f"{dataset}_std", mark=f"{dataset}_mark"
             )
         )
-    rows["mean"] = rows[list(DATASETS)].astype(float).mean(axis=1, skipna=False)
-    columns.append(Column("mean", "Mean", "fraction"))
+    names = {"pecs": "mean", "pecs_std": "mean_std", "mark": "mean_mark"}
+    overall = marked(results.overall).reindex(columns=pd.Index([*index, *names])).rename(columns=names)
+    rows = rows.merge(overall, on=index, how="left")
+    columns.append(Column("mean", "Mean", "fraction", spread="mean_std", mark="mean_mark"))
     rows = rows.sort_values("mean", ascending=False, na_position="last", ignore_index=True, kind="stable")
-    notes = [epochs(cells), *marks(cells)]
+    notes = [epochs(cells), "mean: overall, of the runs that have all four datasets", *marks(cells)]
     trace: Trace = lambda row, field: Behind(field if field in DATASETS else "", row["model"], row["regime"])  # noqa: E731
     return Table(name, title, rows, columns, notes, results.why("cells"), trace)
 

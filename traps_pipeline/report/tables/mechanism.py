@@ -40,7 +40,8 @@ def best_layers(rows: Frame) -> Frame:
     for model, of in rows.groupby("model", sort=False):
         for source, target in TRANSFER_PAIRS:
             pair = of.loc[(of["source"] == source) & (of["target"] == target)]
-            transfer, cf = (pair.loc[pair["analysis"] == name] for name in ("transfer", "confabulated"))
+            analyses = ("transfer", "held_out", "confabulated")
+            transfer, held_out, cf = (pair.loc[pair["analysis"] == name] for name in analyses)
             if not len(transfer):
                 continue
             best, chosen = transfer.loc[transfer["own_best"]], transfer.loc[transfer["source_best"]]
@@ -51,6 +52,7 @@ def best_layers(rows: Frame) -> Frame:
                     "transfer_type": transfer_type(source, target),
                     **_at(best, "best", ("layer", "value", "low", "high", "n_voids")),
                     **_at(chosen, "source", ("layer", "value")),
+                    **_at(held_out.loc[held_out["all_sample_best"]], "held_out", ("value",)),
                     **_at(at_best, "cf", ("value", "low", "high", "n_voids")),
                     **_at(own, "cf_own", ("layer", "value")),
                     "note": next(iter(cf["note"].dropna()), ""),
@@ -69,13 +71,14 @@ def _transfer(results: Results) -> Table:
         MODEL, PATH, TYPE, Column("best_layer", "Best layer", "count"), Column("best_value", "AUROC", "fraction"),
         Column("best_low", "from", "fraction"), Column("best_high", "to", "fraction"),
         Column("source_layer", "Source’s layer", "count"), Column("source_value", "AUROC there", "fraction"),
-        Column("cf_value", "Cf→Cf", "fraction"), Column("cf_own_layer", "Cf’s own layer", "count"),
+        *_held_out(results), Column("cf_value", "Cf→Cf", "fraction"), Column("cf_own_layer", "Cf’s own layer", "count"),
         Column("cf_own_value", "Cf→Cf there", "fraction"), Column("best_n_voids", "Pairs", "count"),
         Column("cf_n_voids", "Cf pairs", "count"),
     ]  # fmt: skip
     notes = [
         "best layer: the highest AUROC on the target itself, as in the paper; the source’s layer is the highest of its "
-        "own grouped cross-validation, which sees no target label",
+        "own grouped cross-validation, which sees the labels of no target",
+        *_shared_controls(results),
         "from, to: 95 %, scenarios of the target resampled, the probe held fixed",
         *([] if not len(rows) else sorted({note for note in rows["note"] if note})),
     ]
@@ -85,15 +88,28 @@ def _transfer(results: Results) -> Table:
 def _means(results: Results) -> Table:
     rows = best_layers(results.probes)
     if len(rows):
-        figures = ["best_value", "source_value", "cf_value", "cf_own_value"]
+        figures = ["best_value", "source_value", "held_out_value", "cf_value", "cf_own_value"]
         grouped = rows.groupby(["model", "transfer_type"], sort=False)
         rows = grouped[figures].mean().join(grouped["path"].count().rename("n_paths")).reset_index()
     columns = [
         MODEL, TYPE, Column("best_value", "AUROC", "fraction"), Column("source_value", "Source’s layer", "fraction"),
-        Column("cf_value", "Cf→Cf", "fraction"), Column("cf_own_value", "Cf→Cf, own layer", "fraction"),
-        Column("n_paths", "Paths", "count"),
+        *_held_out(results), Column("cf_value", "Cf→Cf", "fraction"),
+        Column("cf_own_value", "Cf→Cf, own layer", "fraction"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
-    return Table("probe_means", "Probe transfer: means over paths", rows, columns, [], _why(results, rows))
+    notes = _shared_controls(results)
+    return Table("probe_means", "Probe transfer: means over paths", rows, columns, notes, _why(results, rows))
+
+
+def _held_out(results: Results) -> list[Column]:
+    return [Column("held_out_value", "Held out", "fraction")] if results.is_study else []
+
+
+def _shared_controls(results: Results) -> list[str]:
+    """What is to be known of cross-modality pairs."""
+    notes = [
+        "cross-modality: the two datasets have the same control items, so half of the target’s rows are in the fit"
+    ]
+    return notes + ["held out: at the best layer, fitted without the scenario that is scored"] * results.is_study
 
 
 def _within(results: Results) -> Table:
@@ -185,15 +201,17 @@ def cosines(results: Results) -> list[Table]:
 def _place(values: Any) -> Any:
     if values.name == "name":
         return values.map({short: place for place, short in enumerate(SHORT.values())})
-    return values.map({"standard": 0, "guided": 1}) if values.name == "prompt" else values
+    orders = {"prompt": ("standard", "guided"), "kind": ("void", "shuffled", "random")}
+    return values.map(orders[values.name].index) if values.name in orders else values
 
 
 # --- steering ---------------------------------------------------------------------------------------------------------
 
 
 def steering(results: Results) -> list[Table]:
-    """Abstention under steering: regime matrix, families of directions, domains, the largest alpha, dose, layers."""
+    """Abstention under steering: in all, by regimes and families, by domains, at the largest alpha, dose, layers."""
     return [
+        _shares(results),
         _regimes(results, "steering_regimes", "Steering: direction regime against inference regime"),
         _regimes(results, "steering_families", "Steering by the family of the direction (guided, guided)"),
         _domains(results),
@@ -201,6 +219,31 @@ def steering(results: Results) -> list[Table]:
         _dose(results),
         _layers(results),
     ]
+
+
+def _shares(results: Results) -> Table:
+    rows = results.shares
+    rows = rows.loc[(rows["path_set"] == "all") & (rows["directions"] == "all") & (rows["regime"] == "all")]
+    keys = ["model", "kind", "layer", "alpha"]
+    sides = [
+        rows.loc[rows["side"] == side].set_index(keys)[["abstention", "low", "high", "n_answers", "n_scenarios"]]
+        for side in ("control", "void")
+    ]
+    wide = sides[0].add_prefix("control_").join(sides[1].add_prefix("void_"), how="outer").reset_index()
+    wide = wide.sort_values(keys, key=_place, ignore_index=True)
+    columns = [MODEL, KIND, Column("layer", "Layer", "count"), Column("alpha", "α", "count")]
+    for side in ("control", "void"):
+        columns += [
+            Column(f"{side}_abstention", f"{side.capitalize()}s abstained on %", "percent"),
+            Column(f"{side}_low", "from", "percent"), Column(f"{side}_high", "to", "percent"),
+            Column(f"{side}_n_answers", "Answers", "count"), Column(f"{side}_n_scenarios", "Scenarios", "count"),
+        ]  # fmt: skip
+    notes = [
+        "mean over all paths and regimes; answers: different ones, which may each stand in several paths",
+        "from, to: 95 %, scenarios resampled, not answers; where all scenarios say the same it has no width",
+    ]
+    why = _why(results, wide) if results.is_study else "the paper prints no answers to resample"
+    return Table("steering_shares", "Steering in all, with intervals by scenario", wide, columns, notes, why)
 
 
 def _regimes(results: Results, name: str, title: str) -> Table:
@@ -242,9 +285,19 @@ def _top(results: Results) -> Table:
 def _dose(results: Results) -> Table:
     rows = _named(effects.paths(results.effects))
     columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, Column("layer", "Layer", "count")]
-    columns += [Column("alpha", "α", "count"), *_SIDES]
+    columns += [Column("alpha", "α", "count")]
+    for side in _SIDES:
+        columns += [side]
+        if results.is_study:
+            columns += [
+                Column(f"{side.field}_{end}", word, "percent") for end, word in (("low", "from"), ("high", "to"))
+            ]
     counts = results.effects["n"].dropna()
-    notes = [epochs(results.effects), f"n = {counts.max():.0f} answers a cell at most" if len(counts) else ""]
+    notes = [
+        epochs(results.effects),
+        f"n = {counts.max():.0f} answers a cell at most, one a scenario" if len(counts) else "",
+        "from, to: 95 %, Wilson" if results.is_study else "",
+    ]
     return Table("steering_dose", "Dose and response", rows, columns, [n for n in notes if n], _why(results, rows))
 
 

@@ -30,6 +30,7 @@ SHARES = (
 )
 PECS = Column("pecs", "PECS", "fraction", spread="pecs_std", mark="mark")
 COUNTS = (N, RUNS, MISSING)
+COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
 
 def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
@@ -43,9 +44,32 @@ def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
 
 def marked(rows: Frame) -> Frame:
     """With `mark`: ‡ on incomplete rows, † on others that miss some items."""
-    incomplete = rows["incomplete"].fillna(False).astype(bool).to_numpy()
+    incomplete = rows["incomplete"].eq(True).to_numpy(bool)
     missing = rows["n_missing"].fillna(0).to_numpy(float) > 0
     return rows.assign(mark=np.where(incomplete, INCOMPLETE_MARK, np.where(missing, MISSING_MARK, "")))
+
+
+def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """COUNTED of a comparison of entries: pairs and runs of the one that has fewest, what all of them miss."""
+    if not sides:
+        return dict.fromkeys(COUNTED)
+    counts = {name: min(side[name] for side in sides) for name in ("n_pairs", "n_runs")}
+    missing = sum(side["n_missing"] for side in sides)
+    return {**counts, "n_missing": missing, "incomplete": any(side["incomplete"] for side in sides)}
+
+
+def counted(rows: Frame, entries: Frame, sides: Sequence[Sequence[str]]) -> Frame:
+    """Rows that compare entries, `marked` and with COUNTED. sides: the columns of rows that hold model, regime and
+    dataset of either side; entries: cells, and those of the dataset `overall`."""
+    known = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
+    keys = [[tuple(row[name] for name in side) for side in sides] for row in rows.to_dict("records")]
+    counts = [together([known[key] for key in of_row if key in known]) for of_row in keys]
+    return marked(rows.join(pd.DataFrame(counts, index=rows.index, columns=pd.Index(COUNTED))))
+
+
+def entries(results: Results) -> Frame:
+    """The cells, and below them the overall rows as those of a dataset `overall`."""
+    return pd.concat([results.cells, results.overall.assign(dataset="overall")], ignore_index=True)
 
 
 def marks(rows: Frame) -> list[str]:

@@ -9,9 +9,13 @@ from traps_pipeline.partitions import taxonomy_of
 from traps_pipeline.report.page import SIDE_OF, TITLES
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
+    MISSING,
+    PECS,
     SHARES,
     N,
     epochs,
+    marked,
+    marks,
 )
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
 from traps_pipeline.scoring import Frame, analyses
@@ -25,11 +29,12 @@ def occlusion_sub_scenarios(results: Results) -> list[Table]:
     if len(rows):
         hidden = analyses.hidden_against_others(rows)
     columns = [
-        Column("kind", "Sub-scenarios"), Column("n", "Sub-scenarios", "count"),
+        Column("kind", "Sub-scenarios"), Column("n", "Number", "count"),
         Column("abs_rec", "AbsRec %, standard", "percent"), Column("guided_abs_rec", "AbsRec %, guided", "percent"),
     ]  # fmt: skip
-    columns[1] = Column("n", "Number", "count")
     notes = [epochs(rows), "unweighted means over sub-scenarios", f"hidden: {', '.join(analyses.HIDDEN)}"]
+    if results.is_study:
+        columns += [N, MISSING]
     title = "Hidden sub-scenarios against the others"
     why = results.why("sub_scenarios")
     return [*tables, Table("hidden_sub_scenarios", title, hidden, columns, notes, why, _sub_trace("occlusion"))]
@@ -44,7 +49,7 @@ def chaotic_sub_scenarios(results: Results) -> list[Table]:
     columns = [Column("title", "Dataset"), Column("label", "Ground truth"), Column("acc", "Acc %", "percent")]
     notes = ["mean over models under standard"]
     if results.is_study:
-        columns += [N, Column("n_models", "Models", "count")]
+        columns += [N, Column("n_models", "Models", "count"), MISSING]
     else:
         notes.append("from the paper's text, some of them approximate; epoch original")
     why = results.why("labels")
@@ -57,21 +62,25 @@ def chaotic_sub_scenarios(results: Results) -> list[Table]:
 
 def _sub_rows(results: Results, taxonomy: str) -> Frame:
     rows = results.sub_scenarios
-    rows = rows.loc[rows["dataset"] == taxonomy]
+    rows = marked(rows.loc[rows["dataset"] == taxonomy].assign(incomplete=False))
     return rows.sort_values(["acc", "sub_scenario"], ignore_index=True)
 
 
 def _sub_table(results: Results, rows: Frame, name: str, title: str) -> Table:
     columns = [
         Column("sub_scenario", "Sub-scenario"), Column("answer_type", "Answer"), N,
-        Column("n_models", "Models", "count"), *SHARES, Column("pecs", "PECS", "fraction"),
+        Column("n_models", "Models", "count"), *SHARES, PECS,
         Column("guided_abs_rec", "AbsRec %, guided", "percent"), Column("guided_pecs", "PECS, guided", "fraction"),
         Column("abs_rec_uplift", "Δ AbsRec, guided", "percent"),
         Column("false_abs_uplift", "Δ FalseAbs, guided", "percent"),
         Column("abs_rec_ill_posed", "AbsRec %, ill-posed", "percent"),
-        Column("textual_over_visual", "Textual / visual", "ratio"),
+        Column("textual_over_visual", "Textual / visual", "ratio"), MISSING,
     ]  # fmt: skip
     notes = [epochs(rows), "means over models" + (_left_out(results)), "standard, where no regime is named"]
+    fewer = {"guided": "guided_n_models", "Δ": "uplift_n_models", "ill-posed": "ill_posed_n_models"}
+    if any(((rows[name] != rows["n_models"]) & (rows[name] > 0)).any() for name in fewer.values()):
+        columns += [Column(name, f"Models, {what}", "count") for what, name in fewer.items()]
+    notes += marks(rows)
     taxonomy = "occlusion" if name.startswith("occlusion") else "chaotic"
     return Table(name, title, rows, columns, notes, results.why("sub_scenarios"), _sub_trace(taxonomy))
 
@@ -81,9 +90,9 @@ def _left_out(results: Results) -> str:
 
 
 def _sub_trace(taxonomy: str) -> Trace:
-    def trace(row: Mapping[str, Any], field: str) -> Behind | None:
-        if field in ("n_pairs", "n_models", "n"):
-            return None
+    def trace(row: Mapping[str, Any], field: str) -> Behind:
+        if field in ("n_pairs", "n_models", "n", "n_missing"):
+            return Behind(taxonomy)
         regime = "guided" if field.startswith("guided_") else "standard"
         ill_posed = field == "abs_rec_ill_posed"
         dataset = str(row.get("dataset") or taxonomy)

@@ -1,0 +1,72 @@
+"""Abstention over many paths: answers that stand in several count once as answers, and intervals resample scenarios."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+
+from traps_pipeline.mechanism.paths import STEERING_PATHS
+from traps_pipeline.mechanism.shares import share_rows
+from traps_pipeline.mechanism.steering import UNSTEERED, shared_item
+from traps_pipeline.partitions import DATASETS, taxonomy_of
+
+ABSTAINS = "s0"  # of two scenarios the one on whose void the model always abstains
+
+
+def study(scenarios: tuple[str, ...] = ("s0", "s1")) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Answers and votes of all 14 paths at alpha 0 and 10, one regime."""
+    asked = [(target, UNSTEERED, UNSTEERED, 0, 0.0) for target in DATASETS]
+    asked += [(target, source, "void", 3, 10.0) for source, target in STEERING_PATHS]
+    rows = []
+    for target, source, kind, layer, alpha in asked:
+        for scenario in (f"{taxonomy_of(target)}-{name}" for name in scenarios):
+            for side in ("control", "void"):
+                item = {"dataset": target, "scenario_id": scenario, "side": side}
+                rows.append(
+                    item
+                    | {"item_id": f"{target}:{scenario}:{side}", "source": source, "kind": kind, "layer": layer}
+                    | {"alpha": alpha, "request_key": f"{shared_item(item)} {source} {alpha}"}
+                    | {"abstained": side == "void" and scenario.endswith(ABSTAINS)}
+                )
+    frame = pd.DataFrame(rows).assign(model="m", directions="guided", regime="guided", epoch="e", alpha_relative=0.1)
+    return frame.drop(columns="abstained"), frame
+
+
+def whole(rows: list[dict[str, object]]) -> pd.DataFrame:
+    frame = pd.DataFrame(rows).query("path_set == 'all' and directions == 'all' and regime == 'all'")
+    return frame.set_index(["side", "alpha"])
+
+
+def test_an_answer_that_stands_in_several_paths_is_one_answer_about_one_scenario() -> None:
+    shares = whole(share_rows(*study(), resamples=200))
+    assert (shares["n_paths"] == 14).all() and (shares["n"] == 28).all()
+    # 2 scenarios: 4 targets' voids as they are; 4 sources' directions on the controls of 2 taxonomies; 14 paths' voids
+    assert shares["n_answers"].to_dict() == {
+        ("control", 0.0): 4, ("control", 10.0): 16, ("void", 0.0): 8, ("void", 10.0): 28,
+    }  # fmt: skip
+    assert set(shares["n_scenarios"]) == {4}
+    assert shares["abstention"].to_dict() == {
+        ("control", 0.0): 0, ("control", 10.0): 0, ("void", 0.0): 0.5, ("void", 10.0): 0.5,
+    }  # fmt: skip
+
+
+def test_its_interval_is_as_wide_as_the_scenarios_are_few() -> None:
+    """One scenario of two abstains throughout: a resample of two has 0, 1 or 2 of it in each taxonomy, whatever the
+    number of paths; 28 independent answers would have given 0.33 to 0.67."""
+    void = whole(share_rows(*study(), resamples=2000)).loc[("void", 10.0)]
+    assert (void["low"], void["high"]) == (0.0, 1.0)
+    control = whole(share_rows(*study(), resamples=2000)).loc[("control", 10.0)]
+    assert (control["low"], control["high"]) == (0.0, 0.0)
+
+
+def test_undecided_answers_and_the_sweep_are_left_out() -> None:
+    answers, votes = study()
+    votes["abstained"] = votes["abstained"].astype(object)
+    votes.loc[votes["scenario_id"] == "chaotic-s1", "abstained"] = None
+    shares = whole(share_rows(answers, votes, resamples=50))
+    assert set(shares["n_scenarios"]) == {3}
+    assert shares["abstention"]["void", 10.0] == pytest.approx((7 * 0.5 + 7 * 1) / 14)
+    deep = [frame.assign(layer=5, kind="void") for frame in study() if frame is not None]
+    sweep = [frame.loc[(frame["alpha"] == 10) & (frame["side"] == "control")] for frame in deep]
+    both = [pd.concat(pair, ignore_index=True) for pair in zip(study(), sweep, strict=True)]
+    assert set(whole(share_rows(*both, resamples=50))["layer"]) == {3}

@@ -1,0 +1,116 @@
+"""How often a steered model abstains: a path at a time, and over the paths of a set, from STEERING and STEERING_VOTES
+rows (`benchmark.md` section 8).
+
+A path asks each scenario once, so its Wilson interval is one over scenarios. Over paths the same scenario is asked
+again and again, and the same answer counts in several: there scenarios are resampled, not answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Any, cast
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS
+from traps_pipeline.mechanism.steering import UNSTEERED
+from traps_pipeline.partitions import taxonomy_of, transfer_type
+from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, TAXONOMIES, percentiles, scenario_weights
+from traps_pipeline.scoring.metrics import wilson
+
+Rows = list[dict[str, Any]]
+ALL = "all"
+_RUN = ["model", "directions", "regime"]
+_ROW = [*_RUN, "dataset", "source", "kind", "layer", "alpha", "item_id"]
+_PATH = [*_RUN, "dataset", "source", "kind", "layer", "alpha", "side"]
+_PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
+
+
+def _answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
+    """An answer with its vote, a row in every path that it belongs to: the model as it is (alpha 0) in each."""
+    copied = ["side", "scenario_id", "alpha_relative", "request_key", "epoch"]
+    joined = answers[[*_ROW, *copied]].merge(votes[[*_ROW, "abstained"]], on=_ROW, how="left", validate="one_to_one")
+    steered = joined.loc[joined["kind"] != UNSTEERED]
+    plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=["source", "kind", "layer"])
+    paths = steered[[*_RUN, "dataset", "source", "kind", "layer", "side"]].drop_duplicates()
+    return pd.concat([steered, plain.merge(paths, on=[*_RUN, "dataset", "side"])], ignore_index=True)
+
+
+def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> Rows:
+    """Rows of STEERING_EFFECTS: abstention by path, kind, layer, alpha and side."""
+    rows: Rows = []
+    for key, group in _answers_of_paths(answers, votes).groupby(_PATH, sort=True):
+        model, directions, regime, target, source, kind, layer, alpha, side = cast(tuple[Any, ...], key)
+        decided = group["abstained"].dropna().to_numpy(bool)
+        n, yes = len(decided), int(np.count_nonzero(decided))
+        low, high = wilson(np.array([yes]), np.array([n]))
+        relative = group["alpha_relative"].dropna()
+        rows.append(
+            {
+                **{"model": model, "directions": directions, "regime": regime, "source": source, "target": target},
+                **{"transfer_type": transfer_type(str(source), str(target)), "kind": kind, "layer": layer},
+                **{"alpha": alpha, "alpha_relative": float(relative.iloc[0]) if len(relative) else None},
+                **{"side": side, "n": n, "n_missing": len(group) - n, "abstained": yes},
+                **{"abstention": yes / n if n else None, "low": float(low[0]), "high": float(high[0])},
+                "epoch": "+".join(sorted(set(group["epoch"]))),
+            }
+        )
+    return rows
+
+
+def share_rows(answers: pd.DataFrame, votes: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> Rows:
+    """Rows of STEERING_SHARES: mean abstention over the paths of a set, of each regime of directions and of answers and
+    over all of them, with the interval from resampling scenarios (all paths of a resample share its scenarios)."""
+    decided = _answers_of_paths(answers, votes).dropna(subset=["abstained"])
+    decided = decided.merge(decided.loc[decided["side"] == "void", ["model", "layer"]].drop_duplicates())  # no sweep
+    rows: Rows = []
+    for _, of_model in decided.groupby("model", sort=True):
+        paths = pd.DataFrame(of_model[_PATH]).drop_duplicates(ignore_index=True)
+        numbered = of_model.merge(paths.reset_index(names="path"), on=_PATH)
+        shares, draws = _shares(numbered, len(paths), resamples, seed)
+        for said, chosen in _pools(paths):
+            mine = numbered.loc[np.isin(numbered["path"], chosen)]
+            low, high = percentiles(draws[chosen].mean(axis=0))
+            rows.append(
+                {
+                    **said,
+                    **{"n_paths": len(mine[["source", "dataset"]].drop_duplicates()), "n": len(mine)},
+                    **{"n_answers": mine["request_key"].nunique(), "n_scenarios": mine["scenario_id"].nunique()},
+                    **{"abstention": float(shares[chosen].mean()), "low": float(low), "high": float(high)},
+                    "epoch": "+".join(sorted(set(mine["epoch"]))),
+                }
+            )
+    return rows
+
+
+def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The share of each path, (paths,), and in every resample, (paths, resamples); NaN where a resample has none."""
+    shares, draws = np.empty(n_paths), np.empty((n_paths, resamples))
+    taxonomies = numbered["dataset"].map(taxonomy_of)
+    for k, taxonomy in enumerate(TAXONOMIES):
+        mine = numbered.loc[taxonomies == taxonomy]
+        scenario, names = pd.factorize(mine["scenario_id"], sort=True)
+        path, chosen = pd.factorize(mine["path"])
+        asked, abstained = np.zeros((2, len(chosen), len(names)), np.float32)
+        np.add.at(asked, (path, scenario), 1)
+        np.add.at(abstained, (path, scenario), mine["abstained"].to_numpy(bool))
+        shares[chosen] = abstained.sum(axis=1) / asked.sum(axis=1)
+        weights = scenario_weights(len(names), resamples, [seed, k]).T
+        with np.errstate(invalid="ignore"):
+            draws[chosen] = (abstained @ weights) / (asked @ weights)
+    return shares, draws
+
+
+def _pools(paths: pd.DataFrame) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """What is averaged: its columns, and the rows of `paths`."""
+    pairs = pd.Series(list(zip(paths["source"], paths["dataset"], strict=True)), index=paths.index)
+    every = {name: [ALL, *sorted(set(paths[name]))] for name in ("directions", "regime")}
+    for (path_set, members), directions, regime in product(_PATH_SETS.items(), every["directions"], every["regime"]):
+        inside = pairs.isin(members)
+        for name, value in (("directions", directions), ("regime", regime)):
+            inside &= (paths[name] == value) | (value == ALL)
+        for key, group in paths.loc[inside].groupby(["model", "kind", "layer", "alpha", "side"], sort=True):
+            said = dict(zip(("model", "kind", "layer", "alpha", "side"), cast(tuple[Any, ...], key), strict=True))
+            yield said | {"path_set": path_set, "directions": directions, "regime": regime}, group.index.to_numpy()

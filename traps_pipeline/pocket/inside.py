@@ -1,0 +1,210 @@
+"""What the mechanistic stages find in the pocket model, of several training seeds, as the table that ships."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.paths import TRANSFER_TYPES
+from traps_pipeline.mechanism.shares import ALL
+from traps_pipeline.models.local.checkpoint import as_folder, folder_digest
+from traps_pipeline.partitions import transfer_type
+from traps_pipeline.pocket.evaluate import MODEL
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
+
+FACTS = "training.json"  # beside the folder of the weights
+KINDS = ("void", "shuffled", "random")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of one training seed; empty where a column says nothing about it.
+
+    figure: transfer_best and transfer_source (AUROC of a pair at the layer that is best on the target, and at the
+    source's own), held_out_best and held_out_source (the same, fitted without the scored scenario), shuffled,
+    answerable_void, answerable_control (at the source's own layer), abstention (over all paths and regimes). low, high:
+    95 %, scenarios resampled. answers: different ones.
+    """
+
+    seed: int
+    weights: str
+    figure: str
+    source: str = ""
+    target: str = ""
+    kind: str = ""
+    layer: int | None = None
+    alpha: float | None = None
+    side: str = ""
+    value: float = 0.0
+    low: float | None = None
+    high: float | None = None
+    answers: int | None = None
+    scenarios: int | None = None
+
+
+FIELDS = tuple(field.name for field in fields(Figure))
+
+
+def figures_of(workspace: Workspace) -> list[Figure]:
+    """The figures of a finished workspace. Raises TrapsError when stages are missing, or when nothing says which seed
+    its weights are of."""
+    of = _seed_of(workspace)
+    probes = workspace.tables.read(PROBES, {"model": MODEL, "prompt": "standard"})
+    probes = probes.loc[probes["value"].notna() & (probes["scope"] == "all")]
+    found: list[Figure] = []
+    for figure, analysis, flag in (
+        ("transfer_best", "transfer", "own_best"),
+        ("transfer_source", "transfer", "source_best"),
+        ("held_out_best", "held_out", "all_sample_best"),
+        ("held_out_source", "held_out", "source_best"),
+        ("answerable_void", "answerable_void", "source_best"),
+        ("answerable_control", "answerable_control", "source_best"),
+    ):
+        rows = probes.loc[(probes["analysis"] == analysis) & probes[flag]]
+        copied = ["source", "target", "layer", "value", "low", "high"]
+        found += [Figure(**of, figure=figure, **row) for row in _records(rows[copied])]
+    shuffled = probes.loc[probes["analysis"] == "shuffled"].groupby("source")["value"].mean().reset_index()
+    found += [Figure(**of, figure="shuffled", **row) for row in _records(shuffled)]
+    shares = workspace.tables.read(STEERING_SHARES, {})
+    over_all = (shares[["path_set", "directions", "regime"]] == ALL).all(axis=1) & (shares["model"] == MODEL)
+    shares = shares.rename(columns={"abstention": "value", "n_answers": "answers", "n_scenarios": "scenarios"})
+    copied = ["kind", "layer", "alpha", "side", "value", "low", "high", "answers", "scenarios"]
+    return found + [Figure(**of, figure="abstention", **row) for row in _records(shares.loc[over_all, copied])]
+
+
+def _records(rows: Any) -> list[dict[str, Any]]:
+    """Rows as plain numbers, rounded to what a CSV should hold."""
+    return json.loads(rows.to_json(orient="records", double_precision=6))
+
+
+def _seed_of(workspace: Workspace) -> dict[str, Any]:
+    """Training seed and digest of the weights that a workspace looked into."""
+    states = workspace.tables.read_all(HIDDEN_STATES, ["checkpoint", "checkpoint_digest"], model=MODEL)
+    found = sorted(set(zip(states["checkpoint"], states["checkpoint_digest"], strict=True)))
+    if len(found) != 1:
+        raise TrapsError(
+            f"{workspace.root}: has hidden states of {len(found)} checkpoints of {MODEL}, one is wanted; run "
+            "`traps run mechanism` in a workspace of its own for each seed"
+        )
+    ((name, known),) = found
+    folder = as_folder(name)
+    if folder is None or not folder.is_dir() or folder_digest(folder) != known:
+        raise TrapsError(
+            f"{workspace.root}: was made with a checkpoint {name} ({known[:12]}), and other weights or none lie there "
+            "now; run `traps run mechanism` again with the weights of the seed"
+        )
+    facts = folder.parent / FACTS
+    try:
+        told = json.loads(facts.read_text(encoding="utf-8"))
+        return {"seed": int(told["seed"]), "weights": str(told["weights"])[:12]}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise TrapsError(
+            f"{facts}: does not say which seed these weights are of ({error}); `traps pocket train` writes it"
+        ) from error
+
+
+def write_figures(path: Path, figures: Sequence[Figure]) -> None:
+    """Write figures as CSV, in the place of those of the same seeds."""
+    seeds = {figure.seed for figure in figures}
+    kept = [figure for figure in (read_figures(path) if path.is_file() else []) if figure.seed not in seeds]
+    part = path.with_suffix(".part")
+    with part.open("w", encoding="utf-8", newline="") as stream:
+        table = csv.DictWriter(stream, FIELDS, lineterminator="\n")
+        table.writeheader()
+        table.writerows(asdict(figure) for figure in sorted([*kept, *figures], key=lambda figure: figure.seed))
+    part.replace(path)
+
+
+def read_figures(path: Path) -> list[Figure]:
+    """The figures of a CSV of `write_figures`. Raises TrapsError."""
+    integers, numbers = ("seed", "layer", "answers", "scenarios"), ("alpha", "value", "low", "high")
+    of: Mapping[str, Callable[[str], Any]] = {**dict.fromkeys(integers, int), **dict.fromkeys(numbers, float)}
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            return [
+                Figure(**{name: of.get(name, str)(row[name]) for name in FIELDS if row[name]})
+                for row in csv.DictReader(stream)
+            ]
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise TrapsError(
+            f"{path}: no table of `traps pocket card --mechanism` ({error}); write it again from the workspaces"
+        ) from error
+
+
+# --- the model card ---------------------------------------------------------------------------------------------------
+
+
+def markdown(figures: Sequence[Figure]) -> str:
+    """The model card's tables: mean over training seeds, with the lowest and the highest of several."""
+    seeds = sorted({figure.seed for figure in figures})
+    return "\n".join([*_probes(figures), "", *_steering(figures), "", f"Training seeds: {', '.join(map(str, seeds))}."])
+
+
+def _probes(figures: Sequence[Figure]) -> list[str]:
+    lines = ["| AUROC of probes | best layer | its layers | source's own layer | its layers |", "|" + " --- |" * 5]
+    for crossing, said, analysis in (
+        *((crossing, crossing, "transfer") for crossing in TRANSFER_TYPES[:3]),
+        (TRANSFER_TYPES[0], f"{TRANSFER_TYPES[0]}, fitted without the scored scenario", "held_out"),
+    ):
+        columns = [said]
+        for name in (f"{analysis}_best", f"{analysis}_source"):
+            mine = [f for f in figures if f.figure == name and transfer_type(f.source, f.target) == crossing]
+            columns += [_over_seeds(mine), _layers(mine)]
+        lines.append(f"| {' | '.join(columns)} |")
+    for name, said in (
+        ("shuffled", "label-shuffled, within a dataset, mean over layers"),
+        ("answerable_void", "occlusion's probe: void clips, own question against the answerable one"),
+        ("answerable_control", "occlusion's probe: void clips with the answerable question against controls"),
+    ):
+        mine = [f for f in figures if f.figure == name and (name == "shuffled" or f.source == "occlusion")]
+        lines.append(f"| {said} | | | {_over_seeds(mine)} | {_layers(mine)} |")
+    return lines
+
+
+def _steering(figures: Sequence[Figure]) -> list[str]:
+    mine = [figure for figure in figures if figure.figure == "abstention"]
+    alphas = sorted({figure.alpha for figure in mine if figure.alpha is not None})
+    heads = ["abstained, %", *(f"α {alpha:g}" for alpha in alphas), "95 % at the last", "answers", "scenarios"]
+    lines = [f"| {' | '.join(heads)} |", "|" + " --- |" * len(heads)]
+    for side in ("void", "control"):
+        for kind in KINDS:
+            cells = [[f for f in mine if (f.side, f.kind, f.alpha) == (side, kind, alpha)] for alpha in alphas]
+            if not all(cells):
+                continue
+            top = cells[-1]
+            low, high = (pick(getattr(f, end) for f in top) for pick, end in ((min, "low"), (max, "high")))
+            columns = [f"{side}s, {kind} directions", *(_over_seeds(cell, 100, 1) for cell in cells)]
+            columns += [f"{100 * low:.1f}-{100 * high:.1f}"]
+            columns += [_range(f.answers for f in top), _range(f.scenarios for f in top)]
+            lines.append(f"| {' | '.join(columns)} |")
+    return lines
+
+
+def _over_seeds(figures: Sequence[Figure], times: float = 1, digits: int = 3) -> str:
+    """The mean over seeds, with the lowest and the highest seed of several; a seed's is that over its figures."""
+    by_seed: dict[int, list[float]] = {}
+    for figure in figures:
+        by_seed.setdefault(figure.seed, []).append(times * figure.value)
+    means = [sum(values) / len(values) for values in by_seed.values()]
+    if not means:
+        return "–"
+    mean = f"{sum(means) / len(means):.{digits}f}"
+    return mean if len(means) == 1 else f"{mean} ({min(means):.{digits}f}-{max(means):.{digits}f})"
+
+
+def _layers(figures: Sequence[Figure]) -> str:
+    return _range(figure.layer for figure in figures)
+
+
+def _range(numbers: Any) -> str:
+    """`4`, or `1-4`; empty where there is none."""
+    known = [number for number in numbers if number is not None]
+    if not known:
+        return ""
+    return f"{min(known)}" if min(known) == max(known) else f"{min(known)}-{max(known)}"
