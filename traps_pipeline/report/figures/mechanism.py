@@ -52,6 +52,12 @@ def _key(label: str, face: str) -> Line2D:
     return Line2D([], [], color=SOFT, linestyle="none", marker="o", markersize=4, markerfacecolor=face, label=label)
 
 
+def _bar_key(label: str, width: float = 2.2, color: str = SOFT) -> Line2D:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=color, linewidth=width, solid_capstyle="butt", label=label)
+
+
 def probe_curves(results: Results) -> Figure:
     """AUROC by layer of the twelve ordered pairs, a row a model, a column a kind of transfer; the band is what
     label-shuffled probes within a dataset reach (mean ± 2 deviations over shuffles). Hollow: the source's own layer."""
@@ -72,7 +78,8 @@ def probe_curves(results: Results) -> Figure:
         for ax in axes[-1]:
             ax.set_xlabel("layer (0: embeddings)")
         axes[0, 0].set_ylim(min(0.35, float(curves["value"].min()) - 0.03), 1.02)
-        _legend(figure, _key("source’s own layer", "white"))
+        shuffled = _bar_key("labels shuffled, mean ± 2 sd", 7, GRID)
+        _legend(figure, _key("source’s own layer", "white"), shuffled)
     return figure
 
 
@@ -119,7 +126,7 @@ def confabulated_strip(results: Results) -> Figure:
             ax.set_title(plain(model)[:30], size=7.5)
         lowest = np.nanmin(rows[["best_value", "cf_value"]].to_numpy(float))
         axes[0].set(ylim=(min(0.45, lowest - 0.04), 1.03), ylabel="AUROC on the target")
-        _legend(figure, _key("all samples", "white"), _key("Cf→Cf", SOFT))
+        _legend(figure, _key("all samples", "white"), _key("Cf→Cf", SOFT), _bar_key("median of Cf→Cf"))
     return figure
 
 
@@ -168,7 +175,7 @@ def dose_response(results: Results) -> Figure:
         for line in axes:
             line[0].set_ylabel("abstained, %")
         axes[0, 0].set_ylim(-4, 104)
-        _legend(figure, *([_band_key()] if len(results.shares) else []))
+        _legend(figure, *([_bar_key("mean, 95 % by scenario")] if len(results.shares) else []))
     return figure
 
 
@@ -182,12 +189,6 @@ def _mean_band(ax: Axes, shares: Frame) -> None:
     alphas, percent = shares["alpha"].to_numpy(float), 100 * shares[["low", "high", "abstention"]].astype(float)
     ax.fill_between(alphas, percent["low"], percent["high"], color=GRID, alpha=0.7, linewidth=0, zorder=0.2)
     ax.plot(alphas, percent["abstention"], color=SOFT, linewidth=2.2, zorder=0.3)
-
-
-def _band_key() -> Line2D:
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], color=SOFT, linewidth=2.2, label="mean, 95 % by scenario")
 
 
 def _panels(rows: Frame) -> Mapping[tuple[str, str], Frame]:
