@@ -55,7 +55,7 @@ from traps_pipeline.partitions import (
     SteeringCell,
 )
 from traps_pipeline.report.catalogue import OF_PAPER, OF_STUDY, PRINTED
-from traps_pipeline.report.results import published_digest
+from traps_pipeline.scoring.published import published_digest
 from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace, write_text
 from traps_pipeline.tables import JUDGE_VALIDATION, TABLES

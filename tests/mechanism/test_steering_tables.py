@@ -7,7 +7,7 @@ import pytest
 
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS, TRANSFER_TYPES
-from traps_pipeline.report.results import PublishedResults
+from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables import mechanism
 from traps_pipeline.scoring.published import published
 

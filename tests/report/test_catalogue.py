@@ -19,7 +19,8 @@ from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report import publish
 from traps_pipeline.report.catalogue import FIGURES, OF_PAPER, OF_STUDY, PRINTED, TABLES, workspace_files
 from traps_pipeline.report.figures.abstention import doubt_points
-from traps_pipeline.report.results import PublishedResults, StudyResults
+from traps_pipeline.report.published_results import PublishedResults
+from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.writing import figure_files, freeze_layout, table_files, table_latex
 from traps_pipeline.storage.workspace import Study, Workspace
 from traps_pipeline.tables import CONTRASTS, JUDGE_BIAS, JUDGE_VALIDATION, LEADERBOARD

@@ -106,7 +106,7 @@ def _shortcuts(workspace: Workspace) -> Files:
 def _page(workspace: Workspace) -> Files:
     from traps_pipeline.report.items import FOLDER, write_item_pages
     from traps_pipeline.report.publish import report_files, study_pictures
-    from traps_pipeline.report.results import StudyResults
+    from traps_pipeline.report.study_results import StudyResults
 
     cells = write_item_pages(workspace, workspace.reports / FOLDER, clips="../..")
     return report_files(StudyResults(workspace), cells, study_pictures(workspace))
@@ -156,7 +156,8 @@ def _spec(name: str, report: Report) -> dg.AssetSpec:
 )
 def printed(context: dg.AssetExecutionContext) -> Events:
     """Every selected table and figure, from what is there; what was not run says so."""
-    from traps_pipeline.report.results import PublishedResults, StudyResults
+    from traps_pipeline.report.published_results import PublishedResults
+    from traps_pipeline.report.study_results import StudyResults
 
     workspace = Workspace.open()
     selected = [name for name in PRINTED if dg.AssetKey(name) in context.selected_asset_keys]

@@ -18,7 +18,9 @@ from traps_pipeline.report.page import (
     report_html,
     table_block,
 )
-from traps_pipeline.report.results import PublishedResults, Results, StudyResults
+from traps_pipeline.report.published_results import PublishedResults
+from traps_pipeline.report.results import Results
+from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.writing import Behind, environment, figure_files, write_bytes
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS

@@ -6,6 +6,7 @@ from functools import cache
 
 import pandas as pd
 
+from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.scoring import Frame
@@ -20,6 +21,12 @@ def published(name: str) -> Frame:
     name is the file's stem, e.g. `probe_transfer`. Raises TrapsError that lists the files for another name.
     """
     return _read(name).copy()
+
+
+def published_digest() -> str:
+    """Digest of `assets/published`: everything that the paper's tables and figures are made from."""
+    files = {file.name: file.read_text(encoding="utf-8") for file in sorted(PUBLISHED.glob("*.csv"))}
+    return digest(files)[:16]
 
 
 def published_cells() -> Frame:
