@@ -17,8 +17,9 @@ demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
 demo-mechanism: setup ## the pocket model from hidden states to steering, on the CPU, no key needed
 	TRAPS_WORKSPACE=$(CURDIR)/.workspaces/mechanism $(BIN)/traps run mechanism
 
+# A worker a core: threads of their own would only wait for each other's.
 test: test-packages setup lint ## lint, types and all tests, the slow ones too
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 ui: setup ## Dagster's web server and daemon on 127.0.0.1:3000
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
