@@ -1,4 +1,4 @@
-"""One scenario of every occlusion family is certified on every second of its sampled frames; whatever is altered is found out."""
+"""A scenario of every occlusion family is certified on every second sampled frame; whatever is altered is found out."""
 
 from __future__ import annotations
 
