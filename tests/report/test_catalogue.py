@@ -314,4 +314,4 @@ def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch
     linked = set(re.findall(r'href="([^"]+)"', index))
     assert {path for path in files if path.split("/")[0] in ("tables", "figures")} <= linked
     assert all((tmp_path / path).is_file() for path in linked)
-    assert "not run" in (tmp_path / "report.html").read_text()
+    assert "not run: this study has no leaderboard yet" in (tmp_path / "report.html").read_text()

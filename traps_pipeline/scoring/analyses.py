@@ -88,7 +88,7 @@ def overall(cells: Frame) -> Frame:
     cells = _checked(cells)
     groups = cells.groupby(["model", "regime"], sort=False)
     whole = cells[groups["dataset"].transform("nunique") == cells["dataset"].nunique()]
-    return whole.groupby(["model", "regime"], sort=False)[SHARES].agg(mean).reset_index()
+    return _means(whole.groupby(["model", "regime"], sort=False), SHARES).reset_index()
 
 
 def uplift(cells: Frame, means: Frame | None = None) -> Frame:
@@ -288,7 +288,7 @@ def hidden_against_others(table: Frame, columns: Sequence[str] = ("abs_rec", "gu
     kind = np.where(table["sub_scenario"].isin(HIDDEN), "hidden", "other")
     groups = table.groupby(kind)
     sums = {name: groups[name].sum(min_count=1) for name in ("n_pairs", "n_missing") if name in table}
-    return groups[list(columns)].agg(mean).assign(n=groups.size(), **sums).rename_axis("kind").reset_index()
+    return _means(groups, columns).assign(n=groups.size(), **sums).rename_axis("kind").reset_index()
 
 
 def accuracy_by_label(cells: Frame) -> Frame:
@@ -312,6 +312,12 @@ def ratio(numerator: Any, denominator: Any) -> np.ndarray:
     top, bottom = numerator.to_numpy(float), denominator.to_numpy(float)
     with np.errstate(divide="ignore", invalid="ignore"):
         return top / bottom
+
+
+def _means(groups: Any, columns: Sequence[str]) -> Frame:
+    """Means of columns of a pandas groupby, null where any value is."""
+    values = groups[list(columns)]
+    return values.mean().where(values.count().eq(groups.size(), axis="index"))
 
 
 def _checked(cells: Frame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> Frame:
