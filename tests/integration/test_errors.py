@@ -163,7 +163,7 @@ def test_a_full_disk_ends_in_a_sentence_and_the_same_command_goes_on(study: Chec
     subprocess.run(["cp", "-r", f"{small_disk}/.", more], check=True)
     ledger.unlink()
     ledger.symlink_to(more, target_is_directory=True)
-    finished = study.traps("run", EXPERIMENT, "--until", "responses")
+    finished = study.score(EXPERIMENT)
     assert finished.code == 0, finished.err
     rows = study.ledger_rows("answers")
     assert len({row["key"] for row in rows}) == len(rows) == 288  # 3 models x 2 regimes x 48 items

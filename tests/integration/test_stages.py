@@ -1,4 +1,4 @@
-"""Every stage on its own through Dagster's own command, and its exit codes."""
+"""Every stage on its own, through Dagster's own command or its library, and the exit codes of the command."""
 
 from __future__ import annotations
 

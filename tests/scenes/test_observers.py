@@ -3,8 +3,6 @@ clip is. One scenario of every family, on its sampled frames."""
 
 from __future__ import annotations
 
-from itertools import cycle
-
 import numpy as np
 import pytest
 
@@ -38,11 +36,12 @@ def test_the_observer_answers_the_control_and_abstains_on_the_void(scenario_id: 
         assert observe(padded, question) is None
 
 
-@pytest.mark.parametrize(("scenario_id", "rgb"), [*zip(first_of_each("occluder"), cycle((MAGENTA, OLIVE)))])
-def test_the_colour_of_the_panel_tells_the_observer_nothing(scenario_id: str, rgb: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("scenario_id", first_of_each("occluder"))
+def test_the_colour_of_the_panel_tells_the_observer_nothing(scenario_id: str) -> None:
     case = load(scenario_id)
     assert case.family.observe is not None
-    assert case.family.observe(case.void_frames(rgb), case.spec.question) is None
+    for rgb in (MAGENTA, OLIVE):
+        assert case.family.observe(case.void_frames(rgb), case.spec.question) is None
 
 
 def _with_panel_elsewhere(scenario_id: str, frames: np.ndarray) -> np.ndarray:
