@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.partitions import REGIMES
 from traps_pipeline.pocket.data import SceneRecord, read_shards
 from traps_pipeline.pocket.recipe import Recipe
+from traps_pipeline.pocket.seeds import write_seeds
 from traps_pipeline.scoring.metrics import wilson
 
 if TYPE_CHECKING:
@@ -158,15 +159,7 @@ FIELDS = tuple(Cell.__dataclass_fields__)
 
 def write_cells(path: Path, cells: Sequence[Cell]) -> None:
     """Write counts as CSV, in the place of those of the same seeds."""
-    seeds = {cell.seed for cell in cells}
-    kept = [cell for cell in (read_cells(path) if path.is_file() else []) if cell.seed not in seeds]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    with part.open("w", encoding="utf-8", newline="") as stream:
-        table = csv.DictWriter(stream, FIELDS, lineterminator="\n")
-        table.writeheader()
-        table.writerows(asdict(cell) for cell in sorted([*kept, *cells], key=lambda cell: cell.seed))
-    part.replace(path)
+    write_seeds(path, cells, read_cells)
 
 
 def read_cells(path: Path) -> list[Cell]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from traps_pipeline.mechanism.shares import ALL
 from traps_pipeline.models.local.checkpoint import as_folder, folder_digest
 from traps_pipeline.partitions import transfer_type
 from traps_pipeline.pocket.evaluate import MODEL
+from traps_pipeline.pocket.seeds import write_seeds
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 
@@ -111,14 +112,7 @@ def _seed_of(workspace: Workspace) -> dict[str, Any]:
 
 def write_figures(path: Path, figures: Sequence[Figure]) -> None:
     """Write figures as CSV, in the place of those of the same seeds."""
-    seeds = {figure.seed for figure in figures}
-    kept = [figure for figure in (read_figures(path) if path.is_file() else []) if figure.seed not in seeds]
-    part = path.with_suffix(".part")
-    with part.open("w", encoding="utf-8", newline="") as stream:
-        table = csv.DictWriter(stream, FIELDS, lineterminator="\n")
-        table.writeheader()
-        table.writerows(asdict(figure) for figure in sorted([*kept, *figures], key=lambda figure: figure.seed))
-    part.replace(path)
+    write_seeds(path, figures, read_figures)
 
 
 def read_figures(path: Path) -> list[Figure]:
