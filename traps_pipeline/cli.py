@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -83,7 +84,9 @@ def build_parser() -> argparse.ArgumentParser:
         default=None,
         help="ask models that have no price in the registry",
     )
-    running.add_argument("--until", metavar="STAGE", help="stop after this stage, such as responses")
+    running.add_argument(
+        "--until", metavar="STAGES", help="make these (with commas between) and what they are made from, no more"
+    )
     add("status", status, "what is there, missing and stale, and why").add_argument("experiment", nargs="?")
     add("why", why, "why an item's answers stand or will be asked again").add_argument(
         "item", help="dataset:scenario:side"
@@ -293,14 +296,17 @@ def _plan_line(name: str, counts: tuple) -> str:
 
 def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
-    from traps_pipeline.driver import run_experiment
     from traps_pipeline.progress import Tally, TerminalProgress, clock, reporting
 
     experiment = _experiment(arguments)
     workspace = _allow(_create(arguments, experiment), experiment, arguments)
+    from traps_pipeline.orchestration.run import dagster_history, failed_checks, stages_until, walk
+
+    stages = stages_until(arguments.until)
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
-    with reporting(TerminalProgress()) as progress:
-        outcome = run_experiment(workspace, experiment, arguments.until)
+    with reporting(TerminalProgress()) as progress, dagster_history(workspace) as instance:
+        outcome = walk(instance, workspace, stages, experiment=experiment.name)
+    problems = [*dict.fromkeys([*outcome.problems, *failed_checks(workspace, experiment.name)])]
     total = progress.totals
     asked, voted, drawn = (total.get(stage, Tally()) for stage in ("responses", "votes", "videos"))
     print(
@@ -315,11 +321,11 @@ def run(arguments: argparse.Namespace) -> int:
             f"inside models: {states.asked} items extracted, {steered.asked} steered answers asked "
             f"({steered.cached} from the ledger), {judged.asked} votes on them"
         )
-    if outcome.problems:
-        for problem in outcome.problems:
+    if problems:
+        for problem in problems:
             print(f"traps: {problem}", file=sys.stderr)
         print(
-            f"traps: {len(outcome.problems)} problem(s); what is done is kept: run the same command to go on",
+            f"traps: {len(problems)} problem(s); what is done is kept: run the same command to go on",
             file=sys.stderr,
         )
         return OVER_BUDGET if outcome.over_budget else FAILED
@@ -377,20 +383,21 @@ def _print_results(workspace: Workspace) -> None:
 
 def status(arguments: argparse.Namespace) -> int:
     """See `traps status --help`."""
-    from traps_pipeline.definitions import observe_sources
-    from traps_pipeline.driver import dagster_history, wanted_keys
-    from traps_pipeline.lineage import STAGES
+    workspace = _open(_root(arguments))
+    experiment = _experiment(arguments).name if arguments.experiment else None
+    if experiment is not None and experiment not in workspace.study.experiments:
+        raise TrapsError(f"{workspace.root}/study.yaml: has no experiment {experiment!r}; traps init {experiment} adds it")
+    from traps_pipeline.orchestration.history import History
+    from traps_pipeline.orchestration.lineage import Lineage
+    from traps_pipeline.orchestration.run import dagster_history
     from traps_pipeline.plan import stage_statuses
 
-    workspace = _open(_root(arguments))
-    experiment = _experiment(arguments) if arguments.experiment else None
-    wanted = {stage: wanted_keys(workspace, experiment, stage) for stage in STAGES} if experiment else None
+    lineage = Lineage(workspace)
     with dagster_history(workspace) as instance:
-        observe_sources(instance, workspace)  # so that Dagster's UI shows the same partitions stale
-    print(f"workspace {workspace.root}\n{'stage':<24} {'fresh':>6} {'stale':>6} {'missing':>8}")
-    for row in stage_statuses(workspace, wanted):
-        missing = f"{row.missing:>8}" if wanted else f"{'-':>8}"
-        print(f"{row.stage:<24} {row.fresh:>6} {len(row.stale):>6} {missing}")
+        History(instance, lineage.graph).observe(lineage)  # so that Dagster's UI shows the same partitions stale
+    print(f"workspace {workspace.root}\n{'stage':<34} {'fresh':>6} {'stale':>6} {'missing':>8}")
+    for row in stage_statuses(workspace, lineage, experiment):
+        print(f"{row.stage:<34} {row.fresh:>6} {len(row.stale):>6} {row.missing:>8}")
         for key, reasons in list(row.stale.items())[:SHOWN]:
             print(f"    {key}: {'; '.join(reasons[:3])}{' ...' if len(reasons) > 3 else ''}")
         if len(row.stale) > SHOWN:
@@ -561,7 +568,16 @@ def _root(arguments: argparse.Namespace) -> Path:
 def _open(root: Path) -> Workspace:
     from traps_pipeline.storage.workspace import Workspace
 
-    return Workspace.open(root)
+    return _entered(Workspace.open(root))
+
+
+def _entered(workspace: Workspace) -> Workspace:
+    """The workspace, named to everything that this process loads and starts: partition keys are those of its study."""
+    from traps_pipeline.storage.workspace import VARIABLE
+
+    os.environ[VARIABLE] = str(workspace.root)
+    os.environ.setdefault("DAGSTER_HOME", str(workspace.dagster_home))
+    return workspace
 
 
 def _create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
@@ -571,7 +587,11 @@ def _create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
     experiment.check_study(workspace.study, workspace.root / "study.yaml")
     if experiment.mechanism is not None and workspace.study.mechanism is None:
         workspace = workspace.allow(mechanism=experiment.mechanism)
-    from traps_pipeline.driver import dagster_history
+    asked = workspace.study.experiments | {experiment.name: experiment.asked}
+    if asked != workspace.study.experiments:
+        workspace = workspace.allow(experiments=asked)
+    _entered(workspace)
+    from traps_pipeline.orchestration.run import dagster_history
 
     with dagster_history(workspace):  # opened once here, so that several processes may use it afterwards
         return workspace

@@ -12,7 +12,7 @@ from traps_pipeline.mechanism.settings import MechanismSettings
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.paths import ASSETS
-from traps_pipeline.storage.workspace import Study
+from traps_pipeline.storage.workspace import Asked, Study
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 EXPERIMENTS = ASSETS / "experiments"
@@ -67,6 +67,12 @@ class Experiment(BaseModel):
         fields += ("allow_unknown_prices", "mechanism")
         given = {name: getattr(self, name) for name in fields}
         return Study(**{name: value for name, value in given.items() if value is not None})
+
+    @property
+    def asked(self) -> Asked:
+        """What it asks, as the study keeps it."""
+        given = {name: tuple(getattr(self, name)) for name in ("datasets", "models", "regimes", "runs")}
+        return Asked(**given, mechanism=self.mechanism is not None)
 
     def check_study(self, study: Study, path: Path) -> None:
         """Raises TrapsError where an existing study has another panel or epoch than this experiment asks for, or asks

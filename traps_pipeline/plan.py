@@ -13,15 +13,16 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import Experiment
 from traps_pipeline.judging.confabulation import load_protocol, sample_failures
 from traps_pipeline.judging.panel import PANEL_SIZE, JudgeEntry, load_panel, tasks_for, wanted_ballots
-from traps_pipeline.lineage import Lineage, keys_of, steps, upstream
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answers import answer_request, is_prepared
 from traps_pipeline.models.forecast import Experience, Forecast, experiences, forecast
 from traps_pipeline.models.registry import NETWORK, Entry, get_model, load_models
+from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import REGIMES, SIDES, Cell, Evaluation, SteeredEvaluation, datasets_of_category
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS
+from traps_pipeline.wanted import Wanted
 
 LABEL_TOKENS = 2500  # prompt of a label: instructions, answer and, for half of the models, a trace; an estimate
 VOTES_A_PAIR = PANEL_SIZE * sum(len(tasks_for(side)) for side in SIDES)
@@ -149,7 +150,7 @@ def _items_current(lineage: Lineage, dataset: str) -> bool:
     """Whether a dataset's items, and everything they are made from, are current."""
     if lineage.state("items", dataset) is None:
         return False
-    above = [("items", dataset), *upstream("items", dataset)]
+    above = [("items", dataset), *((s, k) for s, keys in lineage.graph.parents("items", dataset).items() for k in keys)]
     return all(lineage.status(stage, key).kind == "fresh" for stage, key in above if lineage.state(stage, key))
 
 
@@ -178,7 +179,7 @@ def _answer_keys(workspace: Workspace, cell: Cell) -> set[str]:
 
 @dataclass(frozen=True)
 class StageStatus:
-    """How many partitions of a stage, or of those made together, are fresh, which stale and why, how many missing."""
+    """How many partitions of a stage are fresh, which are stale and why, how many are missing."""
 
     stage: str
     fresh: int
@@ -186,17 +187,14 @@ class StageStatus:
     missing: int
 
 
-def stage_statuses(workspace: Workspace, wanted: Mapping[str, list[str | None]] | None) -> Iterator[StageStatus]:
-    """The state of every stage. With `wanted` (keys by stage) partitions outside it are left out; without, missing ones
-    count only where their upstream is there."""
-    lineage = Lineage(workspace)
-    for name, stages in steps():
-        nodes = [(stage, key) for stage in stages for key in (wanted[stage] if wanted else keys_of(stage))]
-        statuses = {key or stage: lineage.status(stage, key) for stage, key in nodes}
+def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
+    """The state of every stage, of what the study wants, or one experiment of it."""
+    wanted = Wanted(workspace, experiment)
+    for stage in lineage.graph.stages:
+        statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(wanted)}
         stale = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
-        fresh = sum(status.kind == "fresh" for status in statuses.values())
-        missing = sum(status.kind == "missing" for status in statuses.values()) if wanted else 0
-        yield StageStatus(name, fresh, stale, missing)
+        kinds = Counter(status.kind for status in statuses.values())
+        yield StageStatus(stage.name, kinds["fresh"], stale, kinds["missing"])
 
 
 # --- why --------------------------------------------------------------------------------------------------------------

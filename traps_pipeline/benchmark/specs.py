@@ -145,6 +145,17 @@ def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpe
     return {id_: s.released for id_, s in plain.items() if s.category == category and s.released is not None}
 
 
+def released_version(workspace: Workspace, category: str) -> str:
+    """Version of a category's released records in a study."""
+    return digest([spec.spec_hash for spec in released_in_study(workspace, category).values()])[:16]
+
+
+def corrections_version(workspace: Workspace, category: str) -> str:
+    """Version of what the review decisions have made of a category's scenarios in a study."""
+    scenarios = load_scenarios(workspace.study).values()
+    return digest([[s.scenario_id, s.version] for s in scenarios if s.category == category])[:16]
+
+
 def void_from_s(spec: SceneSpec) -> float:
     """Time (s) from which the void shows nothing decisive: hiding (occluder) or the cut (truncation)."""
     frame = spec.void["hidden_from_frame"] if spec.void_kind == "occluder" else spec.void["cut_frame"]

@@ -1,147 +1,153 @@
 """The evaluation group: answers of models, votes of judges, verdicts of the panel. A cell is dataset x evaluation."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import dagster as dg
 
-from traps_pipeline import progress
-from traps_pipeline.defs import common
 from traps_pipeline.defs.benchmark import items
-from traps_pipeline.defs.common import (
-    CELL,
-    OWNERS,
-    SINGLE_RUN,
-    Checks,
-    Events,
-    by_dataset,
-    by_evaluation,
-    check,
-    table_metadata,
-)
-from traps_pipeline.lineage import Lineage
-from traps_pipeline.models.answers import FinishedCell, collect_answers
-from traps_pipeline.partitions import Cell
-from traps_pipeline.progress import Tally
+from traps_pipeline.judging.panel import collect_votes, panel_version
+from traps_pipeline.models.answers import collect_answers
+from traps_pipeline.models.prompts import prompt_version
+from traps_pipeline.models.registry import answering_version
+from traps_pipeline.models.request import JUDGED
+from traps_pipeline.orchestration.graph import Check
+from traps_pipeline.orchestration.schemes import CELL, EVALUATION, by_dataset, by_evaluation
+from traps_pipeline.orchestration.stage import source, stage
+from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.report.items import FOLDER, page_name
+from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import RESPONSES, VERDICTS, VOTES
+from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
 
 GROUP = "evaluation"
 MAX_INVALID_SHARE = 0.05
-models = common.source_asset(
-    "models", GROUP, "assets/models.yaml: what decides a model's answers, by evaluation.", ["yaml"]
+ITEMS_SHOWN = 40
+models = source(
+    "models",
+    lambda workspace, key: answering_version(Evaluation.parse(key)),
+    group=GROUP,
+    doc="assets/models.yaml: what decides a model's answers, by evaluation.",
+    kinds=["yaml"],
+    scheme=EVALUATION,
 )
-prompts = common.source_asset("prompts", GROUP, "assets/prompts: the regime's system prompt, by evaluation.", ["text"])
-judges = common.source_asset(
-    "judges", GROUP, "assets/judges.yaml and the judges' prompts: the study's panel.", ["yaml"]
+prompts = source(
+    "prompts",
+    lambda workspace, key: prompt_version(Evaluation.parse(key).regime),
+    group=GROUP,
+    doc="assets/prompts: the regime's system prompt, by evaluation.",
+    kinds=["text"],
+    scheme=EVALUATION,
 )
-
-Collect = Callable[[Workspace, Sequence[Cell], Mapping[str, Mapping[str, str]]], Iterator[FinishedCell]]
-
-
-def _collect(
-    context: dg.AssetExecutionContext, stage: str, collect: Collect
-) -> Iterator[tuple[FinishedCell, dg.AssetMaterialization]]:
-    """Run a paid stage over this run's cells; each is materialized as it is finished."""
-    workspace = Workspace.open()
-    cells = [Cell.parse(key) for key in common.keys(context)]
-    lineage, provenance = Lineage(workspace), common.provenance(context, workspace)
-    inputs = {cell.key: lineage.inputs(stage, cell.key) for cell in cells}
-    for done in collect(workspace, cells, inputs):
-        progress.current().partition(stage, done.cell.key, done.tally)
-        metadata = {
-            "dagster/partition_row_count": done.rows,
-            "asked": done.tally.asked,
-            "from the ledger": done.tally.cached,
-            "failed": done.tally.errors,
-        }
-        yield done, common.materialized(context, done.cell.key, done.version, provenance, **metadata)
+judges = source(
+    "judges",
+    lambda workspace, key: panel_version(workspace.study.panel),
+    group=GROUP,
+    doc="assets/judges.yaml and the judges' prompts: the study's panel.",
+    kinds=["yaml"],
+)
+_ITEM_COLUMNS = {name: [f"items.{name}"] for name in ("item_id", "pair_id", "side", "benchmark_version")}
 
 
-@dg.asset(
-    partitions_def=CELL,
+def _cells(
+    collect: Callable[[Workspace, Sequence[Cell]], Iterator[tuple[Cell, Made]]],
+) -> Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, Made]]]:
+    """`collect` of a stage from one that knows cells; a cell's items are shown with it."""
+
+    def collected(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
+        for cell, made in collect(workspace, [Cell.parse(key) for key in keys]):
+            shown = {**made.shown, **_items_shown(workspace, cell, made)}
+            yield cell.key, Made(made.content, made.tally, shown)
+
+    collected.__doc__ = collect.__doc__
+    return collected
+
+
+def _items_shown(workspace: Workspace, cell: Cell, made: Made) -> dict[str, Any]:
+    """The items behind a cell: those without an answer, as a table, and the page of all of them."""
+    page = workspace.reports / FOLDER / page_name(cell)
+    columns = ("item_id", "side", "outcome", "error", "attempts")
+    rows = [row for row in made.rows if "outcome" in row and row["outcome"] not in JUDGED]
+    records = [dg.TableRecord({name: str(row[name]) for name in columns}) for row in rows[:ITEMS_SHOWN]]
+    table = {"without an answer": dg.MetadataValue.table(records)} if records else {}
+    why = {"one item": f"traps why {made.rows[0]['item_id']}"} if made.rows else {}
+    return {**table, "all items": dg.MetadataValue.path(str(page)), **why}
+
+
+def _answers_missing(workspace: Workspace, key: str | None, made: Made) -> str:
+    state = workspace.tables.state(ITEMS, {"dataset": Cell.parse(str(key)).dataset})
+    n_items = state.rows if state else 0
+    return "" if len(made.rows) == n_items else f"{len(made.rows)} rows for {n_items} items"
+
+
+responses = stage(
+    RESPONSES,
+    collect=_cells(collect_answers),
+    doc="Answers of a model under a regime in a run, one row an item; only what the ledger does not hold is asked.",
+    group=GROUP,
     deps=[
         dg.AssetDep(items, partition_mapping=by_dataset),
         dg.AssetDep(models, partition_mapping=by_evaluation),
         dg.AssetDep(prompts, partition_mapping=by_evaluation),
     ],
-    backfill_policy=SINGLE_RUN,
-    group_name=GROUP,
-    kinds={"parquet"},
-    owners=OWNERS,
-    metadata=table_metadata("responses"),
-    output_required=False,
-    check_specs=[check("one_answer_an_item", "responses", "Every item of the cell has exactly one row.")],
+    scheme=CELL,
+    cost="money",
+    columns=_ITEM_COLUMNS,
+    checks=[Check("one_answer_an_item", "Every item of the cell has exactly one row.", _answers_missing)],
 )
-def responses(context: dg.AssetExecutionContext) -> Events:
-    """Answers of a model under a regime in a run, one row an item; only what the ledger does not hold is asked."""
-    workspace = Workspace.open()
-    checks = Checks(context, workspace)
-    for done, event in _collect(context, "responses", collect_answers):
-        state = Lineage(workspace).state("items", done.cell.dataset)
-        n_items = state.rows if state else 0
-        wrong = "" if done.rows == n_items else f"{done.rows} rows for {n_items} items"
-        checks.record("one_answer_an_item", done.cell.key, wrong)
-        yield event
-    yield from checks.results()
 
 
-@dg.asset(
-    partitions_def=CELL,
+def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
+    invalid = sum(not row["valid"] for row in made.rows)
+    many = invalid > MAX_INVALID_SHARE * len(made.rows)
+    return f"{invalid} of {len(made.rows)} votes are invalid" if many else ""
+
+
+votes = stage(
+    VOTES,
+    collect=_cells(collect_votes),
+    doc="Votes of the study's panel on the answers of a cell, one row a judge and task.",
+    group=GROUP,
     deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, judges],
-    backfill_policy=SINGLE_RUN,
-    group_name=GROUP,
-    kinds={"parquet"},
-    owners=OWNERS,
-    metadata=table_metadata("votes"),
-    output_required=False,
-    check_specs=[
-        check(
-            "few_invalid_votes", "votes", f"At most {MAX_INVALID_SHARE:.0%} of a cell's votes break the judges' schema."
+    scheme=CELL,
+    cost="money",
+    columns={name: [f"responses.{name}"] for name in ("item_id", "side", "benchmark_version")},
+    checks=[
+        Check(
+            "few_invalid_votes",
+            f"At most {MAX_INVALID_SHARE:.0%} of a cell's votes break the judges' schema.",
+            _many_invalid,
+            blocks=False,
         )
     ],
 )
-def votes(context: dg.AssetExecutionContext) -> Events:
-    """Votes of the study's panel on the answers of a cell, one row a judge and task."""
-    from traps_pipeline.judging.panel import collect_votes
-
-    workspace = Workspace.open()
-    checks = Checks(context, workspace)
-    for done, event in _collect(context, "votes", collect_votes):
-        valid = workspace.tables.read(VOTES, done.cell.partition, ["valid"])["valid"].to_numpy(bool)
-        invalid = len(valid) - int(valid.sum())
-        many = f"{invalid} of {len(valid)} votes are invalid" if invalid > MAX_INVALID_SHARE * len(valid) else ""
-        checks.record("few_invalid_votes", done.cell.key, many)
-        yield event
-    yield from checks.results()
 
 
-@dg.asset(
-    partitions_def=CELL,
-    deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, votes],
-    backfill_policy=SINGLE_RUN,
-    group_name=GROUP,
-    kinds={"parquet"},
-    owners=OWNERS,
-    metadata=table_metadata("verdicts"),
-    output_required=False,
-    check_specs=[check("one_verdict_an_item", "verdicts", "Every answered item has exactly one verdict.")],
-)
-def verdicts(context: dg.AssetExecutionContext) -> Events:
+def _make_verdicts(workspace: Workspace, key: str) -> Made:
     """What the panel's majority says of each item of a cell."""
     from traps_pipeline.judging.verdicts import decide_cell
 
-    workspace = Workspace.open()
-    lineage, provenance, checks = Lineage(workspace), common.provenance(context, workspace), Checks(context, workspace)
-    for key in common.keys(context):
-        cell = Cell.parse(key)
-        rows = decide_cell(workspace, cell)
-        answered = workspace.tables.state(RESPONSES, cell.partition)
-        n_answers = answered.rows if answered else 0
-        wrong = "" if n_answers == len(rows) else f"{len(rows)} verdicts for {n_answers} answers"
-        checks.record("one_verdict_an_item", key, wrong)
-        version = workspace.tables.write(VERDICTS, cell.partition, rows, lineage.inputs("verdicts", key))
-        progress.current().partition("verdicts", key, Tally())
-        undecided = int(rows["undecided"].to_numpy(bool).sum())
-        metadata = {"dagster/partition_row_count": len(rows), "undecided": undecided}
-        yield common.materialized(context, key, version, provenance, **metadata)
-    yield from checks.results()
+    rows = decide_cell(workspace, Cell.parse(key))
+    return Made(rows, shown={"undecided": int(rows["undecided"].to_numpy(bool).sum())})
+
+
+def _verdicts_missing(workspace: Workspace, key: str | None, made: Made) -> str:
+    answered = workspace.tables.state(RESPONSES, Cell.parse(str(key)).partition)
+    n_answers = answered.rows if answered else 0
+    return "" if n_answers == len(made.frame) else f"{len(made.frame)} verdicts for {n_answers} answers"
+
+
+verdicts = stage(
+    VERDICTS,
+    _make_verdicts,
+    group=GROUP,
+    deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, votes],
+    scheme=CELL,
+    columns={
+        "item_id": ["responses.item_id"],
+        "abstained": ["votes.abstained", "votes.valid"],
+        "correct": ["votes.correct", "votes.valid"],
+        "control_answer": ["items.control_answer"],
+    },
+    checks=[Check("one_verdict_an_item", "Every answered item has exactly one verdict.", _verdicts_missing)],
+)

@@ -4,21 +4,23 @@ from typing import TYPE_CHECKING
 
 import dagster as dg
 
-from traps_pipeline import progress
-from traps_pipeline.defs import common
 from traps_pipeline.defs.benchmark import items
-from traps_pipeline.defs.common import OWNERS, Checks, Events, check, table_asset, table_metadata
-from traps_pipeline.defs.evaluation import judges, responses, verdicts, votes
+from traps_pipeline.defs.evaluation import MAX_INVALID_SHARE, judges, responses, verdicts, votes
 from traps_pipeline.defs.scoring import leaderboard
+from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.confabulation import load_protocol
-from traps_pipeline.lineage import Lineage
+from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
+from traps_pipeline.orchestration.graph import Check
+from traps_pipeline.orchestration.schemes import CELL, these_keys
+from traps_pipeline.orchestration.stage import source, stage
+from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import (
     AGREEMENT,
     CONFABULATION,
     CONFABULATION_PREVALENCE,
     JUDGE_BIAS,
+    JUDGE_VALIDATION,
     LEADERBOARD,
     LEAVE_ONE_OUT,
     VERDICTS,
@@ -29,22 +31,28 @@ if TYPE_CHECKING:
     import pandas as pd
 
 GROUP = "judging"
-MAX_INVALID_SHARE = 0.05
-confabulation_protocol = common.source_asset(
+
+
+def _validation_version(workspace: Workspace, key: None) -> str:
+    state = workspace.tables.state(JUDGE_VALIDATION, {})
+    return state.version if state else "not run"
+
+
+confabulation_protocol = source(
     "confabulation_protocol",
-    GROUP,
-    "assets/confabulation.yaml and its prompt: whose failures are sampled and who labels them.",
-    ["yaml"],
+    lambda workspace, key: protocol_digest(workspace.study.panel),
+    group=GROUP,
+    doc="assets/confabulation.yaml and its prompt: whose failures are sampled and who labels them.",
+    kinds=["yaml"],
 )
-judge_validation = common.source_asset(
+judge_validation = source(
     "judge_validation",
-    GROUP,
-    "The judge against two annotators: the table that `traps confabulation validate` writes.",
-    ["parquet"],
+    _validation_version,
+    group=GROUP,
+    doc="The judge against two annotators: the table that `traps confabulation validate` writes.",
+    kinds=["parquet"],
 )
-_SAMPLED = dg.SpecificPartitionsPartitionMapping(
-    [cell.key for model in load_protocol().models for cell in load_protocol().cells(model)]
-)
+_SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load_protocol().cells(m)])
 
 
 def _panel(workspace: Workspace) -> list[str]:
@@ -53,7 +61,7 @@ def _panel(workspace: Workspace) -> list[str]:
     return [judge.id for judge in load_panel(workspace.study.panel)]
 
 
-def _votes(workspace: Workspace, stage: str) -> "pd.DataFrame":
+def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
     """The votes of the study's panel. Raises TrapsError if there is none."""
     from traps_pipeline.judging.ratings import VOTE_COLUMNS
     from traps_pipeline.judging.verdicts import current
@@ -61,98 +69,82 @@ def _votes(workspace: Workspace, stage: str) -> "pd.DataFrame":
     votes = current(workspace, VOTES, VOTE_COLUMNS)
     votes = votes.loc[votes["judge"].isin(_panel(workspace))]
     if votes.empty:
-        raise TrapsError(f"{stage}: no votes yet; materialize votes for a cell first")
+        raise TrapsError(f"{name}: no votes yet; materialize votes for a cell first")
     return votes
 
 
-def _agreement(workspace: Workspace) -> "pd.DataFrame":
+def _shown(name: str, frame: "pd.DataFrame") -> Made:
+    return Made(frame, shown={name: rows_shown(frame)})
+
+
+def _make_agreement(workspace: Workspace, _: None) -> Made:
+    """Agreement of the panel and of each two judges per dataset and task: unanimous share, Fleiss, Cohen,
+    Krippendorff."""
     from traps_pipeline.judging.agreement import agreement
 
-    return agreement(_votes(workspace, "agreement"), _panel(workspace))
+    return _shown("agreement", agreement(_votes(workspace, "agreement"), _panel(workspace)))
 
 
-def _judge_bias(workspace: Workspace) -> "pd.DataFrame":
+def _make_judge_bias(workspace: Workspace, _: None) -> Made:
+    """Each judge's rate of yes against the panel's majority, per dataset and task."""
     from traps_pipeline.judging.agreement import judge_bias
 
-    return judge_bias(_votes(workspace, "judge_bias"), _panel(workspace))
+    return _shown("judge bias", judge_bias(_votes(workspace, "judge_bias"), _panel(workspace)))
 
 
-def _leave_one_out(workspace: Workspace) -> "pd.DataFrame":
+def _make_leave_one_out(workspace: Workspace, _: None) -> Made:
+    """PECS as the other two judges decide it, for each judge left out."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.leave_one_out import leave_one_out
 
-    votes, board = _votes(workspace, "leave_one_out"), workspace.tables.read(LEADERBOARD, {})
-    return leave_one_out(current(workspace, VERDICTS), votes, board, _panel(workspace))
+    cast, board = _votes(workspace, "leave_one_out"), workspace.tables.read(LEADERBOARD, {})
+    return _shown("leave one out", leave_one_out(current(workspace, VERDICTS), cast, board, _panel(workspace)))
 
 
-def _prevalence(workspace: Workspace) -> "pd.DataFrame":
+def _make_confabulation(workspace: Workspace, _: None) -> Made:
+    """Void failures of the sampled models, labelled on four axes by one judge; empty where the study has none."""
+    from traps_pipeline.judging.confabulation import collect_labels
+
+    return collect_labels(workspace)
+
+
+def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
+    invalid = sum(not row["valid"] for row in made.rows)
+    return f"{invalid} of {len(made.rows)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(made.rows) else ""
+
+
+def _make_prevalence(workspace: Workspace, _: None) -> Made:
+    """How often each axis applies to each model's sampled void failures; empty where nothing was labelled."""
     from traps_pipeline.scoring.prevalence import prevalence
 
-    return prevalence(workspace.tables.read(CONFABULATION, {}))
+    return _shown("prevalence", prevalence(workspace.tables.read(CONFABULATION, {})))
 
 
-agreement = table_asset(
-    AGREEMENT,
-    GROUP,
-    "Agreement of the panel and of each two judges per dataset and task: unanimous share, Fleiss, Cohen, Krippendorff.",
-    [items, votes, judges],
-    _agreement,
+_SOME = {"items": "some", "votes": "some", "verdicts": "some"}
+agreement = stage(AGREEMENT, _make_agreement, group=GROUP, deps=[items, votes, judges], needs=_SOME)
+judge_bias = stage(JUDGE_BIAS, _make_judge_bias, group=GROUP, deps=[items, votes, judges], needs=_SOME)
+leave_one_out = stage(
+    LEAVE_ONE_OUT, _make_leave_one_out, group=GROUP, deps=[items, votes, verdicts, leaderboard, judges], needs=_SOME
 )
-judge_bias = table_asset(
-    JUDGE_BIAS,
-    GROUP,
-    "Each judge's rate of yes against the panel's majority, per dataset and task.",
-    [items, votes, judges],
-    _judge_bias,
-)
-leave_one_out = table_asset(
-    LEAVE_ONE_OUT,
-    GROUP,
-    "PECS as the other two judges decide it, for each judge left out.",
-    [items, votes, verdicts, leaderboard, judges],
-    _leave_one_out,
-)
-
-
-@dg.asset(
+confabulation = stage(
+    CONFABULATION,
+    _make_confabulation,
+    group=GROUP,
     deps=[
         items,
         dg.AssetDep(responses, partition_mapping=_SAMPLED),
         dg.AssetDep(verdicts, partition_mapping=_SAMPLED),
         confabulation_protocol,
     ],
-    group_name=GROUP,
-    kinds={"parquet"},
-    owners=OWNERS,
-    metadata=table_metadata("confabulation"),
-    output_required=False,
-    check_specs=[
-        check("few_invalid_labels", "confabulation", f"At most {MAX_INVALID_SHARE:.0%} of the labels break the schema.")
+    needs={"items": "none", "responses": "none", "verdicts": "none"},
+    cost="money",
+    checks=[
+        Check(
+            "few_invalid_labels",
+            f"At most {MAX_INVALID_SHARE:.0%} of the labels break the schema.",
+            _many_invalid,
+            blocks=False,
+        )
     ],
 )
-def confabulation(context: dg.AssetExecutionContext) -> Events:
-    """Void failures of the sampled models, labelled on four axes by one judge; empty where the study has none."""
-    from traps_pipeline.judging.confabulation import collect_labels
-
-    workspace = Workspace.open()
-    lineage, provenance, checks = Lineage(workspace), common.provenance(context, workspace), Checks(context, workspace)
-    inputs = lineage.inputs("confabulation", None)
-    done = collect_labels(workspace)
-    invalid = sum(not row["valid"] for row in done.rows)
-    many = f"{invalid} of {len(done.rows)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(done.rows) else ""
-    checks.record("few_invalid_labels", None, many)
-    version = workspace.tables.write(CONFABULATION, {}, done.rows, inputs, failed=done.tally.errors)
-    progress.current().partition("confabulation", "", done.tally)
-    metadata = {"dagster/row_count": len(done.rows), "asked": done.tally.asked, "from the ledger": done.tally.cached}
-    yield common.materialized(context, None, version, provenance, **metadata)
-    yield from checks.results()
-
-
-confabulation_prevalence = table_asset(
-    CONFABULATION_PREVALENCE,
-    GROUP,
-    "How often each axis applies to each model's sampled void failures; empty where nothing was labelled.",
-    [confabulation],
-    _prevalence,
-)
-ASSETS = [agreement, judge_bias, leave_one_out, confabulation, confabulation_prevalence]
+confabulation_prevalence = stage(CONFABULATION_PREVALENCE, _make_prevalence, group=GROUP, deps=[confabulation])

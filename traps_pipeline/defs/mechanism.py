@@ -1,26 +1,51 @@
 """The mechanism group: hidden states of local models, probes, void directions, steering (`benchmark.md` 7 and 8)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import dagster as dg
 
-from traps_pipeline import progress
-from traps_pipeline.defs import common
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
-from traps_pipeline.defs.common import OWNERS, Checks, Events, by_dataset, check, table_metadata
 from traps_pipeline.defs.evaluation import judges, verdicts
+from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.lineage import Lineage, standard_cells
+from traps_pipeline.mechanism.versions import (
+    directions_are_there,
+    extraction_version,
+    probing_version,
+    states_are_there,
+    steering_version,
+)
+from traps_pipeline.models.registry import local_models
+from traps_pipeline.orchestration.graph import Check
+from traps_pipeline.orchestration.schemes import (
+    CATEGORY,
+    CELL,
+    DATASET,
+    EXTRACTION,
+    PROBED,
+    STATES,
+    STEERED,
+    STEERING,
+    by_dataset,
+    by_extraction,
+    by_steering,
+    these_keys,
+    to_keys,
+)
+from traps_pipeline.orchestration.stage import source, stage
 from traps_pipeline.partitions import (
     ANSWERABLE,
     DATASETS,
     OCCLUSION_CATEGORIES,
+    Cell,
+    Evaluation,
     Extraction,
     StatesCell,
     SteeringCell,
 )
 from traps_pipeline.progress import Tally
+from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import (
     COSINES,
@@ -28,241 +53,248 @@ from traps_pipeline.tables import (
     HIDDEN_STATES,
     PROBE_ITEMS,
     PROBES,
-    STEERING,
     STEERING_EFFECTS,
     STEERING_SHARES,
     STEERING_VOTES,
     Table,
 )
+from traps_pipeline.tables import STEERING as STEERING_TABLE
+from traps_pipeline.wanted import PROBE_PROMPT, Wanted
 
 if TYPE_CHECKING:
     import pandas as pd
 
 GROUP = "mechanism"
-PROBED, EXTRACTION, STATES = common.PROBED, common.EXTRACTION, common.STATES
-STEERED, STEERING_CELL = common.STEERED, common.STEERING_CELL
-by_extraction = dg.MultiToSingleDimensionPartitionMapping("extraction")
-_OCCLUSION = dg.StaticPartitionMapping(dict.fromkeys(OCCLUSION_CATEGORIES, ANSWERABLE))
-by_steering = dg.MultiToSingleDimensionPartitionMapping("steering")
-
-extraction_settings = common.source_asset(
-    "extraction_settings", GROUP, "What decides hidden states besides items: checkpoint, precision, prompt.", ["yaml"]
+extraction_settings = source(
+    "extraction_settings",
+    lambda workspace, key: extraction_version(workspace, Extraction.parse(key)),
+    group=GROUP,
+    doc="What decides hidden states besides items: checkpoint, precision, prompt.",
+    kinds=["yaml"],
+    scheme=EXTRACTION,
 )
-probing_settings = common.source_asset(
-    "probing_settings", GROUP, "The study's settings of probes and directions, by model.", ["yaml"]
+probing_settings = source(
+    "probing_settings",
+    lambda workspace, key: probing_version(workspace, Extraction.parse(key)),
+    group=GROUP,
+    doc="The study's settings of probes and directions, by model.",
+    kinds=["yaml"],
+    scheme=EXTRACTION,
 )
-steering_settings = common.source_asset(
-    "steering_settings", GROUP, "The study's settings of steering, the model and its prompt.", ["yaml"]
+steering_settings = source(
+    "steering_settings",
+    steering_version,
+    group=GROUP,
+    doc="The study's settings of steering, the model and its prompt.",
+    kinds=["yaml"],
+    scheme=STEERED,
 )
+# Cells in which the local models answered under Standard in run 1: what they confabulated on there.
+_ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
+_OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if key in OCCLUSION_CATEGORIES else [])
 
 
-def _made(
-    context: dg.AssetExecutionContext, table: Table, partition: dict[str, Any], rows: Sequence[Any], made: int = 0
-) -> dg.AssetMaterialization:
-    """Write a partition and tell Dagster. made: items that were extracted for it."""
-    workspace, key = Workspace.open(), context.partition_key
-    provenance, inputs = common.provenance(context, workspace), Lineage(workspace).inputs(table.name, key)
-    version = workspace.tables.write(table, partition, rows, inputs)
-    progress.current().partition(table.name, key, Tally(asked=made))
-    metadata: dict[str, Any] = {"dagster/partition_row_count": len(rows), "extracted": made}
-    return common.materialized(context, key, version, provenance, **metadata)
+def _steers(wanted: Wanted, key: str | None) -> bool:
+    return wanted.steers
 
 
-def _asset(
-    table: Table,
-    partitions: dg.PartitionsDefinition,
-    deps: Sequence[Any],
-    *checks: dg.AssetCheckSpec,
-    kinds: Sequence[str] = (),
-) -> Callable[[Callable[[dg.AssetExecutionContext], Events]], dg.AssetsDefinition]:
-    """An asset of this group that is a partitioned table and writes itself."""
-    return dg.asset(
-        partitions_def=partitions,
-        deps=deps,
-        group_name=GROUP,
-        kinds={"parquet", *kinds},
-        owners=OWNERS,
-        metadata=table_metadata(table.name),
-        output_required=False,
-        check_specs=checks,
-    )
-
-
-@_asset(
-    PROBE_ITEMS,
-    PROBED,
-    [
-        dg.AssetDep(items, partition_mapping=dg.StaticPartitionMapping({d: d for d in DATASETS})),
-        *(
-            dg.AssetDep(
-                above, partition_mapping=dg.StaticPartitionMapping(dict.fromkeys(OCCLUSION_CATEGORIES, ANSWERABLE))
-            )
-            for above in (scene_specs, videos)
-        ),
-    ],
-)
-def probe_items(context: dg.AssetExecutionContext) -> Events:
+def _make_probe_items(workspace: Workspace, dataset: str) -> Made:
     """Clips and questions that hidden states are extracted of: a dataset's items, or occlusion's void clips with a
     question that even they answer."""
     from traps_pipeline.mechanism.stages import probe_items as rows_of
 
-    dataset = context.partition_key
-    yield _made(context, PROBE_ITEMS, {"dataset": dataset}, rows_of(Workspace.open(), dataset))
+    return Made(rows_of(workspace, dataset))
 
 
-@_asset(
+probe_items = stage(
+    PROBE_ITEMS,
+    _make_probe_items,
+    group=GROUP,
+    deps=[
+        dg.AssetDep(items, partition_mapping=to_keys(DATASET, PROBED, lambda key: [key])),
+        dg.AssetDep(scene_specs, partition_mapping=_OCCLUSION),
+        dg.AssetDep(videos, partition_mapping=_OCCLUSION),
+    ],
+    scheme=PROBED,
+)
+
+
+def _make_hidden_states(workspace: Workspace, key: str) -> Made:
+    """Hidden states of a frozen local model at every layer, one row an item; only what is not there is extracted."""
+    from traps_pipeline.mechanism.stages import extract_states
+
+    rows, new = extract_states(workspace, StatesCell.parse(key))
+    return Made(rows, Tally(asked=new), {"extracted": new})
+
+
+def _unsound_layers(workspace: Workspace, key: str | None, made: Made) -> list[int]:
+    from traps_pipeline.mechanism.stages import unsound_layers
+
+    return unsound_layers(workspace, StatesCell.parse(str(key)), made.rows[0]["n_layers"])
+
+
+hidden_states = stage(
     HIDDEN_STATES,
-    STATES,
-    [
+    _make_hidden_states,
+    group=GROUP,
+    deps=[
         dg.AssetDep(probe_items, partition_mapping=by_dataset),
         dg.AssetDep(extraction_settings, partition_mapping=by_extraction),
     ],
-    check("states_finite", "hidden_states", "Every number of the first and last layer is finite."),
-    kinds=["pytorch"],
+    scheme=STATES,
+    kinds=["parquet", "pytorch"],
+    cost="machine",
+    lost=lambda workspace, key: (
+        [] if states_are_there(workspace, StatesCell.parse(key)) else ["its states are gone"]
+    ),
+    checks=[Check("states_finite", "Every number of the first and last layer is finite.", _unsound_layers)],
 )
-def hidden_states(context: dg.AssetExecutionContext) -> Events:
-    """Hidden states of a frozen local model at every layer, one row an item; only what is not there is extracted."""
-    from traps_pipeline.mechanism.stages import extract_states, unsound_layers
-
-    workspace, cell = Workspace.open(), StatesCell.parse(context.partition_key)
-    rows, new = extract_states(workspace, cell)
-    checks = Checks(context, workspace)
-    checks.record("states_finite", cell.key, unsound_layers(workspace, cell, rows[0]["n_layers"]))
-    yield _made(context, HIDDEN_STATES, cell.partition, rows, new)
-    yield from checks.results()
 
 
-@_asset(
-    PROBES,
-    EXTRACTION,
-    [
-        dg.AssetDep(hidden_states, partition_mapping=by_extraction),
-        dg.AssetDep(verdicts, partition_mapping=dg.SpecificPartitionsPartitionMapping(standard_cells())),
-        probing_settings,
-    ],
-    check("shares_are_shares", "probes", "Every figure and interval lies in [0, 1]."),
-    kinds=["scikitlearn"],
-)
-def probes(context: dg.AssetExecutionContext) -> Events:
+def _make_probes(workspace: Workspace, key: str) -> Made:
     """Probes of every dataset on every other at every layer: transfer, Cf->Cf, within, label-shuffled, centroids."""
     from traps_pipeline.mechanism.stages import probe_rows
 
-    workspace, extraction = Workspace.open(), Extraction.parse(context.partition_key)
-    rows = probe_rows(workspace, extraction)
-    wrong = [row for row in rows if any(v is not None and not -1e-9 <= v <= 1 + 1e-9 for v in _figures(row))]
-    checks = Checks(context, workspace)
-    checks.record("shares_are_shares", extraction.key, f"{len(wrong)} rows are wrong" if wrong else "")
-    yield _made(context, PROBES, dict(extraction.partition), rows)
-    yield from checks.results()
+    return Made(probe_rows(workspace, Extraction.parse(key)))
 
 
-def _figures(row: dict[str, Any]) -> list[float | None]:
-    figures = [row[name] for name in ("value", "low", "high")]
-    return [None if figure != figure else figure for figure in figures]
+def _outside_shares(workspace: Workspace, key: str | None, made: Made) -> str:
+    def is_wrong(row: Mapping[str, Any]) -> bool:
+        figures = [row[name] for name in ("value", "low", "high")]
+        return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
+
+    wrong = sum(is_wrong(row) for row in made.rows)
+    return f"{wrong} rows are wrong" if wrong else ""
 
 
-@_asset(
-    DIRECTIONS,
-    EXTRACTION,
-    [dg.AssetDep(hidden_states, partition_mapping=by_extraction), probing_settings],
+probes = stage(
+    PROBES,
+    _make_probes,
+    group=GROUP,
+    deps=[
+        dg.AssetDep(hidden_states, partition_mapping=by_extraction),
+        dg.AssetDep(verdicts, partition_mapping=_ANSWERED),
+        probing_settings,
+    ],
+    scheme=EXTRACTION,
+    kinds=["parquet", "scikitlearn"],
+    needs={"hidden_states": "some", "verdicts": "none"},
+    wants=lambda wanted, key: Extraction.parse(key).prompt == PROBE_PROMPT,
+    checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
 )
-def directions(context: dg.AssetExecutionContext) -> Events:
+
+
+def _make_directions(workspace: Workspace, key: str) -> Made:
     """The void direction of every dataset at every layer with its random and label-shuffled controls, as values."""
     from traps_pipeline.mechanism.stages import direction_rows
 
-    extraction = Extraction.parse(context.partition_key)
-    yield _made(context, DIRECTIONS, dict(extraction.partition), direction_rows(Workspace.open(), extraction))
+    return Made(direction_rows(workspace, Extraction.parse(key)))
 
 
-def _cosines(workspace: Workspace) -> "pd.DataFrame":
+directions = stage(
+    DIRECTIONS,
+    _make_directions,
+    group=GROUP,
+    deps=[dg.AssetDep(hidden_states, partition_mapping=by_extraction), probing_settings],
+    scheme=EXTRACTION,
+    needs={"hidden_states": "some"},
+    wants=_steers,
+    lost=lambda workspace, key: (
+        [] if directions_are_there(workspace, Extraction.parse(key)) else ["its directions are gone"]
+    ),
+)
+
+
+def _make_cosines(workspace: Workspace, _: None) -> Made:
+    """Cosines of every two void directions of a model at one layer."""
     import pandas as pd
 
     from traps_pipeline.mechanism.stages import cosine_rows
 
-    return pd.DataFrame(cosine_rows(workspace))
+    table = pd.DataFrame(cosine_rows(workspace))
+    return Made(table, shown={"cosines": rows_shown(table)})
 
 
-cosines = common.table_asset(
-    COSINES, GROUP, "Cosines of every two void directions of a model at one layer.", [directions], _cosines
+cosines = stage(
+    COSINES, _make_cosines, group=GROUP, deps=[directions], needs={"directions": "some"}, wants=_steers
 )
 
 
-@_asset(
-    STEERING,
-    STEERING_CELL,
-    [
-        dg.AssetDep(items, partition_mapping=by_dataset),
-        dg.AssetDep(directions, partition_mapping=dg.AllPartitionMapping()),
-        dg.AssetDep(steering_settings, partition_mapping=by_steering),
-    ],
-    kinds=["pytorch"],
-)
-def steering(context: dg.AssetExecutionContext) -> Events:
+def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
     """Answers of a model that is steered along every path into a dataset; what the ledger holds is not asked."""
     from traps_pipeline.mechanism.stages import looked_into, saved_directions
     from traps_pipeline.mechanism.steering import collect_steered
 
-    workspace, cell = Workspace.open(), SteeringCell.parse(context.partition_key)
-    entry = looked_into(workspace, cell.evaluation.model)
-    provenance, inputs = common.provenance(context, workspace), Lineage(workspace).inputs("steering", cell.key)
-    along = {cell.directions: saved_directions(workspace, Extraction(entry.id, cell.directions))}
-    for done in collect_steered(workspace, entry, [cell], along, {cell.key: inputs}):
-        progress.current().partition("steering", cell.key, done.tally)
-        metadata: dict[str, Any] = {"dagster/partition_row_count": done.rows, "asked": done.tally.asked}
-        yield common.materialized(context, cell.key, done.version, provenance, **metadata)
+    for key in keys:
+        cell = SteeringCell.parse(key)
+        entry = looked_into(workspace, cell.evaluation.model)
+        along = {cell.directions: saved_directions(workspace, Extraction(entry.id, cell.directions))}
+        for done, made in collect_steered(workspace, entry, [cell], along):
+            yield done.key, made
 
 
-@_asset(STEERING_VOTES, STEERING_CELL, [dg.AssetDep(items, partition_mapping=by_dataset), steering, judges])
-def steering_votes(context: dg.AssetExecutionContext) -> Events:
+steering = stage(
+    STEERING_TABLE,
+    collect=_collect_steering,
+    group=GROUP,
+    deps=[
+        dg.AssetDep(items, partition_mapping=by_dataset),
+        dg.AssetDep(directions, partition_mapping=dg.AllPartitionMapping()),
+        dg.AssetDep(steering_settings, partition_mapping=by_steering),
+    ],
+    scheme=STEERING,
+    needs={"directions": "some"},
+    kinds=["parquet", "pytorch"],
+    cost="machine",
+)
+
+
+def _collect_steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
     """What the study's panel says of each steered answer: whether it abstains."""
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
-    workspace, cell = Workspace.open(), SteeringCell.parse(context.partition_key)
-    provenance, inputs = common.provenance(context, workspace), Lineage(workspace).inputs("steering_votes", cell.key)
-    for done in collect_steering_votes(workspace, [cell], {cell.key: inputs}):
-        progress.current().partition("steering_votes", cell.key, done.tally)
-        metadata: dict[str, Any] = {"dagster/partition_row_count": done.rows, "asked": done.tally.asked}
-        yield common.materialized(context, cell.key, done.version, provenance, **metadata)
+    for done, made in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
+        yield done.key, made
 
 
-def _effects(workspace: Workspace) -> "pd.DataFrame":
-    import pandas as pd
-
-    from traps_pipeline.mechanism.shares import effect_rows
-
-    return pd.DataFrame(effect_rows(*_judged(workspace, STEERING_EFFECTS)))
-
-
-def _shares(workspace: Workspace) -> "pd.DataFrame":
-    import pandas as pd
-
-    from traps_pipeline.mechanism.shares import share_rows
-
-    return pd.DataFrame(share_rows(*_judged(workspace, STEERING_SHARES)))
+steering_votes = stage(
+    STEERING_VOTES,
+    collect=_collect_steering_votes,
+    group=GROUP,
+    deps=[dg.AssetDep(items, partition_mapping=by_dataset), steering, judges],
+    scheme=STEERING,
+    cost="money",
+)
 
 
 def _judged(workspace: Workspace, table: Table) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    answers, votes = workspace.tables.read_all(STEERING), workspace.tables.read_all(STEERING_VOTES)
+    answers, votes = workspace.tables.read_all(STEERING_TABLE), workspace.tables.read_all(STEERING_VOTES)
     if votes.empty:
         raise TrapsError(f"{table.name}: no votes yet; materialize steering and steering_votes first")
     return answers, votes
 
 
-steering_effects = common.table_asset(
-    STEERING_EFFECTS,
-    GROUP,
-    "Abstention by path, kind of direction, layer, strength and side.",
-    [steering, steering_votes],
-    _effects,
-)
-steering_shares = common.table_asset(
-    STEERING_SHARES,
-    GROUP,
-    "Abstention over the paths of a set, with intervals by scenario.",
-    [steering, steering_votes],
-    _shares,
-)
+def _make_effects(workspace: Workspace, _: None) -> Made:
+    """Abstention by path, kind of direction, layer, strength and side."""
+    import pandas as pd
 
-SOURCES = [extraction_settings, probing_settings, steering_settings]
-_STEERED = [steering, steering_votes, steering_effects, steering_shares]
-ASSETS = [probe_items, hidden_states, probes, directions, cosines, *_STEERED]
+    from traps_pipeline.mechanism.shares import effect_rows
+
+    table = pd.DataFrame(effect_rows(*_judged(workspace, STEERING_EFFECTS)))
+    return Made(table, shown={"effects": rows_shown(table)})
+
+
+def _make_shares(workspace: Workspace, _: None) -> Made:
+    """Abstention over the paths of a set, with intervals by scenario."""
+    import pandas as pd
+
+    from traps_pipeline.mechanism.shares import share_rows
+
+    table = pd.DataFrame(share_rows(*_judged(workspace, STEERING_SHARES)))
+    return Made(table, shown={"shares": rows_shown(table)})
+
+
+_SOME = {"steering": "some", "steering_votes": "some"}
+_ABOVE = [steering, steering_votes]
+steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, deps=_ABOVE, needs=_SOME, wants=_steers)
+steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, deps=_ABOVE, needs=_SOME, wants=_steers)

@@ -1,67 +1,55 @@
-"""What people read: contact sheet, gallery, the catalogue's tables and figures, the report page; are they current."""
+"""The report groups: contact sheet, gallery, the catalogue's tables and figures, the report page."""
 
-import base64
-import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import dagster as dg
 
-from traps_pipeline import progress
-from traps_pipeline.defs import common
-from traps_pipeline.defs.benchmark import items, scene_specs, videos
-from traps_pipeline.defs.common import OWNERS, Events
-from traps_pipeline.defs.evaluation import responses, verdicts, votes
-from traps_pipeline.defs.scoring import leaderboard
+from traps_pipeline.defs.shown import thumbnail
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.lineage import JUDGED, REPORTS, Lineage, write_report_state
-from traps_pipeline.progress import Tally
+from traps_pipeline.orchestration.stage import key_of, source, stage
 from traps_pipeline.report.catalogue import OF_PAPER, OF_STUDY, PRINTED, Report, TableReport, workspace_files
-from traps_pipeline.report.writing import write_bytes
-from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.report.results import Results
+from traps_pipeline.scoring.published import published_digest
+from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, SCENE_SPECS, VIDEOS
 
 GROUP = "report"
 Files = dict[str, bytes]
-published = common.source_asset(
-    "published", "published", "assets/published: the paper's tables as it prints them.", ["csv"]
+published = source(
+    "published",
+    lambda workspace, key: published_digest(),
+    group="published",
+    doc="assets/published: the paper's tables as it prints them.",
+    kinds=["csv"],
 )
 
 
 def _report(
-    name: str, doc: str, deps: Sequence[dg.AssetsDefinition | dg.AssetKey], make: Callable[[Workspace], Files]
+    name: str,
+    make: Callable[[Workspace], Files],
+    doc: str,
+    *,
+    deps: Sequence[str],
+    group: str = GROUP,
+    kinds: Sequence[str] = ("png",),
 ) -> dg.AssetsDefinition:
-    """An unpartitioned asset that writes files for people into the workspace's `reports` folder."""
+    """An asset that writes files for people into the workspace's `reports` folder, from whatever is there."""
 
-    @dg.asset(
-        name=name,
-        description=doc,
-        deps=deps,
-        group_name=GROUP,
-        kinds={"html" if name in ("gallery", "report_page") else "png"},
-        owners=OWNERS,
-        output_required=False,
-    )
-    def report(context: dg.AssetExecutionContext) -> Events:
-        workspace = Workspace.open()
-        provenance = common.provenance(context, workspace)
-        inputs = Lineage(workspace).inputs(name, None)
+    def made(workspace: Workspace, _: None) -> Made:
         files = make(workspace)
-        for file, content in files.items():
-            write_bytes(workspace.reports / file, content)
-        version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
-        write_report_state(workspace, name, version, inputs)
-        progress.current().partition(name, "", Tally())
-        shown = [file for file in files if "/" not in file]  # posters are parts of a page
-        metadata = {file: dg.MetadataValue.path(str(workspace.reports / file)) for file in shown}
-        pictures = {f"preview of {f}": _preview(content) for f, content in files.items() if f.endswith(".png")}
-        yield common.materialized(context, None, version, provenance, **metadata, **pictures)
+        return Made(files, shown=_previews(files))
 
-    return report
+    needs = dict.fromkeys(deps, "none")
+    return stage(name, made, doc=doc, group=group, deps=[key_of(dep) for dep in deps], needs=needs, kinds=kinds)
 
 
-def _preview(png: bytes) -> dg.MarkdownMetadataValue:
-    return dg.MetadataValue.md(f"![preview](data:image/png;base64,{base64.b64encode(png).decode()})")
+def _previews(files: Mapping[str, bytes]) -> dict[str, Any]:
+    """Small pictures, and the tables themselves."""
+    shown = {f"preview of {f}": thumbnail(content) for f, content in files.items() if f.endswith(".png")}
+    text = {f: content.decode() for f, content in files.items() if f.endswith(".md")}
+    return shown | {f"preview of {file}": dg.MetadataValue.md(content) for file, content in text.items()}
 
 
 def _sheet(workspace: Workspace) -> Files:
@@ -90,6 +78,7 @@ def _shortcuts(workspace: Workspace) -> Files:
     from traps_pipeline.benchmark.shortcuts import shortcuts
     from traps_pipeline.report.figures.shortcuts import shortcut_figure
     from traps_pipeline.report.writing import figure_bytes
+    from traps_pipeline.scenes.encode import DamagedClip
 
     rows = workspace.tables.read_all(ITEMS)
     if rows.empty:
@@ -114,120 +103,66 @@ def _page(workspace: Workspace) -> Files:
 
 contact_sheet = _report(
     "contact_sheet",
-    "Control and void frames of one pair of each sub-scenario, with question and ground truth.",
-    [items],
     _sheet,
+    "Control and void frames of one pair of each sub-scenario, with question and ground truth.",
+    deps=["items"],
 )
 gallery = _report(
     "gallery",
-    "Control, void and twin of every scenario on a page that opens from disk, with words and certificates.",
-    [scene_specs, videos],
     _gallery,
+    "Control, void and twin of every scenario on a page that opens from disk, with words and certificates.",
+    deps=["scene_specs", "videos"],
+    kinds=["html"],
 )
 shortcuts = _report(
     "shortcuts",
+    _shortcuts,
     "How well control and void can be told apart by the question's words, the clip's length, its first frame or its "
     "file size alone: a figure and a table.",
-    [items, videos],
-    _shortcuts,
+    deps=["items", "videos"],
 )
 
 
 # --- tables and figures of the catalogue ------------------------------------------------------------------------------
 
 
-def _spec(name: str, report: Report) -> dg.AssetSpec:
-    of_paper = name in OF_PAPER
-    return dg.AssetSpec(
-        name,
-        description=f"{report.doc} From the paper's published numbers." if of_paper else report.doc,
-        deps=[published] if of_paper else [dg.AssetKey(name) for name in report.reads],
-        group_name="published" if of_paper else "tables" if isinstance(report, TableReport) else "figures",
-        kinds={"csv" if isinstance(report, TableReport) else "png"},
-        owners=OWNERS,
-        skippable=True,
-    )
-
-
-@dg.multi_asset(
-    specs=[_spec(name, report) for name, report in {**OF_STUDY, **OF_PAPER}.items()],
-    can_subset=True,
-    description="Tables and figures; any of them in one run, since each takes less than a run's overhead.",
-)
-def printed(context: dg.AssetExecutionContext) -> Events:
-    """Every selected table and figure, from what is there; what was not run says so."""
+def _results(workspace: Workspace, *, of_paper: bool) -> Results:
+    """What is printed from; a study's is kept while its tables stay the same, since a run prints dozens of assets."""
     from traps_pipeline.report.published_results import PublishedResults
     from traps_pipeline.report.study_results import StudyResults
 
-    workspace = Workspace.open()
-    selected = [name for name in PRINTED if dg.AssetKey(name) in context.selected_asset_keys]
-    provenance = common.provenance_of_each(context, workspace)
-    lineage, study, paper = Lineage(workspace), StudyResults(workspace), PublishedResults()
-    for name in selected:
-        inputs = lineage.inputs(name, None)
-        report = OF_STUDY[name] if name in OF_STUDY else OF_PAPER[name]
-        files = workspace_files(report, study if name in OF_STUDY else paper)
-        for file, content in files.items():
-            write_bytes(workspace.reports / file, content)
-        version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
-        write_report_state(workspace, name, version, inputs)
-        progress.current().partition("printed", name, Tally())
-        yield common.event_of(dg.AssetKey(name), None, version, provenance[name], _shown(workspace, files))
+    if of_paper:
+        return PublishedResults()
+    reads = {name for report in OF_STUDY.values() for name in report.reads}
+    files = [f for name in sorted(reads) for f in (workspace.tables.root / name).rglob("*.parquet")]
+    slot = (workspace.root, *((file, file.stat().st_mtime_ns) for file in files))
+    if slot not in _KEPT:
+        _KEPT.clear()
+        _KEPT[slot] = StudyResults(workspace)
+    return _KEPT[slot]
 
 
-def _shown(workspace: Workspace, files: Files) -> dict[str, dg.MetadataValue]:
-    """Paths, with the picture or the table itself."""
-    shown: dict[str, dg.MetadataValue] = {}
-    for file, content in files.items():
-        shown[file] = dg.MetadataValue.path(str(workspace.reports / file))
-        if file.endswith(".png"):
-            shown[f"preview of {file}"] = _preview(content)
-        elif file.endswith(".md"):
-            shown[f"preview of {file}"] = dg.MetadataValue.md(content.decode())
-    return shown
+_KEPT: dict[tuple[Any, ...], Results] = {}
 
 
+def _printed(name: str, report: Report) -> dg.AssetsDefinition:
+    of_paper, table = name in OF_PAPER, isinstance(report, TableReport)
+    return _report(
+        name,
+        lambda workspace: workspace_files(report, _results(workspace, of_paper=of_paper)),
+        f"{report.doc} From the paper's published numbers." if of_paper else report.doc,
+        deps=["published"] if of_paper else report.reads,
+        group="published" if of_paper else "tables" if table else "figures",
+        kinds=["csv" if table else "png"],
+    )
+
+
+printed = [_printed(name, report) for name, report in {**OF_STUDY, **OF_PAPER}.items()]
 report_page = _report(
     "report_page",
+    _page,
     "The report: leaderboard, figures and tables beside the paper's, every number linked to its items (HTML that opens "
     "from disk); the leaderboard as Markdown.",
-    [
-        items,
-        responses,
-        votes,
-        verdicts,
-        leaderboard,
-        contact_sheet,
-        shortcuts,
-        *(dg.AssetKey(name) for name in PRINTED),
-    ],
-    _page,
+    deps=["items", "responses", "votes", "verdicts", "leaderboard", "contact_sheet", "shortcuts", *PRINTED],
+    kinds=["html"],
 )
-ASSETS = [contact_sheet, gallery, shortcuts, printed, report_page]
-
-_CHECKED = ("leaderboard", *JUDGED, "cosines", "steering_effects", "steering_shares", *REPORTS)
-
-
-@dg.multi_asset_check(
-    name="inputs_current",
-    specs=[
-        dg.AssetCheckSpec(
-            "inputs_current",
-            asset=name,
-            description="Made from what is there now; Dagster itself never calls an unpartitioned asset stale.",
-        )
-        for name in _CHECKED
-    ],
-    can_subset=True,
-)
-def inputs_current(context: dg.AssetCheckExecutionContext) -> Iterator[dg.AssetCheckResult]:
-    """Whether reports are made from what is there now."""
-    lineage = Lineage(Workspace.open())
-    for key in sorted(context.selected_asset_check_keys, key=lambda key: key.asset_key):
-        status = lineage.status(key.asset_key.to_user_string(), None)
-        yield dg.AssetCheckResult(
-            check_name=key.name,
-            asset_key=key.asset_key,
-            passed=status.kind == "fresh",
-            metadata={"status": status.kind, "changed": list(status.reasons)},
-        )

@@ -9,7 +9,7 @@ of the sample and no more, so that labels stay paid for once.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -30,6 +30,7 @@ from traps_pipeline.models.request import JUDGED, Request
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation, is_ill_posed
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.progress import Tally
+from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS
 from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
@@ -216,23 +217,15 @@ def parse_labels(row: Row) -> Labels | str:
 # --- the confabulation stage ------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Labelled:
-    """CONFABULATION rows of a study, and what they took."""
-
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    tally: Tally = field(default_factory=Tally)
-
-
-def collect_labels(workspace: Workspace) -> Labelled:
-    """Sample every model of the protocol that the study has judged, and ask what the ledger of votes does not hold.
+def collect_labels(workspace: Workspace) -> Made:
+    """CONFABULATION rows of a study: sample every model of the protocol that the study has judged, and ask what the ledger of votes does not hold.
 
     Nothing where the study's panel has no judge for it.
     """
-    protocol, done = load_protocol(), Labelled()
+    protocol, table, total = load_protocol(), list[dict[str, Any]](), Tally()
     judge = protocol.judge(workspace.study.panel)
     if judge is None:
-        return done
+        return Made(table)
     samples: dict[Cell, list[Failure]] = {}
     for model in protocol.models:
         samples |= sample_failures(workspace, judge, model)
@@ -241,15 +234,15 @@ def collect_labels(workspace: Workspace) -> Labelled:
         return [failure.request for failure in samples[cell]]
 
     def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> None:
-        done.tally.add(tally)
-        done.rows.extend(_label_row(cell, failure, rows[failure.request.key]) for failure in samples[cell])
+        total.add(tally)
+        table.extend(_label_row(cell, failure, rows[failure.request.key]) for failure in samples[cell])
 
     participants = Participants({judge.id: judge}, make_judge, workspace.study)
     with spending(workspace, [judge]) as budget:
         work = Work(TASK, workspace.votes, participants, budget, workspace.study.epoch, requests, finish)
         for _ in run_work(work, list(samples)):
             pass
-    return done
+    return Made(table, total, {"asked": total.asked, "known": total.cached, "failed": total.errors})
 
 
 def _label_row(cell: Cell, failure: Failure, row: Row) -> dict[str, Any]:

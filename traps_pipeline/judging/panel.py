@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, StrictBool, StrictFloat, StrictInt, 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.answers import is_correct, strip_fence
-from traps_pipeline.models.answers import FinishedCell, answer_request
+from traps_pipeline.models.answers import answer_request, calls_shown
 from traps_pipeline.models.ask import Participants, Row, Work, run_work
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import spending
@@ -38,8 +38,9 @@ from traps_pipeline.models.request import JUDGED, Backend, Request
 from traps_pipeline.partitions import Cell
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.progress import Tally
+from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VOTES
+from traps_pipeline.tables import ITEMS, RESPONSES
 from traps_pipeline.yamlfile import explain, read_yaml
 
 JUDGES_FILE = ASSETS / "judges.yaml"
@@ -92,6 +93,12 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     if not whole or any(seat not in judges for seat in seats):
         raise TrapsError(f"{path}: panel {name!r} must seat {PANEL_SIZE} different known judges, not {seats}")
     return tuple(judges[seat] for seat in seats)
+
+
+def panel_version(panel: str) -> str:
+    """Version of what decides a panel's votes besides answers: judges, their prompts and schemas."""
+    judges = [[judge.id, judge.provider_id or judge.backend, judge.params, SCHEMAS] for judge in load_panel(panel)]
+    return digest([judges, prompt("judge_abstention"), prompt("judge_correctness")])[:16]
 
 
 # --- what a judge is asked --------------------------------------------------------------------------------------------
@@ -187,10 +194,8 @@ def parse_vote(task: Task, row: Row, item: Mapping[str, Any]) -> Vote:
 # --- the votes stage --------------------------------------------------------------------------------------------------
 
 
-def collect_votes(
-    workspace: Workspace, cells: Sequence[Cell], inputs: Mapping[str, Mapping[str, str]]
-) -> Iterator[FinishedCell]:
-    """Ask the study's panel what is missing and write the votes table of each cell."""
+def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Made]]:
+    """Ask the study's panel what is missing; the VOTES rows of each cell as it is done."""
     panel = load_panel(workspace.study.panel)
 
     ballots: dict[Cell, list[Ballot]] = {}
@@ -199,10 +204,9 @@ def collect_votes(
         ballots[cell] = wanted_ballots(workspace, panel, cell)
         return [ballot.request for ballot in ballots[cell]]
 
-    def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> FinishedCell:
+    def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> tuple[Cell, Made]:
         table = [_vote_row(cell, ballot, rows[ballot.request.key]) for ballot in ballots.pop(cell)]
-        version = workspace.tables.write(VOTES, cell.partition, table, inputs[cell.key], failed=tally.errors)
-        return FinishedCell(cell, version, len(table), tally)
+        return cell, Made(table, tally, calls_shown(rows, tally))
 
     participants = Participants({judge.id: judge for judge in panel}, make_judge, workspace.study)
     epoch = workspace.study.epoch

@@ -22,7 +22,7 @@ from traps_pipeline.mechanism.directions import Directions, steered_scenarios, v
 from traps_pipeline.mechanism.paths import sources_of
 from traps_pipeline.mechanism.settings import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.mechanism.versions import loaded_params
-from traps_pipeline.models.answers import FinishedCell
+from traps_pipeline.models.answers import calls_shown
 from traps_pipeline.models.ask import Participants, Row, Work, run_work
 from traps_pipeline.models.budget import spending
 from traps_pipeline.models.local.backend import LocalBackend, outcome
@@ -32,8 +32,9 @@ from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import JUDGED, Outcome, Request
 from traps_pipeline.partitions import SIDES, SteeringCell, taxonomy_of
 from traps_pipeline.progress import Tally
+from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, STEERING, STEERING_VOTES
+from traps_pipeline.tables import ITEMS, STEERING
 
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import Prompt
@@ -241,9 +242,8 @@ def collect_steered(
     entry: ModelEntry,
     cells: Sequence[SteeringCell],
     directions: Mapping[str, Mapping[str, Directions]],
-    inputs: Mapping[str, Mapping[str, str]],
-) -> Iterator[FinishedCell]:
-    """Answer what is missing and write the steering table of each cell. directions: by VQA prompt, then by source."""
+) -> Iterator[tuple[SteeringCell, Made]]:
+    """Answer what is missing; the STEERING rows of each cell as it is done. directions: by VQA prompt, then source."""
     vectors = {
         vector_digest(vector): vector
         for of_prompt in directions.values()
@@ -257,10 +257,9 @@ def collect_steered(
         wanted[cell] = wanted_answers(workspace, entry, cell, directions[cell.directions])
         return [one.request for one in wanted[cell]]
 
-    def finish(cell: Any, rows: Mapping[str, Row], tally: Tally) -> FinishedCell:
+    def finish(cell: Any, rows: Mapping[str, Row], tally: Tally) -> tuple[SteeringCell, Made]:
         table = [_steering_row(cell, one, rows[one.request.key]) for one in wanted.pop(cell)]
-        version = workspace.tables.write(STEERING, cell.partition, table, inputs[cell.key], failed=tally.errors)
-        return FinishedCell(cell, version, len(table), tally)
+        return cell, Made(table, tally, calls_shown(rows, tally))
 
     participants = Participants({entry.id: entry}, lambda e: SteeredBackend(e, vectors), workspace.study)
     with spending(workspace, [entry]) as budget:
@@ -286,9 +285,9 @@ def _steering_row(cell: SteeringCell, one: Wanted, row: Row) -> dict[str, Any]:
 
 
 def collect_steering_votes(
-    workspace: Workspace, cells: Sequence[SteeringCell], inputs: Mapping[str, Mapping[str, str]]
-) -> Iterator[FinishedCell]:
-    """Ask the study's panel whether each steered answer abstains, and write the table of each cell."""
+    workspace: Workspace, cells: Sequence[SteeringCell]
+) -> Iterator[tuple[SteeringCell, Made]]:
+    """Ask the study's panel whether each steered answer abstains; the STEERING_VOTES rows of each cell as it is done."""
     from traps_pipeline.judging.panel import load_panel, make_judge
 
     panel = load_panel(workspace.study.panel)
@@ -298,10 +297,9 @@ def collect_steering_votes(
         asked[cell] = list(_ballots(workspace, panel, cell))
         return [request for _, of_answer in asked[cell] for request in of_answer]
 
-    def finish(cell: Any, rows: Mapping[str, Row], tally: Tally) -> FinishedCell:
+    def finish(cell: Any, rows: Mapping[str, Row], tally: Tally) -> tuple[SteeringCell, Made]:
         table = [_vote_row(cell, answer, of_answer, rows) for answer, of_answer in asked.pop(cell)]
-        version = workspace.tables.write(STEERING_VOTES, cell.partition, table, inputs[cell.key], failed=tally.errors)
-        return FinishedCell(cell, version, len(table), tally)
+        return cell, Made(table, tally, calls_shown(rows, tally))
 
     participants = Participants({judge.id: judge for judge in panel}, make_judge, workspace.study)
     with spending(workspace, panel) as budget:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -21,18 +20,9 @@ from traps_pipeline.models.registry import ModelEntry, effective_params, get_mod
 from traps_pipeline.models.request import Request
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
+from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES
-
-
-@dataclass(frozen=True)
-class FinishedCell:
-    """A cell whose table is written: its data version and what it took."""
-
-    cell: Cell
-    version: str
-    rows: int
-    tally: Tally
+from traps_pipeline.tables import ITEMS
 
 
 def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], evaluation: Evaluation) -> Request:
@@ -112,19 +102,23 @@ def response_row(cell: Cell, item: Mapping[str, Any], key: str, row: Row, reason
     }
 
 
-def collect_answers(
-    workspace: Workspace, cells: Sequence[Cell], inputs: Mapping[str, Mapping[str, str]]
-) -> Iterator[FinishedCell]:
-    """Ask what is missing and write the table of each cell; `inputs` are the input versions by cell key."""
+def calls_shown(rows: Mapping[str, Row], tally: Tally) -> dict[str, Any]:
+    """How the calls of a cell went, for people."""
+    dollars = sum(row["cost_usd"] or 0.0 for row in rows.values())
+    counts = {"wanted": len(rows), "known": tally.cached, "asked": tally.asked, "failed": tally.errors}
+    return {**counts, "dollars": round(dollars, 6)}
+
+
+def collect_answers(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Made]]:
+    """Ask what is missing; the RESPONSES rows of each cell as it is done."""
 
     prepare_media(workspace, cells)
 
-    def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> FinishedCell:
+    def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> tuple[Cell, Made]:
         traces = workspace.answers.reasoning(cell.evaluation.key, rows)
         keyed = zip(_items(workspace, cell.dataset), wanted_requests(workspace, cell), strict=True)
         table = [response_row(cell, item, r.key, rows[r.key], traces.get(r.key)) for item, r in keyed]
-        version = workspace.tables.write(RESPONSES, cell.partition, table, inputs[cell.key], failed=tally.errors)
-        return FinishedCell(cell, version, len(table), tally)
+        return cell, Made(table, tally, calls_shown(rows, tally))
 
     def requests(cell: Cell) -> list[Request]:
         return wanted_requests(workspace, cell)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import ASSETS
 
@@ -39,3 +40,8 @@ def vqa_prompt(name: str) -> str:
     """The system prompt under which hidden states are extracted: `standard`, or `guided` (`benchmark.md` section 7)."""
     parts = {"standard": ("vqa_standard",), "guided": ("vqa_standard", "vqa_guided_suffix")}[name]
     return "\n\n".join(prompt(part) for part in parts)
+
+
+def prompt_version(regime: str) -> str:
+    """Version of a regime's system prompt."""
+    return digest(system_prompt(regime))[:16]

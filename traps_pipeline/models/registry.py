@@ -12,10 +12,11 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
-from traps_pipeline.models.media import MediaSpec
-from traps_pipeline.partitions import VQA_PROMPTS, Evaluation, Extraction, check_slug, evaluations
+from traps_pipeline.models.media import MediaSpec, profile_digest
+from traps_pipeline.partitions import Evaluation, check_slug
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
 
@@ -279,6 +280,14 @@ def effective_params(entry: ModelEntry, regime: str) -> dict[str, Any]:
     return entry.params | ({"response_format": JSON_ANSWER} if structured else {})
 
 
+def answering_version(evaluation: Evaluation) -> str:
+    """Version of what decides a model's answers under a regime besides the prompt: what is sent of it."""
+    entry = get_model(evaluation.model)
+    sent = [effective_params(entry, evaluation.regime)]
+    sent += [profile_digest(entry.media)] if entry.media else []
+    return digest([entry.id, entry.provider_id or entry.backend, *sent])[:16]
+
+
 def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:
     """Environment variables of keys that are not set: who needs them."""
     accounts = load_accounts()
@@ -299,24 +308,6 @@ def get_model(model_id: str) -> ModelEntry:
 
 
 @cache
-def all_evaluations() -> tuple[Evaluation, ...]:
-    """The second partition dimension: every model, regime and run of the registry."""
-    return tuple(evaluations((entry.id, entry.runs) for entry in load_models().values()))
-
-
-@cache
 def local_models() -> tuple[str, ...]:
     """Models whose hidden states can be read, in file order."""
     return tuple(entry.id for entry in load_models().values() if entry.backend == LOCAL)
-
-
-@cache
-def all_extractions() -> tuple[Extraction, ...]:
-    """The partitions of what is extracted: every local model under every VQA prompt."""
-    return tuple(Extraction(model, prompt) for model in local_models() for prompt in VQA_PROMPTS)
-
-
-@cache
-def all_steered() -> tuple[str, ...]:
-    """`model__directionregime__inferenceregime` of every local model."""
-    return tuple(f"{model}__{d}__{i}" for model in local_models() for d in VQA_PROMPTS for i in VQA_PROMPTS)

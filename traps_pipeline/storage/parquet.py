@@ -6,12 +6,14 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.progress import Tally
 from traps_pipeline.tables import VOLATILE, Table
 
 if TYPE_CHECKING:
@@ -20,16 +22,40 @@ if TYPE_CHECKING:
 
 
 _FOOTER = b"traps"
+_SOUND: dict[Path, str] = {}  # files whose content this process has compared with their footer
 
 
 @dataclass(frozen=True)
 class State:
-    """What a partition's footer says: its data version, the versions of its inputs, its rows, its failed answers."""
+    """What a partition's footer says: its data version, the versions of its inputs, its rows, its failed answers, and
+    the version of the code that made it."""
 
     version: str
     inputs: dict[str, str]
     rows: int
     failed: int
+    code: str = "1"
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a stage has made of a partition, before it is written: a table's rows or files by path, what they took, what
+    else a person wants to see of them, and what their checks look at beside them."""
+
+    content: Sequence[Mapping[str, Any]] | pd.DataFrame | Mapping[str, bytes]
+    tally: Tally = field(default_factory=Tally)
+    shown: Mapping[str, Any] = field(default_factory=dict)
+    beside: Any = None
+
+    @property
+    def rows(self) -> Sequence[Mapping[str, Any]]:
+        """The rows of a table that is made row by row."""
+        return cast("Sequence[Mapping[str, Any]]", self.content)
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """The rows of a table that is made as a frame."""
+        return cast("pd.DataFrame", self.content)
 
 
 class TableStore:
@@ -55,18 +81,20 @@ class TableStore:
         inputs: Mapping[str, str],
         *,
         failed: int = 0,
+        code: str = "1",
     ) -> str:
         """Write one partition and return its data version (a digest of its content, volatile columns aside).
 
         Rows are sorted by the table's key. `inputs` (versions of what the rows were made from) and `failed` (answers
         that a next run should ask again) go into the file's footer with the version. Raises TrapsError when a row
         breaks the schema or a key repeats, and when the disk is full; the partition's former file then still stands.
+        code is the version of what made the rows.
         """
         import pyarrow.parquet as pq
 
         data = self._checked(table, partition, rows)
         version = content_version(data)
-        state = State(version, dict(inputs), len(data), failed)
+        state = State(version, dict(inputs), len(data), failed, code)
         data = data.replace_schema_metadata({_FOOTER: json.dumps(asdict(state)).encode()})
         path = self.path(table, partition)
         part = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -135,6 +163,32 @@ class TableStore:
             return state if schema.names == table.arrow_schema().names else None
         except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
             raise _unreadable(path, table, error) from error
+
+    def damage(self, table: Table, partition: Mapping[str, Any], *, thorough: bool = False) -> str:
+        """What is wrong with a partition's file, in words; empty where its content is what was written, or where there
+        is no file.
+
+        A file is read whole once; that it was sound is noted beside it with its size and time. thorough: such notes of
+        other processes are not believed.
+        """
+        path = self.path(table, partition)
+        try:
+            found = path.stat()
+        except FileNotFoundError:
+            return ""
+        stamp, note = f"{found.st_mtime_ns} {found.st_size} {found.st_ino}", path.with_name(f".{path.name}.sound")
+        if _SOUND.get(path) == stamp or (not thorough and note.is_file() and note.read_text() == stamp):
+            return ""
+        try:
+            state = self.state(table, partition)
+            if state is not None and content_version(self._load(table, path, None)) != state.version:
+                return f"{path}: is not what was written (its rows were altered)"
+        except TrapsError as error:
+            return str(error)
+        _SOUND[path] = stamp
+        with suppress(OSError):  # a study that can only be read is read again next time
+            note.write_text(stamp)
+        return ""
 
     def read(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
         """One partition. Raises TrapsError naming the file and the stage to materialize when it is not there."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.settings import MechanismSettings
 from traps_pipeline.paths import CHECKOUT, require_checkout
@@ -42,14 +44,29 @@ def write_bytes(path: Path, content: bytes) -> None:
         part.unlink(missing_ok=True)
 
 
+class Asked(BaseModel):
+    """What one experiment asks about a study's scenarios. mechanism: whether it looks inside local models."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    datasets: tuple[str, ...]
+    models: tuple[str, ...]
+    regimes: tuple[str, ...]
+    runs: tuple[int, ...]
+    mechanism: bool = False
+
+
 class Study(BaseModel):
-    """`study.yaml`: the benchmark, its subset, the panel and the budget of everything in the workspace.
+    """`study.yaml`: the benchmark, its subset, the panel, the budget and the experiments of a workspace.
 
     benchmark, scenarios and per_family are fixed when the workspace is created; panel, epoch and budget may be edited.
+    No command and no button asks a model that `experiments` does not name.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     format: int = FORMAT
+    name: str = Field(
+        default="", pattern=r"^([a-z0-9-]+)?$", description="tells studies apart that share one Dagster history"
+    )
     benchmark: str = "released"
     scenarios: list[str] | None = Field(default=None, description="named scenarios; all if absent")
     per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
@@ -61,6 +78,9 @@ class Study(BaseModel):
     )
     allow_unknown_prices: bool = Field(default=False, description="ask models without a price: no budget bounds them")
     mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")
+    experiments: dict[str, Asked] = Field(
+        default={}, description="by name; written by `traps init` and `traps run`, remove one to ask no more for it"
+    )
 
     @property
     def is_subset(self) -> bool:
@@ -72,6 +92,12 @@ class Study(BaseModel):
         if self.scenarios is not None and self.per_family is not None:
             raise ValueError("give scenarios or per_family, not both")
         return self
+
+
+def _name_of(root: Path) -> str:
+    """A name that no study elsewhere has: the folder's, and a digest of where it was made."""
+    plain = re.sub(r"[^a-z0-9]+", "-", root.name.lower()).strip("-")
+    return f"{plain}-{digest(str(root))[:8]}".lstrip("-")
 
 
 class Workspace:
@@ -102,8 +128,7 @@ class Workspace:
             return workspace
         for folder in ("tables", "clips", "trajectories", "ledger", "reports", "dagster"):
             (root / folder).mkdir(parents=True, exist_ok=True)
-        workspace = cls(root, study)
-        workspace._link_dagster_yaml()
+        workspace = cls(root, study.model_copy(update={"name": study.name or _name_of(root)}))
         workspace.save_study()
         return workspace
 
@@ -123,7 +148,7 @@ class Workspace:
         return self.study.mechanism
 
     def allow(self, **changes: Any) -> Workspace:
-        """The workspace with other values of budget_usd, model_budgets_usd, allow_unknown_prices, mechanism."""
+        """The workspace with other values of fields that may change: budgets, prices, mechanism, experiments."""
         changed = Workspace(self.root, self.study.model_copy(update=changes))
         changed.save_study()
         return changed
@@ -146,10 +171,11 @@ class Workspace:
             )
         return cls(root, parse_yaml_model(Study, data, path))
 
-    def _link_dagster_yaml(self) -> None:
-        link = self.dagster_home / "dagster.yaml"
-        if not link.exists():
-            link.symlink_to(CHECKOUT / "dagster.yaml")
+    def copy_dagster_yaml(self) -> None:
+        """Give Dagster's folder the checkout's `dagster.yaml`, unless it has one of its own (another storage, say)."""
+        own = self.dagster_home / "dagster.yaml"
+        if own.is_symlink() or not own.exists():
+            write_text(own, (CHECKOUT / "dagster.yaml").read_text(encoding="utf-8"))
 
     @property
     def dagster_home(self) -> Path:

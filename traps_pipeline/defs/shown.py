@@ -1,0 +1,42 @@
+"""What Dagster shows of tables and pictures beside their numbers."""
+
+import math
+from typing import TYPE_CHECKING
+
+import dagster as dg
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+THUMBNAIL_WIDTH = 480  # px; the picture itself lies in the reports folder, an event holds some 15 KB of it
+
+
+def rows_shown(frame: "pd.DataFrame", rows: int = 60) -> dg.MarkdownMetadataValue | str:
+    """The first rows as Dagster shows them. For figures and ids alone: nothing that a model wrote."""
+    if frame.empty:
+        return "not run"
+    head = frame.head(rows)
+    lines = [[str(name) for name in head.columns], ["---"] * len(head.columns)]
+    lines += [[_plain(value) for value in row] for row in head.itertuples(index=False)]
+    return dg.MetadataValue.md("\n".join("| " + " | ".join(line) + " |" for line in lines))
+
+
+def thumbnail(png: bytes) -> dg.MarkdownMetadataValue:
+    """A small JPEG of a picture."""
+    import base64
+
+    import cv2
+    import numpy as np
+
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None, "our own PNG"
+    scale = min(1.0, THUMBNAIL_WIDTH / picture.shape[1])
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
+    return dg.MetadataValue.md(f"![preview](data:image/jpeg;base64,{base64.b64encode(jpeg).decode()})")
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.4g}"
+    return "" if value is None else str(value).replace("|", "\\|")

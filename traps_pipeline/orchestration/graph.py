@@ -1,0 +1,204 @@
+"""What each partition is made from, which keys there are, and in which order: a view of the assets' own specs.
+
+`stage` and `source` (`orchestration.stage`) are the only declarations. This module reads Dagster's specs and adds what
+Dagster has no words for: how much of a parent is needed, and what making a partition costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Any, Literal
+
+import dagster as dg
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import Table
+from traps_pipeline.wanted import Wanted
+
+if TYPE_CHECKING:
+    from traps_pipeline.orchestration.schemes import Scheme
+
+Node = tuple[str, str | None]  # stage or source, and its partition key
+Need = Literal["every", "some", "none"]
+Cost = Literal["", "money", "machine"]
+GROUPS = ("benchmark", "evaluation", "scoring", "judging", "mechanism", "report", "tables", "figures", "published")
+
+
+@dataclass(frozen=True)
+class Check:
+    """A check of each partition. wrong: what is wrong with it, in words or as data; empty where it passes.
+
+    blocks: nothing is made from a partition that does not pass.
+    """
+
+    name: str
+    doc: str
+    wrong: Callable[[Workspace, str | None, Made], Any]
+    blocks: bool = True
+
+
+@dataclass(frozen=True)
+class Source:
+    """Something that people edit. version: of its content, by partition where it has any."""
+
+    spec: dg.AssetSpec
+    version: Callable[[Workspace, Any], str]
+    scheme: Scheme | None = None
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Something that is made: a table, or files for people (table: None).
+
+    make makes one partition, collect several side by side and hands each on when it is done. needs: how much of each
+    parent must be there, by name (default: every partition that the study wants). code: raise it when the formula
+    changes, and what was made before is stale. cost: what making it takes besides seconds. wants: whether a study wants
+    a key at all. lost: what is missing of the files that a partition names.
+    """
+
+    spec: dg.AssetSpec
+    table: Table | None
+    make: Callable[[Workspace, Any], Made] | None
+    collect: Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, Made]]] | None
+    scheme: Scheme | None
+    needs: Mapping[str, Need]
+    checks: Sequence[Check]
+    code: str
+    cost: Cost
+    wants: Callable[[Wanted, Any], bool]
+    lost: Callable[[Workspace, Any], list[str]]
+
+    @property
+    def name(self) -> str:
+        """Its name: that of its table."""
+        return self.spec.key.path[-1]
+
+    def columns(self, key: str | None) -> Mapping[str, Any]:
+        """Values of the table's partition columns for a key."""
+        return {} if self.scheme is None or key is None else self.scheme.columns(key)
+
+    def wanted(self, wanted: Wanted) -> list[str | None]:
+        """The keys that a study wants, in key order."""
+        keys: Sequence[str | None] = [None] if self.scheme is None else self.scheme.wanted(wanted)
+        return [key for key in keys if self.wants(wanted, key)]
+
+
+DECLARED: dict[str, Stage | Source] = {}  # by name; filled as `defs` is loaded
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """Stages and sources, their keys, and what each partition is made from."""
+
+    declared: Mapping[str, Stage | Source] = field(default_factory=lambda: DECLARED)
+
+    @cached_property
+    def parents_of(self) -> Mapping[str, Mapping[str, dg.AssetDep]]:
+        """What a stage is made from, by name, with Dagster's partition mapping."""
+        return {
+            name: {dep.asset_key.path[-1]: dep for dep in one.spec.deps} if isinstance(one, Stage) else {}
+            for name, one in self.declared.items()
+        }
+
+    def __getitem__(self, name: str) -> Stage:
+        one = self.declared.get(name)
+        if not isinstance(one, Stage):
+            known = ", ".join(stage.name for stage in self.stages)
+            raise TrapsError(f"no stage {name!r}; choose from {known}")
+        return one
+
+    def source(self, name: str) -> Source | None:
+        """The source of that name; None for a stage."""
+        one = self.declared[name]
+        return one if isinstance(one, Source) else None
+
+    @cached_property
+    def sources(self) -> list[str]:
+        """Names of all sources."""
+        return [name for name, one in self.declared.items() if isinstance(one, Source)]
+
+    def blocks(self, names: Collection[str] | None = None) -> list[list[Stage]]:
+        """Stages (default: all) in order, those together that can be made in one run: they share a scheme, and nothing
+        of another scheme stands between them. Among what is ready, the groups come in the order of `GROUPS`."""
+        left = {
+            name: one
+            for name, one in self.declared.items()
+            if isinstance(one, Stage) and (names is None or name in names)
+        }
+        above = {name: {p for p in self.parents_of[name] if p in left} for name in left}
+        found: list[list[Stage]] = []
+        while left:
+            ready = [name for name in left if not above[name] & left.keys()]
+            if not ready:
+                raise TrapsError(f"the graph has a circle among {', '.join(left)}")
+            first = min(ready, key=lambda name: GROUPS.index(left[name].spec.group_name or ""))
+            scheme, block = left[first].scheme, list[Stage]()
+            while ready:
+                block += [left.pop(name) for name in ready if left[name].scheme is scheme]
+                ready = [n for n in left if left[n].scheme is scheme and not above[n] & left.keys()]
+            found.append(block)
+        return found
+
+    @cached_property
+    def stages(self) -> list[Stage]:
+        """All stages, in an order in which each finds its inputs made."""
+        return [stage for block in self.blocks() for stage in block]
+
+    def above(self, names: Iterable[str]) -> set[str]:
+        """The stages of these names, and all that they are made from."""
+        found, left = set[str](), [*names]
+        while left:
+            name = left.pop()
+            if name not in found and isinstance(self.declared[name], Stage):
+                found.add(name)
+                left += self.parents_of[name]
+        return found
+
+    def below(self, name: str) -> set[str]:
+        """The stages that are made directly from one."""
+        return {child for child, parents in self.parents_of.items() if name in parents}
+
+    @cache  # noqa: B019 - a graph lives as long as its process
+    def keys(self, name: str) -> list[str | None]:
+        """All partition keys of a stage or source."""
+        scheme = self.declared[name].scheme
+        return [None] if scheme is None else [str(key) for key in scheme.definition.get_partition_keys()]
+
+    @cache  # noqa: B019 - a graph lives as long as its process
+    def parents(self, name: str, key: str | None) -> Mapping[str, Sequence[str | None]]:
+        """Every partition that a partition may be made from, whether it is there or not: keys by stage or source."""
+        scheme = self.declared[name].scheme
+        if key not in self.keys(name):
+            return {}  # of an experiment that the study has no more
+        child = None if scheme is None else scheme.definition
+        wanted = child.subset_with_partition_keys([key]) if child is not None and key is not None else None
+        found: dict[str, Sequence[str | None]] = {}
+        for parent, dep in self.parents_of[name].items():
+            over = self.declared[parent].scheme
+            if over is None:
+                found[parent] = [None]
+                continue
+            same = dg.IdentityPartitionMapping() if over is scheme else dg.AllPartitionMapping()
+            mapped = (dep.partition_mapping or same).get_upstream_mapped_partitions_result_for_partitions(
+                wanted, child, over.definition
+            )
+            found[parent] = [str(k) for k in mapped.partitions_subset.get_partition_keys()]
+        return found
+
+
+def name_of(node: Node) -> str:
+    """`stage` or `stage/key`, as footers store it."""
+    return node[0] if node[1] is None else f"{node[0]}/{node[1]}"
+
+
+@cache
+def the_graph() -> Graph:
+    """The graph of everything that is declared; `traps_pipeline.definitions` is loaded for it."""
+    import importlib
+
+    importlib.import_module("traps_pipeline.definitions")
+    return Graph()

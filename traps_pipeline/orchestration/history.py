@@ -1,0 +1,87 @@
+"""What Dagster is told of each partition and source, and what it knows: data versions and where they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import dagster as dg
+
+from traps_pipeline.orchestration.graph import Graph, Node, Stage
+from traps_pipeline.orchestration.lineage import Lineage
+
+_VERSION, _USER, _CODE = "dagster/data_version", "dagster/data_version_is_user_provided", "dagster/code_version"
+_INPUT_VERSION, _INPUT_POINTER = "dagster/input_data_version", "dagster/input_event_pointer"
+NEVER = "INITIAL"  # Dagster's word for the version of what was never made
+
+
+class History:
+    """Dagster's history of the assets of a graph."""
+
+    def __init__(self, instance: dg.DagsterInstance, graph: Graph) -> None:
+        self._instance, self._graph = instance, graph
+
+    def event(
+        self, stage: Stage, key: str | None, version: str, provenance: Mapping[str, str], metadata: Mapping[str, Any]
+    ) -> dg.AssetMaterialization:
+        """The event that makes a partition count as made, with its data version and what it was made from."""
+        tags = {_VERSION: version, _USER: "true", _CODE: stage.code, **provenance}
+        return dg.AssetMaterialization(stage.spec.key, partition=key, metadata=metadata, tags=tags)
+
+    def provenance(self, stage: Stage) -> dict[str, str]:
+        """Tags that say which events of the parents are current. Taken before anything is read."""
+        tags: dict[str, str] = {}
+        for dep in stage.spec.deps:
+            name, parent = dep.asset_key.to_user_string(), dep.asset_key.path[-1]
+            found = self._fetch(parent)(dg.AssetRecordsFilter(asset_key=dep.asset_key), limit=1).records
+            version = _version_of(found[0]) if found else None
+            tags[f"{_INPUT_VERSION}/{name}"] = version or NEVER
+            tags[f"{_INPUT_POINTER}/{name}"] = str(found[0].storage_id) if found else "NULL"
+        return tags
+
+    def recorded(self, name: str) -> dict[str | None, str | None]:
+        """The data version that Dagster knows of each partition of a stage or source."""
+        versions: dict[str | None, str | None] = {}
+        cursor, asset_key = None, self._graph.declared[name].spec.key
+        while True:
+            page = self._fetch(name)(dg.AssetRecordsFilter(asset_key=asset_key), limit=1000, cursor=cursor)
+            for record in page.records:  # newest first
+                event = record.asset_materialization or record.asset_observation
+                if event is not None:
+                    versions.setdefault(event.partition, _version_of(record))
+            if not page.has_more or len(versions) >= len(self._graph.keys(name)):
+                return versions
+            cursor = page.cursor
+
+    def observe(self, lineage: Lineage, sources: Iterable[str] | None = None) -> list[Node]:
+        """Tell Dagster the versions of sources (default: all) that it does not know yet; returns those that changed."""
+        changed = list[Node]()
+        for name in self._graph.sources if sources is None else sources:
+            now = {key: str(lineage.version(name, key)) for key in self._graph.keys(name)}
+            slot = (Path(self._instance.root_directory), name)
+            if _OBSERVED.get(slot) == now:
+                continue
+            recorded = self.recorded(name)
+            for key, version in now.items():
+                if recorded.get(key) != version:
+                    tags, asset_key = {_VERSION: version, _USER: "true"}, self._graph.declared[name].spec.key
+                    self._instance.report_runless_asset_event(
+                        dg.AssetObservation(asset_key, partition=key, tags=tags)
+                    )
+                    changed.append((name, key))
+            _OBSERVED[slot] = now
+        return changed
+
+    def _fetch(self, name: str) -> Callable[..., dg.EventRecordsResult]:
+        source = self._graph.source(name) is not None
+        return self._instance.fetch_observations if source else self._instance.fetch_materializations
+
+
+# By history and source: versions when this process last told them. A run has many steps, and each would look again.
+_OBSERVED: dict[tuple[Path, str], dict[str | None, str]] = {}
+
+
+def _version_of(record: dg.EventLogRecord) -> str | None:
+    event = record.asset_materialization or record.asset_observation
+    return (event.tags or {}).get(_VERSION) if event else None

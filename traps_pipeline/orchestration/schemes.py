@@ -1,0 +1,91 @@
+"""How stages are partitioned, in Dagster's words: the keys are those of the study that `TRAPS_WORKSPACE` names."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import dagster as dg
+
+from traps_pipeline.partitions import Cell, Extraction, StatesCell, SteeringCell
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.wanted import Wanted
+
+# Partition mappings over one dimension, observable sources and backfill policies are in beta; the version is pinned.
+warnings.filterwarnings("ignore", category=dg.BetaWarning)
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """One way of partitioning. columns: the values of a table's partition columns for a key; wanted: a study's keys."""
+
+    definition: dg.PartitionsDefinition
+    columns: Callable[[str], Mapping[str, Any]]
+    wanted: Callable[[Wanted], Sequence[str]]
+
+
+def study_here() -> Workspace | None:
+    """The workspace that the environment names; None where there is none yet."""
+    root = Workspace.default_root()
+    return Workspace.open(root) if (root / "study.yaml").is_file() else None
+
+
+_HERE = Wanted(study_here())
+
+
+def _static(keys: Iterable[str]) -> dg.StaticPartitionsDefinition:
+    return dg.StaticPartitionsDefinition([*keys])
+
+
+def _multi(**dimensions: dg.PartitionsDefinition) -> dg.MultiPartitionsDefinition:
+    return dg.MultiPartitionsDefinition(dimensions)
+
+
+CATEGORY = Scheme(_static(_HERE.categories), lambda key: {"category": key}, lambda wanted: wanted.categories)
+DATASET = Scheme(_static(_HERE.datasets), lambda key: {"dataset": key}, lambda wanted: wanted.datasets)
+EVALUATION = Scheme(
+    _static(e.key for e in _HERE.evaluations), lambda key: {}, lambda wanted: [e.key for e in wanted.evaluations]
+)
+CELL = Scheme(
+    _multi(dataset=DATASET.definition, evaluation=EVALUATION.definition),
+    lambda key: Cell.parse(key).partition,
+    lambda wanted: wanted.cells,
+)
+# Inside local models: datasets and occlusion's answerable questions; model__prompt; model__directions__regime.
+PROBED = Scheme(_static(_HERE.probed), lambda key: {"dataset": key}, lambda wanted: wanted.probed)
+EXTRACTION = Scheme(
+    _static(e.key for e in _HERE.extractions),
+    lambda key: Extraction.parse(key).partition,
+    lambda wanted: [e.key for e in wanted.extractions],
+)
+STATES = Scheme(
+    _multi(dataset=PROBED.definition, extraction=EXTRACTION.definition),
+    lambda key: StatesCell.parse(key).partition,
+    lambda wanted: wanted.states,
+)
+STEERED = Scheme(_static(_HERE.steered), lambda key: {}, lambda wanted: wanted.steered)
+STEERING = Scheme(
+    _multi(dataset=DATASET.definition, steering=STEERED.definition),
+    lambda key: SteeringCell.parse(key).partition,
+    lambda wanted: wanted.steering,
+)
+
+by_dataset = dg.MultiToSingleDimensionPartitionMapping("dataset")
+by_evaluation = dg.MultiToSingleDimensionPartitionMapping("evaluation")
+by_extraction = dg.MultiToSingleDimensionPartitionMapping("extraction")
+by_steering = dg.MultiToSingleDimensionPartitionMapping("steering")
+
+
+def to_keys(above: Scheme, below: Scheme, mapping: Callable[[str], Iterable[str]]) -> dg.StaticPartitionMapping:
+    """What partitions below are made from each above, of the keys that the study has."""
+    there = {*below.definition.get_partition_keys()}
+    pairs = {str(key): sorted(there & {*mapping(str(key))}) for key in above.definition.get_partition_keys()}
+    return dg.StaticPartitionMapping({key: found for key, found in pairs.items() if found})
+
+
+def these_keys(above: Scheme, keys: Iterable[str]) -> dg.SpecificPartitionsPartitionMapping:
+    """Of all partitions above these, as far as the study has them."""
+    there = {str(key) for key in above.definition.get_partition_keys()}
+    return dg.SpecificPartitionsPartitionMapping([key for key in keys if key in there])

@@ -1,0 +1,408 @@
+"""The one declaration of a stage, and the one way to make a partition.
+
+`stage(...)` gives the Dagster asset of a table (or of files for people). Whoever starts a run, the same protocol makes its
+partitions, in the one order that is sound: what the inputs are is noted before anything is read; what cannot be made
+yet, or would be made from something damaged, is left with the reason; each partition is written, read again, checked
+and told to Dagster as soon as it is done, with a data version made from its content. Below a partition that is not made
+nothing is made, everything else is; the last step of a run raises with all that is missing.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import dagster as dg
+
+from traps_pipeline import progress
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.budget import BudgetReached
+from traps_pipeline.orchestration.graph import (
+    DECLARED,
+    Check,
+    Cost,
+    Need,
+    Node,
+    Source,
+    Stage,
+    name_of,
+    the_graph,
+)
+from traps_pipeline.orchestration.history import History
+from traps_pipeline.orchestration.lineage import Lineage, write_report_state
+from traps_pipeline.orchestration.schemes import Scheme, study_here
+from traps_pipeline.progress import Tally
+from traps_pipeline.storage.parquet import Made, State
+from traps_pipeline.storage.workspace import Workspace, write_bytes, write_text
+from traps_pipeline.tables import Table
+from traps_pipeline.wanted import Wanted
+
+OWNERS = ["team:benchmark"]
+CURRENT = "current"  # the check that every stage has
+CURRENT_DOC = "Made from what is there now, whole, with no failed call: read again after writing."
+MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # of runs: what to make of what is selected, and for whom
+STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
+REACHED = "a budget is reached"  # in a check's metadata
+SHOWN = 12  # unmade partitions named in an error
+# Dagster skips a step below one that hands on no output, and writes an event with one version for all partitions for
+# an output that is handed on, unless it carries this mark: observable sources that tell their own versions carry it.
+_TOLD_ALREADY = {"__source_asset_observation__": True}
+Event = dg.AssetMaterialization | dg.AssetCheckEvaluation | dg.MaterializeResult | dg.Output
+
+
+class WorkspaceResource(dg.ConfigurableResource):
+    """The study that a run works in."""
+
+    root: str
+
+    def open(self) -> Workspace:
+        """The workspace. Raises TrapsError naming the remedy where there is none."""
+        return Workspace.open(Path(self.root))
+
+
+def key_of(name: str) -> dg.AssetKey:
+    """The asset key of a stage or source: its name, behind the study's where several studies share one history."""
+    return dg.AssetKey([*_PREFIX, name])
+
+
+def _shared_history() -> list[str]:
+    home, workspace = os.environ.get("DAGSTER_HOME"), study_here()
+    if workspace is None or not home or Path(home).resolve() == workspace.dagster_home.resolve():
+        return []
+    return [workspace.study.name] if workspace.study.name else []
+
+
+_PREFIX = _shared_history()
+
+
+def source(
+    name: str,
+    version: Callable[[Workspace, Any], str],
+    *,
+    group: str,
+    doc: str,
+    kinds: Collection[str],
+    scheme: Scheme | None = None,
+) -> dg.AssetsDefinition:
+    """An observable source asset whose data version, by partition where it has any, is made from its content."""
+    spec = dg.AssetSpec(key_of(name), group_name=group)
+    DECLARED[name] = Source(spec, version, scheme)
+
+    @dg.observable_source_asset(
+        key=spec.key,
+        partitions_def=scheme.definition if scheme else None,
+        group_name=group,
+        description=doc,
+        tags={f"dagster/kind/{kind}": "" for kind in kinds},
+        metadata={"owner": OWNERS[0]},
+    )
+    def observe(workspace: WorkspaceResource) -> dg.DataVersion | dg.DataVersionsByPartition:
+        opened = workspace.open()
+        if scheme is None:
+            return dg.DataVersion(version(opened, None))
+        keys = map(str, scheme.definition.get_partition_keys())
+        return dg.DataVersionsByPartition({key: version(opened, key) for key in keys})
+
+    return cast(dg.AssetsDefinition, observe)
+
+
+def stage(
+    table: Table | str,
+    make: Callable[[Workspace, Any], Made] | None = None,
+    *,
+    collect: Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, Made]]] | None = None,
+    group: str,
+    deps: Sequence[Any],
+    doc: str = "",
+    scheme: Scheme | None = None,
+    needs: Mapping[str, Need] | None = None,
+    checks: Sequence[Check] = (),
+    kinds: Collection[str] = (),
+    code: str = "1",
+    cost: Cost = "",
+    wants: Callable[[Wanted, Any], bool] = lambda wanted, key: True,
+    lost: Callable[[Workspace, Any], list[str]] = lambda workspace, key: [],
+    columns: Mapping[str, Collection[str]] | None = None,
+) -> dg.AssetsDefinition:
+    """The asset of a table, or of files for people where only a name is given (see `graph.Stage` for the parameters).
+
+    The description is `doc`, else the docstring of `make` or `collect`. columns: columns of parents that a column is
+    made from, as `parent.column`, where that is known.
+    """
+    name = table if isinstance(table, str) else table.name
+    described = doc or (make or collect).__doc__ or ""
+    spec = dg.AssetSpec(
+        key_of(name),
+        deps=deps,
+        description=" ".join(described.split()),
+        group_name=group,
+        kinds={*kinds} or {"parquet"},
+        owners=OWNERS,
+        partitions_def=scheme.definition if scheme else None,
+        metadata={} if isinstance(table, str) else _table_metadata(table, columns or {}),
+        code_version=code,
+        tags={"cost": cost} if cost else {},
+    )
+    content = None if isinstance(table, str) else table
+    declared = Stage(spec, content, make, collect, scheme, needs or {}, checks, code, cost, wants, lost)
+    DECLARED[name] = declared
+    specs = [(CURRENT, CURRENT_DOC, False), *((check.name, check.doc, check.blocks) for check in checks)]
+
+    @dg.asset(
+        key=spec.key,
+        deps=deps,
+        description=spec.description,
+        group_name=group,
+        kinds=set(spec.kinds),
+        owners=OWNERS,
+        partitions_def=spec.partitions_def,
+        metadata=spec.metadata,
+        code_version=code,
+        tags={"cost": cost} if cost else None,
+        backfill_policy=dg.BackfillPolicy.single_run() if scheme else None,
+        output_required=False,
+        check_specs=[
+            dg.AssetCheckSpec(n, asset=spec.key, description=d, blocking=b, partitions_def=spec.partitions_def)
+            for n, d, b in specs
+        ],
+    )
+    def asset(context: dg.AssetExecutionContext, workspace: WorkspaceResource) -> Iterator[Event]:
+        yield from _Step(declared, context, workspace.open()).run()
+
+    return asset
+
+
+def _table_metadata(table: Table, made_from: Mapping[str, Collection[str]]) -> dict[str, Any]:
+    """A table's contract as Dagster shows it."""
+    columns = [
+        dg.TableColumn(c.name, c.type.rstrip("?"), c.doc, dg.TableColumnConstraints(nullable=c.nullable))
+        for c in table.columns
+    ]
+    metadata: dict[str, Any] = {"dagster/column_schema": dg.TableSchema(columns=columns), "one row is": table.row}
+    if made_from:
+        sources = {
+            column: [
+                dg.TableColumnDep(key_of(above.partition(".")[0]), above.partition(".")[2]) for above in sorted(parents)
+            ]
+            for column, parents in made_from.items()
+        }
+        metadata["dagster/column_lineage"] = dg.TableColumnLineage(sources)
+    return metadata
+
+
+class _Step:
+    """One stage in one run."""
+
+    def __init__(self, stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> None:
+        self.stage, self.context, self.workspace = stage, context, workspace
+        self.graph = the_graph()
+        self.history = History(context.instance, self.graph)
+        self.unmade: dict[str | None, TrapsError] = {}
+
+    def run(self) -> Iterator[Event]:
+        """See the module."""
+        stage, name = self.stage, self.stage.name
+        lineage = Lineage(self.workspace, thorough=True)
+        self.history.observe(lineage, [p for p in self.graph.parents_of[name] if self.graph.source(p)])
+        provenance = self.history.provenance(stage)
+        todo = list[str | None]()
+        for key in (yield from self._asked(lineage, provenance)):
+            yield from self._tell_damage(lineage, key)
+            if self.context.run.tags.get(MAKE_TAG) == OUTDATED and lineage.waits(name, key):
+                continue  # for what is above it: it would be made twice
+            if reason := lineage.blocked(name, key, current=MAKE_TAG in self.context.run.tags):
+                self.unmade[key] = TrapsError(reason)
+            else:
+                todo.append(key)
+        if todo:
+            progress.current().stage(name, len(todo))
+        inputs = {key: lineage.inputs(name, key) for key in todo}  # noted before anything is read
+        for key, made in self._make(todo):
+            version = self._write(key, made, inputs[key])
+            yield from self._checks(key, made, lineage)
+            progress.current().partition(name, key or "", made.tally)
+            yield self.history.event(stage, key, version, provenance, self._metadata(key, made))
+        for key, error in self.unmade.items():
+            reached = isinstance(error, BudgetReached)
+            yield self._evaluation(CURRENT, key, {"not made": str(error), REACHED: reached})
+        for output in self.context.op_def.output_dict:
+            if output != "result":
+                yield dg.Output(None, output_name=output)
+        if not self._below():
+            self._raise_for_all()
+        yield dg.MaterializeResult(metadata=_TOLD_ALREADY)
+
+    # --- what to make -------------------------------------------------------------------------------------------------
+
+    def _asked(self, lineage: Lineage, provenance: Mapping[str, str]) -> Iterator[Any]:
+        """The keys of this run that are to be made (the generator's value); tells Dagster of those that are not wanted.
+
+        A range may hold cells that no experiment of the study asks for; they count as done, so that a backfill ends.
+        """
+        stage, tags = self.stage, self.context.run.tags
+        keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in self.context.partition_keys]
+        wanted = {*stage.wanted(Wanted(self.workspace, tags.get(EXPERIMENT_TAG)))}
+        if MAKE_TAG in tags:
+            recorded = self.history.recorded(stage.name)
+            existing = tags[MAKE_TAG] == OUTDATED
+            return [k for k in keys if k in wanted and to_make(lineage, recorded, stage.name, k, existing=existing)]
+        for key in keys:
+            if key not in wanted:
+                why = f"nothing: no experiment in {self.workspace.root / 'study.yaml'} asks for it"
+                yield self.history.event(stage, key, "not wanted", provenance, {"made": why})
+        return [key for key in keys if key in wanted]
+
+    def _tell_damage(self, lineage: Lineage, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
+        """A failed check for each parent that is not what was written, before anything is made from it."""
+        for parent, keys in self.graph.parents(self.stage.name, key).items():
+            if self.graph.source(parent) is None:
+                for above in keys:
+                    if damage := lineage.damage(parent, above):
+                        yield _evaluation(self.graph[parent], CURRENT, above, {"damaged": damage})
+
+    # --- making it ----------------------------------------------------------------------------------------------------
+
+    def _make(self, todo: Sequence[str | None]) -> Iterator[tuple[str | None, Made]]:
+        """Each partition as it is done. One that ends in a sentence leaves the others to be made."""
+        if self.stage.make is not None:
+            for key in todo:
+                try:
+                    yield key, self.stage.make(self.workspace, key)
+                except TrapsError as error:
+                    self.unmade[key] = error
+            return
+        assert self.stage.collect is not None, "a stage makes or collects"
+        left = [*todo]
+        try:
+            for key, made in self.stage.collect(self.workspace, [str(key) for key in todo]) if todo else ():
+                left.remove(key)
+                yield key, made
+        except TrapsError as error:
+            self.unmade |= dict.fromkeys(left, error)
+
+    def _write(self, key: str | None, made: Made, inputs: Mapping[str, str]) -> str:
+        """Write what was made; returns its data version."""
+        stage, tables, content = self.stage, self.workspace.tables, made.content
+        if stage.table is not None:
+            rows = cast(Any, content)
+            return tables.write(
+                stage.table, stage.columns(key), rows, inputs, failed=made.tally.errors, code=stage.code
+            )
+        files = cast(Mapping[str, bytes], content)
+        for path, data in files.items():
+            write_bytes(self.workspace.reports / path, data)
+        version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
+        write_report_state(self.workspace, stage, State(version, dict(inputs), 0, 0, stage.code))
+        return version
+
+    def _checks(self, key: str | None, made: Made, lineage: Lineage) -> Iterator[dg.AssetCheckEvaluation]:
+        """Every check of a partition. A failure is kept in the workspace until the partition passes, so that every later
+        run and `traps status` tell of it, even if this run dies before it reports to Dagster."""
+        stage, failed = self.stage, made.tally.errors
+        damage = ""
+        if stage.table is not None:
+            damage = self.workspace.tables.damage(stage.table, stage.columns(key), thorough=True)
+        wrong: dict[str, Any] = {}
+        if damage:
+            wrong["damaged"] = damage
+        if failed:
+            wrong["failed"] = f"{failed} calls failed and can be asked again"
+        yield self._evaluation(CURRENT, key, wrong)
+        for check in stage.checks:
+            problems = check.wrong(self.workspace, key, made)
+            file = self.workspace.failed_check(stage.name, check.name, key)
+            if problems:
+                write_text(file, json.dumps(problems, default=str))
+            else:
+                file.unlink(missing_ok=True)
+            yield self._evaluation(check.name, key, {"failing": _plain(problems)} if problems else {})
+
+    def _evaluation(self, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
+        return _evaluation(self.stage, check, key, wrong)
+
+    def _metadata(self, key: str | None, made: Made) -> dict[str, Any]:
+        """What Dagster shows of a partition."""
+        shown: dict[str, Any] = {**made.shown}
+        if self.stage.table is None:
+            paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in made.content}
+            return {path: value for path, value in paths.items() if path.count("/") < 2} | shown
+        count = "dagster/row_count" if self.stage.scheme is None else "dagster/partition_row_count"
+        return {count: len(made.content)} | shown
+
+    # --- the end ------------------------------------------------------------------------------------------------------
+
+    def _below(self) -> set[str]:
+        """The stages of this run that are made directly from this one."""
+        selected = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
+        return self.graph.below(self.stage.name) & {key.path[-1] for key in selected}
+
+    def _raise_for_all(self) -> None:
+        """Raises TrapsError, or BudgetReached, for all that this run has not made or whose checks do not pass, here and
+        above: had the step above raised, Dagster would have made nothing below it, not even what is sound."""
+        above = self.graph.above([self.stage.name])
+        failed = dict[tuple[str, Node], dg.AssetCheckEvaluation]()
+        of_type = dg.DagsterEventType.ASSET_CHECK_EVALUATION
+        for entry in self.context.instance.all_logs(self.context.run_id, of_type=of_type):
+            event = entry.get_dagster_event().asset_check_evaluation_data
+            node = (event.asset_key.path[-1], event.partition)
+            if node[0] in above:
+                failed[event.check_name, node] = event
+        told = [line for (check, node), event in failed.items() for line in _lines(check, node, event)]
+        if told:
+            shown = [*dict.fromkeys(told)]
+            more = [f"... and {len(shown) - SHOWN} more"] if len(shown) > SHOWN else []
+            reached = any(e.metadata[REACHED].value for e in failed.values() if REACHED in e.metadata)
+            raise (BudgetReached if reached else TrapsError)("\n".join([*shown[:SHOWN], *more]))
+
+
+def to_make(
+    lineage: Lineage, recorded: Mapping[str | None, str | None], name: str, key: str | None, *, existing: bool = False
+) -> bool:
+    """Whether a partition is missing, stale, or unknown to Dagster: a crash between a table and its event leaves such a
+    table, which is made once more. existing: only what is there and made from what has changed since."""
+    status = lineage.status(name, key)
+    if existing or status.kind == "missing":
+        return bool(status.outdated) if existing else True
+    return status.kind == "stale" or recorded.get(key) != lineage.version(name, key)
+
+
+def _evaluation(stage: Stage, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
+    return dg.AssetCheckEvaluation(
+        asset_key=stage.spec.key, check_name=check, passed=not wrong, partition=key, metadata={**wrong}
+    )
+
+
+def _plain(problems: Any) -> Any:
+    return json.loads(json.dumps(problems, default=str))
+
+
+def _lines(check: str, node: Node, event: dg.AssetCheckEvaluation) -> Iterable[str]:
+    """What a failed check says, a line each."""
+    if event.passed:
+        return
+    values = {name: value.value for name, value in event.metadata.items() if name != REACHED}
+    for name, value in values.items():
+        if check != CURRENT:
+            text = value if isinstance(value, str) else json.dumps(value)
+            yield f"check {check} of {name_of(node)} does not pass: {text}"
+        elif name == "not made":
+            yield f"{name_of(node)} is not made: {value}"
+        else:
+            yield f"{name_of(node)}: {value}"
+
+
+def rows_of(make: Callable[[Workspace, Any], Any]) -> Callable[[Workspace, Any], Made]:
+    """`make` of a stage from a function that returns rows alone."""
+
+    def made(workspace: Workspace, key: Any) -> Made:
+        return Made(make(workspace, key))
+
+    made.__doc__ = make.__doc__
+    return made
+
+
+def tally_shown(wanted: int, tally: Tally) -> dict[str, int]:
+    """How the calls of a cell went, for people."""
+    return {"wanted": wanted, "known": tally.cached, "asked": tally.asked, "failed": tally.errors}
