@@ -113,12 +113,9 @@ def make_checkout(root: Path) -> Path:
     return root
 
 
-def copy_workspace(source: Path, target: Path, checkout: Path) -> None:
-    """Copy a study; its Dagster history then links to the copied checkout's dagster.yaml."""
+def copy_workspace(source: Path, target: Path) -> None:
+    """Copy a study, its Dagster history with it: nothing in it names where it was made."""
     shutil.copytree(source, target, symlinks=True)
-    link = target / "dagster" / "dagster.yaml"
-    link.unlink()
-    link.symlink_to(checkout / "dagster.yaml")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -200,7 +197,7 @@ def copied(source: Checkout, folder: Path) -> Checkout:
     """A copy of a study in a checkout of its own, to be altered at will."""
     root = make_checkout(folder / "checkout")
     shutil.copytree(SMALL.parent, root / "tests" / "experiments")
-    copy_workspace(source.workspace, folder / "study", root)
+    copy_workspace(source.workspace, folder / "study")
     return Checkout(root, folder / "study")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.models.registry import all_evaluations
 from traps_pipeline.partitions import (
     CATEGORIES,
     CHAOTIC_CATEGORIES,
@@ -14,18 +13,20 @@ from traps_pipeline.partitions import (
     Evaluation,
     check_slug,
     datasets_of_category,
-    evaluations,
     is_ill_posed,
     taxonomy_of,
     transfer_type,
 )
 
+from traps_pipeline.wanted import Wanted
+
 
 def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None:
-    cells = [Cell(dataset, e) for dataset in DATASETS for e in all_evaluations()]
+    every = Wanted(None).evaluations
+    cells = [Cell(dataset, e) for dataset in DATASETS for e in every]
     assert all(Cell.parse(cell.key) == cell for cell in cells)
-    assert all(Evaluation.parse(e.key) == e for e in all_evaluations())
-    assert not any(set(key) & set("|,[]") for key in (*CATEGORIES, *DATASETS, *(e.key for e in all_evaluations())))
+    assert all(Evaluation.parse(e.key) == e for e in every)
+    assert not any(set(key) & set("|,[]") for key in (*CATEGORIES, *DATASETS, *(e.key for e in every)))
     assert len({cell.key for cell in cells}) == len(cells)
 
 
@@ -60,21 +61,6 @@ def test_an_id_that_would_break_keys_is_refused(slug: str) -> None:
     with pytest.raises(ValueError, match="must match"):
         check_slug(slug)
     assert check_slug("qwen3-vl-8b.2") == "qwen3-vl-8b.2"
-
-
-def test_evaluations_go_model_by_model_so_that_a_model_is_one_range() -> None:
-    keys = [e.key for e in evaluations([("a", 2), ("b", 1)])]
-    assert keys == [
-        *(
-            "a__standard__run1",
-            "a__standard__run2",
-            "a__guided__run1",
-            "a__guided__run2",
-            "a__json__run1",
-            "a__json__run2",
-        ),
-        *("b__standard__run1", "b__guided__run1", "b__json__run1"),
-    ]
 
 
 def test_a_category_belongs_to_its_taxonomys_two_datasets() -> None:

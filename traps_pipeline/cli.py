@@ -386,7 +386,9 @@ def status(arguments: argparse.Namespace) -> int:
     workspace = _open(_root(arguments))
     experiment = _experiment(arguments).name if arguments.experiment else None
     if experiment is not None and experiment not in workspace.study.experiments:
-        raise TrapsError(f"{workspace.root}/study.yaml: has no experiment {experiment!r}; traps init {experiment} adds it")
+        raise TrapsError(
+            f"{workspace.root}/study.yaml: has no experiment {experiment!r}; traps init {experiment} adds it"
+        )
     from traps_pipeline.orchestration.history import History
     from traps_pipeline.orchestration.lineage import Lineage
     from traps_pipeline.orchestration.run import dagster_history

@@ -6,7 +6,6 @@ Dagster allows two partition dimensions, sorts them by name, and forbids `|`, `,
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 OCCLUSION_CATEGORIES = (
@@ -87,13 +86,6 @@ class Evaluation:
         if found is None or found["regime"] not in REGIMES:
             raise ValueError(f"evaluation key {key!r} is not model__regime__runN with a regime of {REGIMES}")
         return Evaluation(check_slug(found["model"]), found["regime"], int(found["run"]))
-
-
-def evaluations(models: Iterable[tuple[str, int]]) -> list[Evaluation]:
-    """All evaluations of (model, number of runs), model outermost, so that a model's cells are one range."""
-    return [
-        Evaluation(model, regime, run) for model, runs in models for regime in REGIMES for run in range(1, runs + 1)
-    ]
 
 
 @dataclass(frozen=True, order=True)

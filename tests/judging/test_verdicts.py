@@ -102,8 +102,9 @@ def said(word: str) -> str:
 
 def vote(workspace: Workspace) -> pd.DataFrame:
     """Ask the panel what is missing; the votes and the verdicts of the cell are then written."""
-    (done,) = collect_votes(workspace, [CELL], {CELL.key: {}})
-    assert done.rows == 2 * 3 * 27
+    ((cell, made),) = collect_votes(workspace, [CELL])
+    assert cell == CELL and len(made.rows) == 2 * 3 * 27
+    workspace.tables.write(VOTES, CELL.partition, made.rows, {}, failed=made.tally.errors)
     workspace.tables.write(VERDICTS, CELL.partition, decide_cell(workspace, CELL), {})
     return workspace.tables.read(VERDICTS, CELL.partition)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from traps_pipeline.mechanism.steering import (
 )
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, Extraction, StatesCell, SteeringCell
+from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import (
     DIRECTIONS,
@@ -37,6 +38,7 @@ from traps_pipeline.tables import (
     PROBES,
     STEERING,
     STEERING_VOTES,
+    Table,
 )
 
 STANDARD = Extraction("tiny", "standard")
@@ -244,21 +246,32 @@ def test_a_layer_that_the_model_has_not_is_told_before_anything_is_extracted(own
 # --- steering ---------------------------------------------------------------------------------------------------------
 
 
+def written(
+    workspace: Workspace, table: Table, done: Iterable[tuple[SteeringCell, Made]]
+) -> list[tuple[SteeringCell, Made]]:
+    """Write each cell as it is done."""
+    kept = []
+    for cell, made in done:
+        workspace.tables.write(table, cell.partition, made.rows, {}, failed=made.tally.errors)
+        kept.append((cell, made))
+    return kept
+
+
 @pytest.fixture(scope="module")
 def steered(study: Workspace, entry: ModelEntry) -> Workspace:
     """All four targets, steered and judged."""
     cells = [SteeringCell.make(dataset, "tiny", "standard", "guided") for dataset in DATASETS]
     along = {"standard": stages.saved_directions(study, STANDARD)}
-    empty = {cell.key: {} for cell in cells}
-    done = list(collect_steered(study, entry, cells, along, empty))
+    done = written(study, STEERING, collect_steered(study, entry, cells, along))
     # chaotic: 4 sources x (void, random) x 2 alphas x 4 rows, the sweep's 2 x 2 controls, 4 rows as they are
-    rows = {one.cell.dataset: (one.rows, one.tally.asked) for one in done}
+    rows = {cell.dataset: (len(made.rows), made.tally.asked) for cell, made in done}
     assert rows["chaotic"] == rows["occlusion"] == (72, 72)
     # ill-posed: 3 sources, whose controls the well-posed cell has asked: its voids are new, and its sweep's controls
     assert rows["chaotic_ill_posed"] == rows["occlusion_ill_posed"] == (56, 3 * 2 * 2 * 2 + 2 + 2 * 2)
     planned = count_answers(study.mechanism, "tiny", DATASETS, {"occlusion": PAIRS, "chaotic": PAIRS})
     assert planned == {"guided": sum(asked for _, asked in rows.values())}
-    assert [one.rows for one in collect_steering_votes(study, cells, empty)] == [one.rows for one in done]
+    votes = written(study, STEERING_VOTES, collect_steering_votes(study, cells))
+    assert [len(made.rows) for _, made in votes] == [len(made.rows) for _, made in done]
     return study
 
 
@@ -272,8 +285,7 @@ def test_what_two_cells_share_is_one_answer(steered: Workspace, entry: ModelEntr
     assert len(ledger) == answers["request_key"].nunique()
     again = [SteeringCell.make(d, "tiny", "standard", "guided") for d in DATASETS]
     along = {"standard": stages.saved_directions(steered, STANDARD)}
-    done = list(collect_steered(steered, entry, again, along, {cell.key: {} for cell in again}))
-    assert sum(one.tally.asked for one in done) == 0
+    assert sum(made.tally.asked for _, made in collect_steered(steered, entry, again, along)) == 0
 
 
 def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, entry: ModelEntry) -> None:

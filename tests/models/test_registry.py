@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.registry import all_evaluations, get_model, load_models
+from traps_pipeline.models.registry import get_model, load_models
 from traps_pipeline.partitions import REGIMES, Evaluation
+from traps_pipeline.wanted import Wanted
 
 GROUPS = "groups: {family: f, access: none, input: none, group: g}"
 
@@ -73,6 +74,7 @@ def test_every_model_regime_and_run_is_one_evaluation_model_outermost() -> None:
     expected = [
         (m.id, regime, run) for m in load_models().values() for regime in REGIMES for run in range(1, m.runs + 1)
     ]
-    assert [(e.model, e.regime, e.run) for e in all_evaluations()] == expected
-    assert Evaluation("oracle", "json", 2) not in all_evaluations()  # one run: no run2 key
-    assert Evaluation("random-50", "json", 3) in all_evaluations()
+    found = Wanted(None).evaluations
+    assert [(e.model, e.regime, e.run) for e in found] == expected
+    assert Evaluation("oracle", "json", 2) not in found  # one run: no run2 key
+    assert Evaluation("random-50", "json", 3) in found

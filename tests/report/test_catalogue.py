@@ -14,7 +14,7 @@ from tests.report.test_items import row
 from tests.report.test_report import board_of, board_row
 from tests.report.test_writing import latex_cells
 from traps_pipeline.cli import main
-from traps_pipeline.lineage import REPORTS, upstream
+from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report import publish
 from traps_pipeline.report.catalogue import FIGURES, OF_PAPER, OF_STUDY, PRINTED, TABLES, workspace_files
@@ -278,11 +278,12 @@ def test_the_doubt_figure_refuses_to_mix_epochs():
 
 
 def test_a_table_or_figure_is_stale_when_what_it_reads_changed_and_only_then():
-    assert set(PRINTED) <= set(REPORTS)
-    assert upstream("figure_pecs_landscape", None) == [("leaderboard", None)]
-    assert ("metrics", "chaotic") in upstream("table_chaotic_sub_scenarios", None)
-    assert upstream("published_table_overall", None) == [("published", None)]
-    assert {name for name, _ in upstream("report_page", None)} >= {*OF_STUDY, *OF_PAPER, "verdicts", "leaderboard"}
+    graph = the_graph()
+    assert {*PRINTED} <= {stage.name for stage in graph.stages}
+    assert graph.parents("figure_pecs_landscape", None) == {"leaderboard": [None]}
+    assert "chaotic" in graph.parents("table_chaotic_sub_scenarios", None)["metrics"]
+    assert graph.parents("published_table_overall", None) == {"published": [None]}
+    assert graph.parents("report_page", None).keys() >= {*OF_STUDY, *OF_PAPER, "verdicts", "leaderboard"}
 
 
 def test_names_of_tables_and_figures_are_unique():

@@ -15,7 +15,6 @@ from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.schemes import CELL, EVALUATION, by_dataset, by_evaluation
 from traps_pipeline.orchestration.stage import source, stage
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.report.items import FOLDER, page_name
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
@@ -65,6 +64,8 @@ def _cells(
 
 def _items_shown(workspace: Workspace, cell: Cell, made: Made) -> dict[str, Any]:
     """The items behind a cell: those without an answer, as a table, and the page of all of them."""
+    from traps_pipeline.report.items import FOLDER, page_name
+
     page = workspace.reports / FOLDER / page_name(cell)
     columns = ("item_id", "side", "outcome", "error", "attempts")
     rows = [row for row in made.rows if "outcome" in row and row["outcome"] not in JUDGED]

@@ -10,7 +10,7 @@ from traps_pipeline.defs.scoring import leaderboard
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
-from traps_pipeline.orchestration.graph import Check
+from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import CELL, these_keys
 from traps_pipeline.orchestration.stage import source, stage
 from traps_pipeline.storage.parquet import Made
@@ -120,7 +120,7 @@ def _make_prevalence(workspace: Workspace, _: None) -> Made:
     return _shown("prevalence", prevalence(workspace.tables.read(CONFABULATION, {})))
 
 
-_SOME = {"items": "some", "votes": "some", "verdicts": "some"}
+_SOME: dict[str, Need] = {"items": "some", "votes": "some", "verdicts": "some"}
 agreement = stage(AGREEMENT, _make_agreement, group=GROUP, deps=[items, votes, judges], needs=_SOME)
 judge_bias = stage(JUDGE_BIAS, _make_judge_bias, group=GROUP, deps=[items, votes, judges], needs=_SOME)
 leave_one_out = stage(

@@ -17,7 +17,7 @@ from traps_pipeline.mechanism.versions import (
     steering_version,
 )
 from traps_pipeline.models.registry import local_models
-from traps_pipeline.orchestration.graph import Check
+from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import (
     CATEGORY,
     CELL,
@@ -144,9 +144,7 @@ hidden_states = stage(
     scheme=STATES,
     kinds=["parquet", "pytorch"],
     cost="machine",
-    lost=lambda workspace, key: (
-        [] if states_are_there(workspace, StatesCell.parse(key)) else ["its states are gone"]
-    ),
+    lost=lambda workspace, key: [] if states_are_there(workspace, StatesCell.parse(key)) else ["its states are gone"],
     checks=[Check("states_finite", "Every number of the first and last layer is finite.", _unsound_layers)],
 )
 
@@ -215,9 +213,7 @@ def _make_cosines(workspace: Workspace, _: None) -> Made:
     return Made(table, shown={"cosines": rows_shown(table)})
 
 
-cosines = stage(
-    COSINES, _make_cosines, group=GROUP, deps=[directions], needs={"directions": "some"}, wants=_steers
-)
+cosines = stage(COSINES, _make_cosines, group=GROUP, deps=[directions], needs={"directions": "some"}, wants=_steers)
 
 
 def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
@@ -294,7 +290,7 @@ def _make_shares(workspace: Workspace, _: None) -> Made:
     return Made(table, shown={"shares": rows_shown(table)})
 
 
-_SOME = {"steering": "some", "steering_votes": "some"}
+_SOME: dict[str, Need] = {"steering": "some", "steering_votes": "some"}
 _ABOVE = [steering, steering_votes]
 steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, deps=_ABOVE, needs=_SOME, wants=_steers)
 steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, deps=_ABOVE, needs=_SOME, wants=_steers)

@@ -5,9 +5,11 @@ from typing import Any
 
 import dagster as dg
 
+from traps_pipeline.defs import judging, mechanism, scoring
 from traps_pipeline.defs.shown import thumbnail
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.orchestration.stage import key_of, source, stage
+from traps_pipeline.orchestration.graph import Need
+from traps_pipeline.orchestration.stage import key_of, shown, source, stage
 from traps_pipeline.report.catalogue import OF_PAPER, OF_STUDY, PRINTED, Report, TableReport, workspace_files
 from traps_pipeline.report.results import Results
 from traps_pipeline.scoring.published import published_digest
@@ -16,6 +18,7 @@ from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, SCENE_SPECS, VIDEOS
 
 GROUP = "report"
+READ = (judging, mechanism, scoring)  # declared before: what is printed is printed from them
 Files = dict[str, bytes]
 published = source(
     "published",
@@ -41,8 +44,9 @@ def _report(
         files = make(workspace)
         return Made(files, shown=_previews(files))
 
-    needs = dict.fromkeys(deps, "none")
-    return stage(name, made, doc=doc, group=group, deps=[key_of(dep) for dep in deps], needs=needs, kinds=kinds)
+    there = [dep for dep in deps if shown(dep)]
+    needs: dict[str, Need] = dict.fromkeys(there, "none")
+    return stage(name, made, doc=doc, group=group, deps=[key_of(dep) for dep in there], needs=needs, kinds=kinds)
 
 
 def _previews(files: Mapping[str, bytes]) -> dict[str, Any]:
@@ -127,22 +131,25 @@ shortcuts = _report(
 
 
 def _results(workspace: Workspace, *, of_paper: bool) -> Results:
-    """What is printed from; a study's is kept while its tables stay the same, since a run prints dozens of assets."""
+    """What is printed from; it is kept while its tables stay the same, since a run prints dozens of assets."""
     from traps_pipeline.report.published_results import PublishedResults
     from traps_pipeline.report.study_results import StudyResults
 
     if of_paper:
-        return PublishedResults()
+        return _kept(("paper", published_digest()), PublishedResults)
     reads = {name for report in OF_STUDY.values() for name in report.reads}
     files = [f for name in sorted(reads) for f in (workspace.tables.root / name).rglob("*.parquet")]
     slot = (workspace.root, *((file, file.stat().st_mtime_ns) for file in files))
-    if slot not in _KEPT:
-        _KEPT.clear()
-        _KEPT[slot] = StudyResults(workspace)
-    return _KEPT[slot]
+    return _kept(("study", slot), lambda: StudyResults(workspace))
 
 
-_KEPT: dict[tuple[Any, ...], Results] = {}
+def _kept(slot: tuple[str, Any], make: Callable[[], Results]) -> Results:
+    if _KEPT.get(slot[0], (None,))[0] != slot[1]:
+        _KEPT[slot[0]] = slot[1], make()
+    return _KEPT[slot[0]][1]
+
+
+_KEPT: dict[str, tuple[Any, Results]] = {}
 
 
 def _printed(name: str, report: Report) -> dg.AssetsDefinition:

@@ -6,7 +6,7 @@ from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import verdicts
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.orchestration.graph import Check
+from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import DATASET, by_dataset
 from traps_pipeline.orchestration.stage import stage
 from traps_pipeline.scoring import Frame
@@ -110,7 +110,7 @@ def _wrong_intervals(workspace: Workspace, key: str | None, made: Made) -> str:
     return f"{wrong} intervals are wrong" if wrong else ""
 
 
-_OF_SOME = {"metrics": "some", "verdicts": "some"}
+_OF_SOME: dict[str, Need] = {"metrics": "some", "verdicts": "some"}
 contrasts = stage(CONTRASTS, _make_contrasts, group=GROUP, deps=[metrics, verdicts], needs=_OF_SOME)
 regime_tests = stage(REGIME_TESTS, _make_regime_tests, group=GROUP, deps=[metrics, verdicts], needs=_OF_SOME)
 leaderboard = stage(

@@ -218,7 +218,8 @@ def parse_labels(row: Row) -> Labels | str:
 
 
 def collect_labels(workspace: Workspace) -> Made:
-    """CONFABULATION rows of a study: sample every model of the protocol that the study has judged, and ask what the ledger of votes does not hold.
+    """CONFABULATION rows of a study: sample every model of the protocol that the study has judged, and ask what the
+    ledger of votes does not hold.
 
     Nothing where the study's panel has no judge for it.
     """

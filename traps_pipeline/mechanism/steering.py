@@ -284,10 +284,8 @@ def _steering_row(cell: SteeringCell, one: Wanted, row: Row) -> dict[str, Any]:
 # --- what the panel says ----------------------------------------------------------------------------------------------
 
 
-def collect_steering_votes(
-    workspace: Workspace, cells: Sequence[SteeringCell]
-) -> Iterator[tuple[SteeringCell, Made]]:
-    """Ask the study's panel whether each steered answer abstains; the STEERING_VOTES rows of each cell as it is done."""
+def collect_steering_votes(workspace: Workspace, cells: Sequence[SteeringCell]) -> Iterator[tuple[SteeringCell, Made]]:
+    """Ask the study's panel whether each steered answer abstains; its rows of each cell as it is done."""
     from traps_pipeline.judging.panel import load_panel, make_judge
 
     panel = load_panel(workspace.study.panel)

@@ -1,8 +1,8 @@
 """Jobs that make a part of the study by one command or click, and sensors that follow corrections.
 
 A job makes what is missing or stale of its stages for everything that the study's experiments ask, one Dagster run for
-each block of stages that share their partitions. The sensors launch such a job for what is there and outdated; they look
-at the state of the tables, not at events, so a correction that was made while they were off is followed, too.
+each block of stages that share their partitions. The sensors launch such a job for what is there and outdated. They
+look at the state of the tables, not at events, so a correction that was made while they were off is followed, too.
 """
 
 from collections.abc import Collection
@@ -53,7 +53,9 @@ def reread_sources() -> None:
         cached.cache_clear()
 
 
-def _job(name: str, doc: str, groups: Collection[str] | None, *, costs: bool = True, existing: bool = False) -> dg.JobDefinition:
+def _job(
+    name: str, doc: str, groups: Collection[str] | None, *, costs: bool = True, existing: bool = False
+) -> dg.JobDefinition:
     """A job of one step that walks a part of the graph; the step fails with all that is not made."""
 
     @dg.op(name=f"make_{name}", description=doc)
@@ -77,7 +79,9 @@ def _stages(costs: bool) -> list[Stage]:
     return [stage for stage in the_graph().stages if costs or not stage.cost]
 
 
-follow_free = _job(FREE, "What a correction made outdated, as far as it costs nothing.", None, costs=False, existing=True)
+follow_free = _job(
+    FREE, "What a correction made outdated, as far as it costs nothing.", None, costs=False, existing=True
+)
 follow_paid = _job(PAID, "What a correction made outdated, calls and local models too.", None, existing=True)
 JOBS = [
     *(_job(name, doc, groups) for name, (doc, groups) in PURPOSES.items()),

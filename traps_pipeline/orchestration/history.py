@@ -66,9 +66,7 @@ class History:
             for key, version in now.items():
                 if recorded.get(key) != version:
                     tags, asset_key = {_VERSION: version, _USER: "true"}, self._graph.declared[name].spec.key
-                    self._instance.report_runless_asset_event(
-                        dg.AssetObservation(asset_key, partition=key, tags=tags)
-                    )
+                    self._instance.report_runless_asset_event(dg.AssetObservation(asset_key, partition=key, tags=tags))
                     changed.append((name, key))
             _OBSERVED[slot] = now
         return changed

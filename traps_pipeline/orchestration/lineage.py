@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.orchestration.graph import Graph, Node, Stage, name_of, the_graph
+from traps_pipeline.orchestration.graph import Graph, Stage, name_of, the_graph
 from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace, write_text
 from traps_pipeline.wanted import Wanted

@@ -19,7 +19,7 @@ import dagster as dg
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.models.traffic import remembering_stops
-from traps_pipeline.orchestration.graph import Stage, name_of, the_graph
+from traps_pipeline.orchestration.graph import name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.schemes import Scheme

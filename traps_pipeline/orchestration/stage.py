@@ -1,10 +1,10 @@
 """The one declaration of a stage, and the one way to make a partition.
 
-`stage(...)` gives the Dagster asset of a table (or of files for people). Whoever starts a run, the same protocol makes its
-partitions, in the one order that is sound: what the inputs are is noted before anything is read; what cannot be made
-yet, or would be made from something damaged, is left with the reason; each partition is written, read again, checked
-and told to Dagster as soon as it is done, with a data version made from its content. Below a partition that is not made
-nothing is made, everything else is; the last step of a run raises with all that is missing.
+`stage(...)` gives the Dagster asset of a table (or of files for people). Whoever starts a run, the same protocol makes
+its partitions, in the one order that is sound: what the inputs are is noted before anything is read; what cannot be
+made yet, or would be made from something damaged, is left with the reason; each partition is written, read again,
+checked and told to Dagster as soon as it is done, with a data version made from its content. Below a partition that is
+not made nothing is made, everything else is; the last step of a run raises with all that is missing.
 """
 
 import hashlib
@@ -32,8 +32,7 @@ from traps_pipeline.orchestration.graph import (
 )
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
-from traps_pipeline.orchestration.schemes import Scheme, study_here
-from traps_pipeline.progress import Tally
+from traps_pipeline.orchestration.schemes import LEFT_OUT, Scheme, study_here
 from traps_pipeline.storage.parquet import Made, State
 from traps_pipeline.storage.workspace import Workspace, write_bytes, write_text
 from traps_pipeline.tables import Table
@@ -77,6 +76,16 @@ def _shared_history() -> list[str]:
 _PREFIX = _shared_history()
 
 
+def shown(name: str) -> bool:
+    """Whether a stage or source, declared before, is part of the study's graph."""
+    return name in DECLARED
+
+
+def _declare(name: str, one: Stage | Source) -> None:
+    if one.spec.group_name not in LEFT_OUT:
+        DECLARED[name] = one
+
+
 def source(
     name: str,
     version: Callable[[Workspace, Any], str],
@@ -88,7 +97,7 @@ def source(
 ) -> dg.AssetsDefinition:
     """An observable source asset whose data version, by partition where it has any, is made from its content."""
     spec = dg.AssetSpec(key_of(name), group_name=group)
-    DECLARED[name] = Source(spec, version, scheme)
+    _declare(name, Source(spec, version, scheme))
 
     @dg.observable_source_asset(
         key=spec.key,
@@ -147,7 +156,7 @@ def stage(
     )
     content = None if isinstance(table, str) else table
     declared = Stage(spec, content, make, collect, scheme, needs or {}, checks, code, cost, wants, lost)
-    DECLARED[name] = declared
+    _declare(name, declared)
     specs = [(CURRENT, CURRENT_DOC, False), *((check.name, check.doc, check.blocks) for check in checks)]
 
     @dg.asset(
@@ -298,7 +307,7 @@ class _Step:
         return version
 
     def _checks(self, key: str | None, made: Made, lineage: Lineage) -> Iterator[dg.AssetCheckEvaluation]:
-        """Every check of a partition. A failure is kept in the workspace until the partition passes, so that every later
+        """Every check of a partition. A failure is kept in the workspace until the partition passes, so that each later
         run and `traps status` tell of it, even if this run dies before it reports to Dagster."""
         stage, failed = self.stage, made.tally.errors
         damage = ""
@@ -326,7 +335,8 @@ class _Step:
         """What Dagster shows of a partition."""
         shown: dict[str, Any] = {**made.shown}
         if self.stage.table is None:
-            paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in made.content}
+            files = cast(Mapping[str, bytes], made.content)
+            paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in files}
             return {path: value for path, value in paths.items() if path.count("/") < 2} | shown
         count = "dagster/row_count" if self.stage.scheme is None else "dagster/partition_row_count"
         return {count: len(made.content)} | shown
@@ -391,18 +401,3 @@ def _lines(check: str, node: Node, event: dg.AssetCheckEvaluation) -> Iterable[s
             yield f"{name_of(node)} is not made: {value}"
         else:
             yield f"{name_of(node)}: {value}"
-
-
-def rows_of(make: Callable[[Workspace, Any], Any]) -> Callable[[Workspace, Any], Made]:
-    """`make` of a stage from a function that returns rows alone."""
-
-    def made(workspace: Workspace, key: Any) -> Made:
-        return Made(make(workspace, key))
-
-    made.__doc__ = make.__doc__
-    return made
-
-
-def tally_shown(wanted: int, tally: Tally) -> dict[str, int]:
-    """How the calls of a cell went, for people."""
-    return {"wanted": wanted, "known": tally.cached, "asked": tally.asked, "failed": tally.errors}

@@ -131,9 +131,9 @@ class TableStore:
                 data = data.replace_schema_metadata(None).cast(schema)
         except (pa.ArrowException, ValueError, KeyError, TypeError) as error:
             raise TrapsError(f"table {table.name} {dict(partition)}: rows do not fit the schema ({error})") from error
-        for field in schema:
-            if not field.nullable and data[field.name].null_count:
-                raise TrapsError(f"table {table.name} {dict(partition)}: column {field.name} has missing values")
+        for column in schema:
+            if not column.nullable and data[column.name].null_count:
+                raise TrapsError(f"table {table.name} {dict(partition)}: column {column.name} has missing values")
         for column, value in partition.items():
             strays = set(data[column].to_pylist()) - {value}
             if strays:

@@ -1,0 +1,58 @@
+"""Batches of partitions: ranges that Dagster expands to exactly the keys asked for."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Sequence
+
+import pytest
+from dagster import PartitionKeyRange
+
+from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.orchestration.run import batches
+from traps_pipeline.orchestration.schemes import CELL, DATASET
+from traps_pipeline.partitions import DATASETS, Cell
+from traps_pipeline.wanted import Wanted
+
+CELLS = [str(key) for key in the_graph().keys("responses")]
+
+
+def expanded(keys: Sequence[str]) -> Counter[str]:
+    """What Dagster makes of the batches of some keys: how often each key is run."""
+    ran: Counter[str] = Counter()
+    for first, last in batches(CELL, list(keys)):
+        assert first is not None and last is not None
+        ran.update(str(key) for key in CELL.definition.get_partition_keys_in_range(PartitionKeyRange(first, last)))
+    return ran
+
+
+def test_batches_of_any_cells_run_each_once_and_no_other() -> None:
+    rng = random.Random(7)
+    for size in [1, 2, 3, 5, 10, 30, len(CELLS) // 2, len(CELLS) - 1] * 3:
+        keys = rng.sample(CELLS, size)
+        assert expanded(keys) == Counter(keys)
+
+
+@pytest.mark.parametrize("datasets", [DATASETS, DATASETS[:2], DATASETS[1:3], ("occlusion", "chaotic_ill_posed")])
+def test_whole_models_are_few_runs(datasets: Sequence[str]) -> None:
+    oracle = [e for e in Wanted(None).evaluations if e.model in ("oracle", "always-abstain")]
+    keys = [Cell(dataset, e).key for e in oracle for dataset in datasets]
+    assert expanded(keys) == Counter(keys)
+    neighbours = 1 if datasets != ("occlusion", "chaotic_ill_posed") else 2
+    assert len(list(batches(CELL, keys))) == neighbours
+
+
+def test_a_gap_makes_two_ranges() -> None:
+    one_dataset = [key for key in CELLS if key.startswith("chaotic|")]
+    without = one_dataset[:3] + one_dataset[4:]
+    assert list(batches(CELL, without)) == [(without[0], without[2]), (without[3], without[-1])]
+
+
+def test_neighbours_of_one_dimension_are_one_range_and_no_keys_are_no_run() -> None:
+    assert list(batches(CELL, [])) == []
+    assert list(batches(DATASET, ["occlusion", "occlusion_ill_posed", "chaotic_ill_posed"])) == [
+        ("occlusion", "occlusion_ill_posed"),
+        ("chaotic_ill_posed", "chaotic_ill_posed"),
+    ]
+    assert list(batches(None, [None])) == [(None, None)]
