@@ -35,15 +35,15 @@ import openai.resources.chat.completions
 def fill(root: Path, rows: int) -> None:
     """A ledger as a study leaves it: the evaluation that will be asked has rows of other keys too."""
     from traps_pipeline.models.ask import ledger_row
-    from traps_pipeline.models.registry import all_evaluations
     from traps_pipeline.models.request import Outcome, Request
     from traps_pipeline.partitions import Evaluation
     from traps_pipeline.storage.ledger import Ledger
+    from traps_pipeline.wanted import Wanted
 
     params, text = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}, "The ball comes to rest on the left. " * 15
     outcome = Outcome("answer", text, None, "stop", None, "m-2026", 6500, 150, 20, 0.0002)
     asked = Evaluation("image-model", "standard", 1)
-    evaluations = [asked, *(e for e in all_evaluations() if e.model != asked.model)]
+    evaluations = [asked, *(e for e in Wanted(None).evaluations if e.model != asked.model)]
     for start in range(0, rows, EVALUATION_ROWS):
         evaluation = evaluations[start // EVALUATION_ROWS]
         with Ledger(root, "answers").writer(evaluation.key) as writer:

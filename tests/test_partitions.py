@@ -17,7 +17,6 @@ from traps_pipeline.partitions import (
     taxonomy_of,
     transfer_type,
 )
-
 from traps_pipeline.wanted import Wanted
 
 

@@ -1,9 +1,8 @@
 """The code location: `dagster ... -m traps_pipeline.definitions`."""
 
-from pathlib import Path
-
 import dagster as dg
 
+from traps_pipeline import defs as declared
 from traps_pipeline.orchestration.automation import JOBS, SENSORS
 from traps_pipeline.orchestration.graph import DECLARED
 from traps_pipeline.orchestration.stage import WorkspaceResource
@@ -14,7 +13,7 @@ from traps_pipeline.storage.workspace import Workspace
 def _assets() -> list[dg.AssetsDefinition | dg.SourceAsset]:
     """What `defs/` declares, as Dagster's loader finds it, without the groups that the study has no use for."""
     require_checkout()
-    found = dg.load_from_defs_folder(path_within_project=Path(__file__).parent).assets or ()
+    found = dg.load_definitions_from_package_module(declared).assets or ()
     shown = {one.spec.key for one in DECLARED.values()}
     assets = [one for one in found if isinstance(one, dg.AssetsDefinition | dg.SourceAsset)]
     return [one for one in assets if one.key in shown]

@@ -8,57 +8,197 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers
-from traps_pipeline.lineage import INSIDE, PARTITIONED_BY, STAGES, Lineage
-from traps_pipeline.report.catalogue import PRINTED
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS, METRICS, RESPONSES, VERDICTS
 
 pytestmark = pytest.mark.slow
 CELL = "occlusion|oracle__standard__run1"
-ONE_KEY = {"category": "dominoes", "dataset": "occlusion", "cell": CELL}
-ONE_BY_ONE = """
-import sys
-import dagster as dg
-from traps_pipeline.definitions import ASSETS, SOURCES
-with dg.DagsterInstance.get() as history:
-    for stage in sys.argv[1:]:
-        dg.materialize([*SOURCES, *ASSETS], instance=history, selection=[stage])
+RANGE = "occlusion|oracle__standard__run1...occlusion_ill_posed|oracle__json__run1"
+# Versions of all that is there, by partition, as the footers say; and the stages that share no partitions.
+VERSIONS = """
+import json
+from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.wanted import Wanted
+w = Workspace.open()
+found, stages = Lineage(w), Lineage(w).graph.stages
+print(json.dumps({
+    "versions": {f"{s.name}/{k}": found.version(s.name, k) for s in stages for k in s.wanted(Wanted(w))},
+    "whole": [s.name for s in stages if s.scheme is None],
+}))
 """
-RANGE = "occlusion|oracle__standard__run1...occlusion_ill_posed|always-abstain__json__run1"
 
 
-def materialize(study: Checkout, stage: str, *partition: str) -> Finished:
-    return study.dagster("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", stage, *partition)
+def known(study: Checkout) -> dict:
+    finished = study.run(sys.executable, "-W", "ignore", "-c", VERSIONS)
+    assert finished.code == 0, finished.err
+    return json.loads(finished.out.splitlines()[-1])
 
 
-def test_every_stage_is_rematerialized_alone_from_the_tables_that_are_there(study: Checkout) -> None:
-    stages = [stage for stage in STAGES if stage not in INSIDE]  # those need a local model: tests/mechanism
-    before = {stage: Lineage(Workspace.open(study.workspace)).version(stage, _key(stage)) for stage in stages}
-    # What has partitions and one printed table by the command; a process for each of the others would take minutes.
-    whole = [stage for stage in stages if _key(stage) is None and stage not in PRINTED]
-    for stage in [*(stage for stage in stages if _key(stage)), "table_overall", ",".join(PRINTED)]:
-        key = _key(stage)
-        finished = materialize(study, stage, *(("--partition", key) if key else ()))
-        assert finished.code == 0, (stage, finished.err[-3000:])
-    one_by_one = study.run(sys.executable, "-c", ONE_BY_ONE, *whole)
-    assert one_by_one.code == 0, one_by_one.err[-3000:]
-    after = {stage: Lineage(Workspace.open(study.workspace)).version(stage, _key(stage)) for stage in stages}
-    assert after == before  # rebuilt from the same inputs: the same content
+def materialize(study: Checkout, stages: str, *partition: str) -> Finished:
+    return study.dagster("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", stages, *partition)
 
 
-def _key(stage: str) -> str | None:
-    return ONE_KEY.get(PARTITIONED_BY.get(stage, ""))
+def execute(study: Checkout, job: str) -> Finished:
+    return study.dagster("job", "execute", "-m", "traps_pipeline.definitions", "-j", job)
 
 
-def test_a_range_of_cells_is_one_run_and_makes_exactly_its_cells(study: Checkout) -> None:
+def test_stages_that_share_partitions_are_made_together_from_the_tables_that_are_there(study: Checkout) -> None:
+    before = known(study)
+    for stages, key in (
+        ("scene_specs,videos", "dominoes"),
+        ("items,metrics", "occlusion"),
+        ("responses,votes,verdicts", CELL),
+    ):
+        finished = materialize(study, stages, "--partition", key)
+        assert finished.code == 0, (stages, finished.err[-3000:])
+    finished = materialize(study, ",".join(before["whole"]))
+    assert finished.code == 0, finished.err[-3000:]
+    assert known(study) == before  # rebuilt from the same inputs: the same content
+
+
+def test_a_range_of_cells_is_one_run_through_three_stages_and_makes_exactly_its_cells(study: Checkout) -> None:
     forget_answers(study)
+    finished = materialize(study, "responses,votes,verdicts", "--partition-range", RANGE)
+    assert finished.code == 0, finished.err[-3000:]
     for stage in ("responses", "votes", "verdicts"):
-        finished = materialize(study, stage, "--partition-range", RANGE)
-        assert finished.code == 0, (stage, finished.err[-3000:])
-        made = sorted((study.workspace / "tables" / stage).rglob("*.parquet"))
-        assert len(made) == 2 * 2 * 3  # datasets x models x regimes
-    assert len(study.ledger_rows("answers")) == 2 * 2 * 3 * 12
+        assert len([*(study.workspace / "tables" / stage).rglob("*.parquet")]) == 2 * 2  # datasets x regimes
+    assert len(study.ledger_rows("answers")) == 2 * 2 * 12
+    finished = materialize(study, "metrics", "--partition-range", "occlusion...occlusion_ill_posed")
+    assert finished.code == 0, finished.err[-3000:]
+
+
+def test_one_command_makes_all_that_the_study_asks_and_fails_with_what_it_could_not(study: Checkout) -> None:
+    before = known(study)["versions"]
+    forget_answers(study)
+    finished = execute(study, "everything")
+    assert finished.code == 0, finished.err[-3000:]
+    assert known(study)["versions"] == before
+    question = {"ill_posed_question": "What does the triangle at the bottom weigh?"}
+    study.correct("plinko-0002", **question)
+    asked = len(study.ledger_rows("answers"))
+    assert execute(study, "everything").code == 0  # a correction is one command
+    assert len(study.ledger_rows("answers")) == asked + 3 * 2
+    damaged = Workspace.open(study.workspace).tables.path(VERDICTS, {**_partition(CELL)})
+    (study.root / "scene_specs" / "released" / "plinko.jsonl").write_text("{}\n")
+    damaged.unlink()
+    finished = execute(study, "everything")
+    assert finished.code == 1
+    assert "plinko.jsonl:1" in finished.out + finished.err
+
+
+def _partition(cell: str) -> dict[str, str | int]:
+    from traps_pipeline.partitions import Cell
+
+    return Cell.parse(cell).partition
+
+
+def test_a_stopped_model_leaves_the_other_cells_made_and_the_reason_is_told(study: Checkout, tmp_path: Path) -> None:
+    forget_answers(study)
+    # A registry in which `prior` costs money, of which the study has none: it may not be asked.
+    registry = study.root / "assets" / "models.yaml"
+    entries = yaml.safe_load(registry.read_text())
+    local = next(entry for entry in entries["models"] if entry["id"] == "gpt-5")
+    local["limits"] = {"retries": 0}
+    registry.write_text(yaml.safe_dump(entries))
+    study_file = study.workspace / "study.yaml"
+    settings = yaml.safe_load(study_file.read_text())
+    settings["experiments"]["small"]["models"].append("gpt-5")
+    study_file.write_text(yaml.safe_dump(settings))
+    whole = "occlusion|oracle__standard__run1...occlusion|gpt-5__json__run1"
+    finished = materialize(study, "responses,votes,verdicts", "--partition-range", whole)
+    assert finished.code == 1
+    told = finished.out + finished.err
+    assert "responses/occlusion|gpt-5__standard__run1 is not made: " in told
+    assert "verdicts/occlusion|gpt-5__standard__run1 is not made: responses/occlusion|gpt-5__standard__run1 " in told
+    for stage in ("responses", "votes", "verdicts"):
+        made = {path.parts[-4] for path in (study.workspace / "tables" / stage).rglob("*.parquet")}
+        assert made == {"model=oracle", "model=random-50", "model=prior"}
+
+
+def test_nothing_is_asked_that_no_experiment_of_the_study_names(study: Checkout) -> None:
+    finished = materialize(study, "responses", "--partition", "occlusion|never-abstain__standard__run1")
+    assert finished.code == 1
+    assert not [*(study.workspace / "ledger" / "answers").glob("never-abstain*")]
+    count = "from traps_pipeline.orchestration.graph import the_graph; print(len(the_graph().keys('responses')))"
+    assert study.run(sys.executable, "-W", "ignore", "-c", count).out.split()[-1] == str(4 * 3 * 2)
+
+
+def test_a_changed_formula_makes_its_stage_and_then_what_hangs_on_it_stale(study: Checkout) -> None:
+    path = study.root / "traps_pipeline" / "defs" / "scoring.py"
+    code, needs = path.read_text(), '    needs={"verdicts": "some"},'
+    assert needs in code
+    path.write_text(code.replace(needs, f'{needs}\n    code="2",', 1))
+    status = study.traps("status", EXPERIMENT).out
+    assert "its code has version 2 now, it was made by version 1" in status
+    run = study.score(EXPERIMENT)
+    assert run.code == 0, run.err
+    assert run.counts() == {"answers": 0, "votes": 0, "frames": 0}
+    assert "metrics: 4 partitions to do" in run.out
+    assert Workspace.open(study.workspace).tables.state(METRICS, {"dataset": "chaotic"}).code == "2"
+    assert "its code has version" not in study.traps("status", EXPERIMENT).out
+
+
+def test_an_altered_table_is_named_and_made_again(study: Checkout) -> None:
+    import pyarrow.parquet as pq
+
+    path = Workspace.open(study.workspace).tables.path(METRICS, {"dataset": "chaotic"})
+    table = pq.read_table(path)
+    place = table.schema.get_field_index("acc")
+    better = table.set_column(place, table.schema.field("acc"), [[1.0] * len(table)])
+    pq.write_table(better.replace_schema_metadata(table.schema.metadata), path)
+    assert "is not what was written (its rows were altered)" in study.traps("status", EXPERIMENT).out
+    refused = materialize(study, "leaderboard")
+    assert refused.code == 1
+    assert "metrics/chaotic" in refused.out + refused.err and "its rows were altered" in refused.out + refused.err
+    run = study.score(EXPERIMENT)
+    assert run.code == 0, run.err
+    assert "altered" not in study.traps("status", EXPERIMENT).out
+
+
+def test_a_copied_study_and_two_studies_in_one_history_do_each_other_no_harm(study: Checkout, tmp_path: Path) -> None:
+    copy = Checkout(study.root, tmp_path / "copy")
+    shutil.copytree(study.workspace, copy.workspace)
+    assert copy.score(EXPERIMENT).counts() == {"answers": 0, "votes": 0, "frames": 0}
+    other = Checkout(study.root, tmp_path / "other")
+    (tmp_path / "other").mkdir()
+    shutil.copytree(study.workspace / "clips", other.workspace / "clips")
+    shared = f"DAGSTER_HOME={study.workspace / 'dagster'}"
+    traps = ["env", shared, sys.executable, "-m", "traps_pipeline.cli"]
+    made = other.run(*traps, "run", EXPERIMENT, "--until", "items")
+    assert made.code == 0, made.err
+    assert len(Workspace.open(other.workspace).tables.read_all(ITEMS)) == 48
+    again = study.score(EXPERIMENT)  # the first study finds its own history as it was
+    assert again.code == 0 and " to do" not in again.out, again.out
+    assert len(Workspace.open(study.workspace).tables.read_all(RESPONSES)) == 3 * 2 * 48
+
+
+def test_a_run_that_lives_elsewhere_is_left_alone(study: Checkout) -> None:
+    code = """
+import dagster as dg, os
+from traps_pipeline.definitions import defs
+from traps_pipeline.orchestration.run import HOST_TAG, PID_TAG, this_host
+job = defs.resolve_job_def("report")
+with dg.DagsterInstance.get() as history:
+    for host in ("another machine", this_host()):
+        run = history.create_run_for_job(job, tags={PID_TAG: "999999999", HOST_TAG: host})
+        history.report_engine_event("begun", run)
+        history.handle_run_event(run.run_id, dg.DagsterEvent(dg.DagsterEventType.RUN_START.value, job.name))
+"""
+    begun = study.run(sys.executable, "-W", "ignore", "-c", code)
+    assert begun.code == 0, begun.err
+    assert study.traps("status").code == 0
+    states = """
+import dagster as dg
+with dg.DagsterInstance.get() as history:
+    runs = [run for run in history.get_runs() if run.tags.get("traps/pid") == "999999999"]
+    print(sorted((run.tags["traps/host"], run.status.value) for run in runs))
+"""
+    found = study.run(sys.executable, "-W", "ignore", "-c", states).out
+    assert "('another machine', 'STARTED')" in found and found.count("FAILURE") == 1, found
 
 
 def test_an_unknown_partition_exits_with_one(study: Checkout) -> None:
@@ -71,22 +211,7 @@ def test_a_missing_upstream_exits_with_one_and_names_it(study: Checkout) -> None
     forget_answers(study)
     finished = materialize(study, "votes", "--partition", CELL)
     assert finished.code == 1
-    assert "materialize responses for this partition first" in finished.out + finished.err
-
-
-def test_several_stages_in_one_run_are_refused_instead_of_skipped(study: Checkout) -> None:
-    finished = materialize(study, "scene_specs,videos", "--partition", "dominoes")
-    assert finished.code == 1
-    assert "one stage a run, not scene_specs, videos" in finished.out + finished.err
-
-
-def test_a_history_of_another_study_is_refused(study: Checkout, tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    command = [sys.executable, "-m", "dagster", "asset", "materialize", "-m", "traps_pipeline.definitions"]
-    other = f"DAGSTER_HOME={tmp_path / 'elsewhere'}"
-    finished = study.run("env", other, *command, "--select", "items", "--partition", "occlusion")
-    assert finished.code == 1
-    assert "is not of the workspace" in finished.out + finished.err
+    assert "is not made; materialize responses for this partition first" in finished.out + finished.err
 
 
 def test_a_failing_step_exits_with_one_and_names_the_file(study: Checkout) -> None:

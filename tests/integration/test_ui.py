@@ -1,4 +1,4 @@
-"""Dagster's UI in a real browser: the whole graph, no request off the machine, and a correction driven by clicks."""
+"""Dagster's UI in a real browser: everything from one button, ranges, corrections that are followed, damage shown."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect, sync_playwright
 
-from tests.conftest import EXPERIMENT, Checkout
-from traps_pipeline.definitions import defs
-from traps_pipeline.lineage import partition_of
+from tests.conftest import EXPERIMENT, Checkout, copied
+from traps_pipeline.orchestration.automation import INTERVAL_S
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import TABLES
+from traps_pipeline.tables import ITEMS, RESPONSES
 
 pytestmark = pytest.mark.slow
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
@@ -41,8 +40,9 @@ def wait_until(condition: Callable[[], bool], seconds: float, what: str) -> None
 
 
 @pytest.fixture
-def server(study: Checkout) -> Iterator[str]:
-    """`make ui`'s command on a free port: web server and daemon."""
+def server(request: pytest.FixtureRequest) -> Iterator[str]:
+    """`make ui`'s command on a free port: web server and daemon, of the study that the test names."""
+    study: Checkout = request.getfixturevalue("fresh" if "fresh" in request.fixturenames else "study")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -89,63 +89,150 @@ def page(server: str) -> Iterator[Page]:
         browser.close()
 
 
-def materialize(page: Page, server: str, asset: str, *choices: str) -> None:
-    """Open the asset, press Materialize, choose partitions in the dialog, launch."""
-    page.goto(f"{server}/assets/{asset}")
-    page.get_by_role("button", name="Materialize").first.click()
-    if not choices:
-        expect(page.get_by_text("Launched run")).to_be_visible()
-        return
-    for choice in choices:
-        page.get_by_text("Select a partition or create one").first.click()
-        box = page.get_by_placeholder("Filter partitions")
-        box.fill(choice)
-        # Of what lies over the page: the page behind names partitions, too, and is there before the list is.
-        page.locator(".bp5-portal").get_by_text(choice, exact=True).locator("visible=true").last.click()
-        page.keyboard.press("Escape")
-        expect(box).to_have_count(0)  # the next box opens only once this one is gone
-    page.get_by_role("button", name="Launch").last.click()
-    expect(page.get_by_role("button", name="Launch")).to_have_count(0)
+CELL = "chaotic_ill_posed|prior__json__run1"
 
 
-def materialize_and_wait(study: Checkout, page: Page, server: str, stage: str, key: str | None = None) -> None:
-    """Materialize by clicks and wait until the table (or report) is written anew."""
-    if stage in TABLES:
-        file = Workspace.open(study.workspace).tables.path(TABLES[stage], partition_of(stage, key))
-    else:
-        file = study.workspace / "reports" / ".state" / f"{stage}.json"
-    before = file.stat().st_mtime_ns
-    materialize(page, server, stage, *(key.split("|") if key else ()))
-    wait_until(lambda: file.stat().st_mtime_ns > before, RUN_SECONDS, f"{stage} {key} is made from the UI")
+def launch_all(page: Page, address: str) -> None:
+    """Press "Materialize all" on a page of the graph, choose all partitions, launch."""
+    page.goto(address)
+    page.get_by_role("button", name="Materialize all").first.click()
+    page.get_by_role("button", name="All", exact=True).first.click()
+    for button in page.get_by_role("button", name="All", exact=True).all()[1:]:
+        button.click()
+    launch = page.get_by_role("button", name=re.compile(r"^Launch"))
+    launch.last.click()
+    expect(launch).to_have_count(0)
 
 
-def test_a_correction_is_driven_from_the_ui_and_nothing_leaves_the_machine(
-    study: Checkout, server: str, page: Page, tmp_path: Path
+def launch_job(page: Page, server: str, job: str) -> None:
+    """One click: a job, launched as it is."""
+    page.goto(f"{server}/locations/traps_pipeline.definitions/jobs/{job}/playground")
+    page.get_by_role("button", name="Launch Run").click()
+    expect(page.get_by_role("button", name="Launch Run")).to_have_count(0)
+
+
+def written(study: Checkout, name: str) -> dict[Path, int]:
+    """When each file of a table, or the state of a report, was written."""
+    tables = [*(study.workspace / "tables" / name).rglob("*.parquet")]
+    files = tables or [study.workspace / "reports" / ".state" / f"{name}.json"]
+    return {file: file.stat().st_mtime_ns for file in files if file.exists()}
+
+
+def shows(page: Page, address: str, *texts: str) -> None:
+    """Open a page and wait until it says these."""
+    page.goto(address)
+    for text in texts:
+        expect(page.get_by_text(text).first).to_be_visible()
+
+
+@pytest.fixture
+def fresh(small: Checkout, tmp_path: Path) -> Checkout:
+    """A study of eight scenarios with an empty history; the clips of another serve it."""
+    study = copied(small, tmp_path)
+    clips = study.workspace / "clips"
+    shutil.move(clips, tmp_path / "clips")
+    shutil.rmtree(study.workspace)
+    made = study.traps("init", "tests/experiments/eight.yaml")
+    assert made.code == 0, made.err
+    shutil.rmtree(clips)
+    shutil.move(tmp_path / "clips", clips)
+    return study
+
+
+def test_materialize_all_goes_from_an_empty_history_to_the_report(
+    fresh: Checkout, server: str, page: Page, tmp_path: Path
 ) -> None:
+    study = fresh
     hosts = set[str]()
     page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
-    page.goto(f"{server}/asset-groups")
-    shown = ("report", "scoring", "evaluation", "benchmark")
-    for group in shown:  # opens its list of assets
-        page.get_by_text(group, exact=True).first.dblclick()
+    shows(page, f"{server}/asset-groups", "benchmark", "evaluation", "scoring", "report")
     page.screenshot(path=tmp_path / "graph.png")
-    graph = defs.resolve_asset_graph()
-    for key in graph.get_all_asset_keys():
-        if graph.get(key).group_name in shown:
-            expect(page.get_by_text(key.to_user_string(), exact=True).first).to_be_attached()
-
-    study.correct("plinko-0003", ill_posed_question="Why is the little triangle beside the board singing?")
-    rows = len(study.ledger_rows("answers"))
-
-    for stage, key in (("scene_specs", "plinko"), ("videos", "plinko"), ("items", "chaotic_ill_posed")):
-        assert f"    {key}: " in study.traps("status", EXPERIMENT).out  # stale, with the reason
-        materialize_and_wait(study, page, server, stage, key)
-    cell = "chaotic_ill_posed|prior__json__run1"
-    materialize_and_wait(study, page, server, "responses", cell)
-    assert len(study.ledger_rows("answers")) == rows + 1  # one item touched, one cell materialized
-    materialize_and_wait(study, page, server, "contact_sheet")
-    materialize_and_wait(study, page, server, "items", "chaotic")  # the other dataset of the category: nothing changes
-    status = study.traps("status", EXPERIMENT).out
-    for stage, fresh in (("scene_specs", 4), ("videos", 4), ("items", 4), ("responses", 24 - 5), ("contact_sheet", 1)):
-        assert re.search(rf"^{stage} +{fresh} ", status, re.MULTILINE), status
+    launch_all(page, f"{server}/asset-groups")
+    wait_until(lambda: bool(written(study, "report_page")), 10 * RUN_SECONDS, "the report is made from one click")
+    cells = Workspace.open(study.workspace).tables.read_all(RESPONSES, ["dataset", "model"])
+    assert set(cells["model"]) == {"oracle", "flaky", "prior"}  # all of the study's, and of the registry no other
+    assert len(written(study, "responses")) == 4 * 3
+    # The unreliable model's failed calls are told; all the rest is made.
+    shows(page, f"{server}/assets/responses?view=checks&checkDetail=current", "calls failed and can be asked again")
+    page.screenshot(path=tmp_path / "failed.png")
     assert hosts == {server.removeprefix("http://")}
+
+
+def test_a_correction_is_followed_alone_where_it_is_free_and_by_one_click_where_it_is_paid(
+    study: Checkout, server: str, page: Page
+) -> None:
+    rows, before = (
+        len(study.ledger_rows("answers")),
+        {n: written(study, n) for n in ("items", "metrics", "report_page")},
+    )
+    time.sleep(INTERVAL_S / 3)  # the daemon has seen everything current
+    study.correct("plinko-0003", ill_posed_question="Why is the little triangle beside the board singing?")
+    wait_until(lambda: written(study, "items") != before["items"], 3 * INTERVAL_S, "free stages follow a correction")
+    specs = Workspace.open(study.workspace).tables.read_all(ITEMS, dataset="chaotic_ill_posed")
+    assert (specs["question"] == "Why is the little triangle beside the board singing?").sum() == 1
+    time.sleep(2 * INTERVAL_S)
+    assert len(study.ledger_rows("answers")) == rows  # nothing is asked before the click
+    launch_job(page, server, "evaluation")
+    wait_until(
+        lambda: (
+            written(study, "report_page") != before["report_page"] and written(study, "metrics") != before["metrics"]
+        ),
+        4 * RUN_SECONDS,
+        "what hangs on the answers follows alone",
+    )
+    assert len(study.ledger_rows("answers")) == rows + 3 * 2  # one item, of each model under each regime
+    wait_until(lambda: not stale(study), 2 * RUN_SECONDS, "everything is current again")
+
+
+def stale(study: Checkout) -> list[str]:
+    """Stages of which something is stale or missing."""
+    status = study.traps("status", EXPERIMENT)
+    rows = re.findall(r"^([a-z_]+) +\d+ +(\d+) +(\d+)$", status.out, re.MULTILINE)
+    return [name for name, *counts in rows if counts != ["0", "0"]]
+
+
+def test_a_selection_of_stages_over_all_their_partitions_is_one_click(study: Checkout, server: str, page: Page) -> None:
+    before = {name: written(study, name) for name in ("responses", "votes", "verdicts")}
+    launch_all(page, f"{server}/locations/traps_pipeline.definitions/asset-groups/evaluation/lineage")
+    for name, then in before.items():
+        wait_until(
+            lambda name=name, then=then: all(written(study, name)[file] > time for file, time in then.items()),
+            4 * RUN_SECONDS,
+            f"all of {name} is made anew",
+        )
+    assert not stale(study)  # from the same inputs the same content: nothing below is outdated
+
+
+def test_an_altered_table_is_a_failed_check_before_anything_below_uses_it(
+    study: Checkout, server: str, page: Page, tmp_path: Path
+) -> None:
+    import pyarrow.parquet as pq
+
+    path = Workspace.open(study.workspace).tables.path(ITEMS, {"dataset": "chaotic"})
+    table = pq.read_table(path)
+    questions = ["What else?", *table["question"].to_pylist()[1:]]
+    altered = table.set_column(table.schema.get_field_index("question"), table.schema.field("question"), [questions])
+    pq.write_table(altered, path)
+    before = written(study, "responses")
+    shows_red = f"{server}/assets/items?view=checks&checkDetail=current"
+    wait_until(lambda: red(page, shows_red), 3 * RUN_SECONDS, "the daemon names the altered table")
+    page.screenshot(path=tmp_path / "altered.png")
+    launch_job(page, server, "evaluation")
+    wait_until(lambda: "FAILURE" in runs_of(study), RUN_SECONDS, "what is below is not made from it")
+    assert {
+        f: t for f, t in written(study, "responses").items() if "dataset=chaotic/" in str(f)
+    }.items() <= before.items()
+
+
+def red(page: Page, address: str) -> bool:
+    page.goto(address)
+    with suppress(AssertionError):
+        expect(page.get_by_text("is not what was written").first).to_be_visible(timeout=5_000)
+        return True
+    return False
+
+
+def runs_of(study: Checkout) -> str:
+    """The states of the newest runs, newest first."""
+    code = "import dagster as dg; print(*(r.status.value for r in dg.DagsterInstance.get().get_runs(limit=3)))"
+    return study.run(sys.executable, "-W", "ignore", "-c", code).out

@@ -13,7 +13,6 @@ import pytest
 
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_items, write_verdicts
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.lineage import Lineage
 from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.directions import vector_digest
 from traps_pipeline.mechanism.hook import Steering
@@ -27,6 +26,7 @@ from traps_pipeline.mechanism.steering import (
     strengths,
 )
 from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace

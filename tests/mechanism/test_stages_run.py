@@ -9,7 +9,6 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, Checkout, Finished
-from traps_pipeline.lineage import INSIDE
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import PROBES, STEERING_EFFECTS, STEERING_VOTES
@@ -57,7 +56,13 @@ def counted(finished: Finished) -> tuple[int, ...]:
 
 def test_traps_run_looks_into_a_model_once(study: Checkout) -> None:
     name = with_mechanism(study)
-    run: Callable[[], Finished] = lambda: study.traps("run", name, "--until", INSIDE[-1])  # noqa: E731
+    until = "probes,cosines,steering_effects,steering_shares"
+
+    def run() -> Finished:
+        return study.traps("run", name, "--until", until)
+
+        "run", name, "--until", "probes,cosines,steering_effects,steering_shares"
+    )  # noqa: E731
     extracted, answers, votes = counted(run())
     tables = Workspace.open(study.workspace).tables
     judged, effects = tables.read_all(STEERING_VOTES), tables.read(STEERING_EFFECTS, {})

@@ -79,7 +79,12 @@ def test_every_asset_says_who_owns_it_what_it_is_and_which_code_makes_it() -> No
 
 
 def test_what_can_cost_money_is_marked() -> None:
-    assert {s.name for s in GRAPH.stages if s.cost == "money"} == {"responses", "votes", "confabulation", "steering_votes"}
+    assert {s.name for s in GRAPH.stages if s.cost == "money"} == {
+        "responses",
+        "votes",
+        "confabulation",
+        "steering_votes",
+    }
     assert {s.name for s in GRAPH.stages if s.cost == "machine"} == {"hidden_states", "steering"}
 
 

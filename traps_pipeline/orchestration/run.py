@@ -110,6 +110,7 @@ def walk(
                 known = history.recorded(stage.name)
                 every = stage.wanted(wanted)
                 keys = [k for k in every if to_make(lineage, known, stage.name, k, existing=existing)]
+                keys = [k for k in keys if not (existing and lineage.waits(stage.name, k))]
                 if keys or graph.parents_of[stage.name].keys() & todo.keys():
                     todo[stage.name] = keys
             keys = [key for key in graph.keys(block[0].name) if any(key in of for of in todo.values())]

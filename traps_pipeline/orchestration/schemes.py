@@ -13,8 +13,10 @@ from traps_pipeline.partitions import Cell, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.wanted import Wanted
 
-# Partition mappings over one dimension, observable sources and backfill policies are in beta; the version is pinned.
-warnings.filterwarnings("ignore", category=dg.BetaWarning)
+# Partition mappings over one dimension, observable sources and backfill policies are in beta, partitioned checks in
+# preview; the version is pinned.
+for _category in (dg.BetaWarning, dg.PreviewWarning):
+    warnings.filterwarnings("ignore", category=_category)
 
 
 @dataclass(frozen=True)

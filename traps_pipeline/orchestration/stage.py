@@ -44,6 +44,7 @@ CURRENT_DOC = "Made from what is there now, whole, with no failed call: read aga
 MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # of runs: what to make of what is selected, and for whom
 STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
 REACHED = "a budget is reached"  # in a check's metadata
+STILL = "still failing"  # in a check's metadata: of a partition that the run did not touch
 SHOWN = 12  # unmade partitions named in an error
 # Dagster skips a step below one that hands on no output, and writes an event with one version for all partitions for
 # an output that is handed on, unless it carries this mark: observable sources that tell their own versions carry it.
@@ -236,6 +237,7 @@ class _Step:
         for key, error in self.unmade.items():
             reached = isinstance(error, BudgetReached)
             yield self._evaluation(CURRENT, key, {"not made": str(error), REACHED: reached})
+        yield from self._still_failing({*todo, *self.unmade})
         for output in self.context.op_def.output_dict:
             if output != "result":
                 yield dg.Output(None, output_name=output)
@@ -328,6 +330,15 @@ class _Step:
                 file.unlink(missing_ok=True)
             yield self._evaluation(check.name, key, {"failing": _plain(problems)} if problems else {})
 
+    def _still_failing(self, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
+        """Failed checks of partitions that this run has not made, once more: Dagster shows the newest result of a
+        check, and one that passes elsewhere must not hide them."""
+        for key in self.graph.keys(self.stage.name):
+            if key not in seen:
+                for check in self.workspace.failed_checks(self.stage.name, key):
+                    text = self.workspace.failed_check(self.stage.name, check, key).read_text(encoding="utf-8")
+                    yield self._evaluation(check, key, {STILL: json.loads(text)})
+
     def _evaluation(self, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
         return _evaluation(self.stage, check, key, wrong)
 
@@ -357,7 +368,7 @@ class _Step:
         for entry in self.context.instance.all_logs(self.context.run_id, of_type=of_type):
             event = entry.get_dagster_event().asset_check_evaluation_data
             node = (event.asset_key.path[-1], event.partition)
-            if node[0] in above:
+            if node[0] in above and STILL not in event.metadata:
                 failed[event.check_name, node] = event
         told = [line for (check, node), event in failed.items() for line in _lines(check, node, event)]
         if told:
