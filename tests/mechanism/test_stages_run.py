@@ -61,8 +61,6 @@ def test_traps_run_looks_into_a_model_once(study: Checkout) -> None:
     def run() -> Finished:
         return study.traps("run", name, "--until", until)
 
-        "run", name, "--until", "probes,cosines,steering_effects,steering_shares"
-    )  # noqa: E731
     extracted, answers, votes = counted(run())
     tables = Workspace.open(study.workspace).tables
     judged, effects = tables.read_all(STEERING_VOTES), tables.read(STEERING_EFFECTS, {})
