@@ -7,6 +7,7 @@ RENDER_PACKAGES := libosmesa6 python3-venv
 TEST_PACKAGES := $(RENDER_PACKAGES) chromium
 # Outside the lock, so that a machine may bring the build that suits it; a CPU build is enough: make TORCH="torch==2.13.0 --index-url ..."
 TORCH ?= torch==2.13.0
+PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
 .PHONY: demo demo-mechanism test ui bench lint setup render-packages test-packages clean
@@ -21,9 +22,9 @@ demo-mechanism: setup ## the pocket model from hidden states to steering, on the
 test: test-packages setup lint ## lint, types and all tests, the slow ones too
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-ui: setup ## Dagster's web server and daemon on 127.0.0.1:3000
+ui: setup ## Dagster's web server and daemon on 127.0.0.1:$(PORT)
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
-	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/dagster dev -h 127.0.0.1 -p 3000 -m traps_pipeline.definitions
+	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/dagster dev -h 127.0.0.1 -p $(PORT) -m traps_pipeline.definitions
 
 bench: setup ## ratios against what one would otherwise use
 	$(BIN)/python bench/render.py
