@@ -151,7 +151,7 @@ def test_materialize_all_goes_from_an_empty_history_to_the_report(
     wait_until(lambda: bool(written(study, "report_page")), 10 * RUN_SECONDS, "the report is made from one click")
     cells = Workspace.open(study.workspace).tables.read_all(RESPONSES, ["dataset", "model"])
     assert set(cells["model"]) == {"oracle", "flaky", "prior"}  # all of the study's, and of the registry no other
-    assert len(written(study, "responses")) == 4 * 3
+    assert len(written(study, "responses")) == 4 * 3 * 2
     # The unreliable model's failed calls are told; all the rest is made.
     shows(page, f"{server}/assets/responses?view=checks&checkDetail=current", "calls failed and can be asked again")
     page.screenshot(path=tmp_path / "failed.png")

@@ -72,7 +72,8 @@ def _items_shown(workspace: Workspace, cell: Cell, made: Made) -> dict[str, Any]
     records = [dg.TableRecord({name: str(row[name]) for name in columns}) for row in rows[:ITEMS_SHOWN]]
     table = {"without an answer": dg.MetadataValue.table(records)} if records else {}
     why = {"one item": f"traps why {made.rows[0]['item_id']}"} if made.rows else {}
-    return {**table, "all items": dg.MetadataValue.path(str(page)), **why}
+    links = {"items": dg.MetadataValue.asset(items.key), "all items": dg.MetadataValue.path(str(page))}
+    return {**table, **links, **why}
 
 
 def _answers_missing(workspace: Workspace, key: str | None, made: Made) -> str:

@@ -45,6 +45,7 @@ MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # of runs: what to 
 STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
 REACHED = "a budget is reached"  # in a check's metadata
 STILL = "still failing"  # in a check's metadata: of a partition that the run did not touch
+PREVIEWED = 5  # rows
 SHOWN = 12  # unmade partitions named in an error
 # Dagster skips a step below one that hands on no output, and writes an event with one version for all partitions for
 # an output that is handed on, unless it carries this mark: observable sources that tell their own versions carry it.
@@ -350,7 +351,8 @@ class _Step:
             paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in files}
             return {path: value for path, value in paths.items() if path.count("/") < 2} | shown
         count = "dagster/row_count" if self.stage.scheme is None else "dagster/partition_row_count"
-        return {count: len(made.content)} | shown
+        preview = _preview(self.stage.table, made)
+        return {count: len(made.content)} | ({"first rows": preview} if preview else {}) | shown
 
     # --- the end ------------------------------------------------------------------------------------------------------
 
@@ -393,6 +395,15 @@ def _evaluation(stage: Stage, check: str, key: str | None, wrong: Mapping[str, A
     return dg.AssetCheckEvaluation(
         asset_key=stage.spec.key, check_name=check, passed=not wrong, partition=key, metadata={**wrong}
     )
+
+
+def _preview(table: Table, made: Made) -> dg.TableMetadataValue | None:
+    """The first rows without long texts: what a model wrote is shown on the report's pages, where it is escaped."""
+    content = cast(Any, made.content)
+    rows = content.head(PREVIEWED).to_dict("records") if hasattr(content, "head") else content[:PREVIEWED]
+    names = [c.name for c in table.columns if c.name in table.key or c.type.rstrip("?") in ("int", "float", "bool")]
+    records = [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows]
+    return dg.MetadataValue.table(records) if records else None
 
 
 def _plain(problems: Any) -> Any:
