@@ -67,7 +67,7 @@ class Checkout:
     def run(self, *command: str | Path) -> Finished:
         """Run a command to its end."""
         process = self.start(*command)
-        out, err = process.communicate(timeout=600)
+        out, err = process.communicate()
         return Finished(process.returncode, out, err)
 
     def traps(self, *arguments: str | Path) -> Finished:
