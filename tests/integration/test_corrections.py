@@ -34,6 +34,17 @@ print(json.dumps(sorted(name for name, status in found.items() if status == "STA
 """
 
 
+# The newest result of a check, as the UI shows it for the asset.
+LATEST = """
+import sys
+import dagster as dg
+key = dg.AssetCheckKey(dg.AssetKey(sys.argv[1]), sys.argv[2])
+with dg.DagsterInstance.get() as history:
+    record = history.event_log_storage.get_latest_asset_check_execution_by_key([key])[key]
+    print(record.status.value, record.event.dagster_event.asset_check_evaluation_data.partition)
+"""
+
+
 def stale_in_dagster(study: Checkout) -> list[str]:
     finished = study.run(sys.executable, "-W", "ignore", "-c", STALE)
     assert finished.code == 0, finished.err
@@ -194,6 +205,9 @@ def test_an_added_scenario_joins_and_a_copy_is_told_by_every_run_until_it_is_gon
         assert "check clips_distinct of videos/hidden does not pass" in run.err
     assert len(Workspace.open(whole.workspace).tables.read_all(RESPONSES)) == 2 * (8 + 6 + 1)
     assert "check clips_distinct of videos hidden does not pass" in whole.traps("status").out
+    materialize(whole, "videos", "dominoes")  # another category passes, exit code 0; the failure stays Dagster's newest
+    latest = whole.run(sys.executable, "-W", "ignore", "-c", LATEST, "videos", "clips_distinct")
+    assert latest.out.split() == ["FAILED", "hidden"], latest.err
     study.correct("hidden_race-9001", params={"azimuth_deg": params["azimuth_deg"] + 3.0})
     run = whole.score(tmp_path / "whole.yaml")
     assert run.code == 0, run.err
