@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+import traps_pipeline.definitions  # noqa: F401 - declares the graph
 from tests.providers.server import Provider
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -237,6 +237,7 @@ def plan(arguments: argparse.Namespace) -> int:
 
     experiment, root = _experiment(arguments), _root(arguments)
     workspace = _open(root) if (root / "study.yaml").exists() else None
+    _load_definitions()
     planned = make_plan(workspace, experiment)
     total = (Count(), Count())
     print(f"{experiment.name} in {root if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
@@ -300,12 +301,14 @@ def run(arguments: argparse.Namespace) -> int:
 
     experiment = _experiment(arguments)
     workspace = _allow(_create(arguments, experiment), experiment, arguments)
+    from traps_pipeline.definitions import defs
     from traps_pipeline.orchestration.run import dagster_history, failed_checks, stages_until, walk
 
     stages = stages_until(arguments.until)
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
     with reporting(TerminalProgress()) as progress, dagster_history(workspace) as instance:
-        outcome = walk(instance, workspace, stages, experiment=experiment.name)
+        every_asset = defs.resolve_implicit_global_asset_job_def()
+        outcome = walk(instance, every_asset, workspace, stages, experiment=experiment.name)
     problems = [*dict.fromkeys([*outcome.problems, *failed_checks(workspace, experiment.name)])]
     total = progress.totals
     asked, voted, drawn = (total.get(stage, Tally()) for stage in ("responses", "votes", "videos"))
@@ -394,6 +397,7 @@ def status(arguments: argparse.Namespace) -> int:
     from traps_pipeline.orchestration.run import dagster_history
     from traps_pipeline.plan import stage_statuses
 
+    _load_definitions()
     lineage = Lineage(workspace)
     with dagster_history(workspace) as instance:
         History(instance, lineage.graph).observe(lineage)  # so that Dagster's UI shows the same partitions stale
@@ -580,6 +584,13 @@ def _entered(workspace: Workspace) -> Workspace:
     os.environ[VARIABLE] = str(workspace.root)
     os.environ.setdefault("DAGSTER_HOME", str(workspace.dagster_home))
     return workspace
+
+
+def _load_definitions() -> None:
+    """Declare the graph, which staleness is read off. Not at the top: `traps --help` answers at once."""
+    import importlib
+
+    importlib.import_module("traps_pipeline.definitions")
 
 
 def _create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:

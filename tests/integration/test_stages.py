@@ -20,6 +20,7 @@ RANGE = "occlusion|oracle__standard__run1...occlusion_ill_posed|oracle__json__ru
 # Versions of all that is there, by partition, as the footers say; and the stages that share no partitions.
 VERSIONS = """
 import json
+import traps_pipeline.definitions
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.wanted import Wanted
@@ -123,8 +124,7 @@ def test_nothing_is_asked_that_no_experiment_of_the_study_names(study: Checkout)
     finished = materialize(study, "responses", "--partition", "occlusion|never-abstain__standard__run1")
     assert finished.code == 1
     assert not [*(study.workspace / "ledger" / "answers").glob("never-abstain*")]
-    count = "from traps_pipeline.orchestration.graph import the_graph; print(len(the_graph().keys('responses')))"
-    assert study.run(sys.executable, "-W", "ignore", "-c", count).out.split()[-1] == str(4 * 3 * 2)
+    assert sum(name.startswith("responses/") for name in known(study)["versions"]) == 4 * 3 * 2
 
 
 def test_a_changed_formula_makes_its_stage_and_then_what_hangs_on_it_stale(study: Checkout) -> None:

@@ -78,6 +78,7 @@ MEANWHILE = """
 import json
 import dagster as dg
 import pyarrow.parquet as pq
+from traps_pipeline.definitions import defs
 from traps_pipeline.orchestration.graph import Source, name_of, the_graph
 from traps_pipeline.orchestration.lineage import Lineage, _report_state
 from traps_pipeline.orchestration.run import _execute, dagster_history
@@ -85,6 +86,7 @@ from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.wanted import Wanted
 
 workspace, graph = Workspace.open(), the_graph()
+job = defs.resolve_implicit_global_asset_job_def()
 
 def change(name, key):
     one = graph.declared[name]
@@ -117,7 +119,7 @@ def meanwhile(stage, key, parent):
     object.__setattr__(stage, "make", make and made)
     object.__setattr__(stage, "collect", collect and collected)
     try:
-        problems, _ = _execute(history, [stage.name], key, {})
+        problems, _ = _execute(history, job, [stage.name], key, {})
         status = Lineage(workspace).status(stage.name, key)
     finally:
         object.__setattr__(stage, "make", make)

@@ -63,7 +63,8 @@ def _job(
         reread_sources()
         stages = [stage.name for stage in _stages(costs) if groups is None or stage.spec.group_name in groups]
         opened = workspace.open()
-        outcome = walk(context.instance, opened, stages, existing=existing)
+        every_asset = context.repository_def.get_implicit_global_asset_job_def()
+        outcome = walk(context.instance, every_asset, opened, stages, existing=existing)
         checks = [] if existing else failed_checks(opened, None)
         if problems := [*dict.fromkeys([*outcome.problems, *checks])]:
             raise TrapsError("\n".join(problems))

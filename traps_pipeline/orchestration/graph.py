@@ -197,8 +197,7 @@ def name_of(node: Node) -> str:
 
 @cache
 def the_graph() -> Graph:
-    """The graph of everything that is declared; `traps_pipeline.definitions` is loaded for it."""
-    import importlib
-
-    importlib.import_module("traps_pipeline.definitions")
+    """The graph of everything that is declared, once `traps_pipeline.definitions` is loaded."""
+    if not DECLARED:
+        raise RuntimeError("no stage is declared yet: import traps_pipeline.definitions first")
     return Graph()

@@ -91,14 +91,18 @@ def _alive(pid: int) -> bool:
 
 def walk(
     instance: dg.DagsterInstance,
+    job: dg.JobDefinition,
     workspace: Workspace,
     stages: Collection[str],
     *,
     experiment: str | None = None,
     existing: bool = False,
 ) -> Outcome:
-    """Make what is missing or stale of these stages, block by block. experiment: only what that one of the study's
-    wants; existing: only what is there already and outdated. KeyboardInterrupt passes through."""
+    """Make what is missing or stale of these stages, block by block, in runs of the job of all assets.
+
+    experiment: only what that one of the study's wants; existing: only what is there already and outdated.
+    KeyboardInterrupt passes through.
+    """
     outcome, began, graph = Outcome(), time.monotonic(), the_graph()
     history, wanted = History(instance, graph), Wanted(workspace, experiment)
     tags = {MAKE_TAG: OUTDATED if existing else STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})
@@ -116,7 +120,9 @@ def walk(
             keys = [key for key in graph.keys(block[0].name) if any(key in of for of in todo.values())]
             for first, last in batches(block[0].scheme, keys):
                 ranged = {_RANGE[0]: str(first), _RANGE[1]: str(last)} if first != last else {}
-                problems, over_budget = _execute(instance, [*todo], first if first == last else None, tags | ranged)
+                problems, over_budget = _execute(
+                    instance, job, [*todo], first if first == last else None, tags | ranged
+                )
                 outcome.problems += problems
                 outcome.over_budget |= over_budget
     outcome.problems = [*dict.fromkeys(outcome.problems)]
@@ -181,14 +187,12 @@ def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _execute(
-    instance: dg.DagsterInstance, stages: Sequence[str], key: str | None, tags: Mapping[str, str]
+    instance: dg.DagsterInstance, job: dg.JobDefinition, stages: Sequence[str], key: str | None, tags: Mapping[str, str]
 ) -> tuple[list[str], bool]:
-    """One Dagster run of the asset job; what went wrong in it, a sentence each, and whether a budget was reached."""
-    from traps_pipeline.definitions import defs
-
+    """One Dagster run of some assets; what went wrong in it, a sentence each, and whether a budget was reached."""
     graph = the_graph()
     try:
-        result = defs.resolve_implicit_global_asset_job_def().execute_in_process(
+        result = job.execute_in_process(
             instance=instance,
             asset_selection=[graph[name].spec.key for name in stages],
             partition_key=key,
