@@ -118,6 +118,6 @@ def test_status_calls_everything_fresh_and_plan_has_nothing_new(demo_study: Chec
         ("verdicts", 108),
         ("leaderboard", 1),
     ):
-        assert f"{stage:<24} {partitions:>6}      0        0" in status
+        assert f"{stage:<34} {partitions:>6}      0        0" in status
     plan = demo_study.traps("plan", "demo").out.splitlines()[-1].split()
     assert plan == ["all", "3,456", "3,456", "0", "15,552", "15,552", "0"]
