@@ -151,9 +151,13 @@ def provider(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Prov
 
 
 def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], str]) -> Path:
-    """A folder that is made once for all workers of a test run; `make` returns what it printed (`<name>.out`)."""
+    """A folder that is made once for all workers of a test run; `make` returns what it printed (`<name>.out`).
+
+    TRAPS_TEST_STUDIES names a folder that keeps them for further runs, while one works on what needs them.
+    """
     shared = factory.getbasetemp()
     shared = shared.parent if os.environ.get("PYTEST_XDIST_WORKER") else shared
+    shared = Path(os.environ.get("TRAPS_TEST_STUDIES") or shared)
     with (shared / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (shared / f"{name}.out").exists():
