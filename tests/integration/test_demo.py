@@ -22,6 +22,7 @@ from traps_pipeline.tables import (
 pytestmark = pytest.mark.slow
 NOT_RUN = ("confabulation", "confabulation_prevalence")  # empty, never zeros
 INSIDE = ("probe_items", "hidden_states", "probes", "directions", "cosines", "steering", "steering_votes")
+INSIDE += ("steering_effects", "steering_shares")
 DEGENERATE = ("always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle")
 
 
