@@ -109,10 +109,8 @@ def test_a_stopped_model_leaves_the_other_cells_made_and_the_reason_is_told(stud
     assert finished.code == 1
     told = finished.out + finished.err
     assert "responses/occlusion|gemini-2.5-pro__standard__run1 is not made: " in told
-    assert (
-        "verdicts/occlusion|gemini-2.5-pro__standard__run1 is not made: responses/occlusion|gemini-2.5-pro__standard__run1 "
-        in told
-    )
+    cell = "occlusion|gemini-2.5-pro__standard__run1"
+    assert f"verdicts/{cell} is not made: responses/{cell} " in told
     for stage in ("responses", "votes", "verdicts"):
         made = {path.parts[-4] for path in (study.workspace / "tables" / stage).rglob("*.parquet")}
         assert made == {"model=oracle", "model=random-50", "model=prior"}
