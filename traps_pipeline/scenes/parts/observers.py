@@ -1,0 +1,106 @@
+"""What an observer sees, as values: each takes the frames and the words of the question, and answers or abstains.
+
+An `Observer(frames, named)` gets the sampled frames (N, 360, 480, 3) RGB and what the question names, read back from
+its templates: part -> colour, and 'choices'. It gives a label, or None if the decisive thing is not to be seen or not
+at rest. A `Finder(frame, colour)` finds one thing in one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from traps_pipeline.scenes.vision import Blob, at_rest, blobs, colour_mask, is_panel, largest, track
+
+Observer = Callable[[np.ndarray, Mapping[str, str]], str | None]
+Finder = Callable[[np.ndarray, str], Blob | None]
+
+
+# --- one thing in one frame -------------------------------------------------------------------------------------------
+
+
+def small(frame: np.ndarray, colour: str) -> Blob | None:
+    """The largest region of a colour that is no longer than a ball (80 px)."""
+    return next((blob for blob in blobs(colour_mask(frame, colour), 60) if max(blob.box[2:]) < 80), None)
+
+
+def compact(frame: np.ndarray, colour: str) -> Blob | None:
+    """The largest region of a colour that may be a ball: filled, about as wide as high, small beside the frame."""
+    for blob in blobs(colour_mask(frame, colour), 60):
+        if blob.area < 4000 and 0.4 < blob.box[2] / blob.box[3] < 2.5 and blob.fill > 0.5:
+            return blob
+    return None
+
+
+def rounded(frame: np.ndarray, colour: str) -> Blob | None:
+    """The largest region of a colour that may be a ball: neither as large nor as rectangular as a panel."""
+    for blob in blobs(colour_mask(frame, colour)):
+        if 60 <= blob.area <= 4000 and blob.fill < 0.9 and max(blob.box[2:]) < 1.9 * min(blob.box[2:]):
+            return blob
+    return None
+
+
+def upper_half_stays(frames: np.ndarray, colour: str, first: Blob) -> bool:
+    """Whether the upper half of a thing that the first frame shows is still where it was in the last frame."""
+    x, y, width, height = first.box
+    part = np.s_[y : y + height // 2, x : x + width]
+    before, after = (colour_mask(frame, colour)[part] for frame in (frames[0], frames[-1]))
+    return bool((before & after).sum() > 0.7 * before.sum())
+
+
+# --- observers --------------------------------------------------------------------------------------------------------
+
+
+def beyond(thing: str, mark: str) -> Observer:
+    """'yes' if the thing rests on the far side of the mark, seen from where it was first, else 'no'."""
+
+    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+        path, line = track(frames, named[thing], 60), largest(frames[-1], named[mark], 60)
+        start, end = next((blob for blob in path if blob), None), path[-1]
+        if line is None or start is None or end is None or not at_rest(path):
+            return None
+        return "yes" if (end.x - line.x) * (line.x - start.x) > 0 else "no"
+
+    return observe
+
+
+def past_far_edge(thing: str, screen: str) -> Observer:
+    """'yes' if the thing rests past that edge of the screen which is farther from where it was first, else 'no'."""
+
+    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+        path = [small(frame, named[thing]) for frame in frames]
+        start = next((blob.x for blob in path if blob), None)
+        wall, end = largest(frames[-1], named[screen], 200), path[-1]
+        if start is None or wall is None or end is None or not at_rest(path, tolerance_px=4):
+            return None
+        left, width = wall.box[0], wall.box[2]
+        return "yes" if (end.x > left + width if start < wall.x else end.x < left) else "no"
+
+    return observe
+
+
+def rests_over(thing: str, goal: str, find: Finder = compact) -> Observer:
+    """'yes' if the thing rests within the goal from left to right (2 px more to either side), else 'no'."""
+
+    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+        path = [find(frame, named[thing]) for frame in frames]
+        box, end = largest(frames[-1], named[goal], 60), path[-1]
+        if box is None or end is None or not at_rest(path):
+            return None
+        left, width = box.box[0], box.box[2]
+        return "yes" if left - 2 <= end.x <= left + width + 2 else "no"
+
+    return observe
+
+
+def has_fallen(thing: str) -> Observer:
+    """'yes' if the thing, once at rest, no longer stands where it stood at first, else 'no'."""
+
+    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+        path = track(frames, named[thing], 60)
+        if path[0] is None or is_panel(path[0]) or not at_rest(path):
+            return None
+        return "no" if upper_half_stays(frames, named[thing], path[0]) else "yes"
+
+    return observe
