@@ -102,10 +102,10 @@ def _add_ramp(stage: Stage, p: Params, side: float) -> Vec3:
     foot = np.array([-p.flat_m, ROAD_M])
     up, normal = np.array([-np.cos(slope), np.sin(slope)]), np.array([np.sin(slope), np.cos(slope)])
     middle = foot + up * length / 2 - normal * thick
-    stage.tilted("ramp", (middle[0], 0, middle[1]), (length / 2, side, thick), p.ramp_colour, slope)
+    stage.slab("ramp", (middle[0], 0, middle[1]), (length / 2, side, thick), p.ramp_colour, falls_rad=slope)
     top = foot + up * (length - 0.03) - normal * thick
     half = (top[1] - 0.008) / 2
-    stage.tilted("ramp_post", (top[0], 0, half), (0.02, side * 0.8, half), p.ramp_colour, 0.0)
+    stage.slab("ramp_post", (top[0], 0, half), (0.02, side * 0.8, half), p.ramp_colour)
     ball = foot + up * (length - 1.2 * p.radius_m) + normal * p.radius_m
     return float(ball[0]), 0.0, float(ball[1])
 

@@ -114,8 +114,8 @@ class Stage:
         half = (float(np.hypot(xb - xa, zb - za)) / 2, half_width, half_thick)
         return add_box(self.spec.worldbody, name, centre, half, colour, euler_y=angle)
 
-    def tilted(self, name: str, centre: Vec3, half: Vec3, colour: str, falls_rad: float) -> mujoco.MjsGeom:
-        """A static box from its centre and half sizes that falls by an angle along the way (a ramp: above 0)."""
+    def slab(self, name: str, centre: Vec3, half: Vec3, colour: str, *, falls_rad: float = 0.0) -> mujoco.MjsGeom:
+        """A static box from its centre and half sizes, which may fall by an angle along the way, as a ramp does."""
         at = (self.direction * centre[0], centre[1], centre[2])
         return add_box(self.spec.worldbody, name, at, half, colour, euler_y=self.direction * falls_rad)
 
