@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Box, Physics, add_ball, add_box, new_spec, rgba, uniform
+from traps_pipeline.scenes.kit import Box, Physics, Vec3, add_ball, add_box, new_spec, rgba, uniform
 from traps_pipeline.scenes.parts.vary import Drawn, Group, drawn_by, together
 from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import Blob, blobs, colour_mask
@@ -107,6 +107,10 @@ class Board:
         if not solid:
             geom.contype = geom.conaffinity = 0
         return geom
+
+    def paint(self, name: str, centre: Vec3, half: Vec3, colour: str) -> mujoco.MjsGeom:
+        """A box from its centre and half sizes that is drawn and touches nothing."""
+        return add_box(self.body, name, centre, half, colour, contype=0, conaffinity=0)
 
     def frame(self, bottom: float, top: float, colour: str, *, sill: bool = True) -> None:
         """Sill, head and sides around the part from `bottom` to `top`, and the glass over it, which is never drawn."""
