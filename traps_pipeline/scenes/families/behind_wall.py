@@ -81,8 +81,7 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.block("lane_bed", bed, deep, (0, DECK_M), p.lane_colour, Surface(0.003))
     stage.block("lane_out", (bed[1], p.wall_m), deep, (0, DECK_M), p.lane_colour, Surface(1e-4))
     stage.block("tray", (p.wall_m, far), deep, (0, TRAY_M), p.tray_colour, Surface(0.004))
-    stage.block("tray_front", (p.wall_m, far), (-side - rail, -side), (0, rim), p.tray_colour)
-    stage.block("tray_back", (p.wall_m, far), (side, side + rail), (0, rim), p.tray_colour)
+    stage.sides("tray", (p.wall_m, far), side, rail, (0, rim), p.tray_colour)
     stage.block("tray_end", (far, far + rail), (-side - rail, side + rail), (0, TRAY_M + 1.5 * r), p.tray_colour)
     _add_wall(stage, p, (front, front + WALL_M))
     stop = second + 1.1 * r  # where the block's face is: the ball rests in the window

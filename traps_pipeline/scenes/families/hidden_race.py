@@ -83,8 +83,7 @@ def build(p: Params, physics: Physics) -> Scene:
     stage = Stage(physics, p.direction)
     lanes, r, pitch, wall = len(p.colours), p.radius_m, 2.8 * p.radius_m, 0.012
     side, roof, rim, end = lanes * pitch / 2, DECK_M + 2.6 * r, TRAY_M + 0.9 * r, p.exit_m + p.tray_m
-    deep, tunnel = (-side, side), (p.run_m, p.exit_m)
-    front, back, outer = (-side - wall, -side), (side, side + wall), (-side - wall, side + wall)
+    deep, outer, tunnel = (-side, side), (-side - wall, side + wall), (p.run_m, p.exit_m)
     rough_at = p.run_m + p.mouth_m + 2 * r + 0.04  # no ball feels it before it is wholly behind the panel
     after = rough_at + ROUGH_BOARD_M
 
@@ -99,13 +98,11 @@ def build(p: Params, physics: Physics) -> Scene:
         board = Surface(2e-5 if i == p.clear_lane else _roughness(p, i, physics))
         stage.block(f"board_{i}", (rough_at, after), (y - pitch / 2, y + pitch / 2), (0, DECK_M), "black", board)
         stage.ball(ball, (p.starts_m[i], y, DECK_M + r), r, p.colours[i], speed=p.speeds_m_s[i])
-    stage.block("tunnel_front", tunnel, front, (0, roof), p.tunnel_colour)
-    stage.block("tunnel_back", tunnel, back, (0, roof), p.tunnel_colour)
+    stage.sides("tunnel", tunnel, side, wall, (0, roof), p.tunnel_colour)
     stage.block("tunnel_roof", tunnel, outer, (roof, roof + wall), p.tunnel_colour)
     felt = Surface(4e-4)  # the balls come to rest in view
     stage.block("tray", (p.exit_m, end), deep, (0, TRAY_M), p.tray_colour, felt)
-    stage.block("tray_front", (p.exit_m, end), front, (0, rim), p.tunnel_colour)
-    stage.block("tray_back", (p.exit_m, end), back, (0, rim), p.tunnel_colour)
+    stage.sides("tray", (p.exit_m, end), side, wall, (0, rim), p.tunnel_colour)
     stage.block("tray_end", (end, end + wall), outer, (0, rim), p.tunnel_colour)
 
     covered, up = (p.run_m + p.mouth_m, end + wall), (0, roof + wall)

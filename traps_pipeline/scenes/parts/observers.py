@@ -94,6 +94,26 @@ def rests_over(thing: str, goal: str, find: Finder = compact) -> Observer:
     return observe
 
 
+def reaches(thing: str, goal: str, foot: float | None = None) -> Observer:
+    """'yes' if the thing rests nearer to the middle of the goal than to where it was first, else 'no'.
+
+    foot: which share of the thing's height, from its top, stands for its place; None takes its middle.
+    """
+
+    def place(blob: Blob) -> np.ndarray:
+        return np.array([blob.x, blob.y if foot is None else blob.box[1] + foot * blob.box[3]])
+
+    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+        path, box = track(frames, named[thing], 60), largest(frames[0], named[goal], 60)
+        first, last = path[0], path[-1]
+        if first is None or last is None or box is None or not at_rest(path) or is_panel(last) or is_panel(box):
+            return None
+        way = np.array([box.x, box.y]) - place(first)
+        return "yes" if (place(last) - place(first)) @ way / (way @ way) > 0.6 else "no"
+
+    return observe
+
+
 def has_fallen(thing: str) -> Observer:
     """'yes' if the thing, once at rest, no longer stands where it stood at first, else 'no'."""
 

@@ -44,6 +44,12 @@ def still_from(*paths: np.ndarray, within_m: float) -> int:
     return lasting_from(~np.any(restless, axis=0))
 
 
+def clear_m(past: np.ndarray, before_m: float = 0.0) -> float:
+    """How far (m) a thing ends past a line, `past` (F,) m above 0, or how far its front, so much ahead of its middle,
+    ends before the line."""
+    return float(past[-1] if past[-1] > 0 else -past[-1] - before_m)
+
+
 # --- readings ---------------------------------------------------------------------------------------------------------
 
 

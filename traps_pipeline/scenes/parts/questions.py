@@ -40,7 +40,7 @@ class Question:
     fill: Callable[[Any, np.random.Generator], Filled]
 
     def word(self, p: Any, rng: np.random.Generator, asides: Sequence[Aside]) -> Wording:
-        """The words of a scenario: one wording of the question, one of the asides."""
+        """The words of a scenario: one wording of the question, one of the asides; a sole aside costs no draw."""
         filled = self.fill(p, rng)
         text = str(rng.choice(self.templates)).format_map({**coloured(p), **filled.fills})
         return Wording(text, filled.labels, filled.aliases, _one_of(asides, rng)(p, rng))

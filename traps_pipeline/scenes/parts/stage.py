@@ -106,6 +106,20 @@ class Stage:
             geom.contype = geom.conaffinity = 0
         return geom
 
+    def sides(
+        self,
+        name: str,
+        along: Span,
+        half_width: float,
+        thick: float,
+        up: Span,
+        colour: str,
+        surface: Surface | None = None,
+    ) -> None:
+        """The walls `<name>_front` and `<name>_back` outside a width, the front one first."""
+        for part, across in (("front", (-half_width - thick, -half_width)), ("back", (half_width, half_width + thick))):
+            self.block(f"{name}_{part}", along, across, up, colour, surface)
+
     def plank(self, name: str, a: Point, b: Point, half_width: float, colour: str) -> mujoco.MjsGeom:
         """A plank, 16 mm thick, whose upper face runs from one point of the way to the next."""
         (xa, za), (xb, zb) = sorted(((self.direction * u, z) for u, z in (a, b)))
