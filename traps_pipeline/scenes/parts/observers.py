@@ -94,6 +94,23 @@ def rests_over(thing: str, goal: str, find: Finder = compact) -> Observer:
     return observe
 
 
+def nearer_side(
+    thing: str, left: str, right: str, *, find: Finder = small, least: int = 60, tolerance_px: float = 1.5
+) -> Observer:
+    """'left' or 'right': which of two marks the resting thing is nearer to. left, right: what the question names, or
+    colours; least: of the marks (pixels)."""
+
+    def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+        path = [find(frame, named[thing]) for frame in frames[-3:]]
+        marks = [largest(frames[-1], named.get(mark, mark), least) for mark in (left, right)]
+        end = path[-1]
+        if end is None or marks[0] is None or marks[1] is None or not at_rest(path, tolerance_px=tolerance_px):
+            return None
+        return "left" if abs(end.x - marks[0].x) < abs(end.x - marks[1].x) else "right"
+
+    return observe
+
+
 def reaches(thing: str, goal: str, foot: float | None = None) -> Observer:
     """'yes' if the thing rests nearer to the middle of the goal than to where it was first, else 'no'.
 
