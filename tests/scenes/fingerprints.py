@@ -82,7 +82,9 @@ def versions() -> dict[str, str]:
     import mujoco
 
     grid = np.linspace(0.01, 0.99, 997)
-    vectors = [f(grid) for f in (np.sin, np.cos, np.tan, np.arcsin, np.exp)] + [np.hypot(grid, 1 - grid)]
+    places = np.stack([grid, np.sin(grid), np.cos(grid)], axis=1)
+    vectors = [f(grid) for f in (np.sin, np.cos, np.tan, np.arcsin, np.exp)]
+    vectors += [np.hypot(grid, 1 - grid), places @ places[0], np.linalg.norm(places, axis=1)]
     scalars = [f(float(x)) for f in (math.sin, math.cos, math.tan, math.atan, math.exp) for x in grid]
     return {
         "mujoco": mujoco.__version__,
