@@ -89,6 +89,8 @@ def test_a_stage_mirrors_what_stands_on_it(direction: int) -> None:
     np.testing.assert_allclose(block.size, [0.2, 0.2, 0.25])
     np.testing.assert_allclose(block.friction, [0.8, 0.005, 0.002])
     stage.ball("ball", (-0.5, 0, 0.05), 0.05, "blue", speed=0.4)
+    stage.hull("wedge", [(1.0, y, z) for y in (0, 1) for z in (0, 1)] + [(1.6, 0.5, 0)], "green")
+    assert stage.spec.mesh("wedge").uservert[0] == direction * 1.0
     p = vary.drawn(Params, np.random.default_rng(0))
     scene = stage.scene(
         p, decisive=["ball"], hidden=["wall"], cover=None, in_view=[], things=["red wall"], also=["ball"]

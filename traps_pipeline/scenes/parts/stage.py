@@ -188,6 +188,19 @@ class Stage:
             geom.contype = geom.conaffinity = 0
         return geom
 
+    def hull(
+        self, name: str, corners: Sequence[Vec3], colour: str, *, body: mujoco.MjsBody | None = None
+    ) -> mujoco.MjsGeom:
+        """The convex body around some corners, which is drawn and touches nothing; `body` as in `rod`."""
+        import mujoco
+
+        places = [value for at in corners for value in (self.direction * at[0], at[1], at[2])]
+        self.spec.add_mesh(name=name, uservert=places)
+        geom = (body or self.spec.worldbody).add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, rgba=rgba(colour))
+        geom.meshname = name
+        geom.contype = geom.conaffinity = 0
+        return geom
+
     # --- what moves ---
 
     def ball(
@@ -251,11 +264,12 @@ class Stage:
         density: float,
         sliding: float | None = None,
         solref: tuple[float, float] | None = None,
+        base: float = 0.0,
     ) -> None:
-        """Free boxes one on top of the other, at the origin, the first on the ground."""
+        """Free boxes one on top of the other, at the origin, the first on the ground or so high (m)."""
         height = 2 * half[2]
         for i, (name, colour) in enumerate(zip(names, colours, strict=True)):
-            at = (0.0, 0.0, (i + 0.5) * height)
+            at = (0.0, 0.0, base + (i + 0.5) * height)
             self.free_box(name, at, half, colour, density=density, sliding=sliding, solref=solref)
 
     def hinge(
