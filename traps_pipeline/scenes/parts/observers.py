@@ -25,18 +25,26 @@ def small(frame: np.ndarray, colour: str) -> Blob | None:
     return next((blob for blob in blobs(colour_mask(frame, colour), 60) if max(blob.box[2:]) < 80), None)
 
 
-def compact(frame: np.ndarray, colour: str) -> Blob | None:
-    """The largest region of a colour that may be a ball: filled, about as wide as high, small beside the frame."""
+def compact(
+    frame: np.ndarray, colour: str, *, area: int = 4000, shape: tuple[float, float] = (0.4, 2.5), fill: float = 0.5
+) -> Blob | None:
+    """The largest region of a colour that may be a ball: filled, about as wide as high, small beside the frame.
+
+    area: at most so many pixels. shape: width over height, between. fill: least share of its bounding box.
+    """
     for blob in blobs(colour_mask(frame, colour), 60):
-        if blob.area < 4000 and 0.4 < blob.box[2] / blob.box[3] < 2.5 and blob.fill > 0.5:
+        if blob.area < area and shape[0] < blob.box[2] / blob.box[3] < shape[1] and blob.fill > fill:
             return blob
     return None
 
 
-def rounded(frame: np.ndarray, colour: str) -> Blob | None:
-    """The largest region of a colour that may be a ball: neither as large nor as rectangular as a panel."""
+def rounded(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float = 1.9) -> Blob | None:
+    """The largest region of a colour that may be a ball: neither as large nor as rectangular as a panel.
+
+    fill: greatest share of its bounding box. longer: how many times as long as it is wide, at most.
+    """
     for blob in blobs(colour_mask(frame, colour)):
-        if 60 <= blob.area <= 4000 and blob.fill < 0.9 and max(blob.box[2:]) < 1.9 * min(blob.box[2:]):
+        if 60 <= blob.area <= 4000 and blob.fill < fill and max(blob.box[2:]) < longer * min(blob.box[2:]):
             return blob
     return None
 
