@@ -102,6 +102,14 @@ def test_a_stage_mirrors_what_stands_on_it(direction: int) -> None:
     assert stage.ahead(0.3) == (0.3 if direction > 0 else 0.0)
 
 
+def test_a_stage_towards_a_side_adds_to_the_same_world() -> None:
+    stage = Stage(Physics())
+    left = stage.towards(-1)
+    np.testing.assert_allclose(left.block("wall", (0.2, 0.6), (0, 1), (0, 1), "red").pos, [-0.4, 0.5, 0.5])
+    assert left.spec is stage.spec
+    assert (left.direction, stage.direction) == (-1, 1)
+
+
 def test_a_tray_has_the_walls_that_are_given_a_height() -> None:
     stage = Stage(Physics())
     names = stage.tray("bin", (0, 1), (-1, 1), (0.1, 0.2), "red", wall=0.05, near=0.5, front=0.3)

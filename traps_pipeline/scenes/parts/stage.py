@@ -8,6 +8,7 @@ Everything is added in the order of the calls, which is the order of the compile
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +82,12 @@ class Stage:
         self.direction = direction
         self.surface = surface
         self._velocity: dict[str, tuple[float, ...]] = {}
+
+    def towards(self, direction: int) -> Stage:
+        """The same world with its way to a side: what stands on both sides of a middle is written once."""
+        other = copy(self)
+        other.direction = direction
+        return other
 
     # --- what stands still ---
 
