@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from traps_pipeline.scenes.kit import Physics, Scene, Vec3, rgba
+from traps_pipeline.scenes.kit import Physics, Scene, rgba
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import reaches
 from traps_pipeline.scenes.parts.outcome import Reading, clear_m, still_from, yes_while
@@ -26,6 +26,7 @@ BOX_FLOOR_M = 0.015  # the floor of the box lies this high: lower than the deck,
 WALL_M = 0.012
 PEG_M = 0.008  # radius of the peg
 STILL_M = 0.01  # a ball that moves less than this any more is as good as at rest
+LIVELY = Surface(2e-5, sliding=0.02, solref=(-20000.0, -8.0))  # a ball that hands nearly all of its speed on
 PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("wood", "grey", "white")
 
 
@@ -80,7 +81,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
     ramp = SteppedRamp(p.ramp_m, p.slope_deg, DECK_M + STEP_M)
     Surface(2e-5, priority=2).on(ramp.add(stage, side, p.ramp_colour))
-    _add_ball(stage, "striker", ramp.at(p.start_m, r), r, p.striker_colour)
+    LIVELY.on(stage.ball("striker", ramp.at(p.start_m, r), r, p.striker_colour))
     stage.block("deck", on_deck, deep, (0, DECK_M), p.deck_colour, Surface(1.5e-3, sliding=0.4, priority=2))
     stage.block("box_floor", in_box, deep, (0, BOX_FLOOR_M), p.box_colour, Surface(2e-3, sliding=0.4, priority=2))
     for name, across in (("rim_front", (outer[0], -side)), ("rim_back", (side, outer[1]))):
@@ -89,7 +90,8 @@ def build(p: Params, physics: Physics) -> Scene:
     wall = stage.block("box_end", (end, end + WALL_M), outer, (0, DECK_M + r), p.box_colour)
     wall.priority = 3  # dead: the ball stays in the box
     for name, along in zip(p.balls, p.balls_m, strict=True):
-        _add_ball(stage, name, (along, 0, DECK_M + r), r, p.last_colour if name == "last" else p.row_colour)
+        colour = p.last_colour if name == "last" else p.row_colour
+        LIVELY.on(stage.ball(name, (along, 0, DECK_M + r), r, colour))
     _add_peg(stage, p, side)
 
     high = DECK_M + 2 * r
@@ -104,12 +106,6 @@ def build(p: Params, physics: Physics) -> Scene:
         also=["row", "deck", "peg"],
         colours=["black"],
     )
-
-
-def _add_ball(stage: Stage, name: str, at: Vec3, radius: float, colour: str) -> None:
-    """A hard, slippery ball: it hands nearly all of its speed on."""
-    ball = stage.ball(name, at, radius, colour, sliding=0.02)
-    ball.solref, ball.priority = [-20000.0, -8.0], 1
 
 
 def _add_peg(stage: Stage, p: Params, side: float) -> None:
