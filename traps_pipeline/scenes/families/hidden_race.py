@@ -16,7 +16,7 @@ from traps_pipeline.scenes.kit import Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading, first_past
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, either, which_colour
-from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, Stage, Surface
+from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, Stage, Surface, brake
 from traps_pipeline.scenes.parts.vary import (
     Drawn,
     apart,
@@ -120,9 +120,9 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def _roughness(p: Params, lane: int, physics: Physics) -> float:
-    """Rolling friction (m) that brings this lane's ball down to `creep_m_s`: a solid ball slows at 5 g mu / 7 r."""
+    """Rolling friction (m) that brings this lane's ball down to `creep_m_s`."""
     lost = (ARRIVING * p.speeds_m_s[lane]) ** 2 - p.creep_m_s**2
-    return 7 / 5 * p.radius_m * lost / (2 * ROUGH_BOARD_M * physics.gravity_m_s2)
+    return brake(p.radius_m, lost, ROUGH_BOARD_M, physics)
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
