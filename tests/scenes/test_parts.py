@@ -170,6 +170,8 @@ def test_a_question_is_filled_and_read_back() -> None:
     assert asked.named_in(words.question) == {"ball": p.ball_colour}
     assert asked.named_in("Does it pass?") is None
     assert words.aliases == {"it passes": "yes", "it stops": "no"}
+    other = questions.yes_no("Does {it} pass?", yes=[], no=[], fills=lambda p, rng: {"it": str(rng.choice(["a", "b"]))})
+    assert other.word(p, np.random.default_rng(0), [aside]).question in ("Does a pass?", "Does b pass?")
     answerable = words.answerable_question
     assert answerable.answer == p.ball_colour
     assert len(set(answerable.labels)) == 3 and p.ball_colour in answerable.labels

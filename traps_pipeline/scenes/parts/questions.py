@@ -57,10 +57,16 @@ def _one_of(asides: Sequence[Aside], rng: np.random.Generator) -> Aside:
 # --- questions --------------------------------------------------------------------------------------------------------
 
 
-def yes_no(*templates: str, yes: Forms, no: Forms) -> Question:
-    """A question that is answered by yes or no, and other ways to say either."""
+def yes_no(
+    *templates: str,
+    yes: Forms,
+    no: Forms,
+    fills: Callable[[Any, np.random.Generator], Mapping[str, str]] = lambda p, rng: {},
+) -> Question:
+    """A question that is answered by yes or no, and other ways to say either. fills: what its placeholders that are no
+    part become."""
     aliases = dict.fromkeys(yes, "yes") | dict.fromkeys(no, "no")
-    return Question("binary", templates, lambda p, rng: Filled(("yes", "no"), aliases, {}))
+    return Question("binary", templates, lambda p, rng: Filled(("yes", "no"), aliases, fills(p, rng)))
 
 
 def left_or_right(*templates: str, forms: Forms, colours: Callable[[Any], tuple[str, str]] | None = None) -> Question:
