@@ -201,6 +201,16 @@ class Stage:
             geom.contype = geom.conaffinity = 0
         return geom
 
+    def post(
+        self, name: str, at: Vec3, radius: float, half: float, colour: str, *, body: mujoco.MjsBody | None = None
+    ) -> mujoco.MjsGeom:
+        """An upright cylinder of half a height, its middle at a place; `body` as in `rod`."""
+        import mujoco
+
+        geom = (body or self.spec.worldbody).add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CYLINDER)
+        geom.pos, geom.size, geom.rgba = [self.direction * at[0], at[1], at[2]], [radius, half, 0], rgba(colour)
+        return geom
+
     def hull(
         self, name: str, corners: Sequence[Vec3], colour: str, *, body: mujoco.MjsBody | None = None
     ) -> mujoco.MjsGeom:
