@@ -10,7 +10,7 @@ import pytest
 from traps_pipeline.scenes.kit import COLOURS, Physics
 from traps_pipeline.scenes.parts import observers, outcome, questions, vary
 from traps_pipeline.scenes.parts.ramp import Ramp, SteppedRamp
-from traps_pipeline.scenes.parts.stage import Stage, Surface
+from traps_pipeline.scenes.parts.stage import Stage, Surface, brake
 from traps_pipeline.scenes.simulate import Motion
 
 PLAY = vary.apart("red", "green", "blue", "yellow")
@@ -126,6 +126,12 @@ def test_places_on_a_ramp() -> None:
     np.testing.assert_allclose(SteppedRamp(1.0, 45, 0.2).at(0.25), [0.25, 0, 0.95])
 
 
+def test_a_rough_surface_takes_its_share_of_a_balls_speed() -> None:
+    rolling = brake(0.05, 1.0, 0.5, Physics())
+    slowing = 5 * Physics().gravity_m_s2 * rolling / (7 * 0.05)
+    assert 2 * slowing * 0.5 == pytest.approx(1.0)
+
+
 # --- outcome ----------------------------------------------------------------------------------------------------------
 
 
@@ -189,3 +195,13 @@ def test_what_rests_beyond_a_mark_is_seen_there() -> None:
     assert see(frames[:2], {"ball": "red", "line": "blue"}) is None
     assert see(frames[[0, 1, 1, 1]], {"ball": "red", "line": "blue"}) == "no"
     assert see(frames, {"ball": "red", "line": "purple"}) is None
+
+
+def test_a_finder_takes_what_has_the_size_and_shape_of_a_ball() -> None:
+    frame = np.full((360, 480, 3), 200, np.uint8)
+    frame[150:170, 100:160] = np.array(COLOURS["red"]) * 255  # three times as wide as high
+    assert observers.compact(frame, "red") is None
+    assert observers.compact(frame, "red", shape=(0.3, 3.5)) is not None
+    assert observers.compact(frame, "red", shape=(0.3, 3.5), area=1200) is None
+    assert observers.rounded(frame, "red", longer=3.1) is None  # it fills its box, as a panel does
+    assert observers.rounded(frame, "red", longer=3.1, fill=1.1) is not None
