@@ -89,6 +89,7 @@ def test_a_stage_mirrors_what_stands_on_it(direction: int) -> None:
     np.testing.assert_allclose(block.size, [0.2, 0.2, 0.25])
     np.testing.assert_allclose(block.friction, [0.8, 0.005, 0.002])
     stage.ball("ball", (-0.5, 0, 0.05), 0.05, "blue", speed=0.4)
+    np.testing.assert_allclose(stage.post("peg", (0.3, 0, 0.1), 0.02, 0.1, "red").pos, [direction * 0.3, 0, 0.1])
     stage.hull("wedge", [(1.0, y, z) for y in (0, 1) for z in (0, 1)] + [(1.6, 0.5, 0)], "green")
     assert stage.spec.mesh("wedge").uservert[0] == direction * 1.0
     p = vary.drawn(Params, np.random.default_rng(0))
@@ -183,6 +184,11 @@ def test_a_question_is_filled_and_read_back() -> None:
     assert len(set(answerable.labels)) == 3 and p.ball_colour in answerable.labels
     sides = questions.left_or_right("To which side?", forms=["{1} bin"], colours=lambda p: ("red", "blue"))
     assert sides.fill(p, np.random.default_rng(0)).aliases == {"red bin": "left", "blue bin": "right"}
+    count = questions.how_many("How many, {choices}?", ranges=lambda p: [(0, 1), (2, 2)])
+    filled = count.fill(p, np.random.default_rng(0))
+    assert (filled.labels, filled.fills) == (("0-1", "2-2"), {"choices": "0-1 or 2-2"})
+    assert filled.aliases["0 or 1"] == filled.aliases["one"] == "0-1" != filled.aliases["2"]
+    assert [questions.range_of([(0, 1), (2, 2)], n) for n in (1, 2, 3)] == ["0-1", "2-2", None]
 
 
 def test_what_rests_beyond_a_mark_is_seen_there() -> None:

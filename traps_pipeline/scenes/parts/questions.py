@@ -92,6 +92,33 @@ def which_colour(*templates: str, colours: Callable[[Any], Sequence[str]], forms
     return Question("colour", templates, fill)
 
 
+NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven")
+
+
+def range_of(ranges: Sequence[Sequence[int]], count: int) -> str | None:
+    """The choice '<lowest>-<highest>' that a count belongs to, None if it belongs to none."""
+    return next((f"{low}-{high}" for low, high in ranges if low <= count <= high), None)
+
+
+def how_many(
+    *templates: str,
+    ranges: Callable[[Any], Sequence[tuple[int, int]]],
+    fills: Callable[[Any, np.random.Generator], Mapping[str, str]] = lambda p, rng: {},
+) -> Question:
+    """A question that is answered by a range of numbers; its '{choices}' are all ranges, lowest first. fills: as in
+    `yes_no`."""
+
+    def fill(p: Any, rng: np.random.Generator) -> Filled:
+        aliases: dict[str, str] = {}
+        for low, high in ranges(p):
+            numbers = [form for n in range(low, high + 1) for form in (str(n), NUMBERS[n])]
+            aliases |= dict.fromkeys([f"{low} to {high}", f"{low} or {high}", *numbers], f"{low}-{high}")
+        labels = tuple(f"{low}-{high}" for low, high in ranges(p))
+        return Filled(labels, aliases, {"choices": listed(labels), **fills(p, rng)})
+
+    return Question("count_range", templates, fill)
+
+
 # --- answerable asides ------------------------------------------------------------------------------------------------
 
 
