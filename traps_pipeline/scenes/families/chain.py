@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from traps_pipeline.scenes.kit import Physics, Scene, rgba
+from traps_pipeline.scenes.kit import Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import reaches
 from traps_pipeline.scenes.parts.outcome import Reading, clear_m, still_from, yes_while
@@ -92,7 +92,9 @@ def build(p: Params, physics: Physics) -> Scene:
     for name, along in zip(p.balls, p.balls_m, strict=True):
         colour = p.last_colour if name == "last" else p.row_colour
         LIVELY.on(stage.ball(name, (along, 0, DECK_M + r), r, colour))
-    _add_peg(stage, p, side)
+    peg_at = p.balls_m[p.peg_after] + r + p.gap_m / 2
+    aside, half = 0.0 if p.blocked else side + WALL_M + 2 * PEG_M, (DECK_M + 1.9 * r) / 2
+    stage.post("peg", (peg_at, aside, half), PEG_M, half, "black").priority = 3  # dead: the ball stops at it
 
     high = DECK_M + 2 * r
     across = (outer[0] - 0.02, outer[1] + 4 * PEG_M + SHADOW_BACK * high)
@@ -106,17 +108,6 @@ def build(p: Params, physics: Physics) -> Scene:
         also=["row", "deck", "peg"],
         colours=["black"],
     )
-
-
-def _add_peg(stage: Stage, p: Params, side: float) -> None:
-    """The peg, in the row or behind it."""
-    import mujoco
-
-    along = p.balls_m[p.peg_after] + p.radius_m + p.gap_m / 2
-    across, half = 0.0 if p.blocked else side + WALL_M + 2 * PEG_M, (DECK_M + 1.9 * p.radius_m) / 2
-    peg = stage.spec.worldbody.add_geom(name="peg", type=mujoco.mjtGeom.mjGEOM_CYLINDER, rgba=rgba("black"))
-    peg.size, peg.pos = [PEG_M, half, 0], [p.direction * along, across, half]
-    peg.priority = 3  # dead: the ball stops at it
 
 
 def outcome(motion: Motion, p: Params) -> Reading:

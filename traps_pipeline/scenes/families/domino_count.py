@@ -9,18 +9,18 @@ struck the second row: nothing that the gap changes can push back on what is see
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, listed
+from traps_pipeline.scenes.kit import Physics, Scene
 from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.dominoes import Size, Standing
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import upper_half_stays
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m
-from traps_pipeline.scenes.parts.questions import Filled, Question, colour_of, comes_from, either
+from traps_pipeline.scenes.parts.questions import colour_of, comes_from, either, how_many, range_of
 from traps_pipeline.scenes.parts.stage import Stage
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, one_of
 from traps_pipeline.scenes.simulate import Motion
@@ -29,7 +29,6 @@ from traps_pipeline.scenes.wording import choices_in
 
 Ranges = tuple[tuple[int, int], ...]  # the choices: least and most dominoes of each
 RANGES: tuple[Ranges, ...] = (((1, 2), (3, 4), (5, 6)), ((1, 2), (3, 5), (6, 7)))
-NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven")
 FALLEN = 0.6  # of a domino's height: a top below it belongs to a fallen domino
 PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
@@ -105,15 +104,10 @@ def build(p: Params, physics: Physics) -> Scene:
     )
 
 
-def _choice(ranges: Sequence[Sequence[int]], count: int) -> str | None:
-    """The choice that a number of dominoes belongs to."""
-    return next((f"{low}-{high}" for low, high in ranges if low <= count <= high), None)
-
-
 def twins(p: Params) -> list[Params]:
     """The same rows with the gap where another choice is right."""
-    right, places = _choice(p.ranges, p.gap_after), range(1, len(p.second) + 1)
-    return [replace(p, gap_after=n) for n in places if _choice(p.ranges, n) != right]
+    right, places = range_of(p.ranges, p.gap_after), range(1, len(p.second) + 1)
+    return [replace(p, gap_after=n) for n in places if range_of(p.ranges, n) != right]
 
 
 def outcome(motion: Motion, p: Params) -> Reading:
@@ -122,17 +116,8 @@ def outcome(motion: Motion, p: Params) -> Reading:
     tops = np.stack([top_m(motion, body, p.height_m) for body in p.second], axis=1) - dominoes.PLANK * p.height_m
     fallen = (tops < FALLEN * p.height_m).sum(axis=1)
     still = still_from(*(motion.pos(body) for body in p.second), within_m=dominoes.STILL_M)
-    labels = [_choice(p.ranges, int(n)) if i >= still else None for i, n in enumerate(fallen)]
+    labels = [range_of(p.ranges, int(n)) if i >= still else None for i, n in enumerate(fallen)]
     return Reading(labels, float(np.abs(tops[-1] - FALLEN * p.height_m).min()))
-
-
-def _counts(p: Params, rng: np.random.Generator) -> Filled:
-    """The choices stay in order."""
-    labels = tuple(f"{low}-{high}" for low, high in p.ranges)
-    aliases = {f"{low} {word} {high}": f"{low}-{high}" for low, high in p.ranges for word in ("to", "or")}
-    for n in range(1, len(p.second) + 1):
-        aliases |= dict.fromkeys((str(n), NUMBERS[n]), str(_choice(p.ranges, n)))
-    return Filled(labels, aliases, {"choices": listed(labels)})
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
@@ -142,7 +127,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     standing = blobs(before, min_area=60)
     if len(standing) != ranges[-1][1] or after.sum() < 0.3 * before.sum() or (after != close).sum() > 0.1 * after.sum():
         return None
-    return _choice(ranges, sum(not upper_half_stays(frames, colour, domino) for domino in standing))
+    return range_of(ranges, sum(not upper_half_stays(frames, colour, domino) for domino in standing))
 
 
 FAMILY = scene_family(
@@ -151,14 +136,11 @@ FAMILY = scene_family(
     params=Params,
     build=build,
     outcome=outcome,
-    question=Question(
-        "count_range",
-        (
-            "How many of the {second} dominoes of the second row fall over, {choices}?",
-            "How many {second} dominoes are knocked down in the end: {choices}?",
-            "Count the {second} dominoes that have fallen at the end: are they {choices}?",
-        ),
-        _counts,
+    question=how_many(
+        "How many of the {second} dominoes of the second row fall over, {choices}?",
+        "How many {second} dominoes are knocked down in the end: {choices}?",
+        "Count the {second} dominoes that have fallen at the end: are they {choices}?",
+        ranges=lambda p: p.ranges,
     ),
     asides=[
         either("How many {first} dominoes are there, 2 or 3?", ("2", "3"), lambda p: str(p.visible)),

@@ -20,7 +20,7 @@ from traps_pipeline.scenes.kit import Inventory, Physics, Scene, View, add_box, 
 from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball, turned
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading
-from traps_pipeline.scenes.parts.questions import Filled, Question, choice_of, either
+from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, choice_of, either
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, together
 from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import Blob, colour_mask
@@ -41,7 +41,6 @@ BALL_COLOURS = {
 ZONE_COLOURS = ("red", "green", "blue", "purple")
 TRIM = {"wood": "grey", "grey": "wood", "white": "wood", "black": "grey"}
 LABELS = ("0", "1", "2", "3")
-NUMBERS = ("zero", "one", "two", "three")
 
 
 def _sides(rng: np.random.Generator, so_far: Drawn) -> tuple[int, ...]:
@@ -204,7 +203,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
 def _counts(p: Params, rng: np.random.Generator) -> Filled:
     """The choices are all counts that three balls allow."""
     aliases = {"all three": "3", "all three balls": "3"}
-    for label, number in zip(LABELS, NUMBERS, strict=True):
+    for label, number in zip(LABELS, NUMBERS, strict=False):
         noun = "ball" if label == "1" else "balls"
         aliases |= dict.fromkeys((number, f"{label} {noun}", f"{number} {noun}"), label)
     return Filled(LABELS, aliases, {"choices": listed(LABELS), "zone": p.zone_colours[p.asked]})

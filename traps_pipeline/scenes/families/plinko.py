@@ -18,7 +18,7 @@ from traps_pipeline.scenes.kit import Inventory, Physics, Scene, View, distinct_
 from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading
-from traps_pipeline.scenes.parts.questions import Filled, Question, colour_from, either
+from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, colour_from, either
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, together
 from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.wording import choices_in
@@ -37,7 +37,6 @@ SCHEMES = {
 PEGS = {"wood": "grey", "white": "wood", "blue": "cyan", "green": "wood", "purple": "grey", "black": "grey"}
 # Which segments a digit lights: a top, b upper right, c lower right, d bottom, e lower left, f upper left, g middle.
 SEGMENTS = {1: "bc", 2: "abged", 3: "abgcd", 4: "fgbc", 5: "afgcd", 6: "afgedc", 7: "abc"}
-WORDS = ("one", "two", "three", "four", "five", "six", "seven")
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
 ROWS = peg_rows(5, 7)
 
@@ -167,7 +166,7 @@ def _numbers(p: Params, rng: np.random.Generator) -> Filled:
     """The choices are the buckets' numbers."""
     labels = tuple(str(i + 1) for i in range(p.buckets))
     aliases: dict[str, str] = {}
-    for n, word, ordinal in zip(labels, WORDS, ORDINALS, strict=False):
+    for n, word, ordinal in zip(labels, NUMBERS[1:], ORDINALS, strict=False):
         forms = (word, f"bucket {n}", f"bucket {word}", f"number {n}", f"{ordinal} bucket", f"bucket number {n}")
         aliases |= dict.fromkeys(forms, n)
     return Filled(labels, aliases, {"choices": listed(labels), "ball": p.ball_colours[0]})
