@@ -148,14 +148,15 @@ def of_world(case: Released, twin: bool) -> dict[str, str]:
     params = case.params if stored is None else family.params_from(stored)
     model, scene = compile_scene(family, params, physics)
     motion = replay(model, case.twin if twin else case.qpos, physics)
+    reading = family.outcome(motion, params)
     twins = [] if family.twins is None else [params_to_dict(other) for other in family.twins(params)]
     return {
         "model": of_model(model),
         "scene": of_value(in_floats(plain(scene_roles(family, scene)))),
         "outcome": of_value(
             [
-                family.readings(motion, params),
-                family.margin(motion, params),
+                reading.labels,
+                reading.margin_m,
                 legible_groups(family, model, scene, motion, params),
             ]
         ),

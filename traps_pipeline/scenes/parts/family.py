@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Family, Physics, Scene
+from traps_pipeline.scenes.kit import Family, Physics, Reading, Scene
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.observers import Observer
-from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import Aside, Question
 from traps_pipeline.scenes.simulate import Motion
 
@@ -56,8 +55,7 @@ def scene_family(
         params=params,
         draw=lambda rng: vary.drawn(params, rng),
         build=build,
-        readings=lambda motion, p: outcome(motion, p).labels,
-        margin=lambda motion, p: outcome(motion, p).margin_m,
+        outcome=outcome,
         word=lambda p, rng: question.word(p, rng, asides),
         questions=question.templates,
         observe=seen,

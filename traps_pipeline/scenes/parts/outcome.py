@@ -1,28 +1,19 @@
 """What a run comes to: for every frame the label that holds, and by how much the end is clear of any other outcome.
 
-A family's `outcome(motion, p)` gives a `Reading`, mostly from one of the functions here. Arrays over the frames are
+A family's `outcome(motion, p)` gives a `kit.Reading`, mostly from one of the functions here. Arrays over the frames are
 (F,), lengths in metres.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from traps_pipeline.scenes.kit import Reading
 from traps_pipeline.scenes.simulate import Motion
 
 Labels = list[str | None]
-
-
-@dataclass(frozen=True)
-class Reading:
-    """labels: for every frame the label that holds then, None while undecided. margin_m: distance (m) of the end state
-    from the nearest other outcome."""
-
-    labels: Labels
-    margin_m: float
 
 
 # --- from when something holds ----------------------------------------------------------------------------------------

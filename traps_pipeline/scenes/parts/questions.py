@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -81,13 +82,19 @@ def left_or_right(*templates: str, forms: Forms, colours: Callable[[Any], tuple[
     return Question("direction", templates, fill)
 
 
-def which_colour(*templates: str, colours: Callable[[Any], Sequence[str]], forms: Forms) -> Question:
-    """A question that is answered by one of some colours, '{choices}' in random order. forms: ways to say a colour."""
+def which_colour(
+    *templates: str,
+    colours: Callable[[Any], Sequence[str]],
+    forms: Forms,
+    also: Mapping[str, str] = MappingProxyType({}),
+) -> Question:
+    """A question that is answered by one of some colours, '{choices}' in random order. forms: ways to say a colour.
+    also: other names of colours -> the colour."""
 
     def fill(p: Any, rng: np.random.Generator) -> Filled:
         choices = tuple(str(c) for c in rng.permutation(colours(p)))
         aliases = {form.format(c): c for c in choices for form in forms}
-        return Filled(choices, aliases, {"choices": listed(choices)})
+        return Filled(choices, aliases | dict(also), {"choices": listed(choices)})
 
     return Question("colour", templates, fill)
 

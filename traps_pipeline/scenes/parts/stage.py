@@ -341,10 +341,10 @@ class Stage:
         p: Any,
         *,
         decisive: Sequence[str],
-        hidden: Sequence[str],
-        cover: Box | None,
+        hidden: Sequence[str] = (),
+        cover: Box | None = None,
         in_view: Sequence[Box],
-        things: Sequence[str],
+        things: Sequence[str] = (),
         also: Sequence[str] = (),
         colours: Sequence[str] = (),
     ) -> Scene:
