@@ -18,7 +18,7 @@ same_arithmetic = pytest.mark.skipif(
     FROZEN["versions"] != HERE,
     reason=f"digests were frozen with {FROZEN['versions']}, here it is {HERE}: their last bits differ",
 )
-families = pytest.mark.parametrize("name", family_names(), ids=lambda name: f"{name}-")
+families = pytest.mark.parametrize("name", sorted(FROZEN["families"]), ids=lambda name: f"{name}-")
 
 
 def differing(name: str, records: list[str]) -> list[str]:
@@ -37,7 +37,8 @@ def differing(name: str, records: list[str]) -> list[str]:
 
 def test_every_released_record_has_a_frozen_digest() -> None:
     frozen = {name: sorted(family["records"]) for name, family in FROZEN["families"].items()}
-    assert frozen == {name: fingerprints.records_of(name) for name in family_names()}
+    released = {name: fingerprints.records_of(name) for name in family_names()}
+    assert frozen == {name: records for name, records in released.items() if records}
     assert sum(map(len, frozen.values())) == 702
 
 

@@ -14,6 +14,7 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.scenes.released import Released
+from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import CATEGORIES
 from traps_pipeline.scenes import families as package
@@ -63,7 +64,7 @@ def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Add]:
 
 def test_the_family_of_the_page_is_complete_and_no_part_of_the_benchmark(add: Add) -> None:
     assert len(PAGE.splitlines()) <= 110
-    assert "plank_post" not in registry.family_names()
+    assert "plank_post" not in load_composition()
     add("plank_post")
     family = registry.fit_to_sample("plank_post")
     answers = {simulated_answer(family, family.draw(np.random.default_rng(seed))) for seed in range(4)}
@@ -101,6 +102,12 @@ def test_an_unknown_category_is_refused_with_the_known_ones(add: Add) -> None:
     add("plank_post", category=('"ramps_rolling"', '"planks"'))
     message = r"families/plank_post\.py: unknown category 'planks'; write one of .* ramps_rolling, pendulums_levers"
     with pytest.raises(TrapsError, match=message):
+        registry.get_family("plank_post")
+
+
+def test_a_file_without_a_family_is_named(add: Add) -> None:
+    add("plank_post", name=("FAMILY = ", "MINE = "))
+    with pytest.raises(TrapsError, match=r"families/plank_post\.py defines no FAMILY"):
         registry.get_family("plank_post")
 
 

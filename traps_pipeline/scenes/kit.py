@@ -44,9 +44,9 @@ PANEL_GROUP = 4  # geoms of the cover panel: drawn in the void only, collide wit
 REMOVED_GROUP = 5  # geoms taken away by an ablation: never drawn
 
 
-def rgba(colour: str, alpha: float = 1.0) -> list[float]:
+def rgba(colour: str) -> list[float]:
     """RGBA in [0, 1] of a named colour."""
-    return [*COLOURS[colour], alpha]
+    return [*COLOURS[colour], 1.0]
 
 
 @dataclass(frozen=True)
@@ -279,14 +279,13 @@ def add_box(
     colour: str,
     *,
     euler_y: float = 0.0,
-    alpha: float = 1.0,
     **attributes: Any,
 ) -> mujoco.MjsGeom:
     """A box geom on a body (`spec.worldbody` for a static one), optionally tilted about y (rad)."""
     import mujoco
 
     geom = parent.add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=list(centre), size=list(half), rgba=rgba(colour, alpha)
+        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=list(centre), size=list(half), rgba=rgba(colour)
     )
     if euler_y:
         geom.quat = [float(np.cos(euler_y / 2)), 0.0, float(np.sin(euler_y / 2)), 0.0]

@@ -28,10 +28,14 @@ def family_names() -> tuple[str, ...]:
 
 @cache
 def get_family(name: str) -> Family:
-    """The family of that name. Raises KeyError with the known names, TrapsError if its category is unknown."""
+    """The family of that name. Raises KeyError with the known names, TrapsError if there is none in its file or its
+    category is unknown."""
     if name not in family_names():
         raise KeyError(f"unknown family {name!r}; known: {', '.join(family_names())}")
-    family = importlib.import_module(f"{package.__name__}.{name}").FAMILY
+    module = importlib.import_module(f"{package.__name__}.{name}")
+    family = getattr(module, "FAMILY", None)
+    if not isinstance(family, Family):
+        raise TrapsError(f"{_file(name)} defines no FAMILY = scene_family(...); write it, or take the file away")
     if family.name != name:
         raise ValueError(f"{_file(name)} defines a family named {family.name!r}; they must agree")
     known = CATEGORIES[family.taxonomy]
