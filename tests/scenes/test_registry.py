@@ -106,7 +106,7 @@ def test_an_unknown_category_is_refused_with_the_known_ones(add: Add) -> None:
 
 
 def test_a_file_without_a_family_is_named(add: Add) -> None:
-    add("plank_post", name=("FAMILY = ", "MINE = "))
+    add("plank_post", family=("FAMILY = ", "MINE = "))
     with pytest.raises(TrapsError, match=r"families/plank_post\.py defines no FAMILY"):
         registry.get_family("plank_post")
 
