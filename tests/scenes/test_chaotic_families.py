@@ -83,7 +83,7 @@ def test_the_cut_comes_after_one_second_and_before_the_outcome_is_committed(stor
 
 
 def test_the_last_frames_of_the_void_carry_no_reading_of_the_outcome(stored: Stored):
-    assert stored.family.readings(stored.motion, stored.params)[stored.spec.void["cut_frame"] - 1] is None
+    assert stored.family.outcome(stored.motion, stored.params).labels[stored.spec.void["cut_frame"] - 1] is None
 
 
 def test_the_evidence_meets_the_bounds_on_entropy_top_share_and_rollouts(stored: Stored):
@@ -129,7 +129,7 @@ def test_a_board_without_pegs_has_one_certain_outcome_and_yields_no_cut():
     bare = replace(plinko.params, row_shifts_m=(99.0,) * plinko.params.rows)
     model, scene = compile_scene(plinko.family, bare, plinko.physics)
     qpos = simulate(model, scene, plinko.physics)
-    labels = plinko.family.readings(replay(model, qpos, plinko.physics), bare)
+    labels = plinko.family.outcome(replay(model, qpos, plinko.physics), bare).labels
     commit = labels.index(labels[-1])
     assert not [i for i in range(model.ngeom) if model.geom(i).name.startswith("peg")]
     assert labels[-1] is not None

@@ -75,7 +75,7 @@ def _case(released: Path, kept: Path, spec: SceneSpec) -> Case:
 def code_digest(family: str) -> str:
     """Digest of the code that certifies a family: verdicts of other code are not believed."""
     folder = CHECKOUT / "traps_pipeline" / "scenes"
-    files = [*sorted(folder.glob("*.py")), folder / "families" / f"{family}.py"]
+    files = [*sorted(folder.glob("*.py")), *sorted(folder.glob("parts/*.py")), folder / "families" / f"{family}.py"]
     return digest([[path.name, file_digest(path)] for path in files])
 
 

@@ -111,7 +111,7 @@ def choose_cut(
         cut = latest_open_cut(rollouts, range(first, commit_frame + 1), bound, family.perturbation)
         if cut is not None:
             model = family.build(params, physics).spec.compile()
-            truth = family.readings(replay(model, qpos, physics), params)[-1]
+            truth = family.outcome(replay(model, qpos, physics), params).labels[-1]
             return cut, twin_of(rollouts, cut.frame, truth)
     return None
 
@@ -221,7 +221,7 @@ def _roll(
         mujoco.mj_step(model, data, physics.substeps)
     if not np.isfinite(frames).all():
         return Rollout(parted, None)
-    label = _settled(family.readings(replay(model, frames, physics), params), physics)
+    label = _settled(family.outcome(replay(model, frames, physics), params).labels, physics)
     return Rollout(parted, label, frames.astype(np.float32))
 
 

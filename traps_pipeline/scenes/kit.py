@@ -1,7 +1,7 @@
 """What a scene family is made of: its values, and the few builders that every family shares.
 
-A family file defines one `FAMILY = Family(...)`. Its functions are pure: `draw` and `word` take the generator they
-draw from, `build`, `readings` and `margin` draw nothing, so that a stored spec always gives the same scene.
+A family file defines one `FAMILY`, put together by `parts.family`. Its functions are pure: `draw` and `word` take the
+generator they draw from, `build` and `outcome` draw nothing, so that a stored spec always gives the same scene.
 
 Units are SI (metres, kilograms, seconds, radians unless a name ends in `_deg`). World frame: x right, y away from the
 default camera, z up; the floor is z = 0.
@@ -44,9 +44,9 @@ PANEL_GROUP = 4  # geoms of the cover panel: drawn in the void only, collide wit
 REMOVED_GROUP = 5  # geoms taken away by an ablation: never drawn
 
 
-def rgba(colour: str, alpha: float = 1.0) -> list[float]:
+def rgba(colour: str) -> list[float]:
     """RGBA in [0, 1] of a named colour."""
-    return [*COLOURS[colour], alpha]
+    return [*COLOURS[colour], 1.0]
 
 
 @dataclass(frozen=True)
@@ -136,6 +136,15 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class Reading:
+    """What a run comes to. labels: for every frame the label that holds then, None while undecided. margin_m: distance
+    (m) of the end state from the nearest other outcome."""
+
+    labels: Sequence[str | None]
+    margin_m: float
+
+
+@dataclass(frozen=True)
 class AnswerableQuestion:
     """A question that even the void video answers (a mechanism control: `occlusion_answerable`)."""
 
@@ -161,8 +170,7 @@ class Family:
     params: a frozen dataclass of plain values with units in the names.
     draw(rng): parameters of one scenario.
     build(params, physics): the scene. Draws nothing.
-    readings(motion, params): for every frame the label that holds then, or None while undecided.
-    margin(motion, params): distance (m) of the end state from the nearest other outcome.
+    outcome(motion, params): what a run comes to.
     word(params, rng): the question and its companions.
     questions: the templates that `word` fills; no other family has the same.
     observe(frames, question): the answer of one who sees only the 5 FPS frames (N, 360, 480, 3) RGB and the question;
@@ -180,8 +188,7 @@ class Family:
     params: type
     draw: Callable[[np.random.Generator], Any]
     build: Callable[[Any, Physics], Scene]
-    readings: Callable[[Motion, Any], list[str | None]]
-    margin: Callable[[Motion, Any], float]
+    outcome: Callable[[Motion, Any], Reading]
     word: Callable[[Any, np.random.Generator], Wording]
     questions: tuple[str, ...] = ()
     observe: Callable[[np.ndarray, str], str | None] | None = None
@@ -272,14 +279,13 @@ def add_box(
     colour: str,
     *,
     euler_y: float = 0.0,
-    alpha: float = 1.0,
     **attributes: Any,
 ) -> mujoco.MjsGeom:
     """A box geom on a body (`spec.worldbody` for a static one), optionally tilted about y (rad)."""
     import mujoco
 
     geom = parent.add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=list(centre), size=list(half), rgba=rgba(colour, alpha)
+        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=list(centre), size=list(half), rgba=rgba(colour)
     )
     if euler_y:
         geom.quat = [float(np.cos(euler_y / 2)), 0.0, float(np.sin(euler_y / 2)), 0.0]

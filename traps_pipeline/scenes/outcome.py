@@ -34,7 +34,8 @@ class Outcome:
 
 def read_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
     """The outcome of a trajectory, settled at least 0.6 s before the end. Raises Rejected."""
-    labels = family.readings(motion, params)
+    reading = family.outcome(motion, params)
+    labels, margin = reading.labels, reading.margin_m
     label = labels[-1]
     if label is None:
         raise Rejected("the outcome is undecided at the end of the control")
@@ -45,7 +46,6 @@ def read_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
     left = (len(labels) - 1 - commit) / fps
     if left < COMMITTED_BEFORE_END_S - 1e-9:
         raise Rejected(f"outcome {label!r} is committed only {left:.1f} s before the end")
-    margin = family.margin(motion, params)
     if margin < family.min_margin_m:
         raise Rejected(f"outcome {label!r} has a margin of {margin:.4f} m, below {family.min_margin_m} m")
     return Outcome(label, commit, float(margin))

@@ -19,7 +19,7 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Family
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, read_outcome
-from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.registry import fit_to_sample, get_family
 from traps_pipeline.scenes.resolve import Resolved, resolve
 from traps_pipeline.scenes.simulate import replay, simulate
 from traps_pipeline.scenes.spec import SceneSpec, save_trajectory
@@ -87,9 +87,9 @@ def sample_family(
     """Draw until `released` holds `count` scenarios of a family; the same seed gives the same ones on a machine type.
 
     Goes on where a stopped call with the same seed and count was; anything else of the family is replaced. Raises
-    RuntimeError with the tally of rejections when 40 draws a scenario are not enough.
+    RuntimeError with the tally of rejections when 40 draws a scenario are not enough, TrapsError for an unfit family.
     """
-    family, records = get_family(name), Records(released, name)
+    family, records = fit_to_sample(name), Records(released, name)
     tally = load_tallies(released).get(name)
     if tally is None or (tally.seed, tally.wanted) != (seed, count):
         tally = Tally(seed, count)

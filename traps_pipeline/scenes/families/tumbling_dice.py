@@ -7,38 +7,24 @@ no pixel shows; gravity is low, which nothing in view betrays, so that many tumb
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import (
-    AnswerableQuestion,
-    Box,
-    Family,
-    Inventory,
-    Physics,
-    Scene,
-    View,
-    Wording,
-    add_box,
-    listed,
-    new_spec,
-    uniform,
-)
+from traps_pipeline.scenes.kit import AnswerableQuestion, Physics, Scene, add_box, uniform
+from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.outcome import Reading, undecided
+from traps_pipeline.scenes.parts.questions import either, goes_to, which_colour
+from traps_pipeline.scenes.parts.stage import Stage
+from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, in_front, one_of, shuffled
+from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import blobs, colour_mask
-from traps_pipeline.scenes.wording import asked
 
-if TYPE_CHECKING:
-    import mujoco
-
-    from traps_pipeline.scenes.simulate import Motion
-
-Span = tuple[float, float]
 FACES = ("red", "green", "blue", "cyan", "orange", "yellow")
 EDGES = ("white", "black", "purple")  # nothing else in the scene has them
+EDGE = shuffled(*EDGES)
 NORMALS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))  # in the order of `faces`
 WALL_M = 0.02
 TRAY_M = 0.05  # height of the tray's floor
@@ -50,27 +36,66 @@ DARK_WOOD = (0.50, 0.35, 0.22, 1.0)
 STILL = 0.1  # share of its size by which a lying die may move from one frame to the next
 
 
+def _direction(rng: np.random.Generator, so_far: Drawn) -> int:
+    """Before it, how many dice there are."""
+    so_far["dice"] = int(rng.choice([2, 3, 3]))
+    return int(rng.choice([-1, 1]))
+
+
+def _width(rng: np.random.Generator, so_far: Drawn) -> float:
+    """Room for a turning die beside each wall."""
+    return round(max(0.46, (2.5 * so_far["dice"] + 1.4) * so_far["half_m"]), 4)
+
+
+def _turns(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], ...]:
+    """Before them, which dice of the zigzag are ahead."""
+    so_far["ahead"] = int(rng.integers(2))
+    turns = rng.normal(size=(so_far["dice"], 4))
+    return tuple(tuple(round(float(v), 5) for v in q / np.linalg.norm(q)) for q in turns)
+
+
+def _starts(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], ...]:
+    """A zigzag, so that the dice do not touch before they land."""
+    dice, half, ahead = so_far["dice"], so_far["half_m"], so_far["ahead"]
+    lanes = [(i - (dice - 1) / 2) * 2.5 * half for i in range(dice)]
+    return tuple(
+        (uniform(rng, 0.13, 0.17) + 0.24 * ((i + ahead) % 2), round(y, 4), uniform(rng, 0.22, 0.34))
+        for i, y in enumerate(lanes)
+    )
+
+
+def _each(*ranges: tuple[float, float]) -> tuple[tuple[float, ...], ...]:
+    """For every die one number of each range."""
+    return drawn_by(
+        lambda rng, so_far: tuple(tuple(uniform(rng, *ends) for ends in ranges) for _ in range(so_far["dice"]))
+    )
+
+
+def _faces(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[str, ...], ...]:
+    return tuple(tuple(str(c) for c in rng.permutation(FACES)) for _ in range(so_far["dice"]))
+
+
 @dataclass(frozen=True)
 class Params:
     """Per die: start, turn and throw. faces: the colours on +x, -x, +y, -y, +z, -z of every die."""
 
-    direction: int  # +1: the steps go down to the right
-    steps: int
-    step_m: float  # length of a step
-    drop_m: float  # height of a step
-    width_m: float  # of the steps, between the walls
-    tray_m: float
-    half_m: float  # half a die's edge
-    faces: tuple[tuple[str, ...], ...]
-    starts_m: tuple[tuple[float, ...], ...]  # along the steps, across, above the top step
-    turns: tuple[tuple[float, ...], ...]  # unit quaternions
-    speeds_m_s: tuple[tuple[float, ...], ...]
-    spins_rad_s: tuple[tuple[float, ...], ...]
-    bounce: float  # damping of the contact: the lower, the livelier
-    edge_colours: tuple[str, ...]  # one per die, so that each can be followed
-    dark_first: bool  # dark and light wood in turn, down the steps
-    azimuth_deg: float
-    elevation_deg: float
+    direction: int = drawn_by(_direction)  # +1: the steps go down to the right
+    half_m: float = between(0.060, 0.068)  # half a die's edge
+    steps: int = one_of(4, 5, 6, 7)
+    step_m: float = drawn_by(lambda rng, so_far: round(uniform(rng, 1.35, 1.65) / so_far["steps"], 4))  # its length
+    width_m: float = drawn_by(_width)  # of the steps, between the walls
+    turns: tuple[tuple[float, ...], ...] = drawn_by(_turns)  # unit quaternions
+    drop_m: float = drawn_by(lambda rng, so_far: round(uniform(rng, 0.55, 0.80) / so_far["steps"], 4))  # of a step
+    tray_m: float = between(0.60, 0.75)
+    faces: tuple[tuple[str, ...], ...] = drawn_by(_faces)
+    starts_m: tuple[tuple[float, ...], ...] = drawn_by(_starts)  # along the steps, across, above the top step
+    speeds_m_s: tuple[tuple[float, ...], ...] = _each((0.55, 0.85), (-0.06, 0.06), (1.2, 1.6))
+    spins_rad_s: tuple[tuple[float, ...], ...] = _each((-7, 7), (-7, 7), (-7, 7))
+    bounce: float = between(14, 26)  # damping of the contact: the lower, the livelier
+    edge_colours: tuple[str, ...] = EDGE("dice")  # one per die, so that each can be followed
+    dark_first: bool = chance(0.5)  # dark and light wood in turn, down the steps
+    azimuth_deg: float = in_front(-15, 15)
+    elevation_deg: float = between(-58, -46)
 
     @property
     def run_m(self) -> float:
@@ -82,105 +107,57 @@ class Params:
         return TRAY_M + (self.steps - step) * self.drop_m
 
 
-def draw(rng: np.random.Generator) -> Params:
-    """Two or three dice, thrown up in a zigzag so that they do not touch before they land."""
-    dice, direction = int(rng.choice([2, 3, 3])), int(rng.choice([-1, 1]))
-    half, steps = uniform(rng, 0.060, 0.068), int(rng.integers(4, 8))
-    step = round(uniform(rng, 1.35, 1.65) / steps, 4)
-    width = round(max(0.46, (2.5 * dice + 1.4) * half), 4)  # room for a turning die beside each wall
-    lanes = [(i - (dice - 1) / 2) * 2.5 * half for i in range(dice)]
-    ahead = int(rng.integers(2))
-    turns = rng.normal(size=(dice, 4))
-    return Params(
-        direction=direction,
-        steps=steps,
-        step_m=step,
-        drop_m=round(uniform(rng, 0.55, 0.80) / steps, 4),
-        width_m=width,
-        tray_m=uniform(rng, 0.60, 0.75),
-        half_m=half,
-        faces=tuple(tuple(str(c) for c in rng.permutation(FACES)) for _ in range(dice)),
-        starts_m=tuple(
-            (uniform(rng, 0.13, 0.17) + 0.24 * ((i + ahead) % 2), round(y, 4), uniform(rng, 0.22, 0.34))
-            for i, y in enumerate(lanes)
-        ),
-        turns=tuple(tuple(round(float(v), 5) for v in q / np.linalg.norm(q)) for q in turns),
-        speeds_m_s=tuple(
-            (uniform(rng, 0.55, 0.85), uniform(rng, -0.06, 0.06), uniform(rng, 1.2, 1.6)) for _ in range(dice)
-        ),
-        spins_rad_s=tuple(tuple(uniform(rng, -7, 7) for _ in range(3)) for _ in range(dice)),
-        bounce=uniform(rng, 14, 26),
-        edge_colours=tuple(str(c) for c in rng.permutation(EDGES)[:dice]),
-        dark_first=bool(rng.random() < 0.5),
-        azimuth_deg=90 + uniform(rng, -15, 15),
-        elevation_deg=uniform(rng, -58, -46),
-    )
-
-
 def build(p: Params, physics: Physics) -> Scene:
-    """Steps and tray between two walls. Lengths run down the steps and are mirrored by `direction`."""
-    spec = new_spec(physics)
-    spec.add_material(name="bright", emission=0.5, specular=0.0, shininess=0.0)  # edges that keep their colour in shade
+    """Steps and tray between two walls. Lengths run down the steps."""
+    stage = Stage(physics, p.direction)
+    # The edges keep their colour in shade.
+    stage.spec.add_material(name="bright", emission=0.5, specular=0.0, shininess=0.0)
     side, end, high = p.width_m / 2, p.run_m + p.tray_m, p.floor_m(0)
+    front, back = (-side - WALL_M, -side), (side, side + WALL_M)
+    treads = [(i * p.step_m, (i + 1) * p.step_m) for i in range(p.steps)]
 
-    def block(name: str, along: Span, across: Span, z: Span, colour: str) -> mujoco.MjsGeom:
-        mid = (p.direction * sum(along) / 2, sum(across) / 2, sum(z) / 2)
-        half = ((along[1] - along[0]) / 2, (across[1] - across[0]) / 2, (z[1] - z[0]) / 2)
-        return add_box(spec.worldbody, name, mid, half, colour)
-
-    for i in range(p.steps):
-        along = (i * p.step_m, (i + 1) * p.step_m)
-        step = block(f"step_{i}", along, (-side, side), (0, p.floor_m(i)), "wood")
+    for i, along in enumerate(treads):
+        step = stage.block(f"step_{i}", along, (-side, side), (0, p.floor_m(i)), "wood")
         if i % 2 != p.dark_first:
             step.rgba = DARK_WOOD
-    block("tray", (p.run_m, end), (-side, side), (0, TRAY_M), "grey")
+    stage.block("tray", (p.run_m, end), (-side, side), (0, TRAY_M), "grey")
     rim = TRAY_M + 1.6 * p.half_m  # low, so that it hides and shades no die; glass stands on it
-    block("tray_end", (end, end + WALL_M), (-side, side), (0, rim), "wood")
-    block("tray_front", (p.run_m, end + WALL_M), (-side - WALL_M, -side), (0, rim), "wood")
-    block("wall_back", (-WALL_M, end + WALL_M), (side, side + WALL_M), (0, high + 2 * p.half_m), "wood")
-    for i in range(p.steps):  # a low front wall that follows the steps, so that it hides nothing
-        along = (i * p.step_m, (i + 1) * p.step_m)
-        block(f"front_{i}", along, (-side - WALL_M, -side), (0, p.floor_m(i) + 0.5 * p.half_m), "wood")
-    fence = ((-WALL_M, -side - WALL_M), (end + WALL_M, side + WALL_M))
-    for name, across in (("fence_front", (-side - WALL_M, -side)), ("fence_back", (side, side + WALL_M))):
-        glass = block(name, (fence[0][0], fence[1][0]), across, (0, high + 1.0), "white")
+    stage.block("tray_end", (end, end + WALL_M), (-side, side), (0, rim), "wood")
+    stage.block("tray_front", (p.run_m, end + WALL_M), front, (0, rim), "wood")
+    stage.block("wall_back", (-WALL_M, end + WALL_M), back, (0, high + 2 * p.half_m), "wood")
+    for i, along in enumerate(treads):  # a low front wall that follows the steps, so that it hides nothing
+        stage.block(f"front_{i}", along, front, (0, p.floor_m(i) + 0.5 * p.half_m), "wood")
+    whole = (-WALL_M, end + WALL_M)
+    panes = {"front": (whole, front), "back": (whole, back)}
+    panes |= {"top": ((-WALL_M, 0), (-side, side)), "end": ((end, end + WALL_M), (-side, side))}
+    for name, (along, across) in panes.items():
+        glass = stage.block(f"fence_{name}", along, across, (0, high + 1.0), "white")
         glass.rgba = [1, 1, 1, 0]  # never drawn: nothing leaves the steps
-    for name, along in (("fence_top", (-WALL_M, 0)), ("fence_end", (end, end + WALL_M))):
-        glass = block(name, along, (-side, side), (0, high + 1.0), "white")
-        glass.rgba = [1, 1, 1, 0]
     for i in range(len(p.faces)):
-        _add_die(spec, p, i)
-    ends = sorted((p.direction * -WALL_M, p.direction * (end + WALL_M)))
-    return Scene(
-        spec=spec,
-        view=View(azimuth_deg=p.azimuth_deg, elevation_deg=p.elevation_deg),
-        decisive=tuple(f"die_{i}" for i in range(len(p.faces))),
-        stage=(Box((ends[0], -side - WALL_M, 0), (ends[1], side + WALL_M, TRAY_M)),),
-        velocity={f"die_{i}": _throw(p, i) for i in range(len(p.faces))},
-        inventory=_inventory(p),
+        _add_die(stage, p, i)
+    dice = [f"die_{i}" for i in range(len(p.faces))]
+    scene = stage.scene(
+        p,
+        decisive=dice,
+        in_view=[stage.box(whole, (front[0], back[1]), (0, TRAY_M))],
+        also=["die", "step", "tray", "wall", "face"],
+        colours=sorted({*FACES, *p.edge_colours, "grey", "wood"}),
     )
+    throws = [(p.direction * along, across, up) for along, across, up in p.speeds_m_s]
+    return replace(scene, velocity={d: (*v, *w) for d, v, w in zip(dice, throws, p.spins_rad_s, strict=True)})
 
 
-def _add_die(spec: mujoco.MjSpec, p: Params, i: int) -> None:
+def _add_die(stage: Stage, p: Params, i: int) -> None:
     """A cube in the edge colour with a thin plate, drawn only, on every face."""
-    along, across, above = p.starts_m[i]
-    body = spec.worldbody.add_body(
-        name=f"die_{i}", pos=[p.direction * along, across, p.floor_m(0) + above], quat=list(p.turns[i])
-    )
-    body.add_freejoint()
-    h = p.half_m
-    cube = add_box(body, f"die_{i}", (0, 0, 0), (h, h, h), p.edge_colours[i], density=600.0, condim=4)
-    if p.edge_colours[i] != "black":
+    (along, across, above), h, edge = p.starts_m[i], p.half_m, p.edge_colours[i]
+    body = stage.free_box(f"die_{i}", (along, across, p.floor_m(0) + above), (h, h, h), edge, density=600.0)
+    body.quat, cube = list(p.turns[i]), body.first_geom()
+    if edge != "black":
         cube.material = "bright"
-    cube.friction, cube.solref, cube.priority = [0.5, 0.003, 0.0001], [-6000.0, -p.bounce], 1
+    cube.friction, cube.solref, cube.priority, cube.condim = [0.5, 0.003, 0.0001], [-6000.0, -p.bounce], 1, 4
     for colour, normal in zip(p.faces[i], NORMALS, strict=True):
         half = [0.0015 if n else PLATE * h for n in normal]
         add_box(body, f"die_{i}_{colour}", [h * n for n in normal], half, colour, contype=0, conaffinity=0, mass=0)
-
-
-def _throw(p: Params, i: int) -> tuple[float, ...]:
-    along, across, up = p.speeds_m_s[i]
-    return (p.direction * along, across, up, *p.spins_rad_s[i])
 
 
 def _short_of_tray(motion: Motion, p: Params) -> tuple[np.ndarray, np.ndarray]:
@@ -214,28 +191,21 @@ def _lean(motion: Motion, die: int) -> tuple[np.ndarray, np.ndarray]:
     return faces.argmax(axis=1), np.arccos(np.clip(faces.max(axis=1), -1, 1))
 
 
-def readings(motion: Motion, p: Params) -> list[str | None]:
-    """The upper colour of the first die in the tray, while it lies flat and still (by displacement)."""
+def outcome(motion: Motion, p: Params) -> Reading:
+    """The upper colour of the first die in the tray, while it lies flat and still (by displacement). The margin is the
+    smaller of two distances: how far the next die was from the tray when the first came, and how much an edge of the
+    lying die would have to rise for another face to come up."""
     found = _first_die(motion, p)
     if found is None:
-        return [None] * len(motion.times)
+        return Reading(undecided(motion), 0.0)
     die, arrival = found
     top, lean = _lean(motion, die)
     moved = np.linalg.norm(np.diff(motion.pos(f"die_{die}"), axis=0, prepend=math.inf), axis=1)
     lies = (lean < FLAT_RAD) & (moved < STILL * 2 * p.half_m) & (np.arange(len(top)) > arrival)
-    return [p.faces[die][face] if lying else None for face, lying in zip(top, lies, strict=True)]
-
-
-def margin(motion: Motion, p: Params) -> float:
-    """The smaller of two distances (m): how far the next die was from the tray when the first came, and how much an
-    edge of the lying die would have to rise for another face to come up."""
-    found = _first_die(motion, p)
-    if found is None:
-        return 0.0
-    die, arrival = found
     lead = np.min(np.delete(np.maximum(*_short_of_tray(motion, p))[arrival], die))
-    lean = _lean(motion, die)[1][-1]
-    return float(min(lead, 2 * p.half_m * math.sin(max(0.0, math.pi / 4 - lean))))
+    rise = 2 * p.half_m * math.sin(max(0.0, math.pi / 4 - lean[-1]))
+    labels = [p.faces[die][face] if lying else None for face, lying in zip(top, lies, strict=True)]
+    return Reading(labels, float(min(lead, rise)))
 
 
 def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
@@ -247,44 +217,10 @@ def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:
     return [((f"die_{die}_{p.faces[die][_lean(motion, die)[0][-1]]}",), LEGIBLE_PIXELS)]
 
 
-QUESTIONS = (
-    "Which colour is on top of the first die to reach the tray, once it lies still: {choices}?",
-    "The first die to land in the tray comes to rest with which colour facing up: {choices}?",
-    "Which colour face is up when the first die to reach the tray has stopped: {choices}?",
-)
-
-
-def _inventory(p: Params) -> Inventory:
-    colours = sorted({*FACES, *p.edge_colours, "grey", "wood"})
-    return Inventory(tuple(colours), ("die", "step", "tray", "wall", "face"))
-
-
-def word(p: Params, rng: np.random.Generator) -> Wording:
-    """The choices are the six colours of a die, in random order."""
-    choices = tuple(str(c) for c in rng.permutation(FACES))
-    aliases = {form.format(c): c for c in FACES for form in ("{} face", "{} side", "{} on top", "{} face up")}
-    aliases |= {"teal": "cyan", "turquoise": "cyan", "aqua": "cyan", "light blue": "cyan", "dark blue": "blue"}
-    return Wording(
-        question=str(rng.choice(QUESTIONS)).format(choices=listed(choices)),
-        labels=choices,
-        aliases=aliases,
-        answerable_question=_answerable(p, rng),
-    )
-
-
-def _answerable(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
-    kind = rng.integers(3)
-    if kind == 0:
-        return AnswerableQuestion("How many dice are there, 2 or 3?", ("2", "3"), str(len(p.faces)))
-    if kind == 1:
-        side = "left" if p.direction < 0 else "right"
-        return AnswerableQuestion("Do the steps go down to the left or to the right?", ("left", "right"), side)
+def _edges(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     edge = str(rng.choice(EDGES))
-    return AnswerableQuestion(
-        f"Does one of the dice have {edge} edges, yes or no?",
-        ("yes", "no"),
-        "yes" if edge in p.edge_colours else "no",
-    )
+    question = f"Does one of the dice have {edge} edges, yes or no?"
+    return AnswerableQuestion(question, ("yes", "no"), "yes" if edge in p.edge_colours else "no")
 
 
 # --- what one sees ----------------------------------------------------------------------------------------------------
@@ -303,11 +239,9 @@ class _Sight:
     outline: np.ndarray
 
 
-def observe(frames: np.ndarray, question: str) -> str | None:
+def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     """Follows the dice by the colours of their edges, and reads the upper face of the first one past the steps once it
     has slid to a stop. A die that freezes in full motion has not come to rest."""
-    if asked(QUESTIONS, question) is None:
-        return None
     paths = {colour: [_sight(frame, colour) for frame in frames] for colour in EDGES}
     dice = [path for path in paths.values() if sum(sight is not None for sight in path) >= len(frames) / 2]
     path = _first_over(_tray_edge(frames), dice)
@@ -398,19 +332,25 @@ def _upper_face(frame: np.ndarray, die: _Sight) -> str | None:
     return min(heights, key=lambda colour: heights[colour], default=None)
 
 
-FAMILY = Family(
-    name="tumbling_dice",
-    taxonomy="chaotic",
+FAMILY = scene_family(
+    "tumbling_dice",
     category="tumbling_dice",
-    sub_scenario="tumbling_dice",
-    answer_type="colour",
     params=Params,
-    draw=draw,
     build=build,
-    readings=readings,
-    margin=margin,
-    word=word,
-    questions=QUESTIONS,
+    outcome=outcome,
+    question=which_colour(
+        "Which colour is on top of the first die to reach the tray, once it lies still: {choices}?",
+        "The first die to land in the tray comes to rest with which colour facing up: {choices}?",
+        "Which colour face is up when the first die to reach the tray has stopped: {choices}?",
+        colours=lambda p: FACES,
+        forms=("{} face", "{} side", "{} on top", "{} face up"),
+        also={"teal": "cyan", "turquoise": "cyan", "aqua": "cyan", "light blue": "cyan", "dark blue": "blue"},
+    ),
+    asides=[
+        either("How many dice are there, 2 or 3?", ("2", "3"), lambda p: str(len(p.faces))),
+        goes_to("Do the steps go down to the left or to the right?"),
+        _edges,
+    ],
     observe=observe,
     legible=legible,
     physics=Physics(timestep_s=0.001, gravity_m_s2=4.4),

@@ -1,0 +1,213 @@
+"""The parts of scene families: draws in the order of the fields, mirrored stages, readings and words worked by hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, make_dataclass
+
+import numpy as np
+import pytest
+
+from traps_pipeline.scenes.kit import COLOURS, Physics
+from traps_pipeline.scenes.parts import observers, outcome, questions, vary
+from traps_pipeline.scenes.parts.ramp import Ramp, SteppedRamp
+from traps_pipeline.scenes.parts.stage import Stage, Surface, brake
+from traps_pipeline.scenes.simulate import Motion
+
+PLAY = vary.apart("red", "green", "blue", "yellow")
+
+
+def _direction(rng: np.random.Generator, so_far: vary.Drawn) -> int:
+    so_far["lanes"] = 2
+    return int(rng.choice([-1, 1]))
+
+
+@dataclass(frozen=True)
+class Params:
+    direction: int = vary.drawn_by(_direction)
+    ball_colour: str = PLAY()
+    length_m: float = vary.between(0.1, 0.2)
+    lane_colours: tuple[str, ...] = PLAY("lanes")
+    gate: str = vary.hidden("open", "shut", "ajar")
+    lane: int = vary.one_of(3, 4)
+    azimuth_deg: float = vary.facing(-10, 10)
+    elevation_deg: float = vary.between(-30, -20)
+
+
+def world(**positions: list[list[float]]) -> Motion:
+    """A motion of ten frames a second from the places of its bodies."""
+    paths = {body: np.array(path, dtype=float) for body, path in positions.items()}
+    count = len(next(iter(paths.values())))
+    return Motion(np.arange(count) / 10, paths, {body: np.tile(np.eye(3), (count, 1, 1)) for body in paths})
+
+
+# --- what varies ------------------------------------------------------------------------------------------------------
+
+
+def test_fields_are_drawn_in_their_order_and_a_group_at_its_first_field() -> None:
+    p, rng = vary.drawn(Params, np.random.default_rng(3)), np.random.default_rng(3)
+    assert p.direction == rng.choice([-1, 1])
+    colours = [str(c) for c in rng.permutation(["red", "green", "blue", "yellow"])[:3]]
+    assert (p.ball_colour, *p.lane_colours) == tuple(colours)
+    assert p.length_m == round(float(rng.uniform(0.1, 0.2)), 4)
+    assert p.gate == ("open", "shut", "ajar")[int(rng.integers(3))]
+    assert p.lane == rng.integers(3, 5)
+    assert p.azimuth_deg == 90 - p.direction * round(float(rng.uniform(-10, 10)), 4)
+
+
+def test_a_twin_has_another_value_of_the_hidden_element_and_nothing_else() -> None:
+    p = vary.drawn(Params, np.random.default_rng(0))
+    others = vary.twins(p)
+    assert [other.gate for other in others] == [g for g in ("open", "shut", "ajar") if g != p.gate]
+    assert all(vars(other) | {"gate": p.gate} == vars(p) for other in others)
+
+
+def test_the_hidden_element_is_as_likely_whatever_is_seen() -> None:
+    draws = [vary.drawn(Params, np.random.default_rng(seed)) for seed in range(600)]
+    for direction in (-1, 1):
+        share = np.mean([p.gate == "shut" for p in draws if p.direction == direction])
+        assert abs(share - 1 / 3) < 0.08
+
+
+def test_params_that_cannot_be_drawn_are_named() -> None:
+    two = make_dataclass("Two", [("a", bool, vary.hidden(False, True)), ("b", bool, vary.hidden(False, True))])
+    with pytest.raises(TypeError, match=r"several hidden elements \['a', 'b'\]"):
+        vary.hidden_field(two)
+    with pytest.raises(TypeError, match=r"Params\.speed has no range"):
+        vary.drawn(make_dataclass("Bare", [("speed", float)]), np.random.default_rng(0))
+    with pytest.raises(TypeError, match="there are no twins"):
+        vary.twins(make_dataclass("Seen", [("speed", float, vary.between(0, 1))])(0.5))
+
+
+# --- stage ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("direction", [-1, 1])
+def test_a_stage_mirrors_what_stands_on_it(direction: int) -> None:
+    stage = Stage(Physics(), direction)
+    block = stage.block("wall", (0.2, 0.6), (-0.1, 0.3), (0, 0.5), "red", Surface(0.002))
+    np.testing.assert_allclose(block.pos, [direction * 0.4, 0.1, 0.25])
+    np.testing.assert_allclose(block.size, [0.2, 0.2, 0.25])
+    np.testing.assert_allclose(block.friction, [0.8, 0.005, 0.002])
+    stage.ball("ball", (-0.5, 0, 0.05), 0.05, "blue", speed=0.4)
+    np.testing.assert_allclose(stage.post("peg", (0.3, 0, 0.1), 0.02, 0.1, "red").pos, [direction * 0.3, 0, 0.1])
+    stage.hull("wedge", [(1.0, y, z) for y in (0, 1) for z in (0, 1)] + [(1.6, 0.5, 0)], "green")
+    assert stage.spec.mesh("wedge").uservert[0] == direction * 1.0
+    p = vary.drawn(Params, np.random.default_rng(0))
+    scene = stage.scene(
+        p, decisive=["ball"], hidden=["wall"], cover=None, in_view=[], things=["red wall"], also=["ball"]
+    )
+    np.testing.assert_allclose(scene.velocity["ball"], [direction * 0.4, 0, 0, 0, direction * 8, 0])
+    assert scene.inventory.objects == ("wall", "ball")
+    box = stage.box((0.1, 0.5), (0, 1), (0, 1), right=0.02)
+    assert (box.low[0], box.high[0]) == ((0.1, 0.52) if direction > 0 else (-0.5, -0.08))
+    assert stage.ahead(0.3) == (0.3 if direction > 0 else 0.0)
+
+
+def test_a_stage_towards_a_side_adds_to_the_same_world() -> None:
+    stage = Stage(Physics())
+    left = stage.towards(-1)
+    np.testing.assert_allclose(left.block("wall", (0.2, 0.6), (0, 1), (0, 1), "red").pos, [-0.4, 0.5, 0.5])
+    assert left.spec is stage.spec
+    assert (left.direction, stage.direction) == (-1, 1)
+
+
+def test_a_tray_has_the_walls_that_are_given_a_height() -> None:
+    stage = Stage(Physics())
+    names = stage.tray("bin", (0, 1), (-1, 1), (0.1, 0.2), "red", wall=0.05, near=0.5, front=0.3)
+    assert names == ("bin_floor", "bin_near", "bin_front")
+    near = next(geom for geom in stage.spec.worldbody.geoms if geom.name == "bin_near")
+    np.testing.assert_allclose(near.pos, [-0.025, 0, 0.3])
+
+
+def test_places_on_a_ramp() -> None:
+    np.testing.assert_allclose(Ramp(30, 0.1).at(1.0), [-np.sqrt(3) / 2, 0, 0.6])
+    np.testing.assert_allclose(Ramp(30, 0.1).at(0.0, over=0.2), [0.1, 0, 0.1 + 0.1 * np.sqrt(3)])
+    away = Ramp(30, 0.1, foot_m=0.5, towards_camera=True, middle_m=0.2).at(1.0, aside=0.1)
+    np.testing.assert_allclose(away, [0.3, 0.5 + np.sqrt(3) / 2, 0.6])
+    np.testing.assert_allclose(SteppedRamp(1.0, 45, 0.2).at(0.25), [0.25, 0, 0.95])
+
+
+def test_a_rough_surface_takes_its_share_of_a_balls_speed() -> None:
+    rolling = brake(0.05, 1.0, 0.5, Physics())
+    slowing = 5 * Physics().gravity_m_s2 * rolling / (7 * 0.05)
+    assert 2 * slowing * 0.5 == pytest.approx(1.0)
+
+
+# --- outcome ----------------------------------------------------------------------------------------------------------
+
+
+def test_from_when_a_thing_is_still() -> None:
+    line, space = np.array([0, 1, 2, 2.0005, 2]), np.array([[0, 0, 0]] * 3 + [[0, 0, 1]] * 2, dtype=float)
+    assert outcome.still_from(line, within_m=0.001) == 2
+    assert outcome.still_from(line, space, within_m=0.001) == 3
+    assert outcome.still_from(np.stack([space, 0 * space], axis=1), within_m=0.001) == 3
+    assert outcome.lasting_from(np.array([True, False])) == 2
+
+
+def test_readings_that_were_worked_by_hand() -> None:
+    holds = np.array([False, False, True, False, False])
+    assert outcome.yes_while(holds, 4) == [None, None, "yes", None, "no"]
+    assert outcome.side_while(holds, np.array([1, 1, -1, 1, 1.0])) == [None, None, "no", None, None]
+    past = np.array([-0.3, 0.1, -0.1, 0.2, 0.25])
+    assert outcome.crossed(past) == outcome.Reading([None, None, None, "yes", "yes"], 0.25)
+    assert outcome.crossed(-past, np.arange(5) > 3) == outcome.Reading([None] * 4 + ["no"], 0.25)
+    stays = np.array([-0.6, -0.4, -0.31, -0.3])
+    assert outcome.came_through(stays, 0.05).labels == [None, None, "no", "no"]
+    assert outcome.came_through(stays, 0.05).margin_m == pytest.approx(0.2)
+    assert outcome.clear_m(stays, 0.1) == pytest.approx(0.2)
+
+
+def test_the_first_past_a_line_needs_a_lead() -> None:
+    motion = world(ball=[[0, 0, 0]] * 8)
+    ahead = np.array([[-0.4, -0.5], [0.1, -0.4], [0.2, -0.2], [0.3, 0.1], *[[0.4, 0.2]] * 4])
+    won = outcome.first_past(motion, ahead, ("red", "blue"), 0.15)
+    assert won == outcome.Reading([None, *["red"] * 7], 0.4)
+    assert set(outcome.first_past(motion, ahead, ("red", "blue"), 0.25).labels) == {None}
+
+
+# --- questions and observers ------------------------------------------------------------------------------------------
+
+
+def test_a_question_is_filled_and_read_back() -> None:
+    p = vary.drawn(Params, np.random.default_rng(1))
+    asked = questions.yes_no("Does the {ball} ball pass?", yes=["it passes"], no=["it stops"])
+    aside = questions.colour_from("ball", "What colour is it: {choices}?", list(COLOURS), unlike=("ball",))
+    words = asked.word(p, np.random.default_rng(0), [aside])
+    assert words.question == f"Does the {p.ball_colour} ball pass?"
+    assert asked.named_in(words.question) == {"ball": p.ball_colour}
+    assert asked.named_in("Does it pass?") is None
+    assert words.aliases == {"it passes": "yes", "it stops": "no"}
+    other = questions.yes_no("Does {it} pass?", yes=[], no=[], fills=lambda p, rng: {"it": str(rng.choice(["a", "b"]))})
+    assert other.word(p, np.random.default_rng(0), [aside]).question in ("Does a pass?", "Does b pass?")
+    answerable = words.answerable_question
+    assert answerable.answer == p.ball_colour
+    assert len(set(answerable.labels)) == 3 and p.ball_colour in answerable.labels
+    sides = questions.left_or_right("To which side?", forms=["{1} bin"], colours=lambda p: ("red", "blue"))
+    assert sides.fill(p, np.random.default_rng(0)).aliases == {"red bin": "left", "blue bin": "right"}
+    count = questions.how_many("How many, {choices}?", ranges=lambda p: [(0, 1), (2, 2)])
+    filled = count.fill(p, np.random.default_rng(0))
+    assert (filled.labels, filled.fills) == (("0-1", "2-2"), {"choices": "0-1 or 2-2"})
+    assert filled.aliases["0 or 1"] == filled.aliases["one"] == "0-1" != filled.aliases["2"]
+    assert [questions.range_of([(0, 1), (2, 2)], n) for n in (1, 2, 3)] == ["0-1", "2-2", None]
+
+
+def test_what_rests_beyond_a_mark_is_seen_there() -> None:
+    frames = np.full((5, 360, 480, 3), 200, np.uint8)
+    frames[:, 150:170, 240:260] = np.array(COLOURS["blue"]) * 255
+    for frame, x in zip(frames, (40, 140, 340, 340, 340), strict=True):
+        frame[150:170, x : x + 20] = np.array(COLOURS["red"]) * 255
+    see = observers.beyond("ball", "line")
+    assert see(frames, {"ball": "red", "line": "blue"}) == "yes"
+    assert see(frames[:2], {"ball": "red", "line": "blue"}) is None
+    assert see(frames[[0, 1, 1, 1]], {"ball": "red", "line": "blue"}) == "no"
+    assert see(frames, {"ball": "red", "line": "purple"}) is None
+
+
+def test_a_finder_takes_what_has_the_size_and_shape_of_a_ball() -> None:
+    frame = np.full((360, 480, 3), 200, np.uint8)
+    frame[150:170, 100:160] = np.array(COLOURS["red"]) * 255  # three times as wide as high
+    assert observers.compact(frame, "red") is None
+    assert observers.compact(frame, "red", shape=(0.3, 3.5)) is not None
+    assert observers.compact(frame, "red", shape=(0.3, 3.5), area=1200) is None
+    assert observers.rounded(frame, "red", longer=3.1) is None  # it fills its box, as a panel does
+    assert observers.rounded(frame, "red", longer=3.1, fill=1.1) is not None

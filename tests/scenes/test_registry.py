@@ -1,0 +1,207 @@
+"""What the registry refuses, and the family of docs/scenes.md: taken from the page, drawn, certified, observed."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.conftest import ROOT
+from tests.scenes.released import Released
+from traps_pipeline.benchmark.composition import load_composition
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.partitions import CATEGORIES
+from traps_pipeline.scenes import families as package
+from traps_pipeline.scenes import registry
+from traps_pipeline.scenes.certify import certify
+from traps_pipeline.scenes.independence import dependence
+from traps_pipeline.scenes.kit import Family
+from traps_pipeline.scenes.observe import family_asking
+from traps_pipeline.scenes.resolve import Resolved
+from traps_pipeline.scenes.sample import Draw, sample_family, simulated_answer, try_draw
+from traps_pipeline.scenes.wording import draw_ill_posed
+
+(PAGE,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "scenes.md").read_text(), re.DOTALL | re.MULTILINE)
+Add = Callable[..., None]
+
+
+def forget() -> None:
+    for cached in (registry.family_names, registry.get_family, registry.families, registry.fit_to_sample):
+        cached.cache_clear()
+    family_asking.cache_clear()
+
+
+@pytest.fixture
+def add(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Add]:
+    """Adds a family file beside the others for one test: the page's, with some of its text replaced."""
+    monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
+    added: list[str] = []
+
+    def add(name: str, **changes: Sequence[str]) -> None:
+        text = PAGE.replace('"plank_post"', f'"{name}"')
+        for old, new in changes.values():
+            assert old in text
+            text = text.replace(old, new)
+        (tmp_path / f"{name}.py").write_text(text)
+        added.append(name)
+        forget()
+
+    yield add
+    monkeypatch.undo()
+    for name in added:
+        sys.modules.pop(f"{package.__name__}.{name}", None)
+    forget()
+
+
+# --- the family of the page -------------------------------------------------------------------------------------------
+
+
+def test_the_family_of_the_page_is_complete_and_no_part_of_the_benchmark(add: Add) -> None:
+    assert len(PAGE.splitlines()) <= 110
+    assert "plank_post" not in load_composition()
+    add("plank_post")
+    family = registry.fit_to_sample("plank_post")
+    answers = {simulated_answer(family, family.draw(np.random.default_rng(seed))) for seed in range(4)}
+    assert answers == {"yes", "no"}
+
+
+@pytest.mark.slow
+def test_the_family_of_the_page_is_drawn_certified_rendered_and_observed(add: Add) -> None:
+    add("plank_post")
+    family = registry.fit_to_sample("plank_post")
+    answers: dict[str, Resolved] = {}
+    for number in range(12):
+        found = try_draw(Draw("plank_post", 1, number, frozenset(answers)))
+        if isinstance(found, Resolved):
+            answers[found.spec.ground_truth] = found
+        if len(answers) == 2:
+            break
+    assert set(answers) == {"yes", "no"}
+    for answer, found in answers.items():
+        inventory = family.build(family.params_from(found.spec.params), family.physics).inventory
+        ill_posed = draw_ill_posed("occlusion", inventory, np.random.default_rng(0))
+        spec = found.spec.model_copy(update={"ill_posed_question": ill_posed})
+        assert certify(spec, found.qpos, found.twin, frame_step=2).failures == {}
+        shown = Released(spec, found.qpos, found.twin)
+        assert family.observe is not None
+        assert family.observe(shown.control_frames, spec.question) == answer
+        assert family.observe(shown.void_frames(), spec.question) is None
+        assert family_asking(spec.question) is family
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+def test_an_unknown_category_is_refused_with_the_known_ones(add: Add) -> None:
+    add("plank_post", category=('"ramps_rolling"', '"planks"'))
+    message = r"families/plank_post\.py: unknown category 'planks'; write one of .* ramps_rolling, pendulums_levers"
+    with pytest.raises(TrapsError, match=message):
+        registry.get_family("plank_post")
+
+
+def test_a_file_without_a_family_is_named(add: Add) -> None:
+    add("plank_post", family=("FAMILY = ", "MINE = "))
+    with pytest.raises(TrapsError, match=r"families/plank_post\.py defines no FAMILY"):
+        registry.get_family("plank_post")
+
+
+def test_a_category_of_the_other_taxonomy_is_refused(add: Add) -> None:
+    add("plank_post", category=('"ramps_rolling"', '"plinko"'))
+    with pytest.raises(
+        TrapsError, match="unknown category 'plinko'; write one of the categories of occlusion families"
+    ):
+        registry.get_family("plank_post")
+
+
+@pytest.mark.parametrize("placeholder", ["{ball}", "{plank}"])  # a question is the same whatever fills it
+def test_two_families_with_one_question_template_are_refused(
+    add: Add, placeholder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add("plank_post")
+    start = "Does the {ball} ball roll along"
+    add("plank_post_2", question=(start, start.replace("{ball}", placeholder)), other=("Is the", "Is then the"))
+    message = (
+        r"families/plank_post\.py and scenes/families/plank_post_2\.py have one question template, 'Does the .*word"
+    )
+    with pytest.raises(TrapsError, match=message):
+        registry.families()
+    with pytest.raises(TrapsError, match=message):
+        sample_family("plank_post_2", 1, 1, tmp_path / "released")
+    assert not (tmp_path / "released").exists()
+
+
+def test_a_hidden_element_that_follows_what_is_seen_is_refused_before_anything_is_drawn(
+    add: Add, tmp_path: Path
+) -> None:
+    # Long planks have their post beside them, most of the time.
+    drawn = (
+        "drawn_by(lambda rng, so_far: uniform(rng, 0.3, 0.34) + 0.04 * (so_far['post_in_way'] or rng.random() < 0.2))"
+    )
+    add(
+        "plank_post",
+        seen=("seen_m: float = between(0.30, 0.40)", f"seen_m: float = {drawn}"),
+        names=("import apart,", "import drawn_by, apart,"),
+        kit=("import Physics, Scene", "import Physics, Scene, uniform"),
+    )
+    message = (
+        r"families/plank_post\.py: the hidden element .* `post_in_way` goes with `seen_m`; draw it from nothing but"
+    )
+    with pytest.raises(TrapsError, match=message):
+        sample_family("plank_post", 1, 1, tmp_path / "released")
+    assert not (tmp_path / "released").exists()
+
+
+@pytest.mark.parametrize("name", [name for name in registry.family_names() if registry.get_family(name).twins])
+def test_no_familys_hidden_element_goes_with_what_is_seen(name: str) -> None:
+    assert registry.fit_to_sample(name).name == name
+
+
+def spoilt(name: str, choose: Callable[[Any], bool], hidden: str) -> Family:
+    """A family, seven in ten of whose draws are swapped for the twin where `choose(params)` says so."""
+    family = registry.get_family(name)
+    twins = family.twins
+    assert twins is not None
+
+    def draw(rng: np.random.Generator) -> Any:
+        p = family.draw(rng)
+        worlds = sorted([p, *twins(p)], key=lambda world: getattr(world, hidden))
+        return worlds[0 if choose(p) else -1] if rng.random() < 0.7 else p
+
+    return replace(family, draw=draw)
+
+
+@pytest.mark.parametrize(
+    ("name", "hidden"),
+    [
+        ("drop_split", "offset_m"),
+        ("funnel", "half_throat"),
+        ("spring", "damping_n_s_m"),
+        ("stack", "below"),
+        ("domino_count", "gap_after"),
+        ("hidden_race", "clear_lane"),
+        ("target_land", "slant"),
+        ("tower", "barred"),
+    ],
+)
+def test_a_spoilt_draw_is_found_out_however_a_family_makes_its_twins(name: str, hidden: str) -> None:
+    assert dependence(spoilt(name, lambda p: p.azimuth_deg > 90, hidden)) is not None
+
+
+def test_two_parameters_that_tell_only_together_are_found_out() -> None:
+    told = spoilt("drop_split", lambda p: (p.azimuth_deg > 90) == (p.elevation_deg > -28), "offset_m")
+    found = dependence(told)
+    assert found is not None and "azimuth_deg" in found and "elevation_deg" in found
+
+
+def test_what_is_hidden_may_be_uneven_as_long_as_it_follows_nothing() -> None:
+    assert dependence(spoilt("drop_split", lambda p: True, "offset_m")) is None
+
+
+def test_every_category_has_a_family() -> None:
+    assert {family.category for family in registry.families()} == set(CATEGORIES)

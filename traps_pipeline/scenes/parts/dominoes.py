@@ -1,0 +1,106 @@
+"""Two rows of dominoes with a hand-off between them, such that nothing of the second row pushes back on the first.
+
+A rolling ball sets off the first row, which is in view. Its last domino only kicks a second ball, which is behind the
+panel from the start and which two posts stop after it has struck the second row. Lengths are in domino heights unless a
+name ends in `_m`; they run along the way from the first domino on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from traps_pipeline.scenes.kit import Box
+from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage
+
+PLANK = 0.07  # thickness of the plank that everything stands on
+BALL = 0.40  # radius of both balls
+BALL_AT = 0.55 + BALL  # centre of the kicked ball, from the front face of the last visible domino
+POSTS_AT = 1.75  # near face of the posts, from there as well: the stopped ball is past that domino's reach
+RUN_UP = 2.3  # plank before the first domino
+RUN_OUT = 1.15  # plank behind the second row
+STILL_M = 0.002  # a domino that moves less than this any more is at rest
+
+
+@dataclass(frozen=True)
+class Size:
+    """Of a domino: its height in metres, the rest in heights. spacing: from domino to domino in a row."""
+
+    height_m: float
+    width: float
+    thickness: float
+    spacing: float
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A domino of the second row: place counts spacings from its first place; aside: lies flat behind the row."""
+
+    name: str
+    place: int
+    colour: str
+    aside: bool = False
+
+
+def add_rows(
+    stage: Stage,
+    size: Size,
+    *,
+    first: Sequence[str],
+    second: Sequence[Standing],
+    places: int,
+    ball_colour: str,
+    plank_colour: str,
+    speed_m_s: float,
+) -> Span:
+    """Plank, balls, both rows and the posts. Returns where the covered part of the way begins and ends (m).
+
+    first: the colours of the first row, whose bodies are `domino_0` and so on. places: how many spacings the second row
+    is long. speed_m_s: of the ball that sets all off.
+    """
+    h = size.height_m
+    last = (len(first) - 1) * size.spacing
+    face = last + size.thickness / 2
+    second_at = last + (POSTS_AT + 0.09 + size.thickness)  # in this order: records depend on the last bit
+    end = second_at + places * size.spacing + RUN_OUT
+
+    half_plank = (h * (end + RUN_UP) / 2, (size.width / 2 + 0.06) * h, PLANK * h / 2)
+    stage.slab("plank", (h * (end - RUN_UP) / 2, 0, PLANK * h / 2), half_plank, plank_colour)
+    for name, along, speed in (("starter", -1.8, speed_m_s), ("kicked", face + BALL_AT, 0.0)):
+        at = (h * along, 0, (PLANK + BALL) * h)
+        # The plank grips the ball; a domino slides over it and squeezes it out.
+        stage.ball(name, at, BALL * h, ball_colour, speed=speed, rolling=0.0004, sliding=0.1, density=300)
+    for i, colour in enumerate(first):
+        add_domino(stage, size, Standing(f"domino_{i}", i, colour), 0.0)
+    for standing in second:
+        add_domino(stage, size, standing, second_at)
+    for side in (-1, 1):
+        y = side * h * (0.8 * BALL + 0.06)  # closer together than the ball is wide: it leans through, and stops
+        post = (h * (face + POSTS_AT + 0.03), y, 0.5 * h)
+        stage.slab(f"post_{side}", post, (0.03 * h, 0.06 * h, 0.5 * h), "grey")
+    return h * (face + BALL_AT - BALL - 0.03), h * end
+
+
+def add_domino(stage: Stage, size: Size, domino: Standing, row_at: float) -> None:
+    """A free domino (body and geom of its name) of a row that begins at `row_at`."""
+    h = size.height_m
+    x = (row_at + domino.place * size.spacing) * h
+    at = (x, h * (size.width + 0.10), size.thickness * h / 2) if domino.aside else (x, 0.0, (PLANK + 0.5) * h)
+    half = (size.thickness * h / 2, size.width * h / 2, h / 2)
+    body = stage.free_box(domino.name, at, half, domino.colour, density=500, sliding=0.2, solref=(0.006, 1))
+    if domino.aside:
+        body.quat = [0.5**0.5, 0, 0.5**0.5, 0]
+
+
+def cover(stage: Stage, size: Size, along: Span, back: float) -> Box:
+    """What the panel must hide of the covered part, which reaches to the back by so many heights; whatever a gap
+    changes casts its shadow behind the panel too."""
+    h = size.height_m
+    across = (-h * (size.width / 2 + 0.10), h * back)
+    return stage.box(along, across, (0, (PLANK + 1.04) * h), right=stage.ahead(SHADOW_RIGHT * h))
+
+
+def in_view(stage: Stage, size: Size, along: Span, back: float) -> Box:
+    """What the camera must see of the covered part."""
+    h = size.height_m
+    return stage.box(along, (-h * (size.width / 2 + 0.10), h * back), (0, (PLANK + 1.0) * h))

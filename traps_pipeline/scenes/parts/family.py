@@ -1,0 +1,67 @@
+"""A family put together from its parts, as the registry takes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.scenes.kit import Family, Physics, Reading, Scene
+from traps_pipeline.scenes.parts import vary
+from traps_pipeline.scenes.parts.observers import Observer
+from traps_pipeline.scenes.parts.questions import Aside, Question
+from traps_pipeline.scenes.simulate import Motion
+
+USUAL_PHYSICS = Physics()
+
+
+def scene_family(
+    name: str,
+    *,
+    category: str,
+    params: type,
+    build: Callable[[Any, Physics], Scene],
+    outcome: Callable[[Motion, Any], Reading],
+    question: Question,
+    asides: Sequence[Aside],
+    observe: Observer,
+    physics: Physics = USUAL_PHYSICS,
+    min_margin_m: float = 0.005,
+    sub_scenario: str | None = None,
+    legible: Callable[[Motion, Any], Sequence[tuple[tuple[str, ...], float]]] | None = None,
+    twins: Callable[[Any], Sequence[Any]] | None = None,
+    perturbation: float = 1e-4,
+) -> Family:
+    """A family from its parts; `kit.Family` says what the other fields mean.
+
+    Parameters with a hidden element make an occlusion family, whose twins follow from it; parameters without one make a
+    chaotic family. twins: other worlds than those, for a hidden element that is more than one field. sub_scenario: the
+    family's name unless it is given.
+    """
+    if twins is None and vary.hidden_field(params) is not None:
+        twins = vary.twins
+
+    def seen(frames: np.ndarray, text: str) -> str | None:
+        named = question.named_in(text)
+        return None if named is None else observe(frames, named)
+
+    return Family(
+        name=name,
+        taxonomy="chaotic" if twins is None else "occlusion",
+        category=category,
+        sub_scenario=sub_scenario or name,
+        answer_type=question.answer_type,
+        params=params,
+        draw=lambda rng: vary.drawn(params, rng),
+        build=build,
+        outcome=outcome,
+        word=lambda p, rng: question.word(p, rng, asides),
+        questions=question.templates,
+        observe=seen,
+        legible=legible,
+        physics=physics,
+        min_margin_m=min_margin_m,
+        twins=twins,
+        perturbation=perturbation,
+    )

@@ -1,0 +1,184 @@
+"""What is asked of a scene, as values: templates that are filled and read back, their labels and other forms of these.
+
+A template names parts in braces: '{ball}' is the value of the field `ball_colour`, and `fills` adds others. A family
+has one `Question` and some answerable asides, of which each scenario has one; even the void answers those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.scenes.kit import AnswerableQuestion, AnswerType, Wording, listed
+from traps_pipeline.scenes.parts.stage import coloured
+from traps_pipeline.scenes.wording import asked
+
+Forms = Sequence[str]  # ways to say a label; '{}' stands for it
+Aside = Callable[[Any, np.random.Generator], AnswerableQuestion]
+
+
+@dataclass(frozen=True)
+class Filled:
+    """What a question becomes for one scenario. labels: its choices. aliases: other wordings of a label -> the label.
+    fills: placeholder -> text, besides the parts' colours."""
+
+    labels: tuple[str, ...]
+    aliases: Mapping[str, str]
+    fills: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question in some wordings. fill(p, rng): its choices and placeholders for the parameters of a scenario; what it
+    draws is drawn before the wording is."""
+
+    answer_type: AnswerType
+    templates: tuple[str, ...]
+    fill: Callable[[Any, np.random.Generator], Filled]
+
+    def word(self, p: Any, rng: np.random.Generator, asides: Sequence[Aside]) -> Wording:
+        """The words of a scenario: one wording of the question, one of the asides; a sole aside costs no draw."""
+        filled = self.fill(p, rng)
+        text = str(rng.choice(self.templates)).format_map({**coloured(p), **filled.fills})
+        return Wording(text, filled.labels, filled.aliases, _one_of(asides, rng)(p, rng))
+
+    def named_in(self, question: str) -> dict[str, str] | None:
+        """What a question, read back, has in its placeholders; None if it is not this question."""
+        return asked(self.templates, question)
+
+
+def _one_of(asides: Sequence[Aside], rng: np.random.Generator) -> Aside:
+    return asides[0] if len(asides) == 1 else asides[int(rng.integers(len(asides)))]
+
+
+# --- questions --------------------------------------------------------------------------------------------------------
+
+
+def yes_no(
+    *templates: str,
+    yes: Forms,
+    no: Forms,
+    fills: Callable[[Any, np.random.Generator], Mapping[str, str]] = lambda p, rng: {},
+) -> Question:
+    """A question that is answered by yes or no, and other ways to say either. fills: what its placeholders that are no
+    part become."""
+    aliases = dict.fromkeys(yes, "yes") | dict.fromkeys(no, "no")
+    return Question("binary", templates, lambda p, rng: Filled(("yes", "no"), aliases, fills(p, rng)))
+
+
+def left_or_right(*templates: str, forms: Forms, colours: Callable[[Any], tuple[str, str]] | None = None) -> Question:
+    """A question that is answered by left or right. forms: other ways to say a side; '{0}' is the side and '{1}' its
+    colour, which `colours(p)` gives for left and right."""
+
+    def fill(p: Any, rng: np.random.Generator) -> Filled:
+        of_sides = ("", "") if colours is None else colours(p)
+        sides = tuple(zip(("left", "right"), of_sides, strict=True))
+        return Filled(("left", "right"), {form.format(*side): side[0] for side in sides for form in forms}, {})
+
+    return Question("direction", templates, fill)
+
+
+def which_colour(
+    *templates: str,
+    colours: Callable[[Any], Sequence[str]],
+    forms: Forms,
+    also: Mapping[str, str] = MappingProxyType({}),
+) -> Question:
+    """A question that is answered by one of some colours, '{choices}' in random order. forms: ways to say a colour.
+    also: other names of colours -> the colour."""
+
+    def fill(p: Any, rng: np.random.Generator) -> Filled:
+        choices = tuple(str(c) for c in rng.permutation(colours(p)))
+        aliases = {form.format(c): c for c in choices for form in forms}
+        return Filled(choices, aliases | dict(also), {"choices": listed(choices)})
+
+    return Question("colour", templates, fill)
+
+
+NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven")
+
+
+def range_of(ranges: Sequence[Sequence[int]], count: int) -> str | None:
+    """The choice '<lowest>-<highest>' that a count belongs to, None if it belongs to none."""
+    return next((f"{low}-{high}" for low, high in ranges if low <= count <= high), None)
+
+
+def how_many(
+    *templates: str,
+    ranges: Callable[[Any], Sequence[tuple[int, int]]],
+    fills: Callable[[Any, np.random.Generator], Mapping[str, str]] = lambda p, rng: {},
+) -> Question:
+    """A question that is answered by a range of numbers; its '{choices}' are all ranges, lowest first. fills: as in
+    `yes_no`."""
+
+    def fill(p: Any, rng: np.random.Generator) -> Filled:
+        aliases: dict[str, str] = {}
+        for low, high in ranges(p):
+            numbers = [form for n in range(low, high + 1) for form in (str(n), NUMBERS[n])]
+            aliases |= dict.fromkeys([f"{low} to {high}", f"{low} or {high}", *numbers], f"{low}-{high}")
+        labels = tuple(f"{low}-{high}" for low, high in ranges(p))
+        return Filled(labels, aliases, {"choices": listed(labels), **fills(p, rng)})
+
+    return Question("count_range", templates, fill)
+
+
+# --- answerable asides ------------------------------------------------------------------------------------------------
+
+
+def either(question: str, labels: Sequence[str], answer: Callable[[Any], str]) -> Aside:
+    """A question that names its choices in a fixed order: 'Are the pegs round or square?'. It may name parts."""
+
+    def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
+        return AnswerableQuestion(question.format_map(coloured(p)), tuple(labels), answer(p))
+
+    return ask
+
+
+def comes_from(question: str) -> Aside:
+    """A question after the side, left or right, that things come from."""
+    return either(question, ("left", "right"), lambda p: "left" if p.direction > 0 else "right")
+
+
+def goes_to(question: str) -> Aside:
+    """A question after the side, left or right, that things go to."""
+    return either(question, ("left", "right"), lambda p: "right" if p.direction > 0 else "left")
+
+
+def choice_of(question: str, choices: Callable[[Any], Sequence[str]], answer: Callable[[Any], str]) -> Aside:
+    """A question whose '{choices}' are in random order."""
+
+    def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
+        shown = tuple(str(c) for c in rng.permutation(choices(p)))
+        return AnswerableQuestion(question.format_map({**coloured(p), "choices": listed(shown)}), shown, answer(p))
+
+    return ask
+
+
+def colour_of(part: str, question: str, among: Sequence[str]) -> Aside:
+    """A question after the colour of a part; its '{choices}' are the colours of the parts `among`, itself included."""
+    return choice_of(question, lambda p: [coloured(p)[one] for one in among], lambda p: coloured(p)[part])
+
+
+def colour_from(part: str, question: str, pool: Sequence[str], unlike: Sequence[str]) -> Aside:
+    """A question after the colour of a part; its '{choices}' are that and two of the pool that no part of `unlike`
+    has."""
+
+    def ask(p: Any, rng: np.random.Generator) -> AnswerableQuestion:
+        colours = coloured(p)
+        taken = [colours[one] for one in unlike]
+        others = [str(c) for c in rng.permutation([c for c in pool if c not in taken])[:2]]
+        return choice_of(question, lambda p: [colours[part], *others], lambda p: colours[part])(p, rng)
+
+    return ask
+
+
+_IN_WORDS = {"wood": "brown", "grey": "grey", "black": "black"}
+
+
+def material_of(part: str, question: str) -> Aside:
+    """A question after the colour of a part of wood, grey or black; its '{choices}' are brown, grey and black."""
+    return choice_of(question, lambda p: list(_IN_WORDS.values()), lambda p: _IN_WORDS[coloured(p)[part]])

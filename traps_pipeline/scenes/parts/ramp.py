@@ -1,0 +1,93 @@
+"""Ramps, and places on them: a board that leads down along the way or towards the camera, with rails and a support."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from traps_pipeline.scenes.kit import Vec3, add_box
+from traps_pipeline.scenes.parts.stage import Stage
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """A slope, measured from its foot: `up` the slope, `over` its surface, `aside` of its middle (m).
+
+    foot_m: where the foot is; along the way that is 0 for most, towards the camera it is how far away in y. height_m:
+    of the surface at the foot. towards_camera: the ramp falls towards the camera and its middle is at `middle_m` in x;
+    else it falls along the way.
+    """
+
+    slope_deg: float
+    height_m: float
+    foot_m: float = 0.0
+    towards_camera: bool = False
+    middle_m: float = 0.0
+
+    @property
+    def slope_rad(self) -> float:
+        """Angle of the slope."""
+        return float(np.radians(self.slope_deg))
+
+    def at(self, up: float, over: float = 0.0, aside: float = 0.0) -> Vec3:
+        """A place by the slope, as a stage takes it."""
+        sin, cos = float(np.sin(self.slope_rad)), float(np.cos(self.slope_rad))
+        away, high = self.foot_m + up * cos - over * sin, self.height_m + up * sin + over * cos
+        return (self.middle_m + aside, away, high) if self.towards_camera else (-away, aside, high)
+
+    def board(
+        self,
+        stage: Stage,
+        name: str,
+        up: float,
+        over: float,
+        half: Vec3,
+        colour: str,
+        *,
+        aside: float = 0.0,
+    ) -> mujoco.MjsGeom:
+        """A box that lies on the slope, its middle at a place. half: half sizes up the slope, across it, out of it."""
+        centre = self.at(up, over, aside)
+        if not self.towards_camera:
+            return stage.slab(name, centre, half, colour, falls_rad=self.slope_rad)
+        geom = add_box(stage.spec.worldbody, name, centre, (half[1], half[0], half[2]), colour)
+        geom.quat = [float(np.cos(self.slope_rad / 2)), float(np.sin(self.slope_rad / 2)), 0.0, 0.0]
+        return geom
+
+    def support(self, stage: Stage, name: str, up: float, under: float, half_width: float, colour: str) -> None:
+        """A post from the ground to so far under the surface."""
+        x, y, z = self.at(up, -under)
+        half = (half_width, 0.02, z / 2) if self.towards_camera else (0.02, half_width, z / 2)
+        stage.slab(name, (x, y, z / 2), half, colour)
+
+
+@dataclass(frozen=True)
+class SteppedRamp:
+    """A ramp from the beginning of the way that ends in a step above the deck, so that nothing comes back up.
+
+    length_m: along the ground. height_m: of its lower end.
+    """
+
+    length_m: float
+    slope_deg: float
+    height_m: float
+
+    def at(self, along: float, over: float = 0.0) -> Vec3:
+        """The place so far along the way, and from the surface there so far out of it."""
+        slope = np.radians(self.slope_deg)
+        high = self.height_m + (self.length_m - along) * np.tan(slope)
+        return (float(along + over * np.sin(slope)), 0.0, float(high + over * np.cos(slope)))
+
+    def add(self, stage: Stage, half_width: float, colour: str) -> mujoco.MjsGeom:
+        """The board `ramp`, which is returned, and the `prop` under its upper end."""
+        slope, half_thick = np.radians(self.slope_deg), 0.012
+        half = (self.length_m / 2 / float(np.cos(slope)), half_width, half_thick)
+        ramp = stage.slab("ramp", self.at(self.length_m / 2, -half_thick), half, colour, falls_rad=float(slope))
+        top = self.at(0.05)[2] / 2 - 0.012
+        stage.slab("prop", (0.05, 0, top), (0.012, half_width, top), colour)
+        return ramp

@@ -1,0 +1,196 @@
+"""What varies in a family: a field of its `Params` and the range that the field is drawn from are one line.
+
+    @dataclass(frozen=True)
+    class Params:
+        direction: int = one_of(-1, 1)
+        ball_colour: str = PLAY()
+        wall_colour: str = PLAY()
+        rough: bool = hidden(False, True)
+        speed_m_s: float = between(0.50, 0.66)
+
+    PLAY = apart("red", "green", "blue")  # before the class: colours that differ from each other
+
+`drawn(Params, rng)` draws the fields in the order in which they stand; a field may depend on those before it only. So a
+hidden element that depends on nothing is as likely whatever is seen. `twins(p)` changes the hidden element.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from traps_pipeline.scenes.kit import distinct_colours, uniform
+
+Drawn = dict[str, Any]  # name -> value: what is drawn so far
+Draw = Callable[[np.random.Generator, Drawn], Any]
+Count = int | str | Callable[[Mapping[str, Any]], int]
+Params = TypeVar("Params")
+
+_HOW, _COUNT, _HIDDEN = "how", "count", "hidden"  # keys of a field's metadata
+
+
+# --- one field --------------------------------------------------------------------------------------------------------
+
+
+def drawn_by(draw: Draw) -> Any:
+    """A field that `draw(rng, so_far)` draws, for what no other function here says.
+
+    `so_far` holds the fields above by name. `draw` may put further values into it for fields below: those are not
+    stored with the parameters.
+    """
+    return field(metadata={_HOW: draw})
+
+
+def between(low: float, high: float) -> Any:
+    """A float between two bounds, rounded to 0.0001."""
+    return drawn_by(lambda rng, so_far: uniform(rng, low, high))
+
+
+def several_between(count: Count, low: float, high: float) -> Any:
+    """A tuple of floats between two bounds. count: how many, or the name of the drawn value that says how many."""
+    return drawn_by(lambda rng, so_far: tuple(uniform(rng, low, high) for _ in range(_number(count, so_far))))
+
+
+def one_of(*values: Any) -> Any:
+    """One of these values, each as often. Names of colours, -1 and 1, counts: `one_of(4, 5, 6)`."""
+    return drawn_by(lambda rng, so_far: values[int(rng.integers(len(values)))])
+
+
+def chance(share: float) -> Any:
+    """True in this share of the draws."""
+    return drawn_by(lambda rng, so_far: bool(rng.random() < share))
+
+
+def facing(low: float, high: float) -> Any:
+    """Azimuth (degrees) of a camera in front of the scene that stands by so many degrees, between two bounds, towards
+    the side that things come from. Needs a field `direction` above it."""
+    return drawn_by(lambda rng, so_far: 90 - so_far["direction"] * uniform(rng, low, high))
+
+
+def in_front(low: float, high: float) -> Any:
+    """Azimuth (degrees) of a camera in front of the scene, turned by so many degrees whatever the direction."""
+    return drawn_by(lambda rng, so_far: 90 + uniform(rng, low, high))
+
+
+# --- fields that are drawn together -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Fields that are drawn together, at the place of the first of them. Calling the group gives one of its fields.
+
+    draw(rng, so_far, count): as many values as the group's fields take, in the order of the fields.
+    """
+
+    draw: Callable[[np.random.Generator, Drawn, int], Sequence[Any]]
+
+    def __call__(self, count: Count | None = None) -> Any:
+        """A field with one value of the group, or with a tuple of `count` of them: a number, the name of the drawn
+        value that says how many, or a function of the fields above."""
+        return field(metadata={_HOW: self, _COUNT: count})
+
+
+def apart(*pool: str, fits: Callable[..., bool] | None = None) -> Group:
+    """Colours of a pool that are not easily taken for each other; drawn again until `fits(*colours)`."""
+
+    def draw(rng: np.random.Generator, so_far: Drawn, count: int) -> Sequence[str]:
+        while True:
+            colours = distinct_colours(rng, count, pool)
+            if fits is None or fits(*colours):
+                return colours
+
+    return Group(draw)
+
+
+def shuffled(*values: Any, without: str | None = None) -> Group:
+    """Different ones of these values in random order; not the one that the field named `without` has."""
+
+    def draw(rng: np.random.Generator, so_far: Drawn, count: int) -> Sequence[Any]:
+        left = [value for value in values if without is None or value != so_far[without]]
+        return [left[int(i)] for i in rng.permutation(len(left))[:count]]
+
+    return Group(draw)
+
+
+def together(draw: Callable[[np.random.Generator, Drawn], Sequence[Any]]) -> Group:
+    """Fields whose values `draw(rng, so_far)` gives all at once, in the order of the fields."""
+    return Group(lambda rng, so_far, count: draw(rng, so_far))
+
+
+# --- the hidden element -----------------------------------------------------------------------------------------------
+
+
+def hidden(*values: Any) -> Any:
+    """The hidden element: one of these values, each as often, whatever else is drawn. Twins have the others."""
+    return _hidden(lambda so_far: values)
+
+
+def hidden_index(of: str) -> Any:
+    """The hidden element as a place in the tuple that the field `of` has (which lane, which sector)."""
+    return _hidden(lambda so_far: range(len(so_far[of])))
+
+
+def _hidden(values: Callable[[Mapping[str, Any]], Sequence[Any]]) -> Any:
+    def draw(rng: np.random.Generator, so_far: Drawn) -> Any:
+        choices = values(so_far)
+        return choices[int(rng.integers(len(choices)))]
+
+    return field(metadata={_HOW: draw, _HIDDEN: values})
+
+
+def hidden_field(params: type) -> str | None:
+    """Name of the field that is the hidden element; None if there is none. Raises TypeError if there are several."""
+    names = [each.name for each in fields(params) if _HIDDEN in each.metadata]
+    if len(names) > 1:
+        raise TypeError(f"{params.__module__}: several hidden elements {names}; a scene has one")
+    return names[0] if names else None
+
+
+def twins(p: Any) -> list[Any]:
+    """The same scene with every other value of its hidden element. Raises TypeError if it has none."""
+    name = hidden_field(type(p))
+    if name is None:
+        raise TypeError(f"{type(p).__module__}: no field of Params is `hidden(...)`, so there are no twins")
+    values = {each.name: each for each in fields(p)}[name].metadata[_HIDDEN](vars(p))
+    return [replace(p, **{name: value}) for value in values if value != getattr(p, name)]
+
+
+# --- all fields -------------------------------------------------------------------------------------------------------
+
+
+def drawn(params: type[Params], rng: np.random.Generator) -> Params:
+    """Parameters of one scenario. Raises TypeError naming a field that has no range."""
+    so_far: Drawn = {}
+    members = fields(params)  # type: ignore[arg-type]
+    for each in members:
+        if each.name in so_far:
+            continue
+        how = each.metadata.get(_HOW)
+        if how is None:
+            raise TypeError(f"{params.__module__}: Params.{each.name} has no range; write it as `= between(low, high)`")
+        if isinstance(how, Group):
+            so_far |= _of_group(how, members, rng, so_far)
+        else:
+            so_far[each.name] = how(rng, so_far)
+    return params(**{each.name: so_far[each.name] for each in members})
+
+
+def _of_group(group: Group, members: Sequence[Field[Any]], rng: np.random.Generator, so_far: Drawn) -> Drawn:
+    """Values of all fields of a group."""
+    counts = {each.name: each.metadata[_COUNT] for each in members if each.metadata.get(_HOW) is group}
+    numbers = {name: 1 if count is None else _number(count, so_far) for name, count in counts.items()}
+    values = list(group.draw(rng, so_far, sum(numbers.values())))
+    found: Drawn = {}
+    for name, number in numbers.items():
+        taken, values = values[:number], values[number:]
+        found[name] = taken[0] if counts[name] is None else tuple(taken)
+    return found
+
+
+def _number(count: Count, so_far: Mapping[str, Any]) -> int:
+    if callable(count):
+        return count(so_far)
+    return so_far[count] if isinstance(count, str) else count
