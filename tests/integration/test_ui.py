@@ -58,18 +58,22 @@ def server(request: pytest.FixtureRequest) -> Iterator[str]:
         "-m",
         "traps_pipeline.definitions",
     )
-    process = study.start(*command)
-    url = f"http://127.0.0.1:{port}"
+    url, log = f"http://127.0.0.1:{port}", (study.workspace / "dagster-dev.log").open("w")
+    # Its runs write to the same stream: a pipe that nobody reads would stop them.
+    process = subprocess.Popen(
+        command, cwd=study.root, env=study.environment, stdout=log, stderr=log, start_new_session=True
+    )
     try:
         wait_until(lambda: _answers(f"{url}/server_info"), 60, "the web server answers")
         yield url
     finally:
         os.killpg(process.pid, signal.SIGINT)
         with suppress(subprocess.TimeoutExpired):  # on a busy machine Dagster's own processes may take longer
-            process.communicate(timeout=30)
+            process.wait(timeout=30)
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
+        process.wait()
+        log.close()
 
 
 def _answers(url: str) -> bool:
