@@ -29,7 +29,7 @@ QUIET = (
     "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking --disable-sync "
     "--disable-component-update"
 )
-RUN_SECONDS = 90
+RUN_SECONDS = 600  # nine times what a busy machine of two cores takes
 
 
 def wait_until(condition: Callable[[], bool], seconds: float, what: str) -> None:
@@ -64,7 +64,7 @@ def server(request: pytest.FixtureRequest) -> Iterator[str]:
         command, cwd=study.root, env=study.environment, stdout=log, stderr=log, start_new_session=True
     )
     try:
-        wait_until(lambda: _answers(f"{url}/server_info"), 60, "the web server answers")
+        wait_until(lambda: _answers(f"{url}/server_info"), RUN_SECONDS, "the web server answers")
         yield url
     finally:
         os.killpg(process.pid, signal.SIGINT)
@@ -88,7 +88,8 @@ def page(server: str) -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET.split())
         page = browser.new_page(viewport={"width": 1600, "height": 1000})
-        page.set_default_timeout(30_000)
+        page.set_default_timeout(60_000)
+        expect.set_options(timeout=60_000)
         yield page
         browser.close()
 
@@ -152,7 +153,7 @@ def test_materialize_all_goes_from_an_empty_history_to_the_report(
     shows(page, f"{server}/asset-groups", "benchmark", "evaluation", "scoring", "report")
     page.screenshot(path=tmp_path / "graph.png")
     launch_all(page, f"{server}/asset-groups")
-    wait_until(lambda: bool(written(study, "report_page")), 10 * RUN_SECONDS, "the report is made from one click")
+    wait_until(lambda: bool(written(study, "report_page")), 3 * RUN_SECONDS, "the report is made from one click")
     cells = Workspace.open(study.workspace).tables.read_all(RESPONSES, ["dataset", "model"])
     assert set(cells["model"]) == {"oracle", "flaky", "prior"}  # all of the study's, and of the registry no other
     assert len(written(study, "responses")) == 4 * 3 * 2
@@ -167,13 +168,17 @@ def test_a_correction_is_followed_alone_where_it_is_free_and_by_one_click_where_
 ) -> None:
     rows, before = (
         len(study.ledger_rows("answers")),
-        {n: written(study, n) for n in ("items", "metrics", "report_page")},
+        {n: written(study, n) for n in ("metrics", "report_page")},
     )
     time.sleep(INTERVAL_S / 3)  # the daemon has seen everything current
     study.correct("plinko-0003", ill_posed_question="Why is the little triangle beside the board singing?")
-    wait_until(lambda: written(study, "items") != before["items"], 3 * INTERVAL_S, "free stages follow a correction")
-    specs = Workspace.open(study.workspace).tables.read_all(ITEMS, dataset="chaotic_ill_posed")
-    assert (specs["question"] == "Why is the little triangle beside the board singing?").sum() == 1
+    tables = Workspace.open(study.workspace).tables
+
+    def followed() -> bool:
+        asked = tables.read_all(ITEMS, ["question"], dataset="chaotic_ill_posed")["question"]
+        return bool((asked == "Why is the little triangle beside the board singing?").sum() == 1)
+
+    wait_until(followed, 20 * INTERVAL_S, "free stages follow a correction")
     time.sleep(2 * INTERVAL_S)
     assert len(study.ledger_rows("answers")) == rows  # nothing is asked before the click
     launch_job(page, server, "evaluation")
@@ -181,11 +186,11 @@ def test_a_correction_is_followed_alone_where_it_is_free_and_by_one_click_where_
         lambda: (
             written(study, "report_page") != before["report_page"] and written(study, "metrics") != before["metrics"]
         ),
-        4 * RUN_SECONDS,
+        RUN_SECONDS,
         "what hangs on the answers follows alone",
     )
     assert len(study.ledger_rows("answers")) == rows + 3 * 2  # one item, of each model under each regime
-    wait_until(lambda: not stale(study), 2 * RUN_SECONDS, "everything is current again")
+    wait_until(lambda: not stale(study), RUN_SECONDS, "everything is current again")
 
 
 def stale(study: Checkout) -> list[str]:
@@ -201,7 +206,7 @@ def test_a_selection_of_stages_over_all_their_partitions_is_one_click(study: Che
     for name, then in before.items():
         wait_until(
             lambda name=name, then=then: all(written(study, name)[file] > time for file, time in then.items()),
-            4 * RUN_SECONDS,
+            RUN_SECONDS,
             f"all of {name} is made anew",
         )
     assert not stale(study)  # from the same inputs the same content: nothing below is outdated
@@ -219,7 +224,7 @@ def test_an_altered_table_is_a_failed_check_before_anything_below_uses_it(
     pq.write_table(altered, path)
     before = written(study, "responses")
     shows_red = f"{server}/assets/items?view=checks&checkDetail=current"
-    wait_until(lambda: red(page, shows_red), 3 * RUN_SECONDS, "the daemon names the altered table")
+    wait_until(lambda: red(page, shows_red), RUN_SECONDS, "the daemon names the altered table")
     page.screenshot(path=tmp_path / "altered.png")
     launch_job(page, server, "evaluation")
     wait_until(lambda: "FAILURE" in runs_of(study), RUN_SECONDS, "what is below is not made from it")
