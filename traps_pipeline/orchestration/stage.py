@@ -211,6 +211,7 @@ class _Step:
         self.graph = the_graph()
         self.history = History(context.instance, self.graph)
         self.unmade: dict[str | None, TrapsError] = {}
+        self.failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}  # checks, with what is wrong
 
     def run(self) -> Iterator[Event]:
         """See the module."""
@@ -238,7 +239,7 @@ class _Step:
         for key, error in self.unmade.items():
             reached = isinstance(error, BudgetReached)
             yield self._evaluation(CURRENT, key, {"not made": str(error), REACHED: reached})
-        yield from self._still_failing({*todo, *self.unmade})
+        yield from self._still_failing(lineage, {*todo, *self.unmade})
         for output in self.context.op_def.output_dict:
             if output != "result":
                 yield dg.Output(None, output_name=output)
@@ -320,7 +321,7 @@ class _Step:
         if damage:
             wrong["damaged"] = damage
         if failed:
-            wrong["failed"] = f"{failed} calls failed and can be asked again"
+            wrong["failed"] = _failed_calls(failed)
         yield self._evaluation(CURRENT, key, wrong)
         for check in stage.checks:
             problems = check.wrong(self.workspace, key, made)
@@ -331,16 +332,24 @@ class _Step:
                 file.unlink(missing_ok=True)
             yield self._evaluation(check.name, key, {"failing": _plain(problems)} if problems else {})
 
-    def _still_failing(self, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
-        """Failed checks of partitions that this run has not made, once more: Dagster shows the newest result of a
-        check, and one that passes elsewhere must not hide them."""
-        for key in self.graph.keys(self.stage.name):
+    def _still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
+        """Failed checks once more, those of partitions that this run has not made, too: Dagster shows the newest result
+        of a check, and one that passes elsewhere must not hide them."""
+        name = self.stage.name
+        for key in self.graph.keys(name):
             if key not in seen:
-                for check in self.workspace.failed_checks(self.stage.name, key):
-                    text = self.workspace.failed_check(self.stage.name, check, key).read_text(encoding="utf-8")
-                    yield self._evaluation(check, key, {STILL: json.loads(text)})
+                for check in self.workspace.failed_checks(name, key):
+                    text = self.workspace.failed_check(name, check, key).read_text(encoding="utf-8")
+                    self.failing[check, key] = {STILL: json.loads(text)}
+                state = lineage.state(name, key)
+                if state is not None and state.failed:
+                    self.failing[CURRENT, key] = {STILL: _failed_calls(state.failed)}
+        for (check, key), wrong in [*self.failing.items()]:
+            yield self._evaluation(check, key, wrong)
 
     def _evaluation(self, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
+        if wrong:
+            self.failing[check, key] = wrong
         return _evaluation(self.stage, check, key, wrong)
 
     def _metadata(self, key: str | None, made: Made) -> dict[str, Any]:
@@ -395,6 +404,10 @@ def _evaluation(stage: Stage, check: str, key: str | None, wrong: Mapping[str, A
     return dg.AssetCheckEvaluation(
         asset_key=stage.spec.key, check_name=check, passed=not wrong, partition=key, metadata={**wrong}
     )
+
+
+def _failed_calls(count: int) -> str:
+    return f"{count} calls failed and can be asked again"
 
 
 def _preview(table: Table, made: Made) -> dg.TableMetadataValue | None:
