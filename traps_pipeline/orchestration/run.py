@@ -135,7 +135,10 @@ def stages_until(until: str | None) -> set[str]:
     graph = the_graph()
     if until is None:
         return {stage.name for stage in graph.stages}
-    return graph.above([graph[name].name for name in until.split(",")])
+    known = [stage.name for stage in graph.stages]
+    if unknown := [name for name in until.split(",") if name not in known]:
+        raise TrapsError(f"--until {', '.join(unknown)}: no such stage; choose from {', '.join(known)}")
+    return graph.above(until.split(","))
 
 
 def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
