@@ -87,8 +87,8 @@ def test_two_runs_that_want_the_same_keys_ask_each_once(unasked: Checkout) -> No
     out, err = by_traps.communicate(timeout=300)
     assert by_traps.returncode == 0, err
     asked, cached = map(int, re.search(r"(\d+) answers asked \((\d+) from the ledger", out).groups())  # type: ignore[union-attr]
-    assert asked + cached == ANSWERS
-    assert cached > 0  # the other run's answers were used
+    assert asked + cached <= ANSWERS  # cells that the other run had finished by then are fresh, and not looked into
+    assert asked < ANSWERS  # the other run's answers were used
     _, err = by_dagster.communicate(timeout=300)
     assert by_dagster.returncode == 0, err[-3000:]
     keys = [row["key"] for row in unasked.ledger_rows("answers")]
