@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,12 @@ def edit(root: Path, **changes: Any) -> None:
 def test_a_created_workspace_opens_with_its_study(tmp_path: Path) -> None:
     study = Study(per_family=2, epoch="2026-11", budget_usd=12.5)
     Workspace.create(tmp_path / "w", study)
-    assert Workspace.open(tmp_path / "w").study == study
+    opened = Workspace.open(tmp_path / "w").study
+    assert re.fullmatch(r"w-[0-9a-f]{8}", opened.name)  # the folder's name, and where it was made
+    assert opened.model_copy(update={"name": ""}) == study
     assert yaml.safe_load((tmp_path / "w" / "study.yaml").read_text()) == {
+        "name": opened.name,
+        "experiments": {},
         "format": FORMAT,
         "benchmark": "released",
         "per_family": 2,
