@@ -381,9 +381,12 @@ class _Step:
             node = (event.asset_key.path[-1], event.partition)
             if node[0] in above and STILL not in event.metadata:
                 failed[event.check_name, node] = event
-        told = [line for (check, node), event in failed.items() for line in _lines(check, node, event)]
-        if told:
-            shown = [*dict.fromkeys(told)]
+        alike: dict[tuple[str, str], list[str]] = {}  # by stage and what is said: a reason is told once
+        for (check, node), event in failed.items():
+            for line in _lines(check, node, event):
+                alike.setdefault((node[0], line.replace(name_of(node), "")), []).append(line)
+        if alike:
+            shown = [f"{first} (and {len(more)} more)" if more else first for first, *more in alike.values()]
             more = [f"... and {len(shown) - SHOWN} more"] if len(shown) > SHOWN else []
             reached = any(e.metadata[REACHED].value for e in failed.values() if REACHED in e.metadata)
             raise (BudgetReached if reached else TrapsError)("\n".join([*shown[:SHOWN], *more]))
