@@ -21,7 +21,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 from tests.conftest import EXPERIMENT, Checkout, copied
 from traps_pipeline.orchestration.automation import INTERVAL_S
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES
+from traps_pipeline.tables import ITEMS, RESPONSES, Table
 
 pytestmark = pytest.mark.slow
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
@@ -158,7 +158,10 @@ def test_materialize_all_goes_from_an_empty_history_to_the_report(
     assert set(cells["model"]) == {"oracle", "flaky", "prior"}  # all of the study's, and of the registry no other
     assert len(written(study, "responses")) == 4 * 3 * 2
     # The unreliable model's failed calls are told; all the rest is made.
-    shows(page, f"{server}/assets/responses?view=checks&checkDetail=current", "calls failed and can be asked again")
+    assert "calls failed and can be asked again" in failures(study, RESPONSES)
+    page.goto(f"{server}/assets/responses?view=checks&checkDetail=current")
+    page.get_by_role("tab", name="Execution history").click()
+    expect(page.get_by_text("Failed").first).to_be_visible()
     page.screenshot(path=tmp_path / "failed.png")
     assert hosts == {server.removeprefix("http://")}
 
@@ -224,7 +227,7 @@ def test_an_altered_table_is_a_failed_check_before_anything_below_uses_it(
     altered = table.set_column(table.schema.get_field_index("question"), table.schema.field("question"), [questions])
     pq.write_table(altered, path)
     before = written(study, "responses")
-    wait_until(lambda: "is not what was written" in failures(study), RUN_SECONDS, "the daemon names the altered table")
+    wait_until(lambda: "is not what was written" in failures(study, ITEMS), RUN_SECONDS, "the daemon names the altered table")
     page.goto(f"{server}/assets/items?view=checks&checkDetail=current")
     page.screenshot(path=tmp_path / "altered.png")
     # What is free is made again by itself, from what it was made of; nothing below has used it meanwhile.
@@ -237,10 +240,11 @@ def test_an_altered_table_is_a_failed_check_before_anything_below_uses_it(
     assert written(study, "responses") == before
 
 
-# What failed results of the check `current` of `items` say, newest first.
+# What failed results of an asset's check `current` say, newest first.
 FAILURES = """
+import sys
 import dagster as dg
-key = dg.AssetCheckKey(dg.AssetKey("items"), "current")
+key = dg.AssetCheckKey(dg.AssetKey(sys.argv[1]), "current")
 with dg.DagsterInstance.get() as history:
     for record in history.event_log_storage.get_asset_check_execution_history(key, limit=50):
         if record.event is not None and record.status.value == "FAILED":
@@ -248,5 +252,5 @@ with dg.DagsterInstance.get() as history:
 """
 
 
-def failures(study: Checkout) -> str:
-    return study.run(sys.executable, "-W", "ignore", "-c", FAILURES).out
+def failures(study: Checkout, table: Table) -> str:
+    return study.run(sys.executable, "-W", "ignore", "-c", FAILURES, table.name).out
