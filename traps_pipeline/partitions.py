@@ -45,7 +45,7 @@ def is_ill_posed(dataset: str) -> bool:
 
 
 def transfer_type(source: str, target: str) -> str:
-    """What a path between datasets crosses (benchmark.md section 7): modality of the void, domain, both or neither."""
+    """What a path between datasets crosses (docs/spec.md 7.2): modality of the void, domain, both or neither."""
     domain = taxonomy_of(source) != taxonomy_of(target)
     modality = is_ill_posed(source) != is_ill_posed(target)
     return {(True, True): "Cross-both", (True, False): "Cross-domain", (False, True): "Cross-modality"}.get(

@@ -592,7 +592,7 @@ JUDGE_ROBUSTNESS = Table(
     ),
 )
 
-# --- inside local models (benchmark.md sections 7 and 8) --------------------------------------------------------------
+# --- inside local models (docs/spec.md 7 and 8) -----------------------------------------------------------------------
 
 _LOOKED_INTO = """
     model str id in assets/models.yaml

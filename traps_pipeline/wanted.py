@@ -30,7 +30,7 @@ from traps_pipeline.partitions import (
 from traps_pipeline.storage.workspace import Asked, Workspace
 from traps_pipeline.tables import SCENE_SPECS
 
-PROBE_PROMPT = "standard"  # probes are of this VQA prompt, the other one serves directions (`benchmark.md` section 7)
+PROBE_PROMPT = "standard"  # probes are of this VQA prompt, the other one serves directions (docs/spec.md 7.1)
 
 
 class Wanted:

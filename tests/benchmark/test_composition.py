@@ -19,7 +19,7 @@ from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.spec import SceneSpec
 
-PAPER = {  # counts of the paper's composition table (`benchmark.md` section 2)
+PAPER = {  # counts of the paper's composition table (docs/spec.md 2.1)
     "ramps_rolling": 39,
     "pendulums_levers": 32,
     "trajectories_drops": 29,

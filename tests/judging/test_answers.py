@@ -1,4 +1,4 @@
-"""Correctness is decided by code: benchmark.md section 4."""
+"""Correctness is decided by code: docs/spec.md 4.3."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def test_entries_keep_their_order_and_defaults(tmp_path: Path) -> None:
     models = load_models(registry(tmp_path, entry("z-2.5"), entry("a", ", runs: 1, limits: {retries: 0}")))
     assert list(models) == ["z-2.5", "a"]
     assert (models["z-2.5"].runs, models["a"].runs) == (3, 1)
-    assert (models["z-2.5"].limits.concurrency, models["z-2.5"].limits.retries) == (24, 5)  # benchmark.md section 3
+    assert (models["z-2.5"].limits.concurrency, models["z-2.5"].limits.retries) == (24, 5)  # docs/spec.md 3.1
     assert models["a"].limits.retries == 0
 
 

@@ -36,7 +36,7 @@ PAPER = [
     "gpt-5-mini",
     "gemma-4-e4b",
     "llava-next-video-7b",
-]  # benchmark.md section 3
+]  # docs/spec.md 3.2
 CHECKED = [name for name, entry in wire.participants().items() if entry.backend in ("api", "local")]
 
 

@@ -59,7 +59,7 @@ def verdict_rows(
 
 
 def strategy_pairs(name: str, n: int, seed: int = 0) -> list[Pair]:
-    """How the reference strategies of benchmark.md section 5 answer n pairs; an abstention is not a correct answer."""
+    """How the reference strategies (docs/spec.md 5.3) answer n pairs; an abstention is not a correct answer."""
     rng = np.random.default_rng(seed)
     draws = rng.random((n, 2)) < {"random-50": 0.5, "confidence-noise": 0.3}.get(name, 0.0)
     answers: dict[str, Callable[[int], Pair]] = {

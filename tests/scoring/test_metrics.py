@@ -1,4 +1,4 @@
-"""Figures of a cell against numbers worked out by hand (benchmark.md section 5)."""
+"""Figures of a cell against numbers worked out by hand (docs/spec.md 5.1)."""
 
 from __future__ import annotations
 

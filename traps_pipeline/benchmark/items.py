@@ -1,4 +1,4 @@
-"""The items stage: scenarios and clips to the questions put to models, two a pair (`benchmark.md` sections 1 and 2)."""
+"""The items stage: scenarios and clips to the questions put to models, two a pair (docs/spec.md 1 and 2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The mechanism group: hidden states of local models, probes, void directions, steering (`benchmark.md` 7 and 8)."""
+"""The mechanism group: hidden states of local models, probes, void directions, steering (docs/spec.md 7 and 8)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any

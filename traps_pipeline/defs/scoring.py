@@ -19,7 +19,7 @@ _SHARES = {name: ["verdicts.abstained", "verdicts.correct"] for name in ("pecs",
 
 
 def _make_metrics(workspace: Workspace, dataset: str) -> Made:
-    """Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset, by scope (`benchmark.md` section 5)."""
+    """Acc, FalseAbs, AbsRec, J and PECS of every cell of a dataset, by scope (docs/spec.md 5.1)."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.metrics import cell_metrics
 

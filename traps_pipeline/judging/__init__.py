@@ -1,1 +1,1 @@
-"""Who judges: the panel, what it is shown, how its votes become a verdict (`benchmark.md` section 4)."""
+"""Who judges: the panel, what it is shown, how its votes become a verdict (docs/spec.md 4)."""

@@ -1,4 +1,4 @@
-"""How far the judges agree, and which way each leans (`benchmark.md` section 4).
+"""How far the judges agree, and which way each leans (docs/spec.md 4.4).
 
 Everything is counted per dataset and task over all models, regimes and runs. A coefficient that is undefined is null
 with the reason: votes of one class alone leave nothing to agree on beyond chance.

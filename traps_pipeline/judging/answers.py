@@ -1,4 +1,4 @@
-"""Correctness by code: an extracted value against the ground truth (`benchmark.md` section 4)."""
+"""Correctness by code: an extracted value against the ground truth (docs/spec.md 4.3)."""
 
 from __future__ import annotations
 

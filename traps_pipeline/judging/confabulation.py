@@ -1,4 +1,4 @@
-"""What is wrong with the answers that should have been abstentions (`benchmark.md` section 6).
+"""What is wrong with the answers that should have been abstentions (docs/spec.md 6.1 and 6.2).
 
 A seeded sample of each model's void failures goes to one judge, which labels four independent axes
 (`scoring.prevalence` counts them). `assets/confabulation.yaml` says whose, how many and who judges. A sample is the n

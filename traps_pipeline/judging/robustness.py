@@ -1,4 +1,4 @@
-"""Answers that try to instruct their judge: whose votes they move (`benchmark.md` section 4, the answer is data).
+"""Answers that try to instruct their judge: whose votes they move (docs/spec.md 4.2: the answer is data).
 
 `assets/injected_answers.yaml` holds plain answers and attacks that wrap them. Each is put to every judge of a panel
 through the call path of any vote (ledger, budget, schema), the plain ones too: a vote counts as flipped only where the

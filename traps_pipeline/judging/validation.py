@@ -1,4 +1,4 @@
-"""The confabulation judge against two blind annotators (`benchmark.md` section 6).
+"""The confabulation judge against two blind annotators (docs/spec.md 6.3).
 
 `annotation_sheet` writes what the annotators are shown: question, void kind, answer, and the trace where the judge saw
 it; a sample id stands for model and item. Their labels come back as one CSV file with a line an annotator and failure.

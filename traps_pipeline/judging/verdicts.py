@@ -1,4 +1,4 @@
-"""Verdicts: what the panel's majority says of every answer (`benchmark.md` section 4)."""
+"""Verdicts: what the panel's majority says of every answer (docs/spec.md 4.1)."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Inside local models: hidden states, probes, void directions, steering (`benchmark.md` sections 7 and 8)."""
+"""Inside local models: hidden states, probes, void directions, steering (docs/spec.md 7 and 8)."""

@@ -1,4 +1,4 @@
-"""Void directions: what separates voids from controls on average, as a value that is saved (`benchmark.md` section 8).
+"""Void directions: what separates voids from controls on average, as a value that is saved (docs/spec.md 8.1).
 
 A direction is the unit vector of mean(h_void) - mean(h_control) at one layer. Two controls of the same norm go with it:
 a random one, and one from shuffled labels: the sides of half of the pairs, drawn at random, are swapped.

@@ -1,4 +1,4 @@
-"""What the steering tables show, from effects: abstention by path, strength and side (`benchmark.md` section 8).
+"""What the steering tables show, from effects: abstention by path, strength and side (docs/spec.md 8.4).
 
 Effects are rows of the `steering_effects` table, or the paper's in the same columns: model, directions, regime, source,
 target, kind, layer, alpha, side, abstention (a fraction).

@@ -1,4 +1,4 @@
-"""Extraction: the hidden states of many items, in shards that a crash leaves whole (`benchmark.md` section 7).
+"""Extraction: the hidden states of many items, in shards that a crash leaves whole (docs/spec.md 7.1).
 
     done = extract(model, items, folder, pooling="last")
     ids, states = read_layer(folder, 20)                # item_id, side, key, device; (n, d) float32 in the same order

@@ -1,4 +1,4 @@
-"""The steering hook: alpha times a direction, added to the output of one block (`benchmark.md` section 8).
+"""The steering hook: alpha times a direction, added to the output of one block (docs/spec.md 8.1).
 
     with Steering(direction, layer=20, alphas=(5.0, -5.0)).applied(model): ...
 

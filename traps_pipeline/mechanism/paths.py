@@ -1,4 +1,4 @@
-"""Ordered pairs of datasets: which there are, and what each transfer crosses (`benchmark.md` sections 7 and 8)."""
+"""Ordered pairs of datasets: which there are, and what each transfer crosses (docs/spec.md 7.2 and 8.3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Linear probes: standardise, l2-regularised logistic regression, AUROC (`benchmark.md` section 7).
+"""Linear probes: standardise, l2-regularised logistic regression, AUROC (docs/spec.md 7.2).
 
 With fewer rows than columns the minimiser lies in the span of the rows, so the exact solver takes Newton steps on the
 Gram matrix: the same optimum as scikit-learn's, to rounding, at a fraction of the time. scikit-learn itself is the

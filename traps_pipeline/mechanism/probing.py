@@ -1,4 +1,4 @@
-"""The probing protocol: every pair of datasets at every layer, as rows of the `probes` table (benchmark.md section 7).
+"""The probing protocol: every pair of datasets at every layer, as rows of the `probes` table (docs/spec.md 7).
 
 Layers are read one at a time: at the 8B size one layer of all items takes 46 MB, all of them 1.7 GB.
 """

@@ -22,7 +22,7 @@ class Layers(BaseModel):
 
 
 class ProbeSettings(BaseModel):
-    """How probes are fitted and resampled (`benchmark.md` section 7)."""
+    """How probes are fitted and resampled (docs/spec.md 7)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     solver: Literal["exact", "sklearn"] = "exact"
@@ -32,7 +32,7 @@ class ProbeSettings(BaseModel):
 
 
 class SteeringSettings(BaseModel):
-    """What is steered (`benchmark.md` section 8)."""
+    """What is steered (docs/spec.md 8.2)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     alphas: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(default=(2, 5, 10), min_length=1)
@@ -59,7 +59,7 @@ class MechanismSettings(BaseModel):
     models: dict[str, Layers] = Field(min_length=1)
     prompts: tuple[Regime, ...] = Field(default=VQA_PROMPTS, min_length=1, description="VQA prompts extracted")
     probes: ProbeSettings = ProbeSettings()
-    pooling: Literal["last", "mean"] = Field(default="last", description="of tokens; the paper takes the last")
+    pooling: Literal["last", "mean"] = Field(default="last", description="of tokens; the paper does not say which")
     steering: SteeringSettings | None = SteeringSettings()
     seed: int = 20260101
 

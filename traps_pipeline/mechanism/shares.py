@@ -1,5 +1,5 @@
 """How often a steered model abstains: a path at a time, and over the paths of a set, from STEERING and STEERING_VOTES
-rows (`benchmark.md` section 8).
+rows (docs/spec.md 8.4).
 
 A path asks each scenario once, so its Wilson interval is one over scenarios. Over paths the same scenario is asked
 again and again, and the same answer counts in several: there scenarios are resampled, not answers.

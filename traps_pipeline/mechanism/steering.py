@@ -1,4 +1,4 @@
-"""Steering: which answers a cell wants, how they are got, what the panel says of them (`benchmark.md` section 8).
+"""Steering: which answers a cell wants, how they are got, what the panel says of them (docs/spec.md 8).
 
 A steered answer is a request like any other, so it goes through the same ledger: its key holds the direction's digest,
 the layer and the signed alpha, beside the prompt, the clip and the checkpoint. Alpha 0 holds none of these: it is one

@@ -79,7 +79,7 @@ def media_parts(media: Media, route: str) -> list[dict[str, Any]]:
 
 
 def messages(entry: Entry, request: Request) -> list[dict[str, Any]]:
-    """System prompt, then the clip and the question, nothing else (`benchmark.md` section 3)."""
+    """System prompt, then the clip and the question, nothing else (docs/spec.md 3.3)."""
     user: str | list[dict[str, Any]] = request.user
     if request.sent is not None:
         route = str(entry.provider_id).split("/")[0]

@@ -1,7 +1,7 @@
 """Asking: wanted keys minus known keys, call the difference, append to the ledger, hand on what is complete.
 
 The same code asks models and judges, reference ones and paid ones. There is no resume mode: a crash, a second run and
-a correction are the same operation (`design.md` section 5).
+a correction are the same operation (docs/models.md, "Ledger").
 """
 
 from __future__ import annotations

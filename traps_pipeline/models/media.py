@@ -30,7 +30,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.encode import ENCODER, DamagedClip, decode, encode
 
 Profile = Literal["video", "images", "frames"]
-MOST = 25  # frames an API model sees, `benchmark.md` section 3
+MOST = 25  # frames an API model sees, docs/spec.md 3.1
 JPEG_QUALITY = 92
 CACHE_BYTES = 256 * 2**20
 _REVISION = 1  # raise it when picking, resizing or the container changes: everything is then prepared anew

@@ -1,4 +1,4 @@
-"""System prompts of the three regimes and of the judges, verbatim from `assets/prompts` (`benchmark.md` section 3)."""
+"""System prompts of the three regimes and of the judges, verbatim from `assets/prompts` (docs/spec.md 3.3)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def system_prompt(regime: str) -> str:
 
 @cache
 def vqa_prompt(name: str) -> str:
-    """The system prompt under which hidden states are extracted: `standard`, or `guided` (`benchmark.md` section 7)."""
+    """The system prompt under which hidden states are extracted: `standard`, or `guided` (docs/spec.md 7.1)."""
     parts = {"standard": ("vqa_standard",), "guided": ("vqa_standard", "vqa_guided_suffix")}[name]
     return "\n\n".join(prompt(part) for part in parts)
 

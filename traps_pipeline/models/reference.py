@@ -1,4 +1,4 @@
-"""Reference models: strategies that need no key and go the whole way of a paid model (`benchmark.md` section 5).
+"""Reference models: strategies that need no key and go the whole way of a paid model (docs/spec.md 5.3).
 
 They alone see a request's `secret` (side, ground truth, labels). What looks random is a digest of the request, so a
 crash and a second run give the same answers.

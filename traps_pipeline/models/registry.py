@@ -22,7 +22,7 @@ from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
 
 MODELS_VARIABLE = "TRAPS_MODELS"  # names another registry
 MODELS_FILE = Path(os.environ.get(MODELS_VARIABLE) or ASSETS / "models.yaml").absolute()
-# What the protocol sends (`benchmark.md` section 3): parameter to the names it goes under and its value. An entry that
+# What the protocol sends (docs/spec.md 3.1): parameter to the names it goes under and its value. An entry that
 # sends something else, or nothing, says why under `waivers`.
 Protocol = Mapping[str, tuple[tuple[str, ...], Any]]
 PROTOCOL: Protocol = {

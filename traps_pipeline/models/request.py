@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from traps_pipeline.models.media import Media
 
 OutcomeKind = Literal["answer", "truncated", "empty", "refused", "error"]
-JUDGED: tuple[OutcomeKind, ...] = ("answer", "truncated")  # what has a text; `design.md` section 5
+JUDGED: tuple[OutcomeKind, ...] = ("answer", "truncated")  # what has a text; docs/models.md, "Request -> Outcome"
 RATE_LIMITED = "rate_limited"  # the kind of a 429
 UNBILLED = (RATE_LIMITED, "conflict", "server_error")  # failures after which nothing was generated
 _VERBATIM = 600  # a text up to this long stands in the key's components as it is, so that `traps why` can show it

@@ -59,7 +59,7 @@ _MIMES = {"video": "video/mp4", "images": "image/jpeg"}
 _KEY = "placeholder-of-a-key"
 _QUESTION = 'Does the square stop at the right edge, "yes" or "no"? (1 % of clips: déjà vu)'
 _CLIP_FPS, _CLIP_FRAMES, _CLIP_SIZE = 10, 50, (480, 360)
-_PROTOCOL_FRAMES = 25  # 5 a second of the clip's 5 s, `benchmark.md` section 3
+_PROTOCOL_FRAMES = 25  # 5 a second of the clip's 5 s, docs/spec.md 3.1
 
 
 # --- the request that is caught ---------------------------------------------------------------------------------------

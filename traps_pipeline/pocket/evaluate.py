@@ -130,7 +130,7 @@ def _answers(model: LocalModel, prompts: Sequence[Prompt], max_new_tokens: int) 
 
 
 def _right(one: Asked, said: str) -> bool:
-    """Whether the rule judge takes an answer for the truth (`benchmark.md` section 4)."""
+    """Whether the rule judge takes an answer for the truth (docs/spec.md 4.3)."""
     assert one.truth is not None
     found = judge_correctness(said, one.truth)["extracted_value"]
     value = None if found is None else str(found)

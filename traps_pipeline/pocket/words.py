@@ -27,7 +27,7 @@ _ANYTHING = ("the ball", "the wall", "the floor")
 
 
 def prompt_text(name: str) -> str:
-    """The system text of one of PROMPTS; `vqa_guided` is `vqa_standard` with its suffix (`benchmark.md` section 7)."""
+    """The system text of one of PROMPTS; `vqa_guided` is `vqa_standard` with its suffix (docs/spec.md 7.1)."""
     if name == "vqa_guided":
         return f"{prompt('vqa_standard')}\n\n{prompt('vqa_guided_suffix')}"
     return prompt("vqa_standard") if name == "vqa_standard" else system_prompt(name)

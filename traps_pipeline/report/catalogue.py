@@ -1,4 +1,4 @@
-"""Every table and figure by name: how it is made of `Results`, and what of a study it reads (benchmark.md section 10).
+"""Every table and figure by name: how it is made of `Results`, and what of a study it reads (docs/spec.md 10).
 
 A new one is an entry here: its asset, its staleness, its place on the report page and in `traps export` follow.
 """

@@ -1,4 +1,4 @@
-"""Control beside void, at a glance: what a reviewer looks at first (benchmark.md sections 1 and 10)."""
+"""Control beside void, at a glance: what a reviewer looks at first (docs/spec.md 10)."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.published import published
 from traps_pipeline.tables import COSINES, PROBES, STEERING_EFFECTS, Table
 
-PAIRS, CENTROID_LAYER = 50, 32  # benchmark.md sections 7 and 8
+PAIRS, CENTROID_LAYER = 50, 32  # docs/spec.md 8.2 and 7.5
 STEERED_LAYERS = {"qwen3-vl-8b": 20, "gemma-4-e4b": 35, "llava-next-video-7b": 28}
 NOT_STATED = "not stated"
 _FLAGS = ("own_best", "all_sample_best", "source_best")

@@ -1,4 +1,4 @@
-"""The leaderboard for a terminal, a README and a browser (benchmark.md sections 5 and 10).
+"""The leaderboard for a terminal, a README and a browser (docs/spec.md 5 and 10).
 
 All three show the same entries in the same order. Model ids, epochs and versions are untrusted text: each renderer
 escapes them for its medium.

@@ -128,7 +128,7 @@ class PublishedResults(Results):
 
     @cached_property
     def validation(self) -> Frame:
-        """See `Results.validation`; 100 failures, two annotators (benchmark.md section 6)."""
+        """See `Results.validation`; 100 failures, two annotators (docs/spec.md 6.3)."""
         rows = published("judge_validation").rename(columns={"category": "axis", "acc": "accuracy"})
         rows["human_agreement"] = rows["human_agree_pct"] / 100
         return rows.assign(n_failures=100, n_labels=200, epoch="original")

@@ -8,7 +8,7 @@ import numpy as np
 
 from traps_pipeline.scenes.render import Renderer
 
-SAMPLED_FPS = 5  # models are shown this rate (`benchmark.md` section 3)
+SAMPLED_FPS = 5  # models are shown this rate (docs/spec.md 3.1)
 
 
 def last_sampled(n_frames: int, fps: int, count: int = 3) -> list[int]:

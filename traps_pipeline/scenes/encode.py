@@ -92,8 +92,8 @@ def decode_first(path: Path) -> np.ndarray:
 
 
 def decode_sampled(path: Path, fps: float = 5.0, most: int = 25) -> np.ndarray:
-    """The frames (N, H, W, 3) uint8 RGB shown at the times 0, 1/fps, 2/fps, ..., at most `most` (`benchmark.md`
-    section 3). Raises DamagedClip."""
+    """The frames (N, H, W, 3) uint8 RGB shown at the times 0, 1/fps, 2/fps, ..., at most `most`
+    (docs/spec.md 3.1). Raises DamagedClip."""
     frames, times = decode(path)
     wanted = np.arange(0.0, float(times[-1]) + 1e-6, 1 / fps)[:most]
     return frames[np.abs(times[:, None] - wanted).argmin(axis=0)]

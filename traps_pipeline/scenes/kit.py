@@ -51,7 +51,7 @@ def rgba(colour: str) -> list[float]:
 
 @dataclass(frozen=True)
 class Physics:
-    """Solver settings and clip timing, stored with every spec (`notes.md`, robust settings)."""
+    """Solver settings and clip timing, stored with every spec (docs/engineering-notes.md, "Physics")."""
 
     timestep_s: float = 0.002
     duration_s: float = 5.0
@@ -165,7 +165,7 @@ class Wording:
 
 @dataclass(frozen=True)
 class Family:
-    """A scene family: how it varies, how it is built, what decides its outcome (`benchmark.md` section 2).
+    """A scene family: how it varies, how it is built, what decides its outcome (docs/spec.md 2.2).
 
     params: a frozen dataclass of plain values with units in the names.
     draw(rng): parameters of one scenario.

@@ -1,7 +1,7 @@
 """The words of a scenario: question templates that can be read back, and ill-posed questions with their proof.
 
 An ill-posed question is drawn from shared templates over the scene's inventory, and checked by vocabulary alone, so
-that a question which a reviewer wrote is checked in the same way (`benchmark.md` section 2, ill-posed questions).
+that a question which a reviewer wrote is checked in the same way (docs/spec.md 2.4).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From the panel's verdicts to figures with intervals (benchmark.md section 5)."""
+"""From the panel's verdicts to figures with intervals (docs/spec.md 5)."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The paper's analyses: from a tidy frame of cells to a tidy frame (benchmark.md section 5, paper sections on results).
+"""The paper's analyses: from a tidy frame of cells to a tidy frame (docs/spec.md 5.4).
 
 `cells` has one row a (model, dataset, regime), averaged over runs, with the columns model, dataset, regime, acc,
 abs_rec, false_abs, pecs (fractions) and epoch; `study_cells` makes it of a study, `published.published_cells` of the
@@ -23,7 +23,7 @@ from traps_pipeline.scoring.metrics import joined_epochs, mean
 
 SHARES = ["acc", "abs_rec", "false_abs", "pecs"]
 TAXONOMIES = ("occlusion", "chaotic")
-# The thinking member first (benchmark.md section 5).
+# The thinking member first (docs/spec.md 5.4).
 REASONING_PAIRS = (
     ("gemini-2.5-flash", "gemini-2.5-flash-nt"),
     ("gemini-3.1-pro", "gemini-3.1-pro-r-low"),

@@ -1,4 +1,4 @@
-"""Resampled figures and their percentile intervals: a cluster bootstrap over scenarios (benchmark.md section 5).
+"""Resampled figures and their percentile intervals: a cluster bootstrap over scenarios (docs/scoring.md, "Intervals").
 
 A scenario is one draw of the world: its pairs in both datasets of its taxonomy, in every run, model and regime, stay
 together. One weight matrix a taxonomy serves all cells, so two entries' resamples are paired and their difference is

@@ -1,4 +1,4 @@
-"""Paired comparisons: model against model, regime against regime (benchmark.md section 5), with Holm's correction.
+"""Paired comparisons of models and of regimes, with Holm's correction (docs/scoring.md, "Intervals").
 
 Two entries of the leaderboard share their resamples (`bootstrap`), so the difference of their draws is that of a paired
 design, with whatever the scenarios have in common taken out. McNemar's test compares two regimes item by item. Answers

@@ -1,4 +1,4 @@
-"""What may be compared with what: the rule of epochs (benchmark.md section 9)."""
+"""What may be compared with what: the rule of epochs (docs/spec.md 9.2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Means and deviations over runs, per dataset and overall, with intervals (benchmark.md section 5)."""
+"""Means and deviations over runs, per dataset and overall, with intervals (docs/spec.md 5.2)."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
     standard_error, n (decided items of both sides).
 
     The error combines sqrt(p (1 - p) / n) of the two sides; it holds for answers drawn independently, as the random
-    reference strategies draw them, and shows that these are indistinguishable from J = 0 (benchmark.md section 5).
+    reference strategies draw them, and shows that these are indistinguishable from J = 0 (docs/spec.md 5.3).
     """
     counts = cast(pd.DataFrame, decision_counts(verdicts).groupby(verdicts["model"]).sum())
     on_void, on_control = counts["abs_rec_of"].replace(0, np.nan), counts["false_abs_of"].replace(0, np.nan)

@@ -1,4 +1,4 @@
-"""PECS without one judge: how much a figure owes to any one seat of the panel (`benchmark.md` sections 4 and 5)."""
+"""PECS without one judge: how much a figure owes to any one seat of the panel (docs/spec.md 4.1 and 5.1)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Acc, FalseAbs, AbsRec, J, PECS and Naive of every cell, from the panel's verdicts (benchmark.md section 5)."""
+"""Acc, FalseAbs, AbsRec, J, PECS and Naive of every cell, from the panel's verdicts (docs/spec.md 5.1)."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_B
     correct on a control, abstained on a void.
     BOUNDS say what the missing decisions could do to PECS; they are never null. Every share has its n and its Wilson
     interval.
-    Raises ValueError when the verdicts are of several datasets, whose versions may differ (benchmark.md section 5).
+    Raises ValueError when the verdicts are of several datasets, whose versions may differ (docs/spec.md 5.1).
     """
     datasets = sorted(verdicts["dataset"].unique())
     if len(datasets) > 1:

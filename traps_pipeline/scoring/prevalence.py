@@ -1,4 +1,4 @@
-"""How often each axis of confabulation applies to a model's void failures (`benchmark.md` section 6)."""
+"""How often each axis of confabulation applies to a model's void failures (docs/spec.md 6.2)."""
 
 from __future__ import annotations
 

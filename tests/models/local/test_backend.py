@@ -268,7 +268,7 @@ def test_a_request_that_waits_for_its_batch_is_not_given_up() -> None:
 
 
 def test_the_papers_three_local_models_are_asked_as_the_paper_has_it() -> None:
-    """`benchmark.md` section 3."""
+    """docs/spec.md 3.1."""
     entries = {name: registry.get_model(name) for name in ("qwen3-vl-8b", "gemma-4-e4b", "llava-next-video-7b")}
     params = {name: one.local_params() for name, one in entries.items()}
     assert {one.dtype for one in params.values()} == {"bfloat16"}
@@ -280,7 +280,7 @@ def test_the_papers_three_local_models_are_asked_as_the_paper_has_it() -> None:
         assert one.attn_implementation == "sdpa"
     spec = entries["qwen3-vl-8b"].mechanism
     assert spec is not None
-    assert spec.quantisation == "nf4"  # section 7
+    assert spec.quantisation == "nf4"  # docs/spec.md 7.1
 
 
 def test_the_doctor_tries_every_family_and_says_what_is_not_here(capsys: pytest.CaptureFixture[str]) -> None:

@@ -134,7 +134,7 @@ class LocalModel:
     # --- prompts ------------------------------------------------------------------------------------------------------
 
     def prompt(self, system: str, user: str, frames: np.ndarray, times_s: Sequence[float] | np.ndarray) -> Prompt:
-        """System prompt, then clip and question, nothing else (`benchmark.md` section 3).
+        """System prompt, then clip and question, nothing else (docs/spec.md 3.3).
 
         frames: (N, H, W, 3) uint8 RGB, all of them shown. times_s: (N,) seconds into the clip, which models that read
         time stamps get exactly. Raises TrapsError when the chat template loses a part.

@@ -46,7 +46,7 @@ class LocalParams(BaseModel):
 
 
 class MechanismSpec(BaseModel):
-    """How a model is loaded to look inside (`benchmark.md` sections 7 and 8), where that differs from how it answers.
+    """How a model is loaded to look inside (docs/spec.md 7.1), where that differs from how it answers.
 
     quantisation, with its nf4_skip: None is that of `params`.
     """

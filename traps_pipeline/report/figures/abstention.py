@@ -168,7 +168,7 @@ def _no_doubt(results: Results) -> str:
 def doubt_points(results: Results) -> tuple[Frame, str]:
     """thinking, other, dataset, doubt, gain (fractions), a row a pair and dataset; and what was refused, in words.
 
-    AbsRec is that of `results.rates` (standard), whose epoch must be that of the doubt labels (benchmark.md section 9).
+    AbsRec is that of `results.rates` (standard), whose epoch must be that of the doubt labels (docs/spec.md 9.2).
     """
     labels = results.confabulation.set_index("model") if len(results.confabulation) else pd.DataFrame()
     rates = results.rates.loc[results.rates["taxonomy"] != "pooled"]

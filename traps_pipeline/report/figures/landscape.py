@@ -1,4 +1,4 @@
-"""Models in the plane of Acc and J, with contours of PECS (benchmark.md section 10)."""
+"""Models in the plane of Acc and J, with contours of PECS (docs/spec.md 10)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Probe curves, the Cf->Cf strip, dose and response, cosines (benchmark.md sections 7, 8 and 10)."""
+"""Probe curves, the Cf->Cf strip, dose and response, cosines (docs/spec.md 10)."""
 
 from __future__ import annotations
 

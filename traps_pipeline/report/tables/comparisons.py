@@ -1,4 +1,4 @@
-"""Analyses of cells as tables: gaps, uplifts, pairs, frontier, boundary (benchmark.md section 5)."""
+"""Analyses of cells as tables: gaps, uplifts, pairs, frontier, boundary (docs/spec.md 5.4)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Leaderboards: overall and by dataset (benchmark.md sections 5 and 10)."""
+"""Leaderboards: overall and by dataset (docs/spec.md 5.2 and 10)."""
 
 from __future__ import annotations
 

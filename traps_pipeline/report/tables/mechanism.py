@@ -1,4 +1,4 @@
-"""Probes, directions and steering as tables (benchmark.md sections 7, 8 and 10)."""
+"""Probes, directions and steering as tables (docs/spec.md 7 and 8)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was run: models, what they are sent, the benchmark's composition (benchmark.md sections 2 and 3)."""
+"""What was run: models, what they are sent, the benchmark's composition (docs/spec.md 2 and 3)."""
 
 from __future__ import annotations
 
