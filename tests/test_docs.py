@@ -1,0 +1,75 @@
+"""What code and pages cite exists: pages, their sections, links, modules; and the paper has one name everywhere."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.conftest import ROOT
+
+FOLDERS = ("traps_pipeline", "tests", "bench", "docs", "assets", "scene_specs", ".ci")
+FILES = [path for place in (ROOT.glob("*"), *((ROOT / name).rglob("*") for name in FOLDERS)) for path in place]
+ENDINGS = (".py", ".md", ".yaml", ".toml", ".j2", ".txt", ".cff", "Makefile", ".ci/run")
+TEXTS = [path for path in FILES if str(path).endswith(ENDINGS) and path != Path(__file__)]
+KNOWN = ("traps_pipeline/scenes/families/plank_post.py", *map(str, FILES))  # the first is made by a reader
+NUMBER = r"\d+(?:\.\d+)*"
+# docs/spec.md 4.2, docs/spec.md 7 and 8, docs/models.md, "Ledger"
+SECTION = re.compile(rf'([\w./-]+\.md)`?,?\s[ #]*(?:sections? )?("[^"\n]+"|{NUMBER}(?:(?:, | and ){NUMBER})*)')
+PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join(FOLDERS[:-1])})/[\w./-]*\.(?:md|py|yaml|csv|txt|png)\b")
+MODULE = re.compile(r"(?<![\w./<>-])[\w/]+\.py\b")
+LINK = re.compile(r"\[[^]\n]*\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
+PAPER_IN = ("README.md", "docs/spec.md", "assets/published/README.md", "traps_pipeline/report/templates/report.html.j2")
+
+
+@cache
+def sections(page: Path) -> set[str]:
+    """Numbers, titles and anchors of a page's headings, and the words in bold that begin its paragraphs."""
+    text = page.read_text() if page.is_file() else ""
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    anchors = ["#" + re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]
+    numbers = [found[0] for title in titles if (found := re.match(NUMBER, title))]
+    return {*titles, *anchors, *numbers, *re.findall(r"^\*\*(.+?)\.?\*\*", text, re.MULTILINE)}
+
+
+def wrong(file: Path, text: str) -> Iterator[str]:
+    """Every citation in the text of a file whose page, section or module does not exist, with its line."""
+    found = [(at, any(f"/{path}".endswith(f"/{at[0]}") for path in KNOWN)) for at in PATH.finditer(text)]
+    for at in SECTION.finditer(text):
+        parts = [at[2].strip('"')] if at[2].startswith('"') else re.findall(NUMBER, at[2])
+        found.append((at, {*parts} <= sections(ROOT / at[1])))
+    if file.suffix == ".md":
+        found += [(at, any(f"/{path}".endswith(f"/{at[0]}") for path in KNOWN)) for at in MODULE.finditer(text)]
+        for at in LINK.finditer(text):
+            target = file.parent / at[1] if at[1] else file
+            found.append((at, target.exists() and (not at[2] or f"#{at[2]}" in sections(target))))
+    for at in (at for at, exists in found if not exists):
+        yield f"{file.relative_to(ROOT)}:{text.count(chr(10), 0, at.start()) + 1}: there is no {at[0]}"
+
+
+def test_what_is_cited_exists() -> None:
+    assert len(TEXTS) > 300
+    found = [one for path in TEXTS for one in wrong(path, path.read_text())]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("cited", ["docs/spec.md 9.9", "docs/spec.md 7 and 99", 'docs/models.md, "Purse"', "docs/x.md"])
+def test_a_citation_of_what_is_not_there_is_named_with_its_line(cited: str) -> None:
+    assert list(wrong(ROOT / "bench" / "x.py", f"one\n({cited})")) == [f"bench/x.py:2: there is no {cited}"]
+
+
+@pytest.mark.parametrize("cited", ["x.md section 5", "[x](x.md)", "[x](spec.md#x)", "models/x.py"])
+def test_so_is_a_link_or_a_module_on_a_page(cited: str) -> None:
+    assert list(wrong(ROOT / "docs" / "x.md", f"one\n{cited}")) == [f"docs/x.md:2: there is no {cited}"]
+
+
+def test_the_paper_has_one_name_everywhere() -> None:
+    paper = yaml.safe_load((ROOT / "CITATION.cff").read_text())["preferred-citation"]
+    authors = ", ".join(f"{one['given-names']} {one['family-names']}" for one in paper["authors"])
+    for name in PAPER_IN:
+        text = " ".join((ROOT / name).read_text().replace("\n> ", " ").split())
+        assert [part for part in (paper["title"], authors, "COLM 2026", paper["url"]) if part not in text] == [], name
