@@ -10,7 +10,7 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism test ui bench lint setup render-packages test-packages clean
+.PHONY: demo demo-mechanism check test ui bench lint setup render-packages test-packages clean
 
 demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -18,9 +18,14 @@ demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
 demo-mechanism: setup ## the pocket model from hidden states to steering, on the CPU, no key needed
 	TRAPS_WORKSPACE=$(CURDIR)/.workspaces/mechanism $(BIN)/traps run mechanism
 
-# A worker a core: threads of their own would only wait for each other's.
+# A worker a core: threads of their own would only wait for each other's. Workers steal what another has yet to do.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+
+check: setup lint ## lint, types and the fast tests: under three minutes
+	$(PYTEST) -m "not slow"
+
 test: test-packages setup lint ## lint, types and all tests, the slow ones too
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
 
 ui: setup ## Dagster's web server and daemon on 127.0.0.1:$(PORT)
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo

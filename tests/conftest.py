@@ -119,21 +119,30 @@ def copy_workspace(source: Path, target: Path) -> None:
     shutil.copytree(source, target, symlinks=True)
 
 
+# What a test gets from these takes a study, a server or a browser: it is slow, and comes after all that needs none.
+SERVICES = {"demo", "small", "shared_provider", "page"}
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """A file that is slow as a whole is not even imported where the fast tests are wanted: torch takes seconds."""
+    fast = config.option.markexpr == "not slow" and collection_path.suffix == ".py"
+    return True if fast and "\npytestmark = pytest.mark.slow\n" in collection_path.read_text() else None
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One worker starts with the demo, which others wait for; the other takes what needs no study meanwhile. Of those
-    files that need one the longest go first: a file is one worker's, and the last must not leave the other idle."""
-    studies = {"demo", "small", "study", "demo_study", "unasked", "one_regime"}
-    waiting = {item.path for item in items if studies & set(getattr(item, "fixturenames", ()))}
-    longest = ("test_corrections.py", "test_network.py", "test_crashes.py", "test_ui.py", "test_readme.py")
+    """Mark what needs a service as slow, and put it last: of two workers that steal from each other the second one
+    begins with a study that others wait for, while the first one has all the rest to do."""
+    for item in items:
+        if SERVICES & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: bool(SERVICES & set(getattr(item, "fixturenames", ()))))
 
-    def turn(item: pytest.Item) -> int:
-        if item.path.name == "test_demo.py":
-            return 0
-        if item.path not in waiting:
-            return 1
-        return 2 if item.path.name in longest else 3
 
-    items.sort(key=turn)
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Name each skipped test and why: what did not run was not tested."""
+    for report in terminalreporter.stats.get("skipped", ()):
+        terminalreporter.write_line(f"not run: {report.nodeid}: {report.longrepr[-1]}")
 
 
 @pytest.fixture(scope="session")
@@ -153,6 +162,7 @@ def provider(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Prov
 def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], str]) -> Path:
     """A folder that is made once for all workers of a test run; `make` returns what it printed (`<name>.out`).
 
+    Where it cannot be made, the first test that wants it says why, and all others that it could not be made.
     TRAPS_TEST_STUDIES names a folder that keeps them for further runs, while one works on what needs them.
     """
     shared = factory.getbasetemp()
@@ -160,8 +170,15 @@ def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], str]
     shared = Path(os.environ.get("TRAPS_TEST_STUDIES") or shared)
     with (shared / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
+        if (shared / f"{name}.failed").exists():
+            pytest.fail(f"the study {name} could not be made: see the first test that failed for it", pytrace=False)
         if not (shared / f"{name}.out").exists():
-            (shared / f"{name}.out").write_text(make(shared / name))
+            try:
+                printed = make(shared / name)
+            except Exception:
+                (shared / f"{name}.failed").touch()
+                raise
+            (shared / f"{name}.out").write_text(printed)
     return shared / name
 
 
@@ -230,16 +247,16 @@ def forget_answers(study: Checkout) -> Checkout:
 
 
 @pytest.fixture(scope="session")
-def one_regime(demo: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Checkout:
-    """The demo's study under one regime, scored without a disturbance. Read only."""
-    clips, until = demo.workspace / "clips", ("--until", "leaderboard")
+def one_regime(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Checkout:
+    """The small study's items put to every reference model, scored without a disturbance. Read only."""
+    clips, until = small.workspace / "clips", ("--until", "leaderboard")
     return run_once(tmp_path_factory, "one_regime", SMALL.with_name("one_regime.yaml"), clips, *until)
 
 
 @pytest.fixture
-def unasked(demo_study: Checkout) -> Checkout:
-    """The demo's clips and items, with nothing asked yet."""
-    return forget_answers(demo_study)
+def unasked(study: Checkout) -> Checkout:
+    """The small study's clips and items, with nothing asked yet."""
+    return forget_answers(study)
 
 
 @pytest.fixture

@@ -92,11 +92,7 @@ def test_a_corrected_ill_posed_question_asks_one_item_again(study: Checkout) -> 
     run = study.score(EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts() == {"answers": EVALUATIONS, "votes": 3 * EVALUATIONS, "frames": 0}
-
-
-def test_versions_change_where_the_correction_reaches_and_nowhere_else(study: Checkout) -> None:
-    study.correct("plinko-0002", ill_posed_question="What does the triangle at the bottom weigh?")
-    assert study.score(EXPERIMENT).code == 0
+    # Versions change where the correction reaches, and nowhere else.
     tables = Workspace.open(study.workspace).tables
     versions = tables.read_all(ITEMS).groupby("dataset")["benchmark_version"].unique()
     corrected = versions.pop("chaotic_ill_posed")

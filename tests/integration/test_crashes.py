@@ -20,7 +20,7 @@ from traps_pipeline.tables import TABLES, VOLATILE
 
 ONE_REGIME = "tests/experiments/one_regime.yaml"
 pytestmark = pytest.mark.slow
-ANSWERS, VOTES = 1024, 4608  # 8 models x 1 regime x 128 items; 4.5 votes an item
+ANSWERS, VOTES = 384, 1728  # 8 models x 1 regime x 48 items; 4.5 votes an item
 
 
 def tables(root: Path) -> dict[str, pd.DataFrame]:
@@ -50,7 +50,7 @@ def wait_for_rows(study: Checkout, process: subprocess.Popen[str], kind: str, co
 def test_three_kills_while_answering_leave_the_same_tables_and_no_call_is_made_twice(
     unasked: Checkout, one_regime: Checkout
 ) -> None:
-    moments = sorted(random.Random(20261121).sample(range(30, ANSWERS - 60), 3))
+    moments = sorted(random.Random(20261121).sample(range(10, ANSWERS - 60), 3))
     for moment in moments:
         process = start(unasked)
         wait_for_rows(unasked, process, "answers", moment)
@@ -67,7 +67,7 @@ def test_three_kills_while_answering_leave_the_same_tables_and_no_call_is_made_t
 
 def test_a_kill_while_voting_leaves_the_same_tables(unasked: Checkout, one_regime: Checkout) -> None:
     process = start(unasked)
-    wait_for_rows(unasked, process, "votes", 1500)
+    wait_for_rows(unasked, process, "votes", 600)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
     finished = unasked.score(ONE_REGIME)
@@ -84,12 +84,12 @@ def test_two_runs_that_want_the_same_keys_ask_each_once(unasked: Checkout) -> No
     )
     wait_for_rows(unasked, by_dagster, "answers", 1)
     by_traps = start(unasked)
-    out, err = by_traps.communicate(timeout=300)
+    out, err = by_traps.communicate()
     assert by_traps.returncode == 0, err
     asked, cached = map(int, re.search(r"(\d+) answers asked \((\d+) from the ledger", out).groups())  # type: ignore[union-attr]
     assert asked + cached <= ANSWERS  # cells that the other run had finished by then are fresh, and not looked into
     assert asked < ANSWERS  # the other run's answers were used
-    _, err = by_dagster.communicate(timeout=300)
+    _, err = by_dagster.communicate()
     assert by_dagster.returncode == 0, err[-3000:]
     keys = [row["key"] for row in unasked.ledger_rows("answers")]
     assert len(keys) == len(set(keys)) > ANSWERS
@@ -118,12 +118,12 @@ def test_a_kill_while_rendering_leaves_whole_clips_that_are_not_drawn_again(stud
 
 def test_ctrl_c_drains_and_the_same_command_goes_on(unasked: Checkout, one_regime: Checkout) -> None:
     process = start(unasked)
-    wait_for_rows(unasked, process, "answers", 300)
+    wait_for_rows(unasked, process, "answers", 100)
     os.kill(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate()
     assert process.returncode == 130, err
     assert "interrupted" in err and "Traceback" not in err
-    assert 300 <= rows_written(unasked, "answers") < ANSWERS
+    assert 100 <= rows_written(unasked, "answers") < ANSWERS
     finished = unasked.score(ONE_REGIME)
     assert finished.code == 0, finished.err
     assert len(unasked.ledger_rows("answers")) == ANSWERS

@@ -15,12 +15,13 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from tests.conftest import KEY, ROOT, SECRET, Checkout, Finished
+from tests.conftest import KEY, ROOT, SECRET, SMALL, Checkout, Finished
 from tests.providers.server import Provider
 from traps_pipeline.models.budget import Journal
 
 pytestmark = pytest.mark.slow
-MANY = "TRAPS_MANY_CALLS" in os.environ  # 2,304 calls in the place of 512, and five kills: for a release
+ITEMS = 48  # of the small study: 12 scenarios in two datasets, two sides
+MANY = "TRAPS_MANY_CALLS" in os.environ  # 864 calls in the place of 192, and five kills: for a release
 SAMPLING = "temperature: 0.8, top_p: 0.95, max_tokens: 8000"
 TRANSIENT = {
     "rate_limited": 0.03,
@@ -58,9 +59,8 @@ def register(study: Checkout, provider: Provider, *entries: str) -> None:
 
 
 def experiment(study: Checkout, models: list[str], **more: Any) -> Path:
-    """An experiment on the demo's scenarios."""
-    demo = (study.root / "assets" / "experiments" / "demo.yaml").read_text()
-    scenarios = demo[demo.index("scenarios:") :]
+    """An experiment on the small study's scenarios."""
+    scenarios = SMALL.read_text()[SMALL.read_text().index("scenarios:") :]
     settings = {"models": models, "regimes": ["standard", "json"], "runs": [1], **more}
     head = "".join(f"{name}: {value!r}\n".replace("'", '"') for name, value in settings.items())
     path = study.root / "network.yaml"
@@ -91,7 +91,7 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_
     finished = ask(unasked, path, "--budget-usd", "500")
     assert finished.code == 0, finished.err
     rows, stats = responses(unasked), provider.stats()
-    assert len(rows) == len({(r["item_id"], r["model"], r["regime"], r["run"]) for r in rows}) == 2 * 128 * 9
+    assert len(rows) == len({(r["item_id"], r["model"], r["regime"], r["run"]) for r in rows}) == 2 * ITEMS * 9
     outcomes = Counter(row["outcome"] for row in rows)
     assert outcomes.keys() == {"answer", "truncated", "empty", "refused"}
     assert outcomes["answer"] > 0.95 * len(rows)
@@ -131,7 +131,7 @@ def test_the_cap_holds_and_the_next_run_goes_on(unasked: Checkout, provider: Pro
     assert sum(row["cost_usd"] for row in settled(unasked)) <= 1.0
     more = ask(unasked, path, "--budget-usd", "100")
     assert more.code == 0, more.err
-    assert provider.stats()["answered_in_full"] == len(settled(unasked)) == 2 * 128
+    assert provider.stats()["answered_in_full"] == len(settled(unasked)) == 2 * ITEMS
 
 
 def test_paid_stages_want_a_budget_and_a_price_whoever_starts_them(unasked: Checkout, provider: Provider) -> None:
@@ -154,12 +154,12 @@ def test_paid_stages_want_a_budget_and_a_price_whoever_starts_them(unasked: Chec
 def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checkout, provider: Provider) -> None:
     provider.configure(fault_by_model={"locked-out": "unauthorized"})
     register(unasked, provider, entry("image-model", "images"), entry("locked-out", "images"))
-    path = experiment(unasked, ["image-model", "locked-out"], datasets=["occlusion"])
+    path = experiment(unasked, ["image-model", "locked-out"])
     finished = ask(unasked, path, "--budget-usd", "10")
     assert finished.code == 1
     assert "locked-out is stopped: 20 refusals in a row (http_401)" in finished.err
     assert SECRET not in finished.out + finished.err
-    assert len(responses(unasked)) == 2 * 32
+    assert len(responses(unasked)) == 2 * ITEMS
     assert {row["model"] for row in responses(unasked)} == {"image-model"}
     # 20 in a row, those in flight then, and no more; in no later batch either.
     assert provider.stats()["by_status"]["401"] < 20 + 24
@@ -169,7 +169,7 @@ def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checko
 def test_only_what_decides_an_answer_is_asked_again(unasked: Checkout, provider: Provider) -> None:
     register(unasked, provider, entry("image-model", "images"))
     path = experiment(unasked, ["image-model"], regimes=["standard"], datasets=["chaotic", "chaotic_ill_posed"])
-    assert ask(unasked, path, "--budget-usd", "10").counts()["answers"] == 64
+    assert ask(unasked, path, "--budget-usd", "10").counts()["answers"] == ITEMS / 2
     quick = entry("image-model", "images").replace("timeout_s: 4", "timeout_s: 9, concurrency: 3")
     register(unasked, provider, quick.replace("input: 1.0", "input: 2.0"))
     assert ask(unasked, path).counts()["answers"] == 0
@@ -180,7 +180,7 @@ def test_only_what_decides_an_answer_is_asked_again(unasked: Checkout, provider:
         provider,
         quick.replace("temperature: 0.8", "temperature: 0.5") + "    waivers: {temperature: a test}\n",
     )
-    assert ask(unasked, path).counts()["answers"] == 64
+    assert ask(unasked, path).counts()["answers"] == ITEMS / 2
 
 
 def test_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider: Provider) -> None:
@@ -188,7 +188,7 @@ def test_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider:
     register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
     models, regimes = ["video-model", "image-model"][: 1 + MANY], ["standard", "json", "guided"][: 2 + MANY]
     path = experiment(unasked, models, regimes=regimes, runs=[1, 2, 3][: 2 + MANY])
-    wanted, kills = 128 * len(models) * len(regimes) * (2 + MANY), 5 if MANY else 3
+    wanted, kills = ITEMS * len(models) * len(regimes) * (2 + MANY), 5 if MANY else 3
     points = sorted(random.Random(1).sample(range(1, wanted * 7 // 8), kills))
     for point in points:
         command = ("run", str(path), "--until", "responses", "--budget-usd", "500")
@@ -215,7 +215,7 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
     exported = unasked.traps("requests", "export", path, "--out", tmp_path / "batch")
     assert exported.code == 0, exported.err
     lines = [json.loads(line) for line in (tmp_path / "batch" / "requests.jsonl").read_text().splitlines()]
-    assert len(lines) == len({line["key"] for line in lines}) == 64
+    assert len(lines) == len({line["key"] for line in lines}) == 24
     for line in lines:
         file = tmp_path / "batch" / line["media"]["file"]
         assert file.stem == line["media"]["sha256"] and file.is_file()
@@ -224,22 +224,22 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
     answers[0] = {"key": lines[0]["key"], "outcome": "refused", "finish_reason": "content_filter"}
     given = tmp_path / "answers.jsonl"
 
-    given.write_text("\n".join(json.dumps(answer) for answer in [*answers[:50], {"key": "0" * 64, "text": "x"}]))
+    given.write_text("\n".join(json.dumps(answer) for answer in [*answers[:20], {"key": "0" * 64, "text": "x"}]))
     refused = unasked.traps("answers", "import", path, given)
     assert refused.code == 1
-    assert "answers.jsonl:51: key 0000000000000000 is not wanted" in refused.err
+    assert "answers.jsonl:21: key 0000000000000000 is not wanted" in refused.err
     assert "nothing was imported" in refused.err
     assert settled(unasked) == []
 
-    given.write_text("\n".join(json.dumps(answer) for answer in answers[:50]))
-    assert "50 answers imported, 0 were there already" in unasked.traps("answers", "import", path, given).out
+    given.write_text("\n".join(json.dumps(answer) for answer in answers[:20]))
+    assert "20 answers imported, 0 were there already" in unasked.traps("answers", "import", path, given).out
     given.write_text("\n".join(json.dumps(answer) for answer in answers))
-    assert "14 answers imported, 50 were there already" in unasked.traps("answers", "import", path, given).out
+    assert "4 answers imported, 20 were there already" in unasked.traps("answers", "import", path, given).out
     finished = ask(unasked, path)
     assert finished.code == 0, finished.err
     assert finished.counts()["answers"] == 0
     assert provider.stats()["requests"] == 0
-    assert Counter(row["outcome"] for row in responses(unasked)) == {"answer": 63, "refused": 1}
+    assert Counter(row["outcome"] for row in responses(unasked)) == {"answer": 23, "refused": 1}
 
 
 @pytest.mark.parametrize(

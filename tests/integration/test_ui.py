@@ -227,7 +227,9 @@ def test_an_altered_table_is_a_failed_check_before_anything_below_uses_it(
     altered = table.set_column(table.schema.get_field_index("question"), table.schema.field("question"), [questions])
     pq.write_table(altered, path)
     before = written(study, "responses")
-    wait_until(lambda: "is not what was written" in failures(study, ITEMS), RUN_SECONDS, "the daemon names the altered table")
+    wait_until(
+        lambda: "is not what was written" in failures(study, ITEMS), RUN_SECONDS, "the daemon names the altered table"
+    )
     page.goto(f"{server}/assets/items?view=checks&checkDetail=current")
     page.screenshot(path=tmp_path / "altered.png")
     # What is free is made again by itself, from what it was made of; nothing below has used it meanwhile.

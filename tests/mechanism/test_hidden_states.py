@@ -25,6 +25,8 @@ from traps_pipeline.mechanism.hidden_states import Item, clip_item, extract, rea
 from traps_pipeline.models.local.adapter import LocalModel, Prompt
 from traps_pipeline.models.local.capture import pool
 
+pytestmark = pytest.mark.slow
+
 each_family = pytest.mark.parametrize("family", FAMILIES)
 
 

@@ -11,6 +11,8 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local.adapter import LocalModel
 
+pytestmark = pytest.mark.slow
+
 each_family = pytest.mark.parametrize("family", FAMILIES)
 
 

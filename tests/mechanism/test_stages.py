@@ -41,6 +41,8 @@ from traps_pipeline.tables import (
     Table,
 )
 
+pytestmark = pytest.mark.slow
+
 STANDARD = Extraction("tiny", "standard")
 
 

@@ -35,6 +35,8 @@ from traps_pipeline.pocket.words import PROMPTS, say
 from traps_pipeline.storage.workspace import Study, Workspace
 from traps_pipeline.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 
+pytestmark = pytest.mark.slow
+
 FEW = 2  # scenes
 
 

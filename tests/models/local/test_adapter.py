@@ -42,6 +42,8 @@ from traps_pipeline.models.local.settings import MechanismSpec
 from traps_pipeline.models.local.tiny import build_tiny, make_tokenizer
 from traps_pipeline.models.registry import ModelEntry
 
+pytestmark = pytest.mark.slow
+
 CLASSES = {
     "qwen3-vl": "Qwen3VLForConditionalGeneration",
     "gemma-4": "Gemma4ForConditionalGeneration",

@@ -34,6 +34,8 @@ from traps_pipeline.progress import Tally
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.workspace import Study
 
+pytestmark = pytest.mark.slow
+
 SAMPLED = {"do_sample": True, "temperature": 0.8, "top_p": 0.95}
 
 
