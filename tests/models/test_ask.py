@@ -99,6 +99,23 @@ def test_only_the_difference_is_asked(tmp_path: Path) -> None:
     assert [row["components"]["about"]["item_id"] for row in finished["rows"]] == [f"item-{n}" for n in range(10)]
 
 
+def test_the_calls_of_a_cell_are_made_once_and_handed_on_with_their_rows(tmp_path: Path) -> None:
+    asked: list[Cell] = []
+    cells = [CELL, Cell("chaotic", CELL.evaluation)]
+
+    def wanted(cell: Cell) -> list[Request]:
+        asked.append(cell)
+        return [request(f"{cell.dataset}-{n}") for n in range(3)]
+
+    def finish(settled: Settled[Cell, Call]) -> dict[str, Any]:
+        return {str(call.request.about["item_id"]): row["key"] for call, row in settled.answered()}
+
+    of_items = replace(work(tmp_path, {"m": Answering()}, wanted), finish=finish)
+    found = {item: key for of_cell in run_work(of_items, cells) for item, key in of_cell.items()}
+    assert sorted(asked) == sorted(cells)
+    assert found == {f"item-{c.dataset}-{n}": request(f"{c.dataset}-{n}").key for c in cells for n in range(3)}
+
+
 def test_a_torn_line_costs_one_call(tmp_path: Path) -> None:
     backend = Answering()
     list(run_work(work(tmp_path, {"m": backend}, ten), [CELL]))
