@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 YES, NO, INVALID = 1, 0, -1  # of a vote; of a majority, INVALID is undecided
+PANEL = "panel"  # all judges together, where a table otherwise names one
 ANSWER = ["dataset", "model", "regime", "run", "item_id"]
 ABSTENTION, CORRECTNESS = ("void_abstention", "control_abstention"), ("correctness",)
 TASKS = (*ABSTENTION, *CORRECTNESS)

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_request
-from traps_pipeline.judging.ratings import INVALID, NO, YES, majority
+from traps_pipeline.judging.ratings import INVALID, NO, PANEL, YES, majority
 from traps_pipeline.models.ask import Settled
 from traps_pipeline.models.judges import JudgeEntry, Task
 from traps_pipeline.partitions import Cell, Evaluation
@@ -30,7 +30,6 @@ from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 ATTACKS_FILE = ASSETS / "injected_answers.yaml"
 CELL = Cell("occlusion", Evaluation("injected-answers", "standard", 1))  # names the folder of the votes; no model
 TASKS: tuple[Task, ...] = tasks_for("control")
-PANEL = "panel"
 RESULTS = ("held", "flipped", "broken", "wrong_anyway")
 _PLACE = "{answer}"
 
