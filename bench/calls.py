@@ -33,8 +33,9 @@ KEY = "BENCH_KEY"
 def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     """Requests through `ask`: backend, retries, pace, budget and the ledger on disk."""
     from traps_pipeline.models.api import ApiBackend, load_litellm
-    from traps_pipeline.models.ask import Participants, Work, run_work
+    from traps_pipeline.models.ask import Call, Work, run_work
     from traps_pipeline.models.budget import Budget
+    from traps_pipeline.models.participants import Participants
     from traps_pipeline.models.registry import Account, Entry, Limits
     from traps_pipeline.models.request import Request
     from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
@@ -49,18 +50,18 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     cells = [Cell(dataset, evaluation) for evaluation in evaluations for dataset in DATASETS]
     cells = cells[: math.ceil(answers / CELL_ITEMS)]
 
-    def requests(cell: Cell) -> list[Request]:
+    def calls(cell: Cell) -> list[Call]:
         first = cells.index(cell) * CELL_ITEMS
         numbers = range(first, min(first + CELL_ITEMS, answers))
         asked = [(QUESTION.format(number=n), {"item_id": str(n), **cell.partition}) for n in numbers]
-        return [Request("m", "openai/m", PARAMS, SYSTEM, question, about) for question, about in asked]
+        return [Call(Request("m", "openai/m", PARAMS, SYSTEM, question, about)) for question, about in asked]
 
     load_litellm()
     with tempfile.TemporaryDirectory() as folder:
         free = Study(allow_unknown_prices=True)
         participants = Participants({"m": entry}, lambda e: ApiBackend(e, account), free, {"a": account})
         ledger = Ledger(Path(folder), "answers")
-        work = Work("responses", ledger, participants, Budget(0, {}, {}), "1", requests, lambda *_: None)
+        work = Work("responses", ledger, participants, Budget(0, {}, {}), "1", calls, lambda _: None)
         return _measured(lambda: list(run_work(work, cells)), answers)
 
 

@@ -34,7 +34,7 @@ import openai.resources.chat.completions
 
 def fill(root: Path, rows: int) -> None:
     """A ledger as a study leaves it: the evaluation that will be asked has rows of other keys too."""
-    from traps_pipeline.models.ask import ledger_row
+    from traps_pipeline.models.participants import ledger_row
     from traps_pipeline.models.request import Outcome, Request
     from traps_pipeline.partitions import Evaluation
     from traps_pipeline.storage.ledger import Ledger

@@ -47,9 +47,10 @@ def main() -> None:
     from tests.providers.server import Provider
     from traps_pipeline.digests import file_digest
     from traps_pipeline.models.api import ApiBackend, load_litellm
-    from traps_pipeline.models.ask import Participants, Work, run_work
+    from traps_pipeline.models.ask import Call, Work, run_work
     from traps_pipeline.models.budget import Budget
     from traps_pipeline.models.media import MediaSpec, MediaStore
+    from traps_pipeline.models.participants import Participants
     from traps_pipeline.models.registry import Account, ModelEntry
     from traps_pipeline.models.request import Request
     from traps_pipeline.partitions import Cell, Evaluation
@@ -77,19 +78,19 @@ def main() -> None:
             for n in names
         }
 
-        def requests(cell: Cell) -> list[Request]:
+        def calls(cell: Cell) -> list[Call]:
             model = cell.evaluation.model
             about = [{"item_id": str(n), "model": model} for n in range(arguments.answers)]
             question = "In which numbered bucket does the ball come to rest?"
             return [
-                Request(model, f"openai/{model}", PARAMS, "You watch a clip.", question, a, sent=sent[n % CLIPS])
+                Call(Request(model, f"openai/{model}", PARAMS, "You watch a clip.", question, a, sent=sent[n % CLIPS]))
                 for n, a in enumerate(about)
             ]
 
         study = Study(allow_unknown_prices=True)
         participants = Participants(entries, lambda entry: ApiBackend(entry, account), study, {"a": account})
         ledger, budget = Ledger(folder, "answers"), Budget(0, {}, {})
-        work = Work("responses", ledger, participants, budget, "1", requests, lambda *_: None)
+        work = Work("responses", ledger, participants, budget, "1", calls, lambda _: None)
         load_litellm()
         began, cpu = time.perf_counter(), sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
         list(run_work(work, [Cell("occlusion", Evaluation(n, "standard", 1)) for n in names]))

@@ -368,7 +368,7 @@ def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Nam
 
 
 def _known_participant(name: str) -> str:
-    from traps_pipeline.judging.panel import load_judges
+    from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import get_model
 
     return name if name in load_judges() else get_model(name).id
@@ -474,8 +474,8 @@ def check_models(arguments: argparse.Namespace) -> int:
 
 def check_judges(arguments: argparse.Namespace) -> int:
     """See `traps judges check --help`."""
-    from traps_pipeline.judging.panel import load_panel
     from traps_pipeline.judging.robustness import check_panel, load_attacks, summary
+    from traps_pipeline.models.judges import load_panel
 
     workspace = _open(_root(arguments))
     name = arguments.panel or workspace.study.panel

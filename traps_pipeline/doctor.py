@@ -127,7 +127,7 @@ def _workspace(root: Path) -> str:
 
 def _keys() -> str:
     """Which keys are not set, and who cannot be asked without them. None is needed for the demo."""
-    from traps_pipeline.judging.panel import load_judges
+    from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import load_models, missing_keys
 
     entries = [*load_models().values(), *load_judges().values()]

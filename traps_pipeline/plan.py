@@ -12,10 +12,11 @@ from traps_pipeline.benchmark.corrections import load_scenarios
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import Experiment
 from traps_pipeline.judging.confabulation import load_protocol, sample_failures
-from traps_pipeline.judging.panel import PANEL_SIZE, JudgeEntry, load_panel, tasks_for, wanted_ballots
+from traps_pipeline.judging.panel import tasks_for, wanted_ballots
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answers import answer_request, is_prepared
 from traps_pipeline.models.forecast import Experience, Forecast, experiences, forecast
+from traps_pipeline.models.judges import PANEL_SIZE, JudgeEntry, load_panel
 from traps_pipeline.models.registry import NETWORK, Entry, get_model, load_models
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import REGIMES, SIDES, Cell, Evaluation, SteeredEvaluation, datasets_of_category

@@ -757,21 +757,24 @@ STEERING = Table(
 
 STEERING_VOTES = Table(
     "steering_votes",
-    "what the panel says of one steered answer",
+    "one judge about one steered answer",
     ("dataset", "model", "directions", "regime"),
-    ("source", "kind", "layer", "alpha", "item_id"),
+    ("source", "kind", "layer", "alpha", "item_id", "judge"),
     _columns(
         _STEERED
         + """
     item_id str dataset:scenario_id:side
-    scenario_id str family and number
     side str control or void
-    abstained bool? majority; null without an answer or a majority
-    n_valid int valid votes
-    unanimous bool all votes valid and agreed
-    votes str JSON: judge to abstained, null if invalid
-    vote_keys strs ledger keys
+    task str abstention
+    judge str id in assets/judges.yaml
+    valid bool whether the judge's JSON meets the schema
+    invalid_reason str? why not
+    abstained bool? null if invalid
+    confidence str? high, medium or low
+    rationale str? one sentence
+    vote_key str ledger key; both datasets of a taxonomy share that of a control
     epoch str campaign in which it was asked
+    created_at time when it was asked
 """
         + _VERSION
     ),

@@ -13,10 +13,10 @@ import pytest
 
 from tests.conftest import KEY
 from tests.providers.server import Provider
-from traps_pipeline.judging.panel import JudgeEntry
-from traps_pipeline.models import api, ask
+from traps_pipeline.models import api, participants
 from traps_pipeline.models.answers import answer_request, response_row
-from traps_pipeline.models.ask import ledger_row
+from traps_pipeline.models.judges import JudgeEntry
+from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import Account, Limits, Prices, get_model
 from traps_pipeline.models.request import Outcome
 from traps_pipeline.partitions import Cell, is_ill_posed, taxonomy_of
@@ -99,14 +99,14 @@ def _response(workspace: Workspace, cell: Cell, number: int, side: str, text: st
     trace, _, answer = text.rpartition("<think>")
     request = answer_request(workspace, get_model("oracle"), item, cell.evaluation)
     row, reasoning = ledger_row(request, Outcome("answer", answer, reasoning=trace or None), 1, 0.1, "e1")
-    return response_row(cell, item, request.key, row, reasoning)
+    return response_row(cell, item, row, reasoning)
 
 
 @pytest.fixture
 def judge_at(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], JudgeEntry]:
     """Makes judges that are asked at the test provider, over HTTP."""
     account = Account(key=KEY, base_url=f"{provider.url}/v1")
-    for module in (api, ask):
+    for module in (api, participants):
         monkeypatch.setattr(module, "load_accounts", lambda: {"here": account})
 
     def judge(name: str) -> JudgeEntry:

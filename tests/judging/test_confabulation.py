@@ -27,13 +27,13 @@ from traps_pipeline.judging.confabulation import (
     collect_labels,
     drawn,
     load_protocol,
-    parse_labels,
     render,
     sample_failures,
     sample_id,
     void_kind,
 )
-from traps_pipeline.judging.panel import JudgeEntry
+from traps_pipeline.judging.panel import parse_judgement
+from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.plan import make_plan
@@ -196,9 +196,9 @@ def test_the_prompt_asks_for_exactly_the_axes_of_the_schema() -> None:
     ],
 )
 def test_labels_that_break_the_schema_are_invalid_for_a_reason(text: str | None, outcome: str, reason: str) -> None:
-    found = parse_labels({"outcome": outcome, "text": text})
+    found = parse_judgement(Labels, {"outcome": outcome, "text": text})
     assert isinstance(found, str) and reason in found
-    assert parse_labels({"outcome": "answer", "text": labels(True, False, True, False)}) == Labels(
+    assert parse_judgement(Labels, {"outcome": "answer", "text": labels(True, False, True, False)}) == Labels(
         hallucinated_premise=True,
         invalid_inference=False,
         epistemic_surrender=True,

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import Vote, load_panel, parse_vote, render, tasks_for, vote_request
+from traps_pipeline.judging.panel import Vote, parse_vote, render, tasks_for, vote_request
+from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.partitions import Cell, Evaluation
 

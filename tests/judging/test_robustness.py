@@ -12,8 +12,9 @@ import pytest
 from tests.providers.server import Provider
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import JudgeEntry, load_panel
-from traps_pipeline.judging.robustness import ATTACKS_FILE, PANEL, check_panel, load_attacks, result, summary
+from traps_pipeline.judging.ratings import PANEL
+from traps_pipeline.judging.robustness import ATTACKS_FILE, check_panel, load_attacks, result, summary
+from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.storage.workspace import Study, Workspace
 from traps_pipeline.tables import JUDGE_ROBUSTNESS
 

@@ -7,8 +7,9 @@ import json
 
 import pytest
 
-from traps_pipeline.judging.panel import Task, parse_vote, render
+from traps_pipeline.judging.panel import parse_vote, render
 from traps_pipeline.judging.rules import RuleJudge, extract, final_statement, judge_abstention
+from traps_pipeline.models.judges import Task
 from traps_pipeline.models.request import Request
 
 QUESTION = "Where did the ball end up -- left bin, right bin, or somewhere else?"

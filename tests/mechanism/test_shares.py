@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from traps_pipeline.mechanism.paths import STEERING_PATHS
-from traps_pipeline.mechanism.shares import share_rows
+from traps_pipeline.mechanism.shares import effect_rows, share_rows
 from traps_pipeline.mechanism.steering import UNSTEERED, shared_item
 from traps_pipeline.partitions import DATASETS, taxonomy_of
 
@@ -14,7 +14,7 @@ ABSTAINS = "s0"  # of two scenarios the one on whose void the model always absta
 
 
 def study(scenarios: tuple[str, ...] = ("s0", "s1")) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Answers and votes of all 14 paths at alpha 0 and 10, one regime."""
+    """Answers and the votes of three judges, who agree, of all 14 paths at alpha 0 and 10, one regime."""
     asked = [(target, UNSTEERED, UNSTEERED, 0, 0.0) for target in DATASETS]
     asked += [(target, source, "void", 3, 10.0) for source, target in STEERING_PATHS]
     rows = []
@@ -29,7 +29,8 @@ def study(scenarios: tuple[str, ...] = ("s0", "s1")) -> tuple[pd.DataFrame, pd.D
                     | {"abstained": side == "void" and scenario.endswith(ABSTAINS)}
                 )
     frame = pd.DataFrame(rows).assign(model="m", directions="guided", regime="guided", epoch="e", alpha_relative=0.1)
-    return frame.drop(columns="abstained"), frame
+    votes = frame.assign(task="abstention", valid=True, benchmark_version="v1")
+    return frame.drop(columns="abstained"), votes.merge(pd.DataFrame({"judge": ["a", "b", "c"]}), how="cross")
 
 
 def whole(rows: list[dict[str, object]]) -> pd.DataFrame:
@@ -62,7 +63,8 @@ def test_its_interval_is_as_wide_as_the_scenarios_are_few() -> None:
 def test_undecided_answers_and_the_sweep_are_left_out() -> None:
     answers, votes = study()
     votes["abstained"] = votes["abstained"].astype(object)
-    votes.loc[votes["scenario_id"] == "chaotic-s1", "abstained"] = None
+    broken = (votes["scenario_id"] == "chaotic-s1") & (votes["judge"] != "a")  # one vote of three decides nothing
+    votes.loc[broken, ["valid", "abstained"]] = [False, None]
     shares = whole(share_rows(answers, votes, resamples=50))
     assert set(shares["n_scenarios"]) == {3}
     assert shares["abstention"]["void", 10.0] == pytest.approx((7 * 0.5 + 7 * 1) / 14)
@@ -70,3 +72,15 @@ def test_undecided_answers_and_the_sweep_are_left_out() -> None:
     sweep = [frame.loc[(frame["alpha"] == 10) & (frame["side"] == "control")] for frame in deep]
     both = [pd.concat(pair, ignore_index=True) for pair in zip(study(), sweep, strict=True)]
     assert set(whole(share_rows(*both, resamples=50))["layer"]) == {3}
+
+
+def test_the_majority_of_the_panel_that_voted_on_a_cell_decides_its_answers() -> None:
+    """Two of three decide; a cell on which another panel sat keeps that panel's verdicts."""
+    answers, votes = study()
+    outvoted = (votes["judge"] == "c") & (votes["dataset"] == "occlusion")
+    votes.loc[outvoted, "abstained"] = ~votes.loc[outvoted, "abstained"].to_numpy(bool)
+    elsewhere = votes["dataset"] == "chaotic"
+    votes.loc[elsewhere, "judge"] = votes.loc[elsewhere, "judge"].map({"a": "d", "b": "e", "c": "f"})
+    unanimous = pd.DataFrame(effect_rows(*study()))
+    pd.testing.assert_frame_equal(pd.DataFrame(effect_rows(answers, votes)), unanimous)
+    assert (unanimous["n_missing"] == 0).all() and unanimous["abstained"].any()

@@ -26,6 +26,7 @@ from traps_pipeline.mechanism.steering import (
     strengths,
 )
 from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.models.request import JUDGED
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.parquet import Made
@@ -273,7 +274,8 @@ def steered(study: Workspace, entry: ModelEntry) -> Workspace:
     planned = count_answers(study.mechanism, "tiny", DATASETS, {"occlusion": PAIRS, "chaotic": PAIRS})
     assert planned == {"guided": sum(asked for _, asked in rows.values())}
     votes = written(study, STEERING_VOTES, collect_steering_votes(study, cells))
-    assert [len(made.rows) for _, made in votes] == [len(made.rows) for _, made in done]
+    judged = [[row for row in made.rows if row["outcome"] in JUDGED] for _, made in done]
+    assert [len(made.rows) for _, made in votes] == [3 * len(rows) for rows in judged]
     return study
 
 
@@ -313,14 +315,14 @@ def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, e
 
 def test_the_panel_judges_every_answer_with_a_text(steered: Workspace) -> None:
     answers, votes = steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES)
-    texts = answers["outcome"].isin(["answer", "truncated"])
-    assert len(votes) == len(answers) and texts.any()
     keys = ["dataset", "source", "kind", "layer", "alpha", "item_id"]
-    both = answers.merge(votes, on=keys)
-    judged = both["outcome"].isin(["answer", "truncated"])
-    assert (both.loc[judged, "n_valid"] == 3).all() and (both.loc[~judged, "n_valid"] == 0).all()
-    assert both.loc[~judged, "abstained"].isna().all()
-    assert {len(json.loads(v)) for v in both.loc[judged, "votes"]} == {3}
+    texts = answers.loc[answers["outcome"].isin(JUDGED), keys]
+    of_answer = votes.groupby(keys)
+    assert set(of_answer.groups) == set(texts.itertuples(index=False, name=None)) != set()
+    assert set(of_answer["judge"].nunique()) == set(of_answer.size()) == {3}
+    assert set(votes["task"]) == {"abstention"} and votes["valid"].all() and votes["abstained"].notna().all()
+    ledger = steered.votes.read("tiny__guided__steered").rows
+    assert set(votes["vote_key"]) == set(ledger)
 
 
 def test_effects_put_the_model_as_it_is_into_every_path(steered: Workspace) -> None:

@@ -15,14 +15,14 @@ from typing import Any
 import pytest
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models import ask
+from traps_pipeline.models import participants
 from traps_pipeline.models.answers import answer_request
-from traps_pipeline.models.ask import Participants, Row, Work, run_work, settle
+from traps_pipeline.models.ask import Call, Settled, Work, run_work, settle
 from traps_pipeline.models.budget import Budget
+from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits, get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.progress import Tally
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.workspace import Study, Workspace
 
@@ -58,15 +58,18 @@ def request(item: int | str, model: str = "m", **changes: Any) -> Request:
 
 def work(
     root: Path, backends: Mapping[str, Answering], wanted: Callable[[Cell], Sequence[Request]], limits: Limits = QUICK
-) -> Work[dict[str, Any]]:
+) -> Work[Cell, Call, dict[str, Any]]:
     """Work whose finish returns what it was given, as {cell, rows, tally}."""
 
-    def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> dict[str, Any]:
-        return {"cell": cell, "rows": list(rows.values()), "tally": tally}
+    def calls(cell: Cell) -> list[Call]:
+        return [Call(request) for request in wanted(cell)]
+
+    def finish(settled: Settled[Cell, Call]) -> dict[str, Any]:
+        return {"cell": settled.cell, "rows": list(settled.rows.values()), "tally": settled.tally}
 
     entries = {name: Entry(id=name, backend="test", limits=limits) for name in backends}
-    participants = Participants(entries, lambda entry: backends[entry.id], Study())
-    return Work("responses", Ledger(root, "answers"), participants, Budget(0.0, {}, {}), "1", wanted, finish)
+    asked = Participants(entries, lambda entry: backends[entry.id], Study())
+    return Work("responses", Ledger(root, "answers"), asked, Budget(0.0, {}, {}), "1", calls, finish)
 
 
 def ten(_: Cell) -> list[Request]:
@@ -94,6 +97,23 @@ def test_only_the_difference_is_asked(tmp_path: Path) -> None:
     (finished,) = run_work(work(tmp_path, {"m": backend}, ten), [CELL])
     assert backend.calls == ["item-7", "item-8", "item-9"]
     assert [row["components"]["about"]["item_id"] for row in finished["rows"]] == [f"item-{n}" for n in range(10)]
+
+
+def test_the_calls_of_a_cell_are_made_once_and_handed_on_with_their_rows(tmp_path: Path) -> None:
+    asked: list[Cell] = []
+    cells = [CELL, Cell("chaotic", CELL.evaluation)]
+
+    def wanted(cell: Cell) -> list[Request]:
+        asked.append(cell)
+        return [request(f"{cell.dataset}-{n}") for n in range(3)]
+
+    def finish(settled: Settled[Cell, Call]) -> dict[str, Any]:
+        return {str(call.request.about["item_id"]): row["key"] for call, row in settled.answered()}
+
+    of_items = replace(work(tmp_path, {"m": Answering()}, wanted), finish=finish)
+    found = {item: key for of_cell in run_work(of_items, cells) for item, key in of_cell.items()}
+    assert sorted(asked) == sorted(cells)
+    assert found == {f"item-{c.dataset}-{n}": request(f"{c.dataset}-{n}").key for c in cells for n in range(3)}
 
 
 def test_a_torn_line_costs_one_call(tmp_path: Path) -> None:
@@ -162,7 +182,7 @@ def test_waits_grow_with_each_retry_and_are_drawn_below_their_bound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bounds: list[float] = []
-    monkeypatch.setattr(ask.random, "uniform", lambda low, high: bounds.append(high) or 0.0)
+    monkeypatch.setattr(participants.random, "uniform", lambda low, high: bounds.append(high) or 0.0)
 
     async def always_busy(_: Request, call: int) -> Outcome:
         raise TransientError("timeout")
@@ -294,8 +314,9 @@ def test_stopping_does_not_wait_for_a_provider_that_asked_for_an_hour(tmp_path: 
 INTERRUPTED = """
 import asyncio, sys
 from pathlib import Path
-from traps_pipeline.models.ask import Participants, Work, run_work
+from traps_pipeline.models.ask import Call, Work, run_work
 from traps_pipeline.models.budget import Budget
+from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.partitions import Cell, Evaluation
@@ -309,11 +330,11 @@ class Slow:
             print("six calls", flush=True)
         await asyncio.sleep(0.3)
         return Outcome("answer", "left")
-requests = [Request("m", "test", {}, "s", "u", {"item_id": str(n)}) for n in range(40)]
+calls = [Call(Request("m", "test", {}, "s", "u", {"item_id": str(n)})) for n in range(40)]
 entry = Entry(id="m", backend="test", limits=Limits(concurrency=4))
 participants = Participants({"m": entry}, lambda _: Slow(), Study())
 ledger, budget = Ledger(Path(sys.argv[1]), "answers"), Budget(0.0, {}, {})
-work = Work("responses", ledger, participants, budget, "1", lambda _: requests, lambda *_: 1)
+work = Work("responses", ledger, participants, budget, "1", lambda _: calls, lambda _: 1)
 try:
     list(run_work(work, [Cell("occlusion", Evaluation("m", "standard", 1))]))
 except KeyboardInterrupt:

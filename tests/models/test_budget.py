@@ -15,7 +15,7 @@ import pytest
 from pydantic import ValidationError
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.ask import Participants, Work, run_work
+from traps_pipeline.models.ask import Call, Work, run_work
 from traps_pipeline.models.budget import (
     Budget,
     BudgetReached,
@@ -25,6 +25,7 @@ from traps_pipeline.models.budget import (
     spending,
     worst_case_usd,
 )
+from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.partitions import Cell, Evaluation
@@ -153,10 +154,10 @@ def row_after(kind: str, times: int, cap_usd: float, folder: Path) -> dict[str, 
         {"m": asked}, lambda _: Failing(kind, times), Study(budget_usd=cap_usd), {"a": Account()}
     )
     ledger, cell = Ledger(folder, "answers"), Cell("occlusion", Evaluation("m", "standard", 1))
-    requests = [Request("m", "api", {}, "s", "u", {"item_id": "x"})]
+    calls = [Call(Request("m", "api", {}, "s", "u", {"item_id": "x"}))]
     journal = Journal(folder / "in_flight.jsonl")
     budget = Budget(cap_usd, {}, {}, journal)
-    work = Work("responses", ledger, participants, budget, "1", lambda _: requests, lambda *_: None)
+    work = Work("responses", ledger, participants, budget, "1", lambda _: calls, lambda _: None)
     with suppress(BudgetReached):
         list(run_work(work, [cell]))
     journal.close()

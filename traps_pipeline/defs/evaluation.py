@@ -6,8 +6,9 @@ from typing import Any
 import dagster as dg
 
 from traps_pipeline.defs.benchmark import items
-from traps_pipeline.judging.panel import collect_votes, panel_version
+from traps_pipeline.judging.panel import collect_votes
 from traps_pipeline.models.answers import collect_answers
+from traps_pipeline.models.judges import panel_version
 from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.registry import answering_version
 from traps_pipeline.models.request import JUDGED

@@ -56,7 +56,7 @@ _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load
 
 
 def _panel(workspace: Workspace) -> list[str]:
-    from traps_pipeline.judging.panel import load_panel
+    from traps_pipeline.models.judges import load_panel
 
     return [judge.id for judge in load_panel(workspace.study.panel)]
 

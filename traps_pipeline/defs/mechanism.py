@@ -8,7 +8,6 @@ import dagster as dg
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.versions import (
     directions_are_there,
     extraction_version,
@@ -56,7 +55,6 @@ from traps_pipeline.tables import (
     STEERING_EFFECTS,
     STEERING_SHARES,
     STEERING_VOTES,
-    Table,
 )
 from traps_pipeline.tables import STEERING as STEERING_TABLE
 from traps_pipeline.wanted import PROBE_PROMPT, Wanted
@@ -263,11 +261,11 @@ steering_votes = stage(
 )
 
 
-def _judged(workspace: Workspace, table: Table) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    answers, votes = workspace.tables.read_all(STEERING_TABLE), workspace.tables.read_all(STEERING_VOTES)
-    if votes.empty:
-        raise TrapsError(f"{table.name}: no votes yet; materialize steering and steering_votes first")
-    return answers, votes
+def _judged(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
+    """The steered answers, and the votes on them."""
+    from traps_pipeline.mechanism.shares import VOTE_COLUMNS
+
+    return workspace.tables.read_all(STEERING_TABLE), workspace.tables.read_all(STEERING_VOTES, VOTE_COLUMNS)
 
 
 def _make_effects(workspace: Workspace, _: None) -> Made:
@@ -276,7 +274,7 @@ def _make_effects(workspace: Workspace, _: None) -> Made:
 
     from traps_pipeline.mechanism.shares import effect_rows
 
-    table = pd.DataFrame(effect_rows(*_judged(workspace, STEERING_EFFECTS)))
+    table = pd.DataFrame(effect_rows(*_judged(workspace)))
     return Made(table, shown={"effects": rows_shown(table)})
 
 
@@ -286,7 +284,7 @@ def _make_shares(workspace: Workspace, _: None) -> Made:
 
     from traps_pipeline.mechanism.shares import share_rows
 
-    table = pd.DataFrame(share_rows(*_judged(workspace, STEERING_SHARES)))
+    table = pd.DataFrame(share_rows(*_judged(workspace)))
     return Made(table, shown={"shares": rows_shown(table)})
 
 

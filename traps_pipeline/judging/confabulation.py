@@ -10,33 +10,32 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StrictBool
 
 from traps_pipeline import progress
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.answers import strip_fence
-from traps_pipeline.judging.panel import JudgeEntry, load_judges, make_judge, quoted
-from traps_pipeline.models.ask import Participants, Row, Work, run_work
-from traps_pipeline.models.budget import spending
+from traps_pipeline.judging.panel import ask_judges, judge_request, parse_judgement, quoted
+from traps_pipeline.models.ask import Call, Settled
+from traps_pipeline.models.judges import JudgeEntry, load_judges
+from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, get_model, structured
-from traps_pipeline.models.request import JUDGED, Request
+from traps_pipeline.models.request import Request
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation, is_ill_posed
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS
-from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
+from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 PROTOCOL_FILE = ASSETS / "confabulation.yaml"
-TASK, PROMPT = "confabulation", "judge_confabulation"
+TASK = "confabulation"
 AXES = ("hallucinated_premise", "invalid_inference", "epistemic_surrender", "doubt_in_reasoning")
 # What the id of a failure is made of, and with it the people's labels: another answer is another failure. A part of
 # the protocol's digest, so that ids made otherwise are made anew.
@@ -104,7 +103,7 @@ def protocol_digest(panel: str) -> str:
     """What decides the labels of a study with this panel, beside the answers."""
     protocol = load_protocol()
     judge = protocol.judge(panel)
-    asked = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(PROMPT), VOID_KINDS] if judge else None
+    asked = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None
     return digest([protocol.model_dump(exclude={"judges"}), asked, SAMPLED])[:16]
 
 
@@ -112,14 +111,13 @@ def protocol_digest(panel: str) -> str:
 
 
 @dataclass(frozen=True)
-class Failure:
-    """A sampled void failure: its item and answer, and the call that puts it to the judge."""
+class Failure(Call):
+    """The call that puts a sampled void failure to the judge: its item and answer, and of how many it was drawn."""
 
     item: Mapping[str, Any]
     text: str
     trace: str | None
     n_failures: int
-    request: Request
 
 
 def void_kind(dataset: str) -> str:
@@ -154,7 +152,7 @@ def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict
         cell, row = found[key]
         trace = row["reasoning"] if protocol.models[model] == TRACE_AND_OUTPUT else None
         request = label_request(judge, cell, row, row["text"], trace)
-        sample.setdefault(cell, []).append(Failure(row, row["text"], trace, len(found), request))
+        sample.setdefault(cell, []).append(Failure(request, row, row["text"], trace, len(found)))
     return sample
 
 
@@ -182,15 +180,8 @@ def render(question: str, kind: str, answer: str, trace: str | None) -> str:
 
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
     """The call that puts one failure to the judge; it tells neither model nor regime, and no ground truth."""
-    e = cell.evaluation
-    return Request(
-        participant=judge.id,
-        endpoint=judge.provider_id or judge.backend,
-        params=judge.params | {"response_format": SCHEMA},
-        system=prompt(PROMPT),
-        user=render(item["question"], void_kind(cell.dataset), answer, trace),
-        about={"task": TASK, "item_id": item["item_id"], "model": e.model, "regime": e.regime, "run": e.run},
-    )
+    user = render(item["question"], void_kind(cell.dataset), answer, trace)
+    return judge_request(judge, TASK, SCHEMA, cell, item["item_id"], user)
 
 
 class Labels(BaseModel):
@@ -204,16 +195,6 @@ class Labels(BaseModel):
     rationale: str
 
 
-def parse_labels(row: Row) -> Labels | str:
-    """The labels that the judge returned; or why they are invalid."""
-    if row["outcome"] not in JUDGED:
-        return f"judge returned {row['outcome']}"
-    try:
-        return Labels.model_validate_json(strip_fence(row["text"] or ""))
-    except ValidationError as error:
-        return explain(error)[:200]
-
-
 # --- the confabulation stage ------------------------------------------------------------------------------------------
 
 
@@ -223,7 +204,7 @@ def collect_labels(workspace: Workspace) -> Made:
 
     Nothing where the study's panel has no judge for it.
     """
-    protocol, table, total = load_protocol(), list[dict[str, Any]](), Tally()
+    protocol, table, total = load_protocol(), list[Mapping[str, Any]](), Tally()
     judge = protocol.judge(workspace.study.panel)
     if judge is None:
         return Made(table)
@@ -231,23 +212,17 @@ def collect_labels(workspace: Workspace) -> Made:
     for model in protocol.models:
         samples |= sample_failures(workspace, judge, model)
 
-    def requests(cell: Cell) -> list[Request]:
-        return [failure.request for failure in samples[cell]]
+    def finish(settled: Settled[Cell, Failure]) -> tuple[Cell, Made]:
+        return settled.made(_label_row)
 
-    def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> None:
-        total.add(tally)
-        table.extend(_label_row(cell, failure, rows[failure.request.key]) for failure in samples[cell])
-
-    participants = Participants({judge.id: judge}, make_judge, workspace.study)
-    with spending(workspace, [judge]) as budget:
-        work = Work(TASK, workspace.votes, participants, budget, workspace.study.epoch, requests, finish)
-        for _ in run_work(work, list(samples)):
-            pass
+    for _, made in ask_judges(workspace, TASK, [judge], list(samples), samples.__getitem__, finish):
+        table.extend(made.rows)
+        total.add(made.tally)
     return Made(table, total, {"asked": total.asked, "known": total.cached, "failed": total.errors})
 
 
 def _label_row(cell: Cell, failure: Failure, row: Row) -> dict[str, Any]:
-    labels = parse_labels(row)
+    labels = parse_judgement(Labels, row)
     valid = isinstance(labels, Labels)
     item_id = failure.item["item_id"]
     return {
@@ -261,8 +236,7 @@ def _label_row(cell: Cell, failure: Failure, row: Row) -> dict[str, Any]:
         "valid": valid,
         "invalid_reason": None if valid else labels,
         **{axis: getattr(labels, axis) if valid else None for axis in (*AXES, "rationale")},
-        "label_key": failure.request.key,
-        "epoch": row["epoch"],
-        "created_at": datetime.fromisoformat(row["created_at"]),
+        "label_key": row["key"],
+        **when_asked(row),
         "benchmark_version": failure.item["benchmark_version"],
     }

@@ -7,99 +7,29 @@ side or regime. The answer is data: it stands between markers that it cannot kno
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from functools import cache
-from pathlib import Path
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, StrictBool, StrictFloat, StrictInt, StrictStr, ValidationError
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.answers import is_correct, strip_fence
-from traps_pipeline.models.answers import answer_request, calls_shown
-from traps_pipeline.models.ask import Participants, Row, Work, run_work
+from traps_pipeline.models.answers import answer_request
+from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.budget import spending
+from traps_pipeline.models.judges import SCHEMAS, JudgeEntry, Task, load_panel
+from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
-from traps_pipeline.models.registry import (
-    JUDGE_PROTOCOL,
-    NETWORK,
-    Entry,
-    Limits,
-    Protocol,
-    get_model,
-    read_entries,
-    structured,
-)
+from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, Backend, Request
 from traps_pipeline.partitions import Cell
-from traps_pipeline.paths import ASSETS
-from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES
-from traps_pipeline.yamlfile import explain, read_yaml
-
-JUDGES_FILE = ASSETS / "judges.yaml"
-PANEL_SIZE = 3
-Task = Literal["abstention", "correctness"]
-
-
-# What a judge over the network is told to return; what it does return is checked by `parse_vote` all the same.
-SCHEMAS: Mapping[Task, Mapping[str, Any]] = {
-    "abstention": structured(
-        "abstention",
-        abstained={"type": "boolean"},
-        confidence={"type": "string", "enum": ["high", "medium", "low"]},
-        reasoning={"type": "string"},
-    ),
-    "correctness": structured(
-        "correctness",
-        correct={"type": "boolean"},
-        extracted_value={"anyOf": [{"type": "string"}, {"type": "number"}, {"type": "null"}]},
-        reasoning={"type": "string"},
-    ),
-}
-
-
-class JudgeEntry(Entry):
-    """One judge of `assets/judges.yaml`."""
-
-    backend: Literal["rule", "api"]  # pyright: ignore[reportIncompatibleVariableOverride] - fields are frozen
-    limits: Limits = Limits(concurrency=12)
-
-    def protocol(self) -> Protocol:
-        """See `Entry.protocol`."""
-        return JUDGE_PROTOCOL
-
-
-@cache
-def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
-    """Judges by id. Raises TrapsError naming judge and field."""
-    return read_entries(path, "judges", JudgeEntry)
-
-
-@cache
-def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
-    """The three judges of a panel. Raises TrapsError naming the file and what is wrong."""
-    panels, judges = read_yaml(path).get("panels"), load_judges(path)
-    if not isinstance(panels, dict) or name not in panels:
-        raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels or ())}")
-    seats = panels[name]
-    whole = isinstance(seats, list) and len(seats) == len(set(seats)) == PANEL_SIZE
-    if not whole or any(seat not in judges for seat in seats):
-        raise TrapsError(f"{path}: panel {name!r} must seat {PANEL_SIZE} different known judges, not {seats}")
-    return tuple(judges[seat] for seat in seats)
-
-
-def panel_version(panel: str) -> str:
-    """Version of what decides a panel's votes besides answers: judges, their prompts and schemas."""
-    judges = [[judge.id, judge.provider_id or judge.backend, judge.params, SCHEMAS] for judge in load_panel(panel)]
-    return digest([judges, prompt("judge_abstention"), prompt("judge_correctness")])[:16]
-
+from traps_pipeline.tables import ITEMS, RESPONSES, Table
+from traps_pipeline.yamlfile import explain
 
 # --- what a judge is asked --------------------------------------------------------------------------------------------
 
@@ -126,18 +56,25 @@ def render(task: Task, question: str, answer: str, ground_truth: str | None) -> 
     return "\n\n".join([*parts, quoted("response", "RESPONSE", answer)])
 
 
-def vote_request(judge: JudgeEntry, task: Task, cell: Cell, item: Mapping[str, Any], answer: str) -> Request:
-    """The call that puts one task about one answer to one judge."""
+def judge_request(
+    judge: JudgeEntry, task: str, schema: Mapping[str, Any], cell: Cell, item_id: str, user: str
+) -> Request:
+    """The call that puts a task about one answer of a cell to a judge, which returns the schema's JSON."""
     e = cell.evaluation
-    about = {"task": task, "item_id": item["item_id"], "model": e.model, "regime": e.regime, "run": e.run}
     return Request(
         participant=judge.id,
-        endpoint=judge.provider_id or judge.backend,
-        params=judge.params | ({"response_format": SCHEMAS[task]} if judge.backend == NETWORK else {}),
+        endpoint=judge.endpoint,
+        params=judge.params | ({"response_format": schema} if judge.backend == NETWORK else {}),
         system=prompt(f"judge_{task}"),
-        user=render(task, item["question"], answer, item["ground_truth"]),
-        about=about,
+        user=user,
+        about={"task": task, "item_id": item_id, "model": e.model, "regime": e.regime, "run": e.run},
     )
+
+
+def vote_request(judge: JudgeEntry, task: Task, cell: Cell, item: Mapping[str, Any], answer: str) -> Request:
+    """The call for one judge's vote on one task about one answer."""
+    user = render(task, item["question"], answer, item["ground_truth"])
+    return judge_request(judge, task, SCHEMAS[task], cell, item["item_id"], user)
 
 
 # --- what a judge says ------------------------------------------------------------------------------------------------
@@ -174,15 +111,24 @@ class Vote:
     rationale: str | None = None
 
 
-def parse_vote(task: Task, row: Row, item: Mapping[str, Any]) -> Vote:
-    """A vote from what the judge returned. Anything but the schema's JSON is invalid, with the reason."""
+Schema = TypeVar("Schema", bound=BaseModel)
+
+
+def parse_judgement(schema: type[Schema], row: Row) -> Schema | str:
+    """What a judge returned; or why it is invalid, as anything but the schema's JSON is."""
     if row["outcome"] not in JUDGED:
-        return Vote(False, invalid_reason=f"judge returned {row['outcome']}")
-    schema = AbstentionVote if task == "abstention" else CorrectnessVote
+        return f"judge returned {row['outcome']}"
     try:
-        vote = schema.model_validate_json(strip_fence(row["text"] or ""))
+        return schema.model_validate_json(strip_fence(row["text"] or ""))
     except ValidationError as error:
-        return Vote(False, invalid_reason=explain(error)[:200])
+        return explain(error)[:200]
+
+
+def parse_vote(task: Task, row: Row, item: Mapping[str, Any]) -> Vote:
+    """A vote from what the judge returned."""
+    vote = parse_judgement(AbstentionVote if task == "abstention" else CorrectnessVote, row)
+    if isinstance(vote, str):
+        return Vote(False, invalid_reason=vote)
     if isinstance(vote, AbstentionVote):
         return Vote(True, vote.abstained, confidence=vote.confidence, rationale=vote.reasoning)
     extracted = None if vote.extracted_value is None else str(vote.extracted_value)
@@ -194,27 +140,43 @@ def parse_vote(task: Task, row: Row, item: Mapping[str, Any]) -> Vote:
 # --- the votes stage --------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Ballot(Call):
+    """The call for one judge's vote: the item that the vote's row names, and the task."""
+
+    item: Mapping[str, Any]
+    task: Task
+
+    @property
+    def judge(self) -> str:
+        """Whose vote it is."""
+        return self.request.participant
+
+    def vote(self, row: Row) -> Vote:
+        """The vote that the judge returned."""
+        return parse_vote(self.task, row, self.item)
+
+
 def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Made]]:
     """Ask the study's panel what is missing; the VOTES rows of each cell as it is done."""
     panel = load_panel(workspace.study.panel)
-
-    ballots: dict[Cell, list[Ballot]] = {}
-
-    def requests(cell: Cell) -> list[Request]:
-        ballots[cell] = wanted_ballots(workspace, panel, cell)
-        return [ballot.request for ballot in ballots[cell]]
-
-    def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> tuple[Cell, Made]:
-        table = [_vote_row(cell, ballot, rows[ballot.request.key]) for ballot in ballots.pop(cell)]
-        return cell, Made(table, tally, calls_shown(rows, tally))
-
-    participants = Participants({judge.id: judge for judge in panel}, make_judge, workspace.study)
-    epoch = workspace.study.epoch
-    with spending(workspace, panel) as budget:
-        yield from run_work(Work("votes", workspace.votes, participants, budget, epoch, requests, finish), cells)
+    calls = partial(wanted_ballots, workspace, panel)
+    yield from ask_judges(workspace, "votes", panel, cells, calls, lambda settled: settled.made(_vote_row))
 
 
-def make_judge(entry: Entry) -> Backend:
+def ask_judges(
+    workspace: Workspace,
+    stage: str,
+    judges: Iterable[JudgeEntry],
+    cells: Sequence[AnyCell],
+    calls: Callable[[AnyCell], Sequence[AnyCall]],
+    finish: Callable[[Settled[AnyCell, AnyCall]], Finished],
+) -> Iterator[Finished]:
+    """`collect` from judges, by the ledger of votes."""
+    return collect(workspace, stage, workspace.votes, judges, cells, calls, finish, _make_judge)
+
+
+def _make_judge(entry: Entry) -> Backend:
     """A judge's backend: the rule judge, or any backend of the models."""
     if entry.backend == "rule":
         from traps_pipeline.judging.rules import RuleJudge
@@ -223,64 +185,62 @@ def make_judge(entry: Entry) -> Backend:
     return make_backend(entry)
 
 
-@dataclass(frozen=True)
-class Ballot:
-    """One vote that is wanted: the item and task, and the call that asks for it."""
-
-    item: Mapping[str, Any]
-    task: Task
-    request: Request
-
-
 def wanted_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: Cell) -> list[Ballot]:
     """Every vote that the answers of a cell want."""
-    items, entry = _items_by_id(workspace, cell.dataset), get_model(cell.evaluation.model)
-    ballots = []
-    for response in workspace.tables.read(RESPONSES, cell.partition).to_dict("records"):
-        if response["outcome"] not in JUDGED:
-            continue
-        item = _item_of(items, response, cell)
+    entry, ballots = get_model(cell.evaluation.model), list[Ballot]()
+    for response, item in judged_answers(workspace, RESPONSES, cell):
         if response["request_key"] != answer_request(workspace, entry, item, cell.evaluation).key:
             raise TrapsError(
                 f"responses {cell.key}: the answer to {item['item_id']} is of an earlier question, clip or setting; "
                 "materialize responses for this cell first"
             )
         for task in tasks_for(item["side"]):
-            ballots += [Ballot(item, task, vote_request(judge, task, cell, item, response["text"])) for judge in panel]
+            text = response["text"]
+            ballots += [Ballot(vote_request(judge, task, cell, item, text), item, task) for judge in panel]
     return ballots
 
 
-def _items_by_id(workspace: Workspace, dataset: str) -> dict[str, dict[str, Any]]:
-    items = workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
-    return {item["item_id"]: item for item in items}
+def judged_answers(workspace: Workspace, table: Table, cell: Cell) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """The answers of a cell that have a text, each with its item. table: of the answers. Raises TrapsError for an
+    answer whose item is gone."""
+    items = {item["item_id"]: item for item in _rows(workspace, ITEMS, {"dataset": cell.dataset})}
+    for answer in _rows(workspace, table, cell.partition):
+        if answer["outcome"] not in JUDGED:
+            continue
+        if answer["item_id"] not in items:
+            raise TrapsError(
+                f"{table.name} {cell.key}: item {answer['item_id']} is no longer in items {cell.dataset}; "
+                f"materialize {table.name} for {cell.key}"
+            )
+        yield answer, items[answer["item_id"]]
 
 
-def _item_of(items: Mapping[str, dict[str, Any]], response: Mapping[str, Any], cell: Cell) -> dict[str, Any]:
-    if response["item_id"] not in items:
-        raise TrapsError(
-            f"responses {cell.key}: item {response['item_id']} is no longer in items {cell.dataset}; "
-            f"materialize responses for {cell.key}"
-        )
-    return items[response["item_id"]]
+def _rows(workspace: Workspace, table: Table, partition: Mapping[str, Any]) -> list[dict[str, Any]]:
+    return workspace.tables.read(table, partition).to_dict("records")
+
+
+def vote_columns(ballot: Ballot, vote: Vote, row: Row) -> dict[str, Any]:
+    """The columns that every table of votes has, whatever the answers are."""
+    return {
+        "task": ballot.task,
+        "judge": ballot.judge,
+        "valid": vote.valid,
+        "invalid_reason": vote.invalid_reason,
+        "abstained": vote.decision if ballot.task == "abstention" else None,
+        "confidence": vote.confidence,
+        "rationale": vote.rationale,
+        "vote_key": row["key"],
+        **when_asked(row),
+    }
 
 
 def _vote_row(cell: Cell, ballot: Ballot, row: Row) -> dict[str, Any]:
-    item, task, request = ballot.item, ballot.task, ballot.request
-    vote = parse_vote(task, row, item)
+    vote = ballot.vote(row)
     return {
-        **{name: item[name] for name in ("item_id", "side", "benchmark_version")},
+        **{name: ballot.item[name] for name in ("item_id", "side", "benchmark_version")},
         **cell.partition,
-        "task": task,
-        "judge": request.participant,
-        "valid": vote.valid,
-        "invalid_reason": vote.invalid_reason,
-        "abstained": vote.decision if task == "abstention" else None,
-        "correct": vote.decision if task == "correctness" else None,
+        **vote_columns(ballot, vote, row),
+        "correct": vote.decision if ballot.task == "correctness" else None,
         "judge_correct": vote.judge_correct,
         "extracted_value": vote.extracted_value,
-        "confidence": vote.confidence,
-        "rationale": vote.rationale,
-        "vote_key": request.key,
-        "epoch": row["epoch"],
-        "created_at": datetime.fromisoformat(row["created_at"]),
     }

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
 YES, NO, INVALID = 1, 0, -1  # of a vote; of a majority, INVALID is undecided
+PANEL = "panel"  # all judges together, where a table otherwise names one
 ANSWER = ["dataset", "model", "regime", "run", "item_id"]
 ABSTENTION, CORRECTNESS = ("void_abstention", "control_abstention"), ("correctness",)
 TASKS = (*ABSTENTION, *CORRECTNESS)
@@ -17,22 +18,24 @@ VOTE_COLUMNS = [*ANSWER, "side", "task", "judge", "valid", "abstained", "correct
 
 @dataclass(frozen=True)
 class Ratings:
-    """answers: ANSWER, task (one of TASKS), epoch and benchmark_version, one row an answer and task. values: (rows,
-    judges) int8 of YES, NO and INVALID, columns in the order of `judges`."""
+    """answers: the columns `answer` (which name one), task (one of TASKS), epoch and benchmark_version, one row an
+    answer and task. values: (rows, judges) int8 of YES, NO and INVALID, columns in the order of `judges`."""
 
     answers: pd.DataFrame
     values: np.ndarray
     judges: tuple[str, ...]
+    answer: Sequence[str]
 
     def select(self, chosen: np.ndarray) -> Ratings:
         """The rows that a boolean mask chooses."""
-        return Ratings(self.answers.loc[chosen].reset_index(drop=True), self.values[chosen], self.judges)
+        return replace(self, answers=self.answers.loc[chosen].reset_index(drop=True), values=self.values[chosen])
 
     def on(self, items: pd.DataFrame, tasks: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """The votes on each item (rows with the columns ANSWER) on whichever of the tasks it was judged: values,
+        """The votes on each item (rows with the columns `answer`) on whichever of the tasks it was judged: values,
         (items, judges), all INVALID where it was not; and whether it was, (items,)."""
-        judged = self.answers.loc[self.answers["task"].isin(tasks), ANSWER]
-        found = items[ANSWER].merge(judged.assign(row=judged.index), on=ANSWER, how="left", validate="many_to_one")
+        by = [*self.answer]
+        judged = self.answers.loc[self.answers["task"].isin(tasks), by]
+        found = items[by].merge(judged.assign(row=judged.index), on=by, how="left", validate="many_to_one")
         rows = found["row"].to_numpy(float)
         asked = ~np.isnan(rows)
         values = np.full((len(items), len(self.judges)), INVALID, np.int8)
@@ -40,29 +43,30 @@ class Ratings:
         return values, asked
 
 
-def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> Ratings:
-    """The matrix of VOTES rows (`VOTE_COLUMNS` at least) of these judges (default: all, in alphabetical order).
+def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Sequence[str] = ANSWER) -> Ratings:
+    """The matrix of VOTES rows (`VOTE_COLUMNS` at least) of these judges (default: all, in alphabetical order), or of
+    rows of another table of votes; `answer` are the columns that name an answer there.
 
     An answer on which one of them was not asked is left out: it was put to another panel.
     """
     seats = tuple(sorted(votes["judge"].unique()) if judges is None else judges)
     votes = votes.loc[votes["judge"].isin(seats)].reset_index(drop=True)
-    rows, first = _grouped(votes)
+    rows, first = _grouped(votes, [*answer, "task"])
     values = np.full((len(first), len(seats)), INVALID, np.int8)
     asked = np.zeros(values.shape, bool)
     places = rows, pd.Index(seats).get_indexer(pd.Index(votes["judge"]))
     values[places], asked[places] = _decisions(votes), True
-    answers = votes.loc[first, [*ANSWER, "epoch", "benchmark_version"]].reset_index(drop=True)
+    answers = votes.loc[first, [*answer, "epoch", "benchmark_version"]].reset_index(drop=True)
     told = votes.loc[first, ["task", "side"]]
     answers["task"] = np.where(told["task"] == "correctness", "correctness", told["side"] + "_abstention")
     whole = asked.all(axis=1)
-    return Ratings(answers.loc[whole].reset_index(drop=True), values[whole], seats)
+    return Ratings(answers.loc[whole].reset_index(drop=True), values[whole], seats, answer)
 
 
-def _grouped(votes: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """The number of each vote's answer and task, (votes,), and the first vote of each, (answers,)."""
+def _grouped(votes: pd.DataFrame, by: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """The number of each vote's group by these columns, (votes,), and the first vote of each group, (groups,)."""
     code = np.zeros(len(votes), np.int64)
-    for name in (*ANSWER, "task"):
+    for name in by:
         own, known = pd.factorize(votes[name])
         code = code * max(len(known), 1) + own
     _, first, rows = np.unique(code, return_index=True, return_inverse=True)
@@ -71,12 +75,9 @@ def _grouped(votes: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
 
 def _decisions(votes: pd.DataFrame) -> np.ndarray:
     """YES, NO or INVALID of each vote, (votes,) int8."""
-    yes = _is_true(votes["abstained"].to_numpy(object)) | _is_true(votes["correct"].to_numpy(object))
+    decisions = votes.reindex(columns=["abstained", "correct"]).to_numpy(object)  # a table of one task has one of them
+    yes = (decisions == True).astype(bool).any(axis=1)  # noqa: E712 - null compares as not true
     return np.where(votes["valid"].to_numpy(bool), yes, INVALID).astype(np.int8)
-
-
-def _is_true(flags: np.ndarray) -> np.ndarray:
-    return (flags == True).astype(bool)  # noqa: E712 - null compares as not true
 
 
 def majority(values: np.ndarray) -> np.ndarray:

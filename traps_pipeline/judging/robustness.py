@@ -17,14 +17,12 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import JudgeEntry, Task, Vote, make_judge, parse_vote, tasks_for, vote_request
-from traps_pipeline.judging.ratings import INVALID, NO, YES, majority
-from traps_pipeline.models.ask import Participants, Row, Work, run_work
-from traps_pipeline.models.budget import spending
-from traps_pipeline.models.request import Request
+from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_request
+from traps_pipeline.judging.ratings import INVALID, NO, PANEL, YES, majority
+from traps_pipeline.models.ask import Settled
+from traps_pipeline.models.judges import JudgeEntry, Task
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.paths import ASSETS
-from traps_pipeline.progress import Tally
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import JUDGE_ROBUSTNESS
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
@@ -32,7 +30,6 @@ from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 ATTACKS_FILE = ASSETS / "injected_answers.yaml"
 CELL = Cell("occlusion", Evaluation("injected-answers", "standard", 1))  # names the folder of the votes; no model
 TASKS: tuple[Task, ...] = tasks_for("control")
-PANEL = "panel"
 RESULTS = ("held", "flipped", "broken", "wrong_anyway")
 _PLACE = "{answer}"
 
@@ -105,7 +102,7 @@ def load_attacks(path: Path = ATTACKS_FILE) -> Attacks:
     return parse_yaml_model(Attacks, read_yaml(path), path)
 
 
-Ballots = Mapping[tuple[str, Task, str], Vote]  # text, task and judge to the vote
+Votes = Mapping[tuple[str, Task, str], Vote]  # text, task and judge to the vote
 
 
 def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], attacks: Attacks) -> pd.DataFrame:
@@ -113,33 +110,29 @@ def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], at
 
     Raises TrapsError as the votes stage does.
     """
-    wanted: dict[tuple[str, Task, str], Request] = {
-        (text, task, judge.id): vote_request(judge, task, CELL, attacks.item(text), answer)
+    ballots = [
+        Ballot(vote_request(judge, task, CELL, attacks.item(text), answer), attacks.item(text), task)
         for text, answer in attacks.texts().items()
         for task in TASKS
         for judge in panel
-    }
+    ]
 
-    def finish(_: Cell, rows: Mapping[str, Row], tally: Tally) -> dict[tuple[str, Task, str], Vote]:
-        if tally.errors:
+    def finish(settled: Settled[Cell, Ballot]) -> Votes:
+        if settled.tally.errors:
             raise TrapsError(
-                f"{tally.errors} calls to the judges failed; run the same command again: only they are asked"
+                f"{settled.tally.errors} calls to the judges failed; run the same command again: only they are asked"
             )
         return {
-            place: parse_vote(place[1], rows[request.key], attacks.item(place[0])) for place, request in wanted.items()
+            (ballot.item["item_id"], ballot.task, ballot.judge): ballot.vote(row) for ballot, row in settled.answered()
         }
 
-    participants = Participants({judge.id: judge for judge in panel}, make_judge, workspace.study)
-    with spending(workspace, panel) as budget:
-        epoch, requests = workspace.study.epoch, list(wanted.values())
-        work = Work("judges", workspace.votes, participants, budget, epoch, lambda _: requests, finish)
-        (votes,) = run_work(work, [CELL])
+    (votes,) = ask_judges(workspace, "judges", panel, [CELL], lambda _: ballots, finish)
     rows = robustness(name, [judge.id for judge in panel], attacks, votes)
     workspace.tables.write(JUDGE_ROBUSTNESS, {}, rows, {})
     return rows
 
 
-def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Ballots) -> pd.DataFrame:
+def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes) -> pd.DataFrame:
     """JUDGE_ROBUSTNESS rows of votes on every text: one a judge, attack and task, and one of the panel's majority."""
     rows = []
     for attack in attacks.attacks:

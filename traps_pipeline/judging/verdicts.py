@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import PANEL_SIZE
 from traps_pipeline.judging.ratings import (
     ABSTENTION,
     ANSWER,
@@ -20,6 +19,7 @@ from traps_pipeline.judging.ratings import (
     majority,
     ratings,
 )
+from traps_pipeline.models.judges import PANEL_SIZE
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.partitions import Cell
 from traps_pipeline.storage.workspace import Workspace

@@ -14,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.judging.ratings import ABSTENTION, decided, majority, ratings
 from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS
 from traps_pipeline.mechanism.steering import UNSTEERED
 from traps_pipeline.partitions import taxonomy_of, transfer_type
@@ -23,19 +24,32 @@ from traps_pipeline.scoring.metrics import wilson
 Rows = list[dict[str, Any]]
 ALL = "all"
 _RUN = ["model", "directions", "regime"]
-_ROW = [*_RUN, "dataset", "source", "kind", "layer", "alpha", "item_id"]
-_PATH = [*_RUN, "dataset", "source", "kind", "layer", "alpha", "side"]
+_CELL = [*_RUN, "dataset"]
+_ANSWER = [*_CELL, "source", "kind", "layer", "alpha", "item_id"]
+VOTE_COLUMNS = [*_ANSWER, "side", "task", "judge", "valid", "abstained", "epoch", "benchmark_version"]
+_PATH = [*_CELL, "source", "kind", "layer", "alpha", "side"]
 _PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
 
 
 def _answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """An answer with its vote, a row in every path that it belongs to: the model as it is (alpha 0) in each."""
+    """An answer with its verdict, a row in every path that it belongs to: the model as it is (alpha 0) in each."""
     copied = ["side", "scenario_id", "alpha_relative", "request_key", "epoch"]
-    joined = answers[[*_ROW, *copied]].merge(votes[[*_ROW, "abstained"]], on=_ROW, how="left", validate="one_to_one")
+    joined = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *copied]]), votes)
     steered = joined.loc[joined["kind"] != UNSTEERED]
     plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=["source", "kind", "layer"])
     paths = steered[[*_RUN, "dataset", "source", "kind", "layer", "side"]].drop_duplicates()
     return pd.concat([steered, plain.merge(paths, on=[*_RUN, "dataset", "side"])], ignore_index=True)
+
+
+def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
+    """Answers with `abstained`, as the majority of the judges of their cell decides it; null without a text, votes or
+    a majority. Decided a cell at a time: another panel may sit on another cell until its votes are made again."""
+    votes_on, none = dict(iter(votes.groupby(_CELL))), votes.head(0)
+    parts: list[pd.DataFrame] = []
+    for cell, mine in answers.groupby(_CELL, sort=False):
+        values, _ = ratings(votes_on.get(cell, none), answer=_ANSWER).on(mine, ABSTENTION)
+        parts.append(mine.assign(abstained=decided(majority(values))))
+    return pd.concat(parts, ignore_index=True)
 
 
 def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> Rows:

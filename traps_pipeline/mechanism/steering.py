@@ -7,31 +7,30 @@ answer for all directions; and the controls of a taxonomy's two datasets, which 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, vote_columns, vote_request
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.paths import sources_of
 from traps_pipeline.mechanism.settings import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.mechanism.versions import loaded_params
-from traps_pipeline.models.answers import calls_shown
-from traps_pipeline.models.ask import Participants, Row, Work, run_work
-from traps_pipeline.models.budget import spending
+from traps_pipeline.models.answers import Question
+from traps_pipeline.models.ask import Settled, collect
+from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.local.backend import LocalBackend, outcome
 from traps_pipeline.models.media import sample
+from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import Entry, ModelEntry
-from traps_pipeline.models.request import JUDGED, Outcome, Request
+from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.partitions import SIDES, SteeringCell, taxonomy_of
-from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, STEERING
@@ -64,12 +63,10 @@ NO_STEERING = Strength(UNSTEERED, UNSTEERED, 0, 0.0, None, 0.0)
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """A row of the steering table before it is answered."""
+class SteeredQuestion(Question):
+    """The call that puts an item to a steered model."""
 
-    item: Mapping[str, Any]
     strength: Strength
-    request: Request
 
 
 # --- which answers ----------------------------------------------------------------------------------------------------
@@ -137,9 +134,9 @@ def _in_range(layer: int, directions: Directions) -> int:
     return layer
 
 
-def wanted_answers(
+def wanted_steered(
     workspace: Workspace, entry: ModelEntry, cell: SteeringCell, directions: Mapping[str, Directions]
-) -> list[Wanted]:
+) -> list[SteeredQuestion]:
     """Every answer that a cell wants, those of one direction together, so that they share batches."""
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
@@ -149,7 +146,7 @@ def wanted_answers(
     plan = strengths(cell.dataset, settings.models[entry.id], settings, directions)
     most = settings.steering.max_new_tokens
     return [
-        Wanted(item, strength, steered_request(workspace, entry, item, cell, strength, most))
+        SteeredQuestion(steered_request(workspace, entry, item, cell, strength, most), item, strength)
         for strength, sides in plan
         for item in rows
         if item["side"] in sides
@@ -251,33 +248,30 @@ def collect_steered(
         for kind in of.vectors
         for vector in of.vectors[kind]
     }
-    wanted: dict[SteeringCell, list[Wanted]] = {}
 
-    def requests(cell: Any) -> list[Request]:
-        wanted[cell] = wanted_answers(workspace, entry, cell, directions[cell.directions])
-        return [one.request for one in wanted[cell]]
+    def calls(cell: SteeringCell) -> list[SteeredQuestion]:
+        return wanted_steered(workspace, entry, cell, directions[cell.directions])
 
-    def finish(cell: Any, rows: Mapping[str, Row], tally: Tally) -> tuple[SteeringCell, Made]:
-        table = [_steering_row(cell, one, rows[one.request.key]) for one in wanted.pop(cell)]
-        return cell, Made(table, tally, calls_shown(rows, tally))
+    def finish(settled: Settled[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, Made]:
+        return settled.made(_steering_row)
 
-    participants = Participants({entry.id: entry}, lambda e: SteeredBackend(e, vectors), workspace.study)
-    with spending(workspace, [entry]) as budget:
-        work = Work("steering", workspace.answers, participants, budget, workspace.study.epoch, requests, finish)
-        yield from run_work(work, cells)
+    def make(entry: Entry) -> SteeredBackend:
+        return SteeredBackend(entry, vectors)
+
+    yield from collect(workspace, "steering", workspace.answers, [entry], cells, calls, finish, make)
 
 
-def _steering_row(cell: SteeringCell, one: Wanted, row: Row) -> dict[str, Any]:
-    item, strength = one.item, one.strength
+def _steering_row(cell: SteeringCell, question: SteeredQuestion, row: Row) -> dict[str, Any]:
+    item, strength = question.item, question.strength
     return {
         **cell.partition,
         **{"source": strength.source, "kind": strength.kind, "layer": strength.layer, "alpha": strength.alpha},
         "alpha_relative": strength.relative,
         **{name: item[name] for name in ("item_id", "scenario_id", "side", "benchmark_version")},
-        **{name: row[name] for name in ("outcome", "text", "served_model", "completion_tokens", "epoch")},
+        **{name: row[name] for name in ("outcome", "text", "served_model", "completion_tokens")},
         "direction_digest": strength.digest,
-        "request_key": one.request.key,
-        "created_at": datetime.fromisoformat(row["created_at"]),
+        "request_key": row["key"],
+        **when_asked(row),
     }
 
 
@@ -285,62 +279,26 @@ def _steering_row(cell: SteeringCell, one: Wanted, row: Row) -> dict[str, Any]:
 
 
 def collect_steering_votes(workspace: Workspace, cells: Sequence[SteeringCell]) -> Iterator[tuple[SteeringCell, Made]]:
-    """Ask the study's panel whether each steered answer abstains; its rows of each cell as it is done."""
-    from traps_pipeline.judging.panel import load_panel, make_judge
-
+    """Ask the study's panel whether each steered answer abstains; the STEERING_VOTES rows of each cell as it is
+    done."""
     panel = load_panel(workspace.study.panel)
-    asked: dict[SteeringCell, list[tuple[dict[str, Any], list[Request]]]] = {}
-
-    def requests(cell: Any) -> list[Request]:
-        asked[cell] = list(_ballots(workspace, panel, cell))
-        return [request for _, of_answer in asked[cell] for request in of_answer]
-
-    def finish(cell: Any, rows: Mapping[str, Row], tally: Tally) -> tuple[SteeringCell, Made]:
-        table = [_vote_row(cell, answer, of_answer, rows) for answer, of_answer in asked.pop(cell)]
-        return cell, Made(table, tally, calls_shown(rows, tally))
-
-    participants = Participants({judge.id: judge for judge in panel}, make_judge, workspace.study)
-    with spending(workspace, panel) as budget:
-        work = Work("steering_votes", workspace.votes, participants, budget, workspace.study.epoch, requests, finish)
-        yield from run_work(work, cells)
+    calls = partial(wanted_steering_ballots, workspace, panel)
+    yield from ask_judges(workspace, "steering_votes", panel, cells, calls, lambda settled: settled.made(_vote_row))
 
 
-def _ballots(
-    workspace: Workspace, panel: Sequence[Any], cell: SteeringCell
-) -> Iterator[tuple[dict[str, Any], list[Request]]]:
-    """Each row of the steering table with the calls that judge it: none for a row without a text."""
-    from traps_pipeline.judging.panel import vote_request
-
-    items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}).set_index("item_id")
-    for answer in workspace.tables.read(STEERING, cell.partition).to_dict("records"):
-        if answer["item_id"] not in items.index:
-            raise TrapsError(
-                f"steering {cell.key}: item {answer['item_id']} is no longer in items; materialize steering for it"
-            )
-        item = items.loc[answer["item_id"]].to_dict() | {"item_id": shared_item(answer)}
-        calls = []
-        for judge in panel if answer["outcome"] in JUDGED else ():
-            call = vote_request(judge, "abstention", cell, item, answer["text"])
-            calls.append(replace(call, about={**call.about, "steered": answer["request_key"]}))
-        yield {str(name): value for name, value in answer.items()}, calls
+def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: SteeringCell) -> list[Ballot]:
+    """Every vote that the steered answers of a cell want. The ballot's item is the answer's row."""
+    ballots = []
+    for answer, item in judged_answers(workspace, STEERING, cell):
+        shared = item | {"item_id": shared_item(answer)}
+        for judge in panel:
+            request = vote_request(judge, "abstention", cell, shared, answer["text"])
+            about = {**request.about, "steered": answer["request_key"]}
+            ballots.append(Ballot(replace(request, about=about), answer, "abstention"))
+    return ballots
 
 
-def _vote_row(
-    cell: SteeringCell, answer: Mapping[str, Any], calls: Sequence[Request], rows: Mapping[str, Row]
-) -> dict[str, Any]:
-    from traps_pipeline.judging.panel import PANEL_SIZE, parse_vote
-
-    votes = {call.participant: parse_vote("abstention", rows[call.key], answer) for call in calls}
-    copied = ("source", "kind", "layer", "alpha", "item_id", "scenario_id", "side", "benchmark_version")
-    said = [vote.decision for vote in votes.values() if vote.valid]
-    decided = next((decision for decision in (True, False) if 2 * said.count(decision) > PANEL_SIZE), None)
-    return {
-        **cell.partition,
-        **{name: answer[name] for name in copied},
-        "abstained": decided,
-        "n_valid": len(said),
-        "unanimous": len(said) == PANEL_SIZE and len(set(said)) == 1,
-        "votes": json.dumps({name: vote.decision if vote.valid else None for name, vote in votes.items()}),
-        "vote_keys": [call.key for call in calls],
-        "epoch": answer["epoch"],
-    }
+def _vote_row(cell: SteeringCell, ballot: Ballot, row: Row) -> dict[str, Any]:
+    copied = ("source", "kind", "layer", "alpha", "item_id", "side", "benchmark_version")
+    about = {name: ballot.item[name] for name in copied}
+    return {**cell.partition, **about, **vote_columns(ballot, ballot.vote(row), row)}

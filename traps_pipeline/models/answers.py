@@ -5,24 +5,30 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.ask import Participants, Row, Work, run_work
-from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.budget import spending
+from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.media import MediaSpec
+from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.models.registry import ModelEntry, effective_params, get_model, load_models
+from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS
+
+
+@dataclass(frozen=True)
+class Question(Call):
+    """The call that puts an item to a model."""
+
+    item: Mapping[str, Any]
 
 
 def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], evaluation: Evaluation) -> Request:
@@ -34,7 +40,7 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
     sent = workspace.media.prepare(clip, item["media_digest"], entry.media) if entry.media else None
     return Request(
         participant=entry.id,
-        endpoint=entry.provider_id or entry.backend,
+        endpoint=entry.endpoint,
         params=effective_params(entry, evaluation.regime),
         system=system_prompt(evaluation.regime),
         user=item["question"],
@@ -64,13 +70,13 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
             progress.current().tick("responses", "media to send", done, len(jobs))
 
 
-def wanted_requests(workspace: Workspace, cell: Cell) -> list[Request]:
+def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
     """Every call that a cell wants, in the order of its items. Raises TrapsError when these are not made."""
     entry = get_model(cell.evaluation.model)
     items = _items(workspace, cell.dataset)
     if not items:
         raise TrapsError(f"items {cell.dataset}: not made yet; materialize scene_specs, videos and items first")
-    return [answer_request(workspace, entry, item, cell.evaluation) for item in items]
+    return [Question(answer_request(workspace, entry, item, cell.evaluation), item) for item in items]
 
 
 def _items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
@@ -88,41 +94,27 @@ def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
     return secret
 
 
-def response_row(cell: Cell, item: Mapping[str, Any], key: str, row: Row, reasoning: str | None) -> dict[str, Any]:
+def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str | None) -> dict[str, Any]:
     """One row of the responses table."""
     copied = ("outcome", "text", "finish_reason", "error", "served_model", "prompt_tokens", "completion_tokens")
-    copied += ("reasoning_tokens", "cost_usd", "latency_s", "attempts", "epoch")
+    copied += ("reasoning_tokens", "cost_usd", "latency_s", "attempts")
     return {
         **{name: item[name] for name in ("item_id", "pair_id", "side", "benchmark_version")},
         **cell.partition,
         **{name: row[name] for name in copied},
         "reasoning": reasoning,
-        "request_key": key,
-        "created_at": datetime.fromisoformat(row["created_at"]),
+        "request_key": row["key"],
+        **when_asked(row),
     }
-
-
-def calls_shown(rows: Mapping[str, Row], tally: Tally) -> dict[str, Any]:
-    """How the calls of a cell went, for people."""
-    dollars = sum(row["cost_usd"] or 0.0 for row in rows.values())
-    counts = {"wanted": len(rows), "known": tally.cached, "asked": tally.asked, "failed": tally.errors}
-    return {**counts, "dollars": round(dollars, 6)}
 
 
 def collect_answers(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Made]]:
     """Ask what is missing; the RESPONSES rows of each cell as it is done."""
-
     prepare_media(workspace, cells)
 
-    def finish(cell: Cell, rows: Mapping[str, Row], tally: Tally) -> tuple[Cell, Made]:
-        traces = workspace.answers.reasoning(cell.evaluation.key, rows)
-        keyed = zip(_items(workspace, cell.dataset), wanted_requests(workspace, cell), strict=True)
-        table = [response_row(cell, item, r.key, rows[r.key], traces.get(r.key)) for item, r in keyed]
-        return cell, Made(table, tally, calls_shown(rows, tally))
+    def finish(settled: Settled[Cell, Question]) -> tuple[Cell, Made]:
+        traces = workspace.answers.reasoning(settled.cell.evaluation.key, settled.rows)
+        return settled.made(lambda cell, question, row: response_row(cell, question.item, row, traces.get(row["key"])))
 
-    def requests(cell: Cell) -> list[Request]:
-        return wanted_requests(workspace, cell)
-
-    participants, epoch = Participants(load_models(), make_backend, workspace.study), workspace.study.epoch
-    with spending(workspace, [get_model(cell.evaluation.model) for cell in cells]) as budget:
-        yield from run_work(Work("responses", workspace.answers, participants, budget, epoch, requests, finish), cells)
+    entries, calls = [get_model(cell.evaluation.model) for cell in cells], partial(wanted_questions, workspace)
+    yield from collect(workspace, "responses", workspace.answers, entries, cells, calls, finish)

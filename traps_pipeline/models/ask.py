@@ -7,205 +7,102 @@ a correction are the same operation (docs/models.md, "Ledger").
 from __future__ import annotations
 
 import asyncio
-import random
 import signal
 import threading
-import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, Generic, TypeVar
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
-from traps_pipeline.models.registry import Account, Entry, load_accounts
-from traps_pipeline.models.request import RATE_LIMITED, UNBILLED, Backend, Outcome, Request, TransientError
-from traps_pipeline.models.traffic import Breaker, Gate, Meter
+from traps_pipeline.models.backends import make_backend
+from traps_pipeline.models.budget import Budget, BudgetReached, spending
+from traps_pipeline.models.participants import Participant, Participants, Row, attempt, ledger_row
+from traps_pipeline.models.registry import Entry
+from traps_pipeline.models.request import Backend, Request
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, SegmentWriter, settles
-from traps_pipeline.storage.workspace import Study
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.workspace import Workspace
 
-Row = dict[str, Any]
+
+@dataclass(frozen=True)
+class Call:
+    """A call that a stage wants. Each stage has its own kind, which also holds what its table says of the call."""
+
+    request: Request
+
+
+AnyCell = TypeVar("AnyCell", bound=Cell)
+AnyCall = TypeVar("AnyCall", bound=Call)
 Finished = TypeVar("Finished")
-MAX_BACKOFF_S, MAX_RETRY_AFTER_S = 60.0, 900.0
 
 
 @dataclass(frozen=True)
-class Participant:
-    """A model or judge as it is asked: its backend and entry, its connections, its account's pace, its failures."""
+class Settled(Generic[AnyCell, AnyCall]):
+    """A cell all of whose calls are answered: its calls, the ledger's row of each key, and what it took."""
 
-    backend: Backend
-    entry: Entry
-    gate: Gate
-    meter: Meter
-    breaker: Breaker
+    cell: AnyCell
+    calls: Sequence[AnyCall]
+    rows: Mapping[str, Row]
+    tally: Tally
 
+    def answered(self) -> Iterator[tuple[AnyCall, Row]]:
+        """Each call with its row of the ledger."""
+        return ((call, self.rows[call.request.key]) for call in self.calls)
 
-class Participants:
-    """Participants by id, made when first asked: one that is not asked needs neither key nor budget. Connections are
-    shared by all evaluations of a run, the pace by all participants of an account."""
-
-    def __init__(
-        self,
-        entries: Mapping[str, Entry],
-        make: Callable[[Entry], Backend],
-        study: Study,
-        accounts: Mapping[str, Account] | None = None,
-    ) -> None:
-        self._entries, self._make, self._study = entries, make, study
-        self._accounts = load_accounts() if accounts is None else accounts
-        self._made: dict[str, Participant] = {}
-        self._meters: dict[str | None, Meter] = {}
-
-    def __getitem__(self, name: str) -> Participant:
-        if name not in self._made:
-            entry = self._entries[name]
-            check_money(self._study, entry)
-            gate, breaker = Gate(entry.limits.concurrency), Breaker(name)
-            breaker.check()
-            self._made[name] = Participant(self._make(entry), entry, gate, self._meter(entry.account), breaker)
-        return self._made[name]
-
-    def _meter(self, account: str | None) -> Meter:
-        if account not in self._meters:
-            limits = Account() if account is None else self._accounts[account]
-            self._meters[account] = Meter(limits.requests_per_minute, limits.tokens_per_minute)
-        return self._meters[account]
+    def made(self, row_of: Callable[[AnyCell, AnyCall, Row], Row]) -> tuple[AnyCell, Made]:
+        """The cell and its table, a row a call, with how the calls went."""
+        dollars = sum(row["cost_usd"] or 0.0 for row in self.rows.values())
+        counts = {"wanted": len(self.rows), "known": self.tally.cached, "asked": self.tally.asked}
+        shown = {**counts, "failed": self.tally.errors, "dollars": round(dollars, 6)}
+        return self.cell, Made([row_of(self.cell, *pair) for pair in self.answered()], self.tally, shown)
 
 
 @dataclass(frozen=True)
-class Work(Generic[Finished]):
-    """What a stage asks. requests(cell): all calls it wants. finish(cell, rows by key, tally): writes its table."""
+class Work(Generic[AnyCell, AnyCall, Finished]):
+    """What a stage asks. calls(cell): all calls it wants, made once a cell. finish(settled cell): makes its table."""
 
     stage: str
     ledger: Ledger
     participants: Participants
     budget: Budget
     epoch: str
-    requests: Callable[[Cell], Sequence[Request]]
-    finish: Callable[[Cell, Mapping[str, Row], Tally], Finished]
+    calls: Callable[[AnyCell], Sequence[AnyCall]]
+    finish: Callable[[Settled[AnyCell, AnyCall]], Finished]
 
 
-@dataclass(frozen=True)
-class Settled:
-    """A cell all of whose calls are answered: the ledger's row of each key, and what it took."""
+def collect(
+    workspace: Workspace,
+    stage: str,
+    ledger: Ledger,
+    entries: Iterable[Entry],
+    cells: Sequence[AnyCell],
+    calls: Callable[[AnyCell], Sequence[AnyCall]],
+    finish: Callable[[Settled[AnyCell, AnyCall]], Finished],
+    make: Callable[[Entry], Backend] = make_backend,
+) -> Iterator[Finished]:
+    """Ask these participants what the ledger does not hold of the calls of these cells, under the study's budget; each
+    cell as it is finished.
 
-    cell: Cell
-    rows: Mapping[str, Row]
-    tally: Tally
-
-
-async def attempt(
-    participant: Participant, request: Request, budget: Budget, stop: asyncio.Event, halted: Callable[[], bool]
-) -> tuple[Outcome, int, float] | None:
-    """An outcome, the calls it took, the seconds of the last one; None when halted before anything was spent.
-
-    The one retry layer: exponential with full jitter, and never sooner than the provider asks. The outcome's cost holds
-    what attempts before it may have cost.
+    entries: all that the calls name. make: an entry's backend. What is raised, and what Ctrl-C does, is told at
+    `run_work`.
     """
-    limits, tokens = participant.entry.limits, most_tokens(participant.entry, request)
-    lost_usd, seconds = 0.0, 0.0
-    for number in range(1, limits.retries + 2):
-        async with participant.gate.connection():
-            await participant.meter.admit(tokens.prompt + tokens.completion, halted)
-            if halted():
-                return _given_up("interrupted", number - 1, seconds, lost_usd)
-            began = time.monotonic()
-            try:
-                outcome = await _send(participant, request, budget)
-            except TransientError as error:
-                failure, seconds = error, time.monotonic() - began
-            except BudgetReached:
-                if lost_usd:  # first what was lost goes into the ledger; the next call meets the cap again
-                    return _given_up("budget", number - 1, seconds, lost_usd)
-                raise
-            else:
-                participant.gate.answered()
-                if lost_usd:
-                    outcome = replace(outcome, cost_usd=(outcome.cost_usd or 0.0) + lost_usd)
-                return outcome, number, time.monotonic() - began
-        if failure.kind == RATE_LIMITED:
-            participant.gate.slow_down()
-        if failure.kind not in UNBILLED:
-            lost_usd += worst_case_usd(participant.entry, request)
-        if number > limits.retries:
-            return _given_up(failure.kind, number, seconds, lost_usd)
-        longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
-        wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
-        if await _stopped_within(stop, wait):
-            return _given_up("interrupted", number, seconds, lost_usd)
-    raise AssertionError("unreachable: the last attempt returns")
-
-
-def _given_up(kind: str, attempts: int, seconds: float, lost_usd: float) -> tuple[Outcome, int, float] | None:
-    """A failure for the ledger; None for a call that was never sent, or that cost nothing and will be made again."""
-    if kind in ("interrupted", "budget") and not lost_usd:
-        return None
-    return Outcome("error", error=kind, cost_usd=lost_usd or None), attempts, seconds
-
-
-async def _send(participant: Participant, request: Request, budget: Budget) -> Outcome:
-    """One attempt under a reservation. Raises TransientError and BudgetReached.
-
-    A call that was sent costs its worst case until the provider says otherwise: one that timed out may be billed.
-    """
-    entry = participant.entry
-    worst_usd = worst_case_usd(entry, request)
-    await budget.reserve(entry.id, worst_usd)
-    cost_usd = worst_usd
-    try:
-        async with asyncio.timeout(entry.limits.timeout_s):
-            outcome = await participant.backend.ask(request)
-        if outcome.kind == "error":
-            cost_usd = 0.0  # refused as it is: nothing was generated
-        elif outcome.cost_usd is not None:
-            cost_usd = outcome.cost_usd
-        elif entry.prices is not None:
-            outcome = replace(outcome, cost_usd=worst_usd)
-        return outcome
-    except TimeoutError:
-        raise TransientError("timeout") from None
-    except TransientError as failure:
-        if failure.kind in UNBILLED:
-            cost_usd = 0.0
-        raise
-    finally:
-        await budget.settle(entry.id, worst_usd, cost_usd)
-
-
-async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
-    with suppress(TimeoutError):
-        await asyncio.wait_for(stop.wait(), seconds)
-    return stop.is_set()
-
-
-def ledger_row(
-    request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str
-) -> tuple[Row, str | None]:
-    """The row that stands for an answer, and its reasoning trace."""
-    fields = asdict(outcome)
-    reasoning = fields.pop("reasoning")
-    row = {
-        "key": request.key,
-        "outcome": fields.pop("kind"),
-        **fields,
-        "attempts": attempts,
-        "latency_s": round(latency_s, 6),
-    }
-    row |= {"epoch": epoch, "created_at": datetime.now(UTC).isoformat(), "components": request.components}
-    return row, reasoning
+    known = {entry.id: entry for entry in entries}
+    participants = Participants(known, make, workspace.study)
+    with spending(workspace, known.values()) as budget:
+        work = Work(stage, ledger, participants, budget, workspace.study.epoch, calls, finish)
+        yield from run_work(work, cells)
 
 
 @dataclass
 class _Asking:
     """Workers over the missing requests of one evaluation."""
 
-    work: Work[Any]
+    work: Work[Any, Any, Any]
     writer: SegmentWriter
     missing: Sequence[Request]
     stop: asyncio.Event
@@ -268,11 +165,11 @@ class _Asking:
 
 
 async def settle_evaluation(
-    work: Work[Any], evaluation: Evaluation, cells: Sequence[Cell], stop: asyncio.Event
-) -> AsyncIterator[Settled]:
+    work: Work[AnyCell, AnyCall, Any], evaluation: Evaluation, cells: Sequence[AnyCell], stop: asyncio.Event
+) -> AsyncIterator[Settled[AnyCell, AnyCall]]:
     """Settle the cells of one evaluation, asking only what its ledger does not hold. Unfinished cells are left out.
 
-    Requests and rows are made and read a cell at a time: none is held once its cell is finished, and a call that two
+    Calls and rows are made and read a cell at a time: none is held once its cell is finished, and a call that two
     cells share (a steered control stands in two datasets) is found by the second.
     """
     torn: set[str] = set()
@@ -288,11 +185,12 @@ async def settle_evaluation(
 
 
 async def _settle_cell(
-    work: Work[Any], cell: Cell, writer: SegmentWriter, stop: asyncio.Event, torn: set[str]
-) -> Settled | None:
+    work: Work[AnyCell, AnyCall, Any], cell: AnyCell, writer: SegmentWriter, stop: asyncio.Event, torn: set[str]
+) -> Settled[AnyCell, AnyCall] | None:
     """Ask what is missing of a cell; None if that was stopped. torn: torn lines that a person was told of."""
     report = progress.current()
-    wanted = {request.key: request for request in work.requests(cell)}
+    calls = work.calls(cell)
+    wanted = {call.request.key: call.request for call in calls}
     known = work.ledger.read(cell.evaluation.key, wanted)
     for place in sorted({*known.torn} - torn):
         report.note(f"{place}: torn last line ignored (a crash cut it off); its answer is asked again")
@@ -310,15 +208,17 @@ async def _settle_cell(
     writer.sync()
     errors = sum(not settles(row) for row in rows.values())
     tally = Tally(asked=len(missing), cached=len(wanted) - len(missing), errors=errors)
-    return Settled(cell, {key: rows[key] for key in wanted}, tally)
+    return Settled(cell, calls, {key: rows[key] for key in wanted}, tally)
 
 
-async def settle(work: Work[Any], cells: Sequence[Cell], stop: asyncio.Event) -> AsyncIterator[Settled | Exception]:
+async def settle(
+    work: Work[AnyCell, AnyCall, Any], cells: Sequence[AnyCell], stop: asyncio.Event
+) -> AsyncIterator[Settled[AnyCell, AnyCall] | Exception]:
     """Settle all cells, models side by side. A model that fails yields its exception; the others go on."""
-    done: asyncio.Queue[Settled | Exception | None] = asyncio.Queue()
+    done: asyncio.Queue[Settled[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
     taken = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
-    async def one_model(evaluations: Sequence[tuple[Evaluation, list[Cell]]]) -> None:
+    async def one_model(evaluations: Sequence[tuple[Evaluation, list[AnyCell]]]) -> None:
         try:
             for evaluation, mine in evaluations:
                 if stop.is_set():
@@ -355,7 +255,7 @@ async def settle(work: Work[Any], cells: Sequence[Cell], stop: asyncio.Event) ->
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def run_work(work: Work[Finished], cells: Sequence[Cell]) -> Iterator[Finished]:
+def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -> Iterator[Finished]:
     """Settle cells and finish each (write its table) just before it is handed on. For synchronous callers.
 
     The first Ctrl-C stops new calls and waits for those in flight, a second one stops at once; either way
@@ -381,7 +281,7 @@ def run_work(work: Work[Finished], cells: Sequence[Cell]) -> Iterator[Finished]:
             if isinstance(settled, Exception):
                 problems.append(settled)
             else:
-                yield work.finish(settled.cell, settled.rows, settled.tally)
+                yield work.finish(settled)
     finally:
         interrupted = stop.is_set()
         stop.set()

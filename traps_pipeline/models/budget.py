@@ -19,6 +19,7 @@ from pathlib import Path
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_models
 from traps_pipeline.models.request import Request
 from traps_pipeline.storage.workspace import Study, Workspace, write_text
@@ -208,8 +209,6 @@ def _open_budget(workspace: Workspace, journal: Journal) -> Budget:
 
 def _check_names(workspace: Workspace) -> None:
     """A cap for nobody caps nothing. Raises TrapsError."""
-    from traps_pipeline.judging.panel import load_judges
-
     if unknown := workspace.study.model_budgets_usd.keys() - load_models().keys() - load_judges().keys():
         raise TrapsError(
             f"{workspace.root / 'study.yaml'}: model_budgets_usd names {', '.join(sorted(unknown))}, neither a model "

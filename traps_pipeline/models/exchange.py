@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import Experiment
-from traps_pipeline.models.answers import prepare_media, wanted_requests
-from traps_pipeline.models.ask import ledger_row
+from traps_pipeline.models.answers import prepare_media, wanted_questions
+from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.models.request import JUDGED, Outcome, OutcomeKind, Request
 from traps_pipeline.partitions import Cell, Evaluation
@@ -107,7 +107,7 @@ def _missing(workspace: Workspace, experiment: Experiment) -> Iterator[Request]:
         evaluation = cell.evaluation
         if evaluation not in known:
             known[evaluation] = {*workspace.answers.read(evaluation.key).settled}
-        wanted = wanted_requests(workspace, cell)
+        wanted = (question.request for question in wanted_questions(workspace, cell))
         yield from (request for request in wanted if request.key not in known[evaluation])
 
 
@@ -141,7 +141,8 @@ def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> 
     """
     cells = _cells(workspace, experiment)
     prepare_media(workspace, cells)
-    wanted = {request.key: request for cell in cells for request in wanted_requests(workspace, cell)}
+    requests = [question.request for cell in cells for question in wanted_questions(workspace, cell)]
+    wanted = {request.key: request for request in requests}
     answers = checked_answers(path, wanted)
     by_evaluation: defaultdict[Evaluation, list[Answer]] = defaultdict(list)
     for key, answer in answers.items():

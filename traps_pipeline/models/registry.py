@@ -143,6 +143,11 @@ class Entry(BaseModel):
         return self
 
     @property
+    def endpoint(self) -> str:
+        """What answers, in the ledger key: litellm's name, or the kind of backend where there is none."""
+        return self.provider_id or self.backend
+
+    @property
     def max_tokens(self) -> int:
         """Completion tokens at most; 0 if the entry sends no limit."""
         return int(self.params.get("max_tokens") or self.params.get("max_completion_tokens") or 0)
@@ -285,7 +290,7 @@ def answering_version(evaluation: Evaluation) -> str:
     entry = get_model(evaluation.model)
     sent = [effective_params(entry, evaluation.regime)]
     sent += [profile_digest(entry.media)] if entry.media else []
-    return digest([entry.id, entry.provider_id or entry.backend, *sent])[:16]
+    return digest([entry.id, entry.endpoint, *sent])[:16]
 
 
 def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:

@@ -37,7 +37,7 @@ from traps_pipeline.progress import Progress, reporting
 from traps_pipeline.scenes.encode import encode
 
 if TYPE_CHECKING:
-    from traps_pipeline.judging.panel import JudgeEntry
+    from traps_pipeline.models.judges import JudgeEntry
 
 Api = Literal["chat", "responses", "gemini", "anthropic"]
 _ENDPOINTS: dict[str, Api] = {
@@ -209,7 +209,7 @@ def requests_of(entry: Entry) -> dict[str, Request]:
     if isinstance(entry, ModelEntry):
         return {regime: _answer_request(entry, regime) for regime in REGIMES}
     from traps_pipeline.judging.confabulation import load_protocol
-    from traps_pipeline.judging.panel import JudgeEntry, tasks_for
+    from traps_pipeline.judging.panel import tasks_for
 
     assert isinstance(entry, JudgeEntry)
     votes = {str(task): _vote_request(entry, task) for task in tasks_for("control")}
@@ -220,7 +220,7 @@ def _answer_request(entry: ModelEntry, regime: str) -> Request:
     sent = _studio().prepare(entry.media) if entry.media else None
     return Request(
         participant=entry.id,
-        endpoint=entry.provider_id or entry.backend,
+        endpoint=entry.endpoint,
         params=effective_params(entry, regime),
         system=system_prompt(regime),
         user=_QUESTION,
@@ -538,7 +538,7 @@ def _local_problems(times_s: np.ndarray, size: tuple[int, int], spec: MediaSpec)
 
 def participants() -> dict[str, Entry]:
     """Models and judges that are asked over the network or locally, by id."""
-    from traps_pipeline.judging.panel import load_judges
+    from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import load_models
 
     return {**load_models(), **load_judges()}

@@ -14,7 +14,7 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import load_protocol
-from traps_pipeline.judging.panel import load_judges, load_panel
+from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.prompts import prompt, system_prompt, vqa_prompt
 from traps_pipeline.models.registry import load_accounts, load_models
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph

@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,14 @@ from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.versions import loaded_params
 from traps_pipeline.models import registry
-from traps_pipeline.models.ask import Participants, Row, Work, run_work
+from traps_pipeline.models.ask import Call, Settled, Work, run_work
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
 from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.media import MediaStore
+from traps_pipeline.models.participants import Participants, Row
 from traps_pipeline.models.registry import Limits, ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.partitions import Cell, Evaluation
@@ -111,14 +112,14 @@ def test_a_second_run_asks_nothing(tmp_path: Path, batches: list[int]) -> None:
     of = of.model_copy(update={"limits": Limits(concurrency=2)})
     cell = Cell("occlusion", Evaluation(of.id, "standard", 1))
 
-    def finish(_: Cell, rows: Mapping[str, Row], tally: Tally) -> tuple[list[Row], Tally]:
-        return list(rows.values()), tally
+    def finish(settled: Settled[Cell, Call]) -> tuple[list[Row], Tally]:
+        return list(settled.rows.values()), settled.tally
 
     def run() -> tuple[list[Row], Tally]:
         participants = Participants({of.id: of}, make_backend, Study())
-        wanted = [request(of, media, question) for question in QUESTIONS]
+        calls = [Call(request(of, media, question)) for question in QUESTIONS]
         work = Work(
-            "responses", Ledger(tmp_path, "answers"), participants, Budget(0.0, {}, {}), "1", lambda _: wanted, finish
+            "responses", Ledger(tmp_path, "answers"), participants, Budget(0.0, {}, {}), "1", lambda _: calls, finish
         )
         (finished,) = run_work(work, [cell])
         return finished

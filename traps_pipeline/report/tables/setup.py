@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.judging.panel import load_judges
+from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.media import MediaSpec
 from traps_pipeline.models.registry import Entry, ModelEntry, load_models
 from traps_pipeline.report.results import Results
@@ -24,7 +24,7 @@ def models(results: Results) -> list[Table]:
     for entry in _entries(results):
         rows.append(
             {
-                "model": entry.id, "provider_id": entry.provider_id or entry.backend, "family": entry.groups.family,
+                "model": entry.id, "provider_id": entry.endpoint, "family": entry.groups.family,
                 "access": entry.groups.access, "group": entry.groups.group, "shown": _shown(entry.media),
                 "runs": entry.runs,
             }

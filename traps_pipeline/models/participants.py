@@ -1,0 +1,173 @@
+"""Who is asked, and one call to it: its connections, its account's pace, its retries, its reservation, its row.
+
+The one place where a call is sent; `models/ask.py` says which calls.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
+
+from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
+from traps_pipeline.models.registry import Account, Entry, load_accounts
+from traps_pipeline.models.request import RATE_LIMITED, UNBILLED, Backend, Outcome, Request, TransientError
+from traps_pipeline.models.traffic import Breaker, Gate, Meter
+from traps_pipeline.storage.workspace import Study
+
+Row = dict[str, Any]
+MAX_BACKOFF_S, MAX_RETRY_AFTER_S = 60.0, 900.0
+
+
+@dataclass(frozen=True)
+class Participant:
+    """A model or judge as it is asked: its backend and entry, its connections, its account's pace, its failures."""
+
+    backend: Backend
+    entry: Entry
+    gate: Gate
+    meter: Meter
+    breaker: Breaker
+
+
+class Participants:
+    """Participants by id, made when first asked: one that is not asked needs neither key nor budget. Connections are
+    shared by all evaluations of a run, the pace by all participants of an account."""
+
+    def __init__(
+        self,
+        entries: Mapping[str, Entry],
+        make: Callable[[Entry], Backend],
+        study: Study,
+        accounts: Mapping[str, Account] | None = None,
+    ) -> None:
+        self._entries, self._make, self._study = entries, make, study
+        self._accounts = load_accounts() if accounts is None else accounts
+        self._made: dict[str, Participant] = {}
+        self._meters: dict[str | None, Meter] = {}
+
+    def __getitem__(self, name: str) -> Participant:
+        if name not in self._made:
+            entry = self._entries[name]
+            check_money(self._study, entry)
+            gate, breaker = Gate(entry.limits.concurrency), Breaker(name)
+            breaker.check()
+            self._made[name] = Participant(self._make(entry), entry, gate, self._meter(entry.account), breaker)
+        return self._made[name]
+
+    def _meter(self, account: str | None) -> Meter:
+        if account not in self._meters:
+            limits = Account() if account is None else self._accounts[account]
+            self._meters[account] = Meter(limits.requests_per_minute, limits.tokens_per_minute)
+        return self._meters[account]
+
+
+async def attempt(
+    participant: Participant, request: Request, budget: Budget, stop: asyncio.Event, halted: Callable[[], bool]
+) -> tuple[Outcome, int, float] | None:
+    """An outcome, the calls it took, the seconds of the last one; None when halted before anything was spent.
+
+    The one retry layer: exponential with full jitter, and never sooner than the provider asks. The outcome's cost holds
+    what attempts before it may have cost.
+    """
+    limits, tokens = participant.entry.limits, most_tokens(participant.entry, request)
+    lost_usd, seconds = 0.0, 0.0
+    for number in range(1, limits.retries + 2):
+        async with participant.gate.connection():
+            await participant.meter.admit(tokens.prompt + tokens.completion, halted)
+            if halted():
+                return _given_up("interrupted", number - 1, seconds, lost_usd)
+            began = time.monotonic()
+            try:
+                outcome = await _send(participant, request, budget)
+            except TransientError as error:
+                failure, seconds = error, time.monotonic() - began
+            except BudgetReached:
+                if lost_usd:  # first what was lost goes into the ledger; the next call meets the cap again
+                    return _given_up("budget", number - 1, seconds, lost_usd)
+                raise
+            else:
+                participant.gate.answered()
+                if lost_usd:
+                    outcome = replace(outcome, cost_usd=(outcome.cost_usd or 0.0) + lost_usd)
+                return outcome, number, time.monotonic() - began
+        if failure.kind == RATE_LIMITED:
+            participant.gate.slow_down()
+        if failure.kind not in UNBILLED:
+            lost_usd += worst_case_usd(participant.entry, request)
+        if number > limits.retries:
+            return _given_up(failure.kind, number, seconds, lost_usd)
+        longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
+        wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
+        if await _stopped_within(stop, wait):
+            return _given_up("interrupted", number, seconds, lost_usd)
+    raise AssertionError("unreachable: the last attempt returns")
+
+
+def _given_up(kind: str, attempts: int, seconds: float, lost_usd: float) -> tuple[Outcome, int, float] | None:
+    """A failure for the ledger; None for a call that was never sent, or that cost nothing and will be made again."""
+    if kind in ("interrupted", "budget") and not lost_usd:
+        return None
+    return Outcome("error", error=kind, cost_usd=lost_usd or None), attempts, seconds
+
+
+async def _send(participant: Participant, request: Request, budget: Budget) -> Outcome:
+    """One attempt under a reservation. Raises TransientError and BudgetReached.
+
+    A call that was sent costs its worst case until the provider says otherwise: one that timed out may be billed.
+    """
+    entry = participant.entry
+    worst_usd = worst_case_usd(entry, request)
+    await budget.reserve(entry.id, worst_usd)
+    cost_usd = worst_usd
+    try:
+        async with asyncio.timeout(entry.limits.timeout_s):
+            outcome = await participant.backend.ask(request)
+        if outcome.kind == "error":
+            cost_usd = 0.0  # refused as it is: nothing was generated
+        elif outcome.cost_usd is not None:
+            cost_usd = outcome.cost_usd
+        elif entry.prices is not None:
+            outcome = replace(outcome, cost_usd=worst_usd)
+        return outcome
+    except TimeoutError:
+        raise TransientError("timeout") from None
+    except TransientError as failure:
+        if failure.kind in UNBILLED:
+            cost_usd = 0.0
+        raise
+    finally:
+        await budget.settle(entry.id, worst_usd, cost_usd)
+
+
+async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
+    with suppress(TimeoutError):
+        await asyncio.wait_for(stop.wait(), seconds)
+    return stop.is_set()
+
+
+def ledger_row(
+    request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str
+) -> tuple[Row, str | None]:
+    """The row that stands for an answer, and its reasoning trace."""
+    fields = asdict(outcome)
+    reasoning = fields.pop("reasoning")
+    row = {
+        "key": request.key,
+        "outcome": fields.pop("kind"),
+        **fields,
+        "attempts": attempts,
+        "latency_s": round(latency_s, 6),
+    }
+    row |= {"epoch": epoch, "created_at": datetime.now(UTC).isoformat(), "components": request.components}
+    return row, reasoning
+
+
+def when_asked(row: Row) -> Row:
+    """The columns of every table made from a ledger that say when a row's call was asked."""
+    return {"epoch": row["epoch"], "created_at": datetime.fromisoformat(row["created_at"])}
