@@ -40,7 +40,7 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     from traps_pipeline.models.request import Request
     from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
     from traps_pipeline.storage.ledger import Ledger
-    from traps_pipeline.storage.workspace import Study
+    from traps_pipeline.storage.study import Study
 
     account = Account(key=KEY, base_url=f"{url}/v1")
     fields: dict[str, Any] = {"id": "m", "backend": "api", "account": "a", "provider_id": "openai/m", "params": PARAMS}

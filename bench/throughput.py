@@ -49,13 +49,13 @@ def main() -> None:
     from traps_pipeline.models.api import ApiBackend, load_litellm
     from traps_pipeline.models.ask import Call, Work, run_work
     from traps_pipeline.models.budget import Budget
-    from traps_pipeline.models.media import MediaSpec, MediaStore
     from traps_pipeline.models.participants import Participants
     from traps_pipeline.models.registry import Account, ModelEntry
     from traps_pipeline.models.request import Request
     from traps_pipeline.partitions import Cell, Evaluation
     from traps_pipeline.storage.ledger import Ledger
-    from traps_pipeline.storage.workspace import Study
+    from traps_pipeline.storage.media import MediaSpec, MediaStore
+    from traps_pipeline.storage.study import Study
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--answers", type=int, default=404, help="of each model; the smallest cell has 404")

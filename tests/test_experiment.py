@@ -9,7 +9,7 @@ import pytest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.experiment import load_experiment
 from traps_pipeline.partitions import DATASETS, REGIMES
-from traps_pipeline.storage.workspace import Study
+from traps_pipeline.storage.study import Study
 
 
 def experiment(tmp_path: Path, text: str) -> str:

@@ -8,11 +8,10 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.mechanism.settings import MechanismSettings
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.paths import ASSETS
-from traps_pipeline.storage.workspace import Asked, Study
+from traps_pipeline.storage.study import Asked, MechanismSettings, Study
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 EXPERIMENTS = ASSETS / "experiments"

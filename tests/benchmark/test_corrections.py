@@ -12,7 +12,7 @@ from traps_pipeline.benchmark.corrections import Scenario, categories_of, fold, 
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.storage.workspace import Study
+from traps_pipeline.storage.study import Study
 
 RELEASED = load_released()
 ID = "domino_chain-0001"

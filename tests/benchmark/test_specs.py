@@ -10,7 +10,8 @@ from traps_pipeline.benchmark.corrections import Correction, Scenario, fold
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.specs import resolve_scenario
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 
 
 @pytest.fixture

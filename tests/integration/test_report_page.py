@@ -13,7 +13,8 @@ from tests.conftest import Checkout
 from tests.report.test_items import CELL, HOSTILE, write_cell
 from traps_pipeline.report.items import item_page
 from traps_pipeline.report.writing import write_bytes
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"

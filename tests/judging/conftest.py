@@ -20,7 +20,8 @@ from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import Account, Limits, Prices, get_model
 from traps_pipeline.models.request import Outcome
 from traps_pipeline.partitions import Cell, is_ill_posed, taxonomy_of
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, RESPONSES, VOTES
 
 DECISIONS = {"y": True, "n": False, "-": None}

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from traps_pipeline.digests import file_digest
-from traps_pipeline.mechanism.settings import MechanismSettings
 from traps_pipeline.models import registry
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.partitions import DATASETS, SIDES, is_ill_posed, taxonomy_of
 from traps_pipeline.scenes.encode import encode
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.study import MechanismSettings, Study
+from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, SCENE_SPECS, VERDICTS, VIDEOS, Table
 
 CATEGORY = {"occlusion": "hidden", "chaotic": "plinko"}

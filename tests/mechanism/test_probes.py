@@ -24,10 +24,10 @@ from traps_pipeline.mechanism.probes import (
     within_split,
 )
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
-from traps_pipeline.mechanism.settings import ProbeSettings
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, LONG, transfer_type
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.scoring.published import published
+from traps_pipeline.storage.study import ProbeSettings
 
 
 def random_states(rows: int, columns: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

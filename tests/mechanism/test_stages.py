@@ -16,7 +16,6 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.directions import vector_digest
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.mechanism.settings import MechanismSettings
 from traps_pipeline.mechanism.shares import effect_rows
 from traps_pipeline.mechanism.steering import (
     UNSTEERED,
@@ -30,6 +29,7 @@ from traps_pipeline.models.request import JUDGED
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.study import MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import (
     DIRECTIONS,
@@ -294,8 +294,8 @@ def test_what_two_cells_share_is_one_answer(steered: Workspace, entry: ModelEntr
 
 def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, entry: ModelEntry) -> None:
     from traps_pipeline.models.local.adapter import load_local_model
-    from traps_pipeline.models.media import sample
     from traps_pipeline.models.prompts import system_prompt
+    from traps_pipeline.storage.media import sample
 
     model, items = load_local_model(entry), steered.tables.read(ITEMS, {"dataset": "chaotic"}).set_index("item_id")
     answers = steered.tables.read_all(STEERING, dataset="chaotic")

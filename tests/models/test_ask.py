@@ -24,7 +24,8 @@ from traps_pipeline.models.registry import Entry, Limits, get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.ledger import Ledger
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 
 CELL = Cell("occlusion", Evaluation("m", "standard", 1))
 QUICK = Limits(concurrency=4, retries=2, backoff_s=0.001)
@@ -321,7 +322,7 @@ from traps_pipeline.models.registry import Entry, Limits
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.ledger import Ledger
-from traps_pipeline.storage.workspace import Study
+from traps_pipeline.storage.study import Study
 class Slow:
     asked = 0
     async def ask(self, request):

@@ -30,7 +30,8 @@ from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.ledger import Ledger
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 
 
 def entry(prices: Prices | None) -> Entry:

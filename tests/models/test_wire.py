@@ -13,9 +13,9 @@ import pytest
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models import api, wire
-from traps_pipeline.models.media import Media, MediaSpec, data_uris, payload
 from traps_pipeline.models.registry import JSON_ANSWER, ModelEntry, get_model, load_models
 from traps_pipeline.models.wire import Clip, WireBody, check_entry, check_named, read_body, render, requests_of
+from traps_pipeline.storage.media import Media, MediaSpec, data_uris, payload
 
 pytestmark = pytest.mark.slow  # litellm's import
 

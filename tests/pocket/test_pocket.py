@@ -16,7 +16,6 @@ from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.rules import judge_abstention, judge_correctness
 from traps_pipeline.models.local.checkpoint import folder_digest
-from traps_pipeline.models.media import sample
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pocket import inside
 from traps_pipeline.pocket.commands import CARD, EVALUATION, FACTS, INSIDE, INSIDE_MARKS, MARKS, WEIGHTS
@@ -32,7 +31,9 @@ from traps_pipeline.pocket.data import (
 from traps_pipeline.pocket.evaluate import MODEL, Asked, entry_of, evaluate, markdown, read_cells, write_cells
 from traps_pipeline.pocket.recipe import POCKET, Recipe, load_recipe
 from traps_pipeline.pocket.words import PROMPTS, say
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 
 pytestmark = pytest.mark.slow

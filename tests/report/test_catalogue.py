@@ -22,7 +22,8 @@ from traps_pipeline.report.figures.abstention import doubt_points
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.writing import figure_files, freeze_layout, table_files, table_latex
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import CONTRASTS, JUDGE_BIAS, JUDGE_VALIDATION, LEADERBOARD
 
 PAPER = PublishedResults()

@@ -9,7 +9,8 @@ import pytest
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.report.items import addresses, index_page, item_page, page_name, write_item_pages
 from traps_pipeline.report.writing import Behind
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
 
 HOSTILE = '<script>alert(1)</script> \\textbf{bold} $x$ <img src="http://evil.example/x.png"> & "quoted"'

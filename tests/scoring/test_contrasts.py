@@ -26,7 +26,8 @@ from traps_pipeline.scoring.bootstrap import (
 from traps_pipeline.scoring.contrasts import contrasts, holm, regime_tests, version_contrasts
 from traps_pipeline.scoring.leaderboard import leaderboard
 from traps_pipeline.scoring.metrics import cell_metrics, wilson
-from traps_pipeline.storage.workspace import Study, Workspace
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, VERDICTS
 
 

@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.storage.workspace import FORMAT, Study, Workspace
+from traps_pipeline.storage.study import FORMAT, Study
+from traps_pipeline.storage.workspace import Workspace
 
 
 def edit(root: Path, **changes: Any) -> None:

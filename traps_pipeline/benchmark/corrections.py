@@ -29,7 +29,7 @@ from traps_pipeline.partitions import CATEGORIES
 from traps_pipeline.paths import CHECKOUT, CORRECTIONS, SCENE_SPECS, SPECS_VARIABLE
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.spec import Answerable, SceneSpec, Slug
-from traps_pipeline.storage.workspace import Study
+from traps_pipeline.storage.study import Study
 from traps_pipeline.yamlfile import explain, read_lines
 
 WORDS = ("question", "labels", "aliases", "ill_posed_question", "answerable_question")

@@ -30,7 +30,7 @@ from traps_pipeline import progress
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.local.capture import Pooling
-from traps_pipeline.models.media import MediaSpec, profile_digest, sample
+from traps_pipeline.storage.media import MediaSpec, profile_digest, sample
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -28,9 +28,9 @@ from traps_pipeline.mechanism.probes import (
     transfer_scores,
     within_split,
 )
-from traps_pipeline.mechanism.settings import ProbeSettings
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import scenario_weights
+from traps_pipeline.storage.study import ProbeSettings
 
 MOST_WORKERS = 4
 Result = TypeVar("Result")

@@ -19,19 +19,19 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, vote_columns, vote_request
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.paths import sources_of
-from traps_pipeline.mechanism.settings import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.mechanism.versions import loaded_params
 from traps_pipeline.models.answers import Question
 from traps_pipeline.models.ask import Settled, collect
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.local.backend import LocalBackend, outcome
-from traps_pipeline.models.media import sample
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.partitions import SIDES, SteeringCell, taxonomy_of
+from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, STEERING
 

@@ -13,12 +13,12 @@ from typing import Any
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.ask import Call, Settled, collect
-from traps_pipeline.models.media import MediaSpec
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS

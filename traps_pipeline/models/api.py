@@ -14,9 +14,9 @@ from importlib import import_module
 from typing import Any
 
 from traps_pipeline import progress
-from traps_pipeline.models.media import Media, data_uris
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import JUDGED, RATE_LIMITED, Outcome, OutcomeKind, Request, TransientError
+from traps_pipeline.storage.media import Media, data_uris
 
 UNREADABLE = 422  # what litellm makes of a page that is no JSON; no provider here sends it
 SERVED, REFUSAL = "traps_served_model", "traps_refusal"  # what the hook adds to a response's hidden parameters

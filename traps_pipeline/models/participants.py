@@ -18,7 +18,7 @@ from traps_pipeline.models.budget import Budget, BudgetReached, check_money, mos
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import RATE_LIMITED, UNBILLED, Backend, Outcome, Request, TransientError
 from traps_pipeline.models.traffic import Breaker, Gate, Meter
-from traps_pipeline.storage.workspace import Study
+from traps_pipeline.storage.study import Study
 
 Row = dict[str, Any]
 MAX_BACKOFF_S, MAX_RETRY_AFTER_S = 60.0, 900.0

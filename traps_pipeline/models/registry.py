@@ -15,9 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationIn
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
-from traps_pipeline.models.media import MediaSpec, profile_digest
 from traps_pipeline.partitions import Evaluation, check_slug
 from traps_pipeline.paths import ASSETS
+from traps_pipeline.storage.media import MediaSpec, profile_digest
 from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
 
 MODELS_VARIABLE = "TRAPS_MODELS"  # names another registry

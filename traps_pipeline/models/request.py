@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 from traps_pipeline.digests import digest
 
 if TYPE_CHECKING:
-    from traps_pipeline.models.media import Media
+    from traps_pipeline.storage.media import Media
 
 OutcomeKind = Literal["answer", "truncated", "empty", "refused", "error"]
 JUDGED: tuple[OutcomeKind, ...] = ("answer", "truncated")  # what has a text; docs/models.md, "Request -> Outcome"

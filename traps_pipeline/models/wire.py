@@ -28,13 +28,13 @@ import numpy as np
 from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.api import ApiBackend
-from traps_pipeline.models.media import Media, MediaSpec, MediaStore, sample
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import NETWORK, Account, Entry, ModelEntry, effective_params, load_accounts
 from traps_pipeline.models.request import Request, TransientError
 from traps_pipeline.partitions import REGIMES, Cell, Evaluation
 from traps_pipeline.progress import Progress, reporting
 from traps_pipeline.scenes.encode import encode
+from traps_pipeline.storage.media import Media, MediaSpec, MediaStore, sample
 
 if TYPE_CHECKING:
     from traps_pipeline.models.judges import JudgeEntry

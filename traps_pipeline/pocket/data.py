@@ -24,7 +24,6 @@ import numpy as np
 
 from traps_pipeline.digests import canonical_json, digest, file_digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.media import MediaSpec, pick, resized
 from traps_pipeline.pocket.recipe import Recipe, Split
 from traps_pipeline.pocket.words import guess
 from traps_pipeline.scenes import checks
@@ -38,6 +37,7 @@ from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.simulate import replay, simulate, swept_points
 from traps_pipeline.scenes.wording import draw_ill_posed
 from traps_pipeline.scenes.workers import run_in_order
+from traps_pipeline.storage.media import MediaSpec, pick, resized
 
 SHARD = 50  # scenes
 LATEST_CUT_S = 2.0  # released cuts lie between 1.1 and 2.0 s

@@ -14,7 +14,6 @@ import numpy as np
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.answers import is_correct
 from traps_pipeline.judging.rules import judge_abstention, judge_correctness
-from traps_pipeline.models.media import sample
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.partitions import REGIMES
@@ -22,6 +21,7 @@ from traps_pipeline.pocket.data import SceneRecord, read_shards
 from traps_pipeline.pocket.recipe import Recipe
 from traps_pipeline.pocket.seeds import write_seeds
 from traps_pipeline.scoring.metrics import wilson
+from traps_pipeline.storage.media import sample
 
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel

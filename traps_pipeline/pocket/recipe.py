@@ -7,9 +7,9 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from traps_pipeline.models.media import MediaSpec
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.scenes.registry import family_names
+from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 POCKET = ASSETS / "pocket"

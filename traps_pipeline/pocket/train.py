@@ -13,12 +13,12 @@ import numpy as np
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.media import pick
 from traps_pipeline.pocket.data import Question, SceneRecord, data_digest, read_shards
 from traps_pipeline.pocket.model import PATCH, make_model, save, train_tokenizer
 from traps_pipeline.pocket.recipe import Recipe, Training
 from traps_pipeline.pocket.words import COLUMNS, PROMPTS, ROWS, place_question, prompt_text, say
 from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.storage.media import pick
 
 if TYPE_CHECKING:
     import torch

@@ -6,23 +6,21 @@ import os
 import re
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.mechanism.settings import MechanismSettings
 from traps_pipeline.paths import CHECKOUT, require_checkout
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 if TYPE_CHECKING:
-    from traps_pipeline.models.media import MediaStore
+    from traps_pipeline.storage.media import MediaStore
 
-FORMAT = 1
 VARIABLE = "TRAPS_WORKSPACE"
 
 
@@ -42,56 +40,6 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise TrapsError(f"{path}: cannot be written ({error.strerror}); free some space and run again") from error
     finally:
         part.unlink(missing_ok=True)
-
-
-class Asked(BaseModel):
-    """What one experiment asks about a study's scenarios. mechanism: whether it looks inside local models."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    datasets: tuple[str, ...]
-    models: tuple[str, ...]
-    regimes: tuple[str, ...]
-    runs: tuple[int, ...]
-    mechanism: bool = False
-
-
-class Study(BaseModel):
-    """`study.yaml`: the benchmark, its subset, the panel, the budget and the experiments of a workspace.
-
-    benchmark, scenarios and per_family are fixed when the workspace is created; panel, epoch and budget may be edited.
-    No command and no button asks a model that `experiments` does not name.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    format: int = FORMAT
-    name: str = Field(
-        default="", pattern=r"^([a-z0-9-]+)?$", description="tells studies apart that share one Dagster history"
-    )
-    benchmark: str = "released"
-    scenarios: list[str] | None = Field(default=None, description="named scenarios; all if absent")
-    per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
-    panel: str = "rules"
-    epoch: str = Field(default="1", pattern=r"^[A-Za-z0-9._-]+$")
-    budget_usd: float = Field(default=0.0, ge=0.0, description="for all calls over the network, ever")
-    model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] = Field(
-        default={}, description="by model or judge, besides"
-    )
-    allow_unknown_prices: bool = Field(default=False, description="ask models without a price: no budget bounds them")
-    mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")
-    experiments: dict[str, Asked] = Field(
-        default={}, description="by name; written by `traps init` and `traps run`, remove one to ask no more for it"
-    )
-
-    @property
-    def is_subset(self) -> bool:
-        """Whether the study leaves scenarios of its benchmark out."""
-        return self.scenarios is not None or self.per_family is not None
-
-    @model_validator(mode="after")
-    def _one_subset(self) -> Study:
-        if self.scenarios is not None and self.per_family is not None:
-            raise ValueError("give scenarios or per_family, not both")
-        return self
 
 
 def _name_of(root: Path) -> str:
@@ -205,7 +153,7 @@ class Workspace:
     @cached_property
     def media(self) -> MediaStore:
         """Clips as they are sent to models."""
-        from traps_pipeline.models.media import MediaStore
+        from traps_pipeline.storage.media import MediaStore
 
         return MediaStore(self.root / "media")
 

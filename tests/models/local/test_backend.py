@@ -26,14 +26,14 @@ from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
 from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds
 from traps_pipeline.models.local.tiny import build_tiny
-from traps_pipeline.models.media import MediaStore
 from traps_pipeline.models.participants import Participants, Row
 from traps_pipeline.models.registry import Limits, ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.ledger import Ledger
-from traps_pipeline.storage.workspace import Study
+from traps_pipeline.storage.media import MediaStore
+from traps_pipeline.storage.study import Study
 
 pytestmark = pytest.mark.slow
 

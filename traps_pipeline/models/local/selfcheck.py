@@ -14,9 +14,9 @@ from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompts import Prompt
 from traps_pipeline.models.local.settings import Quantisation
 from traps_pipeline.models.local.tiny import Family, build_tiny
-from traps_pipeline.models.media import MediaSpec, sample
 from traps_pipeline.models.registry import LOCAL, ModelEntry, load_models
 from traps_pipeline.scenes.encode import encode
+from traps_pipeline.storage.media import MediaSpec, sample
 
 _SPEC = MediaSpec(profile="frames", uniform=4)
 # Vision towers of tiny checkpoints are too narrow for NF4 on a CPU; no library quantises the head.

@@ -8,7 +8,6 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.models.judges import load_judges
-from traps_pipeline.models.media import MediaSpec
 from traps_pipeline.models.registry import Entry, ModelEntry, load_models
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
@@ -16,6 +15,7 @@ from traps_pipeline.report.tables.shared import (
     frame,
 )
 from traps_pipeline.report.writing import Column, Table
+from traps_pipeline.storage.media import MediaSpec
 
 
 def models(results: Results) -> list[Table]:

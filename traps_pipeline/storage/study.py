@@ -1,4 +1,4 @@
-"""What an experiment asks of the mechanistic stages; it becomes part of the study, which every run reads."""
+"""What `study.yaml` says: the benchmark of a workspace, its experiments, its money, and what is asked inside models."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from traps_pipeline.partitions import VQA_PROMPTS, check_slug
 
-Kind = Literal["void", "random", "shuffled"]
+FORMAT = 1  # of a workspace
 Regime = Literal["standard", "guided"]
+
+
+# --- what is asked inside local models --------------------------------------------------------------------------------
 
 
 class Layers(BaseModel):
@@ -74,3 +77,56 @@ class MechanismSettings(BaseModel):
     @classmethod
     def _slugs(cls, values: dict[str, Any]) -> dict[str, Any]:
         return {check_slug(name): layers for name, layers in values.items()}
+
+
+# --- the study --------------------------------------------------------------------------------------------------------
+
+
+class Asked(BaseModel):
+    """What one experiment asks about a study's scenarios. mechanism: whether it looks inside local models."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    datasets: tuple[str, ...]
+    models: tuple[str, ...]
+    regimes: tuple[str, ...]
+    runs: tuple[int, ...]
+    mechanism: bool = False
+
+
+class Study(BaseModel):
+    """`study.yaml`: the benchmark, its subset, the panel, the budget and the experiments of a workspace.
+
+    benchmark, scenarios and per_family are fixed when the workspace is created; panel, epoch and budget may be edited.
+    No command and no button asks a model that `experiments` does not name.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    format: int = FORMAT
+    name: str = Field(
+        default="", pattern=r"^([a-z0-9-]+)?$", description="tells studies apart that share one Dagster history"
+    )
+    benchmark: str = "released"
+    scenarios: list[str] | None = Field(default=None, description="named scenarios; all if absent")
+    per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
+    panel: str = "rules"
+    epoch: str = Field(default="1", pattern=r"^[A-Za-z0-9._-]+$")
+    budget_usd: float = Field(default=0.0, ge=0.0, description="for all calls over the network, ever")
+    model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] = Field(
+        default={}, description="by model or judge, besides"
+    )
+    allow_unknown_prices: bool = Field(default=False, description="ask models without a price: no budget bounds them")
+    mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")
+    experiments: dict[str, Asked] = Field(
+        default={}, description="by name; written by `traps init` and `traps run`, remove one to ask no more for it"
+    )
+
+    @property
+    def is_subset(self) -> bool:
+        """Whether the study leaves scenarios of its benchmark out."""
+        return self.scenarios is not None or self.per_family is not None
+
+    @model_validator(mode="after")
+    def _one_subset(self) -> Study:
+        if self.scenarios is not None and self.per_family is not None:
+            raise ValueError("give scenarios or per_family, not both")
+        return self

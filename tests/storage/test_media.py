@@ -23,8 +23,9 @@ from pydantic import ValidationError
 
 from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models import media
-from traps_pipeline.models.media import (
+from traps_pipeline.scenes.encode import DamagedClip, decode, decode_sampled, encode
+from traps_pipeline.storage import media
+from traps_pipeline.storage.media import (
     Media,
     MediaSpec,
     MediaStore,
@@ -35,7 +36,6 @@ from traps_pipeline.models.media import (
     profile_digest,
     sample,
 )
-from traps_pipeline.scenes.encode import DamagedClip, decode, decode_sampled, encode
 
 VIDEO = MediaSpec(profile="video", fps=5)
 IMAGES = MediaSpec(profile="images", fps=5)
@@ -432,7 +432,7 @@ def test_many_threads_prepare_a_clip_once(clip: tuple[Path, str], store: MediaSt
 PREPARE = """
 import sys
 from pathlib import Path
-from traps_pipeline.models import media
+from traps_pipeline.storage import media
 encode, count = media.encode, [0]
 def counting(*arguments):
     count[0] += 1
