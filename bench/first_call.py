@@ -36,9 +36,9 @@ def fill(root: Path, rows: int) -> None:
     """A ledger as a study leaves it: the evaluation that will be asked has rows of other keys too."""
     from traps_pipeline.models.participants import ledger_row
     from traps_pipeline.models.request import Outcome, Request
+    from traps_pipeline.orchestration.wanted import Wanted
     from traps_pipeline.partitions import Evaluation
     from traps_pipeline.storage.ledger import Ledger
-    from traps_pipeline.wanted import Wanted
 
     params, text = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}, "The ball comes to rest on the left. " * 15
     outcome = Outcome("answer", text, None, "stop", None, "m-2026", 6500, 150, 20, 0.0002)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import (
     CATEGORIES,
     CHAOTIC_CATEGORIES,
@@ -17,7 +18,6 @@ from traps_pipeline.partitions import (
     taxonomy_of,
     transfer_type,
 )
-from traps_pipeline.wanted import Wanted
 
 
 def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None:

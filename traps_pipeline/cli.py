@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from traps_pipeline.errors import TrapsError
 
 if TYPE_CHECKING:
-    from traps_pipeline.experiment import Experiment
     from traps_pipeline.models.forecast import Forecast
     from traps_pipeline.storage.workspace import Workspace
+    from traps_pipeline.study.experiment import Experiment
 
 MONEY = ("budget_usd", "model_budgets_usd", "allow_unknown_prices")  # fields of an experiment and of a study
 OK, FAILED, BAD_USAGE, OVER_BUDGET, INTERRUPTED = 0, 1, 2, 4, 130
@@ -183,7 +183,7 @@ def _add_pocket(commands: Any) -> None:
 
 def doctor(arguments: argparse.Namespace) -> int:
     """See `traps doctor --help`."""
-    from traps_pipeline.doctor import examine, examine_local
+    from traps_pipeline.study.doctor import examine, examine_local
 
     who, needs = ("local models", "need") if arguments.local else ("the demo", "needs")
     problems = 0
@@ -233,7 +233,7 @@ def init(arguments: argparse.Namespace) -> int:
 
 def plan(arguments: argparse.Namespace) -> int:
     """See `traps plan --help`."""
-    from traps_pipeline.plan import Count, make_plan
+    from traps_pipeline.study.plan import Count, make_plan
 
     experiment, root = _experiment(arguments), _root(arguments)
     workspace = _open(root) if (root / "study.yaml").exists() else None
@@ -395,7 +395,7 @@ def status(arguments: argparse.Namespace) -> int:
     from traps_pipeline.orchestration.history import History
     from traps_pipeline.orchestration.lineage import Lineage
     from traps_pipeline.orchestration.run import dagster_history
-    from traps_pipeline.plan import stage_statuses
+    from traps_pipeline.study.status import stage_statuses
 
     _load_definitions()
     lineage = Lineage(workspace)
@@ -420,7 +420,7 @@ SHOWN = 8
 
 def why(arguments: argparse.Namespace) -> int:
     """See `traps why --help`."""
-    from traps_pipeline.plan import why as explain
+    from traps_pipeline.study.why import why as explain
 
     for line in explain(_open(_root(arguments)), arguments.item):
         print(line)
@@ -441,7 +441,7 @@ def export_results(arguments: argparse.Namespace) -> int:
 
 def export_calls(arguments: argparse.Namespace) -> int:
     """See `traps requests export --help`."""
-    from traps_pipeline.models.exchange import REQUESTS, export_requests
+    from traps_pipeline.study.exchange import REQUESTS, export_requests
 
     experiment = _experiment(arguments)
     count = export_requests(_open(_root(arguments)), experiment, arguments.out.absolute())
@@ -452,7 +452,7 @@ def export_calls(arguments: argparse.Namespace) -> int:
 
 def import_given(arguments: argparse.Namespace) -> int:
     """See `traps answers import --help`."""
-    from traps_pipeline.models.exchange import import_answers
+    from traps_pipeline.study.exchange import import_answers
 
     imported = import_answers(_open(_root(arguments)), _experiment(arguments), arguments.file)
     print(f"{imported.new} answers imported, {imported.known} were there already")
@@ -462,7 +462,7 @@ def import_given(arguments: argparse.Namespace) -> int:
 
 def check_models(arguments: argparse.Namespace) -> int:
     """See `traps models check --help`."""
-    from traps_pipeline.models.wire import check_named
+    from traps_pipeline.study.wire_check import check_named
 
     wrong = 0
     for checked in check_named(arguments.names):
@@ -611,7 +611,7 @@ def _create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
 
 
 def _experiment(arguments: argparse.Namespace) -> Experiment:
-    from traps_pipeline.experiment import load_experiment
+    from traps_pipeline.study.experiment import load_experiment
 
     return load_experiment(arguments.experiment)
 

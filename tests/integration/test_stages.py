@@ -23,7 +23,7 @@ import json
 import traps_pipeline.definitions
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.wanted import Wanted
+from traps_pipeline.orchestration.wanted import Wanted
 w = Workspace.open()
 found, stages = Lineage(w), Lineage(w).graph.stages
 print(json.dumps({

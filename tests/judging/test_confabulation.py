@@ -16,7 +16,6 @@ from statsmodels.stats.proportion import proportion_confint
 from tests.judging.conftest import answered_study
 from tests.providers.server import Provider
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.experiment import load_experiment
 from traps_pipeline.judging import confabulation
 from traps_pipeline.judging.confabulation import (
     AXES,
@@ -36,9 +35,10 @@ from traps_pipeline.judging.panel import parse_judgement
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation
-from traps_pipeline.plan import make_plan
 from traps_pipeline.scoring.prevalence import prevalence
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.study.experiment import load_experiment
+from traps_pipeline.study.plan import make_plan
 from traps_pipeline.tables import CONFABULATION, CONFABULATION_PREVALENCE, VERDICTS
 
 THINKS, SPEAKS = "gemini-2.5-flash", "gemini-2.5-flash-nt"  # trace and output, output alone

@@ -83,7 +83,7 @@ from traps_pipeline.orchestration.graph import Source, name_of, the_graph
 from traps_pipeline.orchestration.lineage import Lineage, _report_state
 from traps_pipeline.orchestration.run import _execute, dagster_history
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.wanted import Wanted
+from traps_pipeline.orchestration.wanted import Wanted
 
 workspace, graph = Workspace.open(), the_graph()
 job = defs.resolve_implicit_global_asset_job_def()

@@ -8,8 +8,8 @@ import pytest
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.registry import get_model, load_models
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import REGIMES, Evaluation
-from traps_pipeline.wanted import Wanted
 
 GROUPS = "groups: {family: f, access: none, input: none, group: g}"
 

@@ -12,8 +12,8 @@ from dagster import PartitionKeyRange
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.run import batches
 from traps_pipeline.orchestration.schemes import CELL, DATASET
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import DATASETS, Cell
-from traps_pipeline.wanted import Wanted
 
 CELLS = [str(key) for key in the_graph().keys("responses")]
 

@@ -33,6 +33,7 @@ from traps_pipeline.orchestration.schemes import (
     to_keys,
 )
 from traps_pipeline.orchestration.stage import source, stage
+from traps_pipeline.orchestration.wanted import PROBE_PROMPT, Wanted
 from traps_pipeline.partitions import (
     ANSWERABLE,
     DATASETS,
@@ -57,7 +58,6 @@ from traps_pipeline.tables import (
     STEERING_VOTES,
 )
 from traps_pipeline.tables import STEERING as STEERING_TABLE
-from traps_pipeline.wanted import PROBE_PROMPT, Wanted
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -22,8 +22,8 @@ from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.run import failed_checks, walk
 from traps_pipeline.orchestration.stage import CURRENT, WorkspaceResource
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.wanted import Wanted
 
 PURPOSES = {
     "benchmark": ("Scenarios, clips and items.", ("benchmark",)),

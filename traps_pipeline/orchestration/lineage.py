@@ -17,9 +17,9 @@ from typing import Literal
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.graph import Graph, Stage, name_of, the_graph
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace, write_text
-from traps_pipeline.wanted import Wanted
 
 DAMAGED = "damaged"  # the version of what cannot be believed
 

@@ -24,8 +24,8 @@ from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.schemes import Scheme
 from traps_pipeline.orchestration.stage import EXPERIMENT_TAG, MAKE_TAG, OUTDATED, STALE, to_make
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.wanted import Wanted
 
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
 _RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"

@@ -9,9 +9,9 @@ from typing import Any
 
 import dagster as dg
 
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import Cell, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.wanted import Wanted
 
 # Partition mappings over one dimension, observable sources and backfill policies are in beta, partitioned checks in
 # preview; the version is pinned.

@@ -33,10 +33,10 @@ from traps_pipeline.orchestration.graph import (
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
 from traps_pipeline.orchestration.schemes import LEFT_OUT, Scheme, study_here
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made, State
 from traps_pipeline.storage.workspace import Workspace, write_bytes, write_text
 from traps_pipeline.tables import Table
-from traps_pipeline.wanted import Wanted
 
 OWNERS = ["team:benchmark"]
 CURRENT = "current"  # the check that every stage has

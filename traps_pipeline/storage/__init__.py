@@ -1,1 +1,1 @@
-"""What is kept on disk: the workspace and its `study.yaml`, its Parquet tables, its ledger of paid calls, the media sent."""
+"""What is kept on disk: a workspace, what its `study.yaml` says, its tables, its ledger of paid calls, prepared media."""

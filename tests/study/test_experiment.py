@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.experiment import load_experiment
 from traps_pipeline.partitions import DATASETS, REGIMES
 from traps_pipeline.storage.study import Study
+from traps_pipeline.study.experiment import load_experiment
 
 
 def experiment(tmp_path: Path, text: str) -> str:

@@ -1,29 +1,25 @@
-"""`traps plan`, `traps status` and `traps why`: what would be asked, what is there, and why it would be asked again."""
+"""`traps plan`: which calls an experiment would make, and what they would take."""
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from traps_pipeline.benchmark.corrections import load_scenarios
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.experiment import Experiment
 from traps_pipeline.judging.confabulation import load_protocol, sample_failures
 from traps_pipeline.judging.panel import tasks_for, wanted_ballots
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answers import answer_request, is_prepared
 from traps_pipeline.models.forecast import Experience, Forecast, experiences, forecast
 from traps_pipeline.models.judges import PANEL_SIZE, JudgeEntry, load_panel
-from traps_pipeline.models.registry import NETWORK, Entry, get_model, load_models
+from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.orchestration.lineage import Lineage
-from traps_pipeline.partitions import REGIMES, SIDES, Cell, Evaluation, SteeredEvaluation, datasets_of_category
+from traps_pipeline.partitions import SIDES, Cell, Evaluation, SteeredEvaluation, datasets_of_category
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.study.experiment import Experiment
 from traps_pipeline.tables import ITEMS
-from traps_pipeline.wanted import Wanted
 
 LABEL_TOKENS = 2500  # prompt of a label: instructions, answer and, for half of the models, a trace; an estimate
 VOTES_A_PAIR = PANEL_SIZE * sum(len(tasks_for(side)) for side in SIDES)
@@ -173,80 +169,3 @@ def _answer_keys(workspace: Workspace, cell: Cell) -> set[str]:
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}).to_dict("records")
     sent = [item for item in items if is_prepared(workspace, entry, item)]  # what was never prepared was never asked
     return {answer_request(workspace, entry, item, cell.evaluation).key for item in sent}
-
-
-# --- status -----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class StageStatus:
-    """How many partitions of a stage are fresh, which are stale and why, how many are missing."""
-
-    stage: str
-    fresh: int
-    stale: Mapping[str, tuple[str, ...]]
-    missing: int
-
-
-def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
-    """The state of every stage, of what the study wants, or one experiment of it."""
-    wanted = Wanted(workspace, experiment)
-    for stage in lineage.graph.stages:
-        statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(wanted)}
-        stale = {key: status.reasons for key, status in statuses.items() if status.kind == "stale"}
-        kinds = Counter(status.kind for status in statuses.values())
-        yield StageStatus(stage.name, kinds["fresh"], stale, kinds["missing"])
-
-
-# --- why --------------------------------------------------------------------------------------------------------------
-
-
-def why(workspace: Workspace, item_id: str) -> Iterator[str]:
-    """For every evaluation that ever asked the item: whether its answer still stands, else which component of the key
-    changed. Raises TrapsError for an unknown item."""
-    dataset = item_id.split(":")[0]
-    current = _current_item(workspace, dataset, item_id)
-    asked = 0
-    for model, entry in load_models().items():
-        for regime in REGIMES:
-            for run in range(1, entry.runs + 1):
-                evaluation = Evaluation(model, regime, run)
-                rows = [r for r in workspace.answers.read(evaluation.key).rows.values() if _about(r) == item_id]
-                if not rows:
-                    continue
-                asked += 1
-                wanted = answer_request(workspace, entry, current, evaluation) if current else None
-                yield f"{evaluation.key}: {_explain(rows, wanted.components if wanted else None)}"
-    if current is None and not asked:
-        raise TrapsError(
-            f"item {item_id!r} is unknown; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void"
-        )
-    if not asked:
-        yield "never asked of any model"
-
-
-def _about(row: Mapping[str, Any]) -> Any:
-    return row["components"]["about"]["item_id"]
-
-
-def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:
-    items = workspace.tables.read_all(ITEMS, dataset=dataset)
-    return next((item for item in items.to_dict("records") if item["item_id"] == item_id), None)
-
-
-def _explain(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
-    newest = max(rows, key=lambda row: row["created_at"])
-    if wanted is None:
-        return f"asked {len(rows)} times; the item is no longer in the benchmark, its answers stay in the ledger"
-    for row in rows:
-        if row["components"] == dict(wanted):
-            return f"answered {row['created_at'][:19]} ({row['outcome']}), key {row['key'][:12]}: still stands"
-    old = newest["components"]
-    changed = [name for name in sorted(old.keys() | wanted.keys()) if old.get(name) != wanted.get(name)]
-    parts = [f"{name}: {_short(old.get(name))} -> {_short(wanted.get(name))}" for name in changed]
-    return f"will be asked again; changed since {newest['created_at'][:19]}: {'; '.join(parts)}"
-
-
-def _short(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-    return repr(text if len(text) <= 160 else text[:157] + "...")

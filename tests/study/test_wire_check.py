@@ -12,10 +12,13 @@ import pytest
 
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models import api, wire
+from traps_pipeline.models import api
 from traps_pipeline.models.registry import JSON_ANSWER, ModelEntry, get_model, load_models
-from traps_pipeline.models.wire import Clip, WireBody, check_entry, check_named, read_body, render, requests_of
 from traps_pipeline.storage.media import Media, MediaSpec, data_uris, payload
+from traps_pipeline.study import wire_check
+from traps_pipeline.study.loopback import render
+from traps_pipeline.study.wire_body import ClipPart, WireBody, read_body
+from traps_pipeline.study.wire_check import check_named, examine, requests_of
 
 pytestmark = pytest.mark.slow  # litellm's import
 
@@ -37,7 +40,7 @@ PAPER = [
     "gemma-4-e4b",
     "llava-next-video-7b",
 ]  # docs/spec.md 3.2
-CHECKED = [name for name, entry in wire.participants().items() if entry.backend in ("api", "local")]
+CHECKED = [name for name, entry in wire_check.participants().items() if entry.backend in ("api", "local")]
 
 
 def altered(name: str, params: dict[str, Any] | None = None, **changes: Any) -> ModelEntry:
@@ -104,7 +107,7 @@ def test_the_clip_in_the_body_is_the_one_that_was_prepared() -> None:
         sent = requests_of(get_model(name))["standard"].sent
         assert sent is not None
         _, user = read_body(bodies(name)["guided"]).turns[1]
-        clips = [part for part in user if isinstance(part, Clip)]
+        clips = [part for part in user if isinstance(part, ClipPart)]
         assert (len(clips), [clip.data for clip in clips]) == (images, payload(sent))
         assert {clip.fps for clip in clips} == {sent.fps} == {None if images > 1 else 5}
 
@@ -117,7 +120,7 @@ def test_gemini_drops_a_video_url_without_a_word(monkeypatch: pytest.MonkeyPatch
         return [{"type": "video_url", "video_url": {"url": data_uris(media)[0]}, "fps": 5}]
 
     monkeypatch.setattr(api, "media_parts", as_video_url)
-    assert check_entry(get_model("gemini-2.5-pro")) == ["media: 0 of 1 videos arrive"]
+    assert examine(get_model("gemini-2.5-pro")).problems == ["media: 0 of 1 videos arrive"]
 
 
 def test_gemini_is_not_told_the_rate_of_a_video_sent_as_an_image(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,7 +128,7 @@ def test_gemini_is_not_told_the_rate_of_a_video_sent_as_an_image(monkeypatch: py
         return [{"type": "image_url", "image_url": {"url": data_uris(media)[0]}}]
 
     monkeypatch.setattr(api, "media_parts", as_image_url)
-    assert check_entry(get_model("gemini-2.5-pro")) == ["media.fps: 5 is declared, None arrives"]
+    assert examine(get_model("gemini-2.5-pro")).problems == ["media.fps: 5 is declared, None arrives"]
 
 
 @pytest.mark.parametrize("name", ["gemini-3.1-flash-lite", "qwen3-vl-think"])
@@ -139,20 +142,20 @@ def test_another_rate_than_the_clips_is_found(name: str, monkeypatch: pytest.Mon
         return [part | {"fps": 1}]
 
     monkeypatch.setattr(api, "media_parts", at_one_fps)
-    assert check_entry(get_model(name)) == ["media.fps: 5 is declared, 1 arrives"]
+    assert examine(get_model(name)).problems == ["media.fps: 5 is declared, 1 arrives"]
 
 
 def test_an_image_too_few_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     honest = api.media_parts
     monkeypatch.setattr(api, "media_parts", lambda media, route: honest(media, route)[1:])
-    assert check_entry(get_model("gpt-5-nr")) == ["media: 24 of 25 images arrive"]
+    assert examine(get_model("gpt-5-nr")).problems == ["media: 24 of 25 images arrive"]
 
 
 def test_anything_beside_clip_and_question_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     honest = api.media_parts
     hint = {"type": "text", "text": "These are 25 frames."}
     monkeypatch.setattr(api, "media_parts", lambda media, route: [*honest(media, route), hint])
-    assert check_entry(get_model("gpt-5-nr")) == ["something other than clip and question arrives"]
+    assert examine(get_model("gpt-5-nr")).problems == ["something other than clip and question arrives"]
 
 
 @pytest.mark.parametrize(
@@ -211,7 +214,7 @@ def test_anything_beside_clip_and_question_is_found(monkeypatch: pytest.MonkeyPa
     ],
 )
 def test_an_altered_entry_is_told_what_is_wrong(entry: ModelEntry, complaint: str) -> None:
-    problems = check_entry(entry)
+    problems = examine(entry).problems
     assert any(complaint in problem for problem in problems), problems
 
 
@@ -278,7 +281,7 @@ def test_the_command_fails_where_an_entry_does(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     broken = altered("gpt-5-nr", {"temperature": 0.8})
-    monkeypatch.setattr(wire, "participants", lambda: {"gpt-5-nr": broken})
+    monkeypatch.setattr(wire_check, "participants", lambda: {"gpt-5-nr": broken})
     assert main(["models", "check"]) == 1
     printed = capsys.readouterr().out.splitlines()
     assert printed[0] == f"{'gpt-5-nr':<24} nothing caught"

@@ -1,0 +1,104 @@
+"""A provider on this machine: an entry's backend asks it as it would ask its own, and the request is caught."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+from typing import Any
+from urllib.parse import urlsplit
+
+from traps_pipeline.models.api import ApiBackend
+from traps_pipeline.models.registry import Account, Entry, load_accounts
+from traps_pipeline.models.request import Request, TransientError
+from traps_pipeline.progress import Progress, reporting
+from traps_pipeline.study.wire_body import WireBody
+
+PLACEHOLDER_KEY = "placeholder-of-a-key"
+
+
+class _Loopback(Account):
+    """An account whose provider is this machine."""
+
+    def secret(self) -> str | None:
+        """A key that opens nothing."""
+        return PLACEHOLDER_KEY
+
+
+@dataclass
+class _Notes(Progress):
+    """Keeps what a backend would tell a person: why a client library refused to send."""
+
+    texts: list[str] = field(default_factory=list)
+
+    def note(self, text: str) -> None:
+        """See `Progress.note`."""
+        self.texts.append(text)
+
+
+@contextmanager
+def _listening() -> Iterator[tuple[str, list[WireBody]]]:
+    """A server on this machine: its address and the requests that reach it. Each is answered with a final 400."""
+    caught: list[WireBody] = []
+
+    class Catcher(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            raw = self.rfile.read(int(self.headers.get("content-length") or 0))
+            caught.append(WireBody(self.command, self.path, dict(self.headers), raw))
+            answer = b'{"error": {"message": "caught", "type": "invalid_request_error", "code": 400}}'
+            self.send_response(400)
+            self.send_header("content-type", "application/json")
+            self.send_header("content-length", str(len(answer)))
+            self.end_headers()
+            self.wfile.write(answer)
+
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Catcher)
+    Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    try:
+        with _no_proxy("127.0.0.1"):
+            yield f"http://127.0.0.1:{server.server_port}", caught
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@contextmanager
+def _no_proxy(host: str) -> Iterator[None]:
+    """Clients ask a host directly, whatever proxy the environment names."""
+    names = ("no_proxy", "NO_PROXY")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update({name: ",".join(filter(None, (before[name], host))) for name in names})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def render(entry: Entry, requests: Sequence[Request]) -> list[WireBody | str]:
+    """The body of each request, or why none was sent."""
+    account, notes = load_accounts()[str(entry.account)], _Notes()
+    with _listening() as (address, caught), reporting(notes):
+        loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
+
+        async def ask_all() -> list[WireBody | str]:
+            return [await _ask(entry, loopback, request, caught, notes) for request in requests]
+
+        return asyncio.run(ask_all())
+
+
+async def _ask(
+    entry: Entry, account: Account, request: Request, caught: list[WireBody], notes: _Notes
+) -> WireBody | str:
+    caught.clear()
+    backend = ApiBackend(entry, account)  # a new one each time: it tells a failure of a kind once
+    with suppress(TransientError):
+        await backend.ask(request)
+    return caught[0] if len(caught) == 1 else f"{len(caught)} requests were sent, not one ({notes.texts[-1:]})"

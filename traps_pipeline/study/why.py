@@ -1,0 +1,65 @@
+"""`traps why`: whether an item's answers still stand, and what would be asked again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.answers import answer_request
+from traps_pipeline.models.registry import load_models
+from traps_pipeline.partitions import REGIMES, Evaluation
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.tables import ITEMS
+
+
+def why(workspace: Workspace, item_id: str) -> Iterator[str]:
+    """For every evaluation that ever asked the item: whether its answer still stands, else which component of the key
+    changed. Raises TrapsError for an unknown item."""
+    dataset = item_id.split(":")[0]
+    current = _current_item(workspace, dataset, item_id)
+    asked = 0
+    for model, entry in load_models().items():
+        for regime in REGIMES:
+            for run in range(1, entry.runs + 1):
+                evaluation = Evaluation(model, regime, run)
+                rows = [r for r in workspace.answers.read(evaluation.key).rows.values() if _about(r) == item_id]
+                if not rows:
+                    continue
+                asked += 1
+                wanted = answer_request(workspace, entry, current, evaluation) if current else None
+                yield f"{evaluation.key}: {_explain(rows, wanted.components if wanted else None)}"
+    if current is None and not asked:
+        raise TrapsError(
+            f"item {item_id!r} is unknown; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void"
+        )
+    if not asked:
+        yield "never asked of any model"
+
+
+def _about(row: Mapping[str, Any]) -> Any:
+    return row["components"]["about"]["item_id"]
+
+
+def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:
+    items = workspace.tables.read_all(ITEMS, dataset=dataset)
+    return next((item for item in items.to_dict("records") if item["item_id"] == item_id), None)
+
+
+def _explain(rows: list[dict[str, Any]], wanted: Mapping[str, Any] | None) -> str:
+    newest = max(rows, key=lambda row: row["created_at"])
+    if wanted is None:
+        return f"asked {len(rows)} times; the item is no longer in the benchmark, its answers stay in the ledger"
+    for row in rows:
+        if row["components"] == dict(wanted):
+            return f"answered {row['created_at'][:19]} ({row['outcome']}), key {row['key'][:12]}: still stands"
+    old = newest["components"]
+    changed = [name for name in sorted(old.keys() | wanted.keys()) if old.get(name) != wanted.get(name)]
+    parts = [f"{name}: {_short(old.get(name))} -> {_short(wanted.get(name))}" for name in changed]
+    return f"will be asked again; changed since {newest['created_at'][:19]}: {'; '.join(parts)}"
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return repr(text if len(text) <= 160 else text[:157] + "...")

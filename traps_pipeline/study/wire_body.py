@@ -1,0 +1,172 @@
+"""The bodies that providers' APIs get, read into one form, and the fields that each API has for a parameter."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+Api = Literal["chat", "responses", "gemini", "anthropic"]
+ENDPOINTS: dict[str, Api] = {
+    "/chat/completions": "chat",
+    "/responses": "responses",
+    ":generateContent": "gemini",
+    "/v1/messages": "anthropic",
+}
+# A parameter's name in the body, where it is another than in the entry.
+_NAMES: dict[Api, dict[str, str]] = {
+    "chat": {},
+    "responses": {"max_tokens": "max_output_tokens", "max_completion_tokens": "max_output_tokens"},
+    "gemini": {"top_p": "topP", "top_k": "topK", "max_tokens": "maxOutputTokens"},
+    "anthropic": {},
+}
+UNKNOWN_FORM = (ValueError, KeyError, TypeError, AttributeError)
+SCHEMAS = ("response_format", "text.format", "generationConfig.responseJsonSchema", "output_format")  # kept whole
+
+
+@dataclass(frozen=True)
+class WireBody:
+    """One HTTP request as a provider would get it."""
+
+    method: str
+    path: str
+    headers: Mapping[str, str]
+    raw: bytes
+
+    @cached_property
+    def body(self) -> dict[str, Any]:
+        """The parsed JSON."""
+        return json.loads(self.raw)
+
+    @property
+    def api(self) -> Api | None:
+        """Which API the path belongs to."""
+        return next((api for ending, api in ENDPOINTS.items() if self.path.endswith(ending)), None)
+
+
+# --- what a body says -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ClipPart:
+    """A video or an image in a body. fps: as the body says it."""
+
+    mime: str
+    data: bytes
+    fps: float | None = None
+
+
+@dataclass(frozen=True)
+class ParsedBody:
+    """A body in one form for all APIs. turns: role and parts, each a text, a clip, or None for anything else.
+
+    fields: by dotted name, whatever is neither model nor turn; a schema is kept whole.
+    """
+
+    model: str
+    turns: list[tuple[str, list[str | ClipPart | None]]]
+    fields: dict[str, Any]
+
+
+def read_body(wire: WireBody) -> ParsedBody:
+    """What a body says. Raises one of `UNKNOWN_FORM`."""
+    body = _camel(wire.body) if wire.api == "gemini" else dict(wire.body)
+    model = body.pop("model", None) or wire.path.rsplit("/", 1)[-1].removesuffix(":generateContent")
+    match wire.api:
+        case "gemini":
+            turns = [{"role": "system", **body.pop("systemInstruction")}, *body.pop("contents")]
+        case "responses":
+            turns = [{"role": "system", "content": body.pop("instructions")}, *body.pop("input")]
+        case "anthropic":
+            turns = [{"role": "system", "content": body.pop("system")}, *body.pop("messages")]
+        case _:
+            turns = body.pop("messages")
+    return ParsedBody(model, [_turn(turn) for turn in turns], flat(body))
+
+
+def _turn(turn: Mapping[str, Any]) -> tuple[str, list[str | ClipPart | None]]:
+    content = turn["parts"] if "parts" in turn else turn["content"]
+    return turn["role"], [content] if isinstance(content, str) else [_part(part) for part in content]
+
+
+def _part(part: Mapping[str, Any]) -> str | ClipPart | None:
+    """A part of a turn, in the words of any of the APIs; None for what is none of ours."""
+    match part:
+        case {"text": str(text), **rest} if rest.keys() <= {"type"}:
+            return text
+        case {"image_url": {"url": str(uri), **more}, **rest} if not more and rest.keys() <= {"type"}:
+            return _clip(uri)
+        case {"image_url": str(uri), **rest} if rest == {"type": "input_image", "detail": "auto"}:
+            return _clip(uri)  # litellm adds the detail; auto is the provider's default
+        case {"video_url": {"url": str(uri), **more}, **rest} if not more and rest.keys() <= {"type", "fps"}:
+            return _clip(uri, rest.get("fps"))
+        case {"inlineData": {"mimeType": str(mime), "data": str(data)}, **rest} if rest.keys() <= {"videoMetadata"}:
+            return _clip(f"data:{mime};base64,{data}", **rest.get("videoMetadata", {}))
+    return None
+
+
+def _clip(uri: str, fps: float | None = None) -> ClipPart:
+    head, data = uri.split(",", 1)
+    return ClipPart(head.removeprefix("data:").removesuffix(";base64"), base64.b64decode(data, validate=True), fps)
+
+
+def _camel(value: Any) -> Any:
+    """Gemini's names in one spelling: it reads snake_case and camelCase alike, and litellm mixes them."""
+    if isinstance(value, list):
+        return [_camel(one) for one in value]
+    if not isinstance(value, dict):
+        return value
+    renamed = {_camel_name(name): one for name, one in value.items()}
+    return {name: one if name == "responseJsonSchema" else _camel(one) for name, one in renamed.items()}
+
+
+def _camel_name(name: str) -> str:
+    head, *others = name.split("_")
+    return head + "".join(word.capitalize() for word in others)
+
+
+def flat(value: Any, name: str = "") -> dict[str, Any]:
+    """Leaves of nested mappings by dotted name."""
+    if not isinstance(value, dict) or not value or name in SCHEMAS:
+        return {name: value}
+    leaves: dict[str, Any] = {}
+    for key, one in value.items():
+        leaves |= flat(one, f"{name}.{key}" if name else key)
+    return leaves
+
+
+# --- what a body must have --------------------------------------------------------------------------------------------
+
+
+def declared_fields(api: Api, params: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields that a body of an API must have, and no others, by dotted name."""
+    fields: dict[str, Any] = {}
+    for name, value in params.items():
+        if name == "response_format":
+            fields |= _schema_fields(api, value)
+        elif name == "extra_body":
+            fields |= flat(value)
+        elif name == "reasoning_effort" and api == "responses":
+            fields |= flat(value if isinstance(value, dict) else {"effort": value}, "reasoning")
+        else:
+            place = "generationConfig." if api == "gemini" else ""
+            fields |= flat(value, place + _NAMES[api].get(name, name))
+    return fields
+
+
+def _schema_fields(api: Api, response_format: Mapping[str, Any]) -> dict[str, Any]:
+    """How an API is told a JSON schema."""
+    given = response_format["json_schema"]
+    match api:
+        case "chat":
+            return {"response_format": response_format}
+        case "responses":
+            return {"text.format": {"type": "json_schema", **given}}
+        case "gemini":
+            config = {"responseMimeType": "application/json", "responseJsonSchema": given["schema"]}
+            return {f"generationConfig.{name}": value for name, value in config.items()}
+        case "anthropic":
+            return {"output_format": {"type": "json_schema", "schema": given["schema"]}}
