@@ -1,12 +1,12 @@
-"""What `traps pocket ...` does: glue between the command line and the modules beside this one."""
+"""What `traps pocket ...` does with the modules beside this one: draw, train, evaluate, write the model card."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
+from pathlib import Path
 
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
@@ -14,7 +14,7 @@ from traps_pipeline.pocket import evaluate as evaluation
 from traps_pipeline.pocket import inside
 from traps_pipeline.pocket.data import data_digest, render
 from traps_pipeline.pocket.inside import FACTS
-from traps_pipeline.pocket.recipe import POCKET, RECIPE, Recipe, Split, load_recipe
+from traps_pipeline.pocket.recipe import POCKET, Recipe, Split
 from traps_pipeline.storage.workspace import Workspace
 
 EVALUATION = POCKET / "evaluation.csv"
@@ -26,70 +26,77 @@ MARKS = "<!-- evaluation: written by `traps pocket card` -->", "<!-- end of eval
 INSIDE_MARKS = "<!-- inside: written by `traps pocket card` -->", "<!-- end of inside -->"
 
 
-def _say(line: str) -> None:
-    print(line, flush=True)
+Report = Callable[[str], None]  # is told, in a line, how far the work is
 
 
-def _recipe(arguments: argparse.Namespace) -> Recipe:
-    return load_recipe(arguments.recipe or RECIPE)
-
-
-def render_data(arguments: argparse.Namespace) -> None:
-    """Both splits."""
+def render_data(recipe: Recipe, data: Path, *, workers: int | None, report: Report) -> None:
+    """Draw what is missing of both splits. workers: processes; None for one a core."""
     splits: tuple[Split, Split] = ("train", "held-out")
     for split in splits:
-        _render(arguments, split)
+        _render(recipe, split, data, workers, report)
 
 
-def _render(arguments: argparse.Namespace, split: Split) -> None:
+def _render(recipe: Recipe, split: Split, data: Path, workers: int | None, report: Report) -> None:
     """Draw what is missing of a split."""
     began = time.monotonic()
-    render(_recipe(arguments), split, arguments.data, workers=arguments.workers, report=_say)
-    _say(f"{split}: rendered in {(time.monotonic() - began) / 60:.1f} minutes")
+    render(recipe, split, data, workers=workers, report=report)
+    report(f"{split}: rendered in {(time.monotonic() - began) / 60:.1f} minutes")
 
 
-def train(arguments: argparse.Namespace) -> None:
+def train(recipe: Recipe, data: Path, out: Path, seed: int, *, workers: int | None, report: Report) -> None:
     """Render what is missing, train, and note in `training.json` what the weights came from."""
     import torch
 
     from traps_pipeline.pocket.train import train as fit
 
-    recipe, out = _recipe(arguments), arguments.out
-    _render(arguments, "train")
+    _render(recipe, "train", data, workers, report)
     began = time.monotonic()
     torch.set_num_threads(THREADS)
-    weights = fit(recipe, arguments.data, out, arguments.seed, report=_say)
+    weights = fit(recipe, data, out, seed, report=report)
     facts = {
-        "seed": arguments.seed,
+        "seed": seed,
         "recipe": digest(recipe.model_dump(mode="json")),
-        "data": data_digest(recipe, "train", arguments.data),
+        "data": data_digest(recipe, "train", data),
         "weights": file_digest(weights / "model.safetensors"),
         "versions": {name: version(name) for name in ("mujoco", "tokenizers", "torch", "transformers")},
     }
     (out / FACTS).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-    _say(f"{weights}: trained in {(time.monotonic() - began) / 60:.1f} minutes")
+    report(f"{weights}: trained in {(time.monotonic() - began) / 60:.1f} minutes")
 
 
-def evaluate(arguments: argparse.Namespace) -> None:
-    """Ask the weights of a seed about the held-out scenes; prints the table and adds the counts to the CSV."""
+def evaluate(
+    recipe: Recipe,
+    data: Path,
+    out: Path,
+    seed: int,
+    *,
+    scenes: int | None,
+    counts: Path,
+    workers: int | None,
+    report: Report,
+) -> str:
+    """Ask the weights of a seed about the held-out scenes and add the counts to their CSV; the table in Markdown.
+
+    scenes: of each family; None for all that are held out.
+    """
     import torch
 
     torch.set_num_threads(THREADS)
-    recipe = _recipe(arguments)
-    _render(arguments, "held-out")
-    asked = list(evaluation.held_out(recipe, arguments.data, arguments.scenes))
-    cells = evaluation.evaluate(evaluation.entry_of(arguments.out / WEIGHTS), asked, arguments.seed, report=_say)
-    evaluation.write_cells(arguments.csv or EVALUATION, cells)
-    _say(evaluation.markdown(cells))
+    _render(recipe, "held-out", data, workers, report)
+    asked = list(evaluation.held_out(recipe, data, scenes))
+    cells = evaluation.evaluate(evaluation.entry_of(out / WEIGHTS), asked, seed, report=report)
+    evaluation.write_cells(counts, cells)
+    return evaluation.markdown(cells)
 
 
-def card(arguments: argparse.Namespace) -> None:
-    """Take the figures of finished workspaces into their CSV, and put the tables of both CSVs into the model card."""
-    figures = [figure for folder in arguments.mechanism for figure in inside.figures_of(Workspace.open(folder))]
+def write_card(counts: Path, workspaces: Sequence[Path]) -> list[str]:
+    """Take the figures of finished workspaces into their CSV, and put the tables of both CSVs into the model card;
+    returns the tables in Markdown. Raises TrapsError where the card has no place for them."""
+    figures = [figure for folder in workspaces for figure in inside.figures_of(Workspace.open(folder))]
     if figures:
         inside.write_figures(INSIDE, figures)
     tables = {
-        MARKS: evaluation.markdown(evaluation.read_cells(arguments.csv or EVALUATION)),
+        MARKS: evaluation.markdown(evaluation.read_cells(counts)),
         INSIDE_MARKS: inside.markdown(inside.read_figures(INSIDE)),
     }
     text = CARD.read_text(encoding="utf-8")
@@ -100,9 +107,4 @@ def card(arguments: argparse.Namespace) -> None:
             raise TrapsError(f"{CARD}: has no place for a table ({begin!r} to {end!r}); restore it from git")
         text = f"{before}{begin}\n\n{table}\n\n{end}{after}"
     CARD.write_text(text, encoding="utf-8")
-    for table in tables.values():
-        _say(table)
-
-
-Command = Callable[[argparse.Namespace], None]
-COMMANDS: Mapping[str, Command] = {"render": render_data, "train": train, "evaluate": evaluate, "card": card}
+    return [*tables.values()]

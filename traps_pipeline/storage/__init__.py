@@ -1,1 +1,1 @@
-"""What is kept on disk: a workspace, what its `study.yaml` says, its tables, its ledger of paid calls, prepared media."""
+"""What is kept on disk: a workspace and its `study.yaml`, its tables, its ledger of paid calls, its prepared media."""

@@ -1,0 +1,108 @@
+"""Rooms of the package import downwards only, and no files import each other in a circle."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import traps_pipeline
+
+PACKAGE = Path(traps_pipeline.__file__).parent
+# From bottom to top. A room imports rooms that stand before it here, and none that stands behind it: neither at the top
+# of a file nor inside a function nor for types alone.
+ROOMS = (
+    "errors",
+    "digests",
+    "paths",
+    "yamlfile",
+    "partitions",
+    "progress",
+    "tables",
+    "scenes",
+    "storage",
+    "benchmark",
+    "models",
+    "judging",
+    "scoring",
+    "mechanism",
+    "pocket",
+    "report",
+    "orchestration",
+    "study",
+    "defs",
+    "definitions",
+    "cli",
+)
+
+
+def files() -> dict[str, Path]:
+    """Every file of the package by its module's name."""
+    named = {}
+    for path in PACKAGE.rglob("*.py"):
+        parts = [PACKAGE.name, *path.relative_to(PACKAGE).with_suffix("").parts]
+        named[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return named
+
+
+def imported(source: str, known: Mapping[str, Path]) -> Iterator[tuple[int, str]]:
+    """Line and module of each import of ours in a file, wherever in the file it stands."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0 and node.module, f"line {node.lineno}: name the package in an import"
+            whole = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [name if name in known else node.module for name in whole]
+        else:
+            continue
+        yield from ((node.lineno, name) for name in names if name in known)
+
+
+def room_of(module: str) -> str:
+    return module.split(".")[1] if "." in module else ""
+
+
+def test_every_room_has_its_place_and_every_place_a_room() -> None:
+    assert {room_of(module) for module in files()} - {""} == {*ROOMS}
+    assert len({*ROOMS}) == len(ROOMS)
+
+
+def test_no_room_imports_one_above_it() -> None:
+    known, height = files(), {room: number for number, room in enumerate(ROOMS)}
+    upwards = [
+        f"{path.relative_to(PACKAGE)}:{line} imports {name}"
+        for module, path in known.items()
+        for line, name in imported(path.read_text(encoding="utf-8"), known)
+        if room_of(module) and height[room_of(name)] > height[room_of(module)]
+    ]
+    assert upwards == []
+
+
+def test_no_files_import_each_other_in_a_circle() -> None:
+    known = files()
+    graph = {
+        module: {name for _, name in imported(path.read_text(encoding="utf-8"), known)}
+        for module, path in known.items()
+    }
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" <- ".join(error.args[1]))
+
+
+def test_an_import_counts_in_a_function_and_for_types_too() -> None:
+    source = """
+from typing import TYPE_CHECKING
+import traps_pipeline.errors
+if TYPE_CHECKING:
+    from traps_pipeline import cli
+def late():
+    from traps_pipeline.scenes import kit, nothing
+    import json
+"""
+    found = [(3, "errors"), (5, "cli"), (7, "scenes.kit"), (7, "scenes")]
+    assert sorted(imported(source, files())) == sorted((line, f"traps_pipeline.{name}") for line, name in found)

@@ -1,0 +1,78 @@
+"""`traps certify` and `traps sample`: the benchmark's certificates, and a fresh draw of it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from traps_pipeline.cli.command import FAILED, OK, Commands
+from traps_pipeline.errors import TrapsError
+
+
+def add(commands: Commands) -> None:
+    """Add `traps certify` and `traps sample`."""
+    text = "re-derive every certificate of the released records"
+    parser = commands.add("certify", certify, text, workspace=False)
+    parser.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
+    parser.add_argument("--families", nargs="+", metavar="FAMILY", help="these only")
+    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
+    parser.add_argument("--fresh", action="store_true", help="certify again what an earlier call has certified")
+
+    text = "draw a fresh benchmark, certified like the released one"
+    parser = commands.add("sample", sample, text, workspace=False)
+    parser.add_argument("--seed", type=int, required=True, help="the same seed gives the same scenarios")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the new benchmark")
+    parser.add_argument("--name", help="its name (default: private-SEED)")
+    parser.add_argument("--families", nargs="+", metavar="FAMILY", help="these only (default: all)")
+    parser.add_argument("--scale", type=float, default=1.0, help="times as many scenarios as the released benchmark")
+    parser.add_argument("--count", type=int, help="so many scenarios of each family instead")
+    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
+
+
+def certify(arguments: argparse.Namespace) -> int:
+    """See `traps certify --help`."""
+    from traps_pipeline.benchmark.certificates import certify_all, family_table
+    from traps_pipeline.paths import CHECKOUT, SCENE_SPECS
+
+    folder = (arguments.specs or SCENE_SPECS).absolute()
+    kept = CHECKOUT / ".workspaces" / "certificates"
+    verdicts, problems = certify_all(
+        folder,
+        kept,
+        families=arguments.families,
+        workers=arguments.workers,
+        fresh=arguments.fresh,
+        report=lambda line: print(line, file=sys.stderr, flush=True),
+    )
+    print(family_table(folder, verdicts))
+    for problem in problems:
+        print(f"traps: {problem}", file=sys.stderr)
+    passed = sum(verdict.passed for verdict in verdicts)
+    print(f"{passed} of {len(verdicts)} scenarios certified")
+    return FAILED if problems else OK
+
+
+def sample(arguments: argparse.Namespace) -> int:
+    """See `traps sample --help`."""
+    from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
+    from traps_pipeline.scenes.registry import family_names
+
+    counts = load_composition()
+    names = arguments.families or list(counts)
+    unknown = sorted(set(names) - (set(family_names()) if arguments.count else set(counts)))
+    if unknown:
+        raise TrapsError(f"unknown families {', '.join(unknown)}; known: {', '.join(family_names())}")
+    wanted = {name: arguments.count or max(1, round(counts[name] * arguments.scale)) for name in names}
+    name = arguments.name or f"private-{arguments.seed}"
+    sample_benchmark(
+        arguments.out.absolute(),
+        wanted,
+        arguments.seed,
+        name,
+        workers=arguments.workers,
+        report=lambda line: print(line, flush=True),
+    )
+    print(f"{sum(wanted.values())} scenarios of {len(wanted)} families in {arguments.out}")
+    print(f"next: traps certify --specs {arguments.out}; to run studies on it, TRAPS_SCENE_SPECS={arguments.out}")
+    return OK

@@ -1,0 +1,78 @@
+"""What all commands share: exit codes, how a command is added to the parser, the workspace and experiment it names.
+
+Nothing of the package but `errors` is imported here before a command runs: `traps --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from traps_pipeline.storage.workspace import Workspace
+    from traps_pipeline.study.experiment import Experiment
+
+# Exit codes. Bad usage exits with 2, which argparse does by itself.
+OK, FAILED, OVER_BUDGET, INTERRUPTED = 0, 1, 4, 130
+
+Run = Callable[[argparse.Namespace], int]  # a command: its parsed arguments to an exit code
+
+
+class Commands:
+    """The commands of a parser, or those of one noun of it."""
+
+    def __init__(self, parser: argparse.ArgumentParser, *, title: str | None = None) -> None:
+        named = {"title": title, "metavar": "COMMAND"} if title else {}
+        self._parsers = parser.add_subparsers(required=True, **named)
+
+    def add(self, name: str, run: Run, text: str, *, workspace: bool = True) -> argparse.ArgumentParser:
+        """A command; returns its parser, which takes its further arguments. workspace: whether it works in a study."""
+        parser = self._parsers.add_parser(name, help=text, description=text)
+        parser.set_defaults(command=run)
+        if workspace:
+            parser.add_argument(
+                "--workspace", type=Path, help="study folder (default: $TRAPS_WORKSPACE, else .workspaces/default)"
+            )
+        return parser
+
+    def noun(self, name: str, text: str) -> Commands:
+        """A noun, which has commands of its own."""
+        return Commands(self._parsers.add_parser(name, help=text, description=text))
+
+
+def root_of(arguments: argparse.Namespace) -> Path:
+    """The folder of the study that a command works in, whether there is one yet or not."""
+    from traps_pipeline.storage.workspace import Workspace
+
+    return arguments.workspace.absolute() if arguments.workspace else Workspace.default_root()
+
+
+def open_workspace(arguments: argparse.Namespace) -> Workspace:
+    """The study that a command works in. Raises TrapsError naming the remedy where there is none."""
+    from traps_pipeline.storage.workspace import Workspace
+
+    return entered(Workspace.open(root_of(arguments)))
+
+
+def entered(workspace: Workspace) -> Workspace:
+    """The workspace, named to everything that this process loads and starts: partition keys are those of its study."""
+    from traps_pipeline.storage.workspace import VARIABLE
+
+    os.environ[VARIABLE] = str(workspace.root)
+    os.environ.setdefault("DAGSTER_HOME", str(workspace.dagster_home))
+    return workspace
+
+
+def load_definitions() -> None:
+    """Declare the graph, which staleness is read off."""
+    import traps_pipeline.definitions  # noqa: F401 - its import is what declares the graph
+
+
+def experiment_of(arguments: argparse.Namespace) -> Experiment:
+    """The experiment that a command names. Raises TrapsError with the known names."""
+    from traps_pipeline.study.experiment import load_experiment
+
+    return load_experiment(arguments.experiment)

@@ -1,0 +1,38 @@
+"""`traps confabulation`: the labels of void failures, held against people's."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from traps_pipeline.cli.command import OK, Commands, open_workspace
+
+
+def add(commands: Commands) -> None:
+    """Add `traps confabulation sheet` and `traps confabulation validate`."""
+    noun = commands.noun("confabulation", "labels of void failures")
+    for name, command, text in (
+        ("sheet", make_sheet, "write a CSV of labelled failures for a person to label blindly"),
+        ("validate", validate_judge, "compare the judge with the labels of two annotators"),
+    ):
+        parser = noun.add(name, command, text)
+        parser.add_argument("file", type=Path, help="CSV; see docs/judging.md for its columns")
+
+
+def make_sheet(arguments: argparse.Namespace) -> int:
+    """See `traps confabulation sheet --help`."""
+    from traps_pipeline.judging.validation import annotation_sheet, write_sheet
+
+    rows = annotation_sheet(open_workspace(arguments))
+    write_sheet(rows, arguments.file)
+    print(f"{len(rows)} failures in {arguments.file}; two people each fill in a copy: their name, then 1 or 0 an axis")
+    print("next: put both copies' rows into one file, then traps confabulation validate FILE.csv")
+    return OK
+
+
+def validate_judge(arguments: argparse.Namespace) -> int:
+    """See `traps confabulation validate --help`."""
+    from traps_pipeline.judging.validation import validate, validation_text
+
+    print(validation_text(validate(open_workspace(arguments), arguments.file)))
+    return OK

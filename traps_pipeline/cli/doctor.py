@@ -1,0 +1,28 @@
+"""`traps doctor`: whether this machine can do what a study needs."""
+
+from __future__ import annotations
+
+import argparse
+
+from traps_pipeline.cli.command import FAILED, OK, Commands, root_of
+
+
+def add(commands: Commands) -> None:
+    """Add `traps doctor`."""
+    parser = commands.add("doctor", doctor, "render one frame, encode it, and name what is missing")
+    parser.add_argument(
+        "--local", action="store_true", help="try local models instead: tiny checkpoints of each family, devices, NF4"
+    )
+
+
+def doctor(arguments: argparse.Namespace) -> int:
+    """See `traps doctor --help`."""
+    from traps_pipeline.study.doctor import examine, examine_local
+
+    who, needs = ("local models", "need") if arguments.local else ("the demo", "needs")
+    problems = 0
+    for finding in examine_local() if arguments.local else examine(root_of(arguments)):
+        print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.detail}", flush=True)
+        problems += not finding.ok
+    print(f"{problems} problem(s); {who} will not run" if problems else f"everything that {who} {needs} is here")
+    return FAILED if problems else OK

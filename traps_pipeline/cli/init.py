@@ -1,0 +1,47 @@
+"""`traps init`: the workspace of an experiment."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from traps_pipeline.cli.command import OK, Commands, entered, experiment_of, root_of
+
+if TYPE_CHECKING:
+    from traps_pipeline.storage.workspace import Workspace
+    from traps_pipeline.study.experiment import Experiment
+
+
+def add(commands: Commands) -> None:
+    """Add `traps init`."""
+    parser = commands.add("init", init, "make a workspace for an experiment without running it")
+    parser.add_argument("experiment", nargs="?", default="demo")
+
+
+def init(arguments: argparse.Namespace) -> int:
+    """See `traps init --help`."""
+    workspace = create(arguments, experiment_of(arguments))
+    print(f"workspace {workspace.root} (study.yaml names its benchmark, panel and budget)")
+    print(f"next: export TRAPS_WORKSPACE={workspace.root} DAGSTER_HOME={workspace.dagster_home}")
+    return OK
+
+
+def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
+    """The workspace that a command names, made where it is missing, with the experiment in its study.
+
+    Raises TrapsError where the study that is there differs from what the experiment asks for.
+    """
+    from traps_pipeline.storage.workspace import Workspace
+
+    workspace = Workspace.create(root_of(arguments), experiment.study)
+    experiment.check_study(workspace.study, workspace.root / "study.yaml")
+    if experiment.mechanism is not None and workspace.study.mechanism is None:
+        workspace = workspace.allow(mechanism=experiment.mechanism)
+    asked = workspace.study.experiments | {experiment.name: experiment.asked}
+    if asked != workspace.study.experiments:
+        workspace = workspace.allow(experiments=asked)
+    entered(workspace)
+    from traps_pipeline.orchestration.run import dagster_history
+
+    with dagster_history(workspace):  # opened once here, so that several processes may use it afterwards
+        return workspace

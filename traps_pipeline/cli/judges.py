@@ -1,0 +1,28 @@
+"""`traps judges check`: whether a panel can be told how to vote."""
+
+from __future__ import annotations
+
+import argparse
+
+from traps_pipeline.cli.command import OK, Commands, open_workspace
+
+
+def add(commands: Commands) -> None:
+    """Add `traps judges check`."""
+    text = "put answers that instruct their judge to a panel; costs calls to judges"
+    parser = commands.noun("judges", "whether a panel can be told how to vote").add("check", check, text)
+    parser.add_argument("panel", nargs="?", help="of assets/judges.yaml (default: the study's)")
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """See `traps judges check --help`."""
+    from traps_pipeline.judging.robustness import check_panel, load_attacks, summary
+    from traps_pipeline.models.judges import load_panel
+
+    workspace = open_workspace(arguments)
+    name = arguments.panel or workspace.study.panel
+    rows = check_panel(workspace, name, load_panel(name), load_attacks())
+    print(f"panel {name}: votes on {rows['attack'].nunique()} answers that try to instruct the judge")
+    print(summary(rows))
+    print("flipped: right on the plain answer, wrong under the attack; broken: no valid vote under it")
+    return OK

@@ -1,0 +1,65 @@
+"""`traps audit`, `traps export` and `traps compare`: what was found, checked, written out and held against another."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from traps_pipeline.cli.command import OK, Commands, open_workspace, root_of
+
+
+def add(commands: Commands) -> None:
+    """Add `traps audit`, `traps export` and `traps compare`."""
+    text = "recompute what the published tables allow, and compare"
+    parser = commands.add("audit", audit_published, text, workspace=False)
+    parser.add_argument("--all", action="store_true", help="show what agrees, too")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write every finding to a file")
+
+    parser = commands.add("export", export_results, "write every table, figure and page to a folder")
+    parser.add_argument("folder", nargs="?", type=Path, help="default: `export` in the study's folder")
+
+    parser = commands.add(
+        "compare", compare_studies, "this study minus another on what both hold, with paired intervals"
+    )
+    parser.add_argument("other", type=Path, help="folder of the other study, such as an earlier benchmark version")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write every row to a file")
+
+
+def audit_published(arguments: argparse.Namespace) -> int:
+    """See `traps audit --help`. Discrepancies of the published tables are findings, not failures."""
+    from traps_pipeline.scoring.audit import audit, audit_text
+
+    findings = audit()
+    print(audit_text(findings, arguments.all))
+    if arguments.csv:
+        findings.to_csv(arguments.csv, index=False)
+        print(f"every finding: {arguments.csv}")
+    return OK
+
+
+def export_results(arguments: argparse.Namespace) -> int:
+    """See `traps export --help`."""
+    from traps_pipeline.report.publish import INDEX, export
+
+    workspace = open_workspace(arguments)
+    target = (arguments.folder or workspace.root / "export").absolute()
+    count = export(workspace, target, say=lambda line: print(line, flush=True))
+    print(f"{count} files in {target}\nnext: open {target / INDEX}")
+    return OK
+
+
+def compare_studies(arguments: argparse.Namespace) -> int:
+    """See `traps compare --help`."""
+    from traps_pipeline.judging.verdicts import current
+    from traps_pipeline.scoring.contrasts import version_contrasts
+    from traps_pipeline.storage.workspace import Workspace
+    from traps_pipeline.tables import VERDICTS
+
+    studies = Workspace.open(arguments.other), Workspace.open(root_of(arguments))
+    then, now = (current(study, VERDICTS) for study in studies)
+    table = version_contrasts(then, now)
+    if arguments.csv:
+        table.to_csv(arguments.csv, index=False)
+    shown = table.assign(refused=table["refused"].fillna(""))
+    print(shown.to_string(index=False, na_rep="-", float_format=lambda value: f"{value:.4f}"))
+    return OK

@@ -1,0 +1,128 @@
+"""`traps run`: make whatever an experiment asks and the study does not have."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, experiment_of
+from traps_pipeline.cli.init import create
+from traps_pipeline.errors import TrapsError
+
+if TYPE_CHECKING:
+    from traps_pipeline.storage.workspace import Workspace
+    from traps_pipeline.study.experiment import Experiment
+
+MONEY = ("budget_usd", "model_budgets_usd", "allow_unknown_prices")  # fields of an experiment and of a study
+
+
+def add(commands: Commands) -> None:
+    """Add `traps run`."""
+    parser = commands.add("run", run, "materialize whatever of an experiment is missing or stale")
+    parser.add_argument("experiment")
+    parser.add_argument(
+        "--budget-usd", action="append", default=[], metavar="[MODEL=]USD",
+        help="spend no more on calls over the network, in this study or on one model or judge; kept in study.yaml",
+    )  # fmt: skip
+    parser.add_argument(
+        "--allow-unknown-prices",
+        action="store_true",
+        default=None,
+        help="ask models that have no price in the registry",
+    )
+    parser.add_argument(
+        "--until", metavar="STAGES", help="make these (with commas between) and what they are made from, no more"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """See `traps run --help`."""
+    from traps_pipeline.cli.progress import TerminalProgress
+    from traps_pipeline.progress import Tally, clock, reporting
+
+    experiment = experiment_of(arguments)
+    workspace = _allow(create(arguments, experiment), experiment, arguments)
+    from traps_pipeline.definitions import defs
+    from traps_pipeline.orchestration.run import dagster_history, failed_checks, stages_until, walk
+
+    stages = stages_until(arguments.until)
+    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
+    with reporting(TerminalProgress()) as progress, dagster_history(workspace) as instance:
+        every_asset = defs.resolve_implicit_global_asset_job_def()
+        outcome = walk(instance, every_asset, workspace, stages, experiment=experiment.name)
+    problems = [*dict.fromkeys([*outcome.problems, *failed_checks(workspace, experiment.name)])]
+    total = progress.totals
+    asked, voted, drawn = (total.get(stage, Tally()) for stage in ("responses", "votes", "videos"))
+    print(
+        f"\n{asked.asked} answers asked ({asked.cached} from the ledger), {voted.asked} votes asked "
+        f"({voted.cached} from the ledger), {drawn.frames} frames rendered, {clock(outcome.seconds)} min"
+    )
+    if experiment.mechanism is not None:
+        states, steered, judged = (
+            total.get(stage, Tally()) for stage in ("hidden_states", "steering", "steering_votes")
+        )
+        print(
+            f"inside models: {states.asked} items extracted, {steered.asked} steered answers asked "
+            f"({steered.cached} from the ledger), {judged.asked} votes on them"
+        )
+    if problems:
+        for problem in problems:
+            print(f"traps: {problem}", file=sys.stderr)
+        print(
+            f"traps: {len(problems)} problem(s); what is done is kept: run the same command to go on",
+            file=sys.stderr,
+        )
+        return OVER_BUDGET if outcome.over_budget else FAILED
+    if arguments.until is not None:
+        print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
+        return OK
+    _print_results(workspace)
+    print(f"next: open {workspace.reports / 'report.html'}, or traps why ITEM for what stands behind a figure")
+    return OK
+
+
+def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:
+    """The workspace with what the experiment, and above it the command line, says about money in its study. Raises
+    TrapsError for a wrong amount or name."""
+    stated = {name: getattr(experiment, name) for name in MONEY}
+    money: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+    if arguments.allow_unknown_prices:
+        money["allow_unknown_prices"] = True
+    for text in arguments.budget_usd:
+        name, _, amount = text.rpartition("=")
+        try:
+            dollars = float(amount)
+        except ValueError:
+            dollars = -1.0
+        if not 0 <= dollars < float("inf"):
+            raise TrapsError(
+                f"--budget-usd {text}: give dollars (20 or 20.50), or MODEL=dollars for one model or judge"
+            )
+        if name:
+            caps = money.setdefault("model_budgets_usd", dict(workspace.study.model_budgets_usd))
+            caps[name] = dollars
+        else:
+            money["budget_usd"] = dollars
+    for name in money.get("model_budgets_usd", {}):
+        _check_participant(name)
+    return workspace.allow(**money) if money else workspace
+
+
+def _check_participant(name: str) -> None:
+    """Raises TrapsError with the known names unless a model or judge is called so."""
+    from traps_pipeline.models.judges import load_judges
+    from traps_pipeline.models.registry import get_model
+
+    if name not in load_judges():
+        get_model(name)
+
+
+def _print_results(workspace: Workspace) -> None:
+    from traps_pipeline.report.page import leaderboard_text
+    from traps_pipeline.tables import LEADERBOARD
+
+    print(leaderboard_text(workspace.tables.read(LEADERBOARD, {})))
+    pictures = ("figures/pecs_landscape.png", "contact_sheet.png", "shortcuts.png")
+    for name in ("report.html", "leaderboard.md", "gallery.html", *pictures):
+        print(workspace.reports / name)

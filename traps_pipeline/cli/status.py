@@ -1,0 +1,58 @@
+"""`traps status` and `traps why`: where a study stands."""
+
+from __future__ import annotations
+
+import argparse
+
+from traps_pipeline.cli.command import OK, Commands, experiment_of, load_definitions, open_workspace
+from traps_pipeline.errors import TrapsError
+
+SHOWN = 8  # stale partitions of a stage
+
+
+def add(commands: Commands) -> None:
+    """Add `traps status` and `traps why`."""
+    parser = commands.add("status", status, "what is there, missing and stale, and why")
+    parser.add_argument("experiment", nargs="?")
+    parser = commands.add("why", why, "why an item's answers stand or will be asked again")
+    parser.add_argument("item", help="dataset:scenario:side")
+
+
+def status(arguments: argparse.Namespace) -> int:
+    """See `traps status --help`."""
+    workspace = open_workspace(arguments)
+    experiment = experiment_of(arguments).name if arguments.experiment else None
+    if experiment is not None and experiment not in workspace.study.experiments:
+        raise TrapsError(
+            f"{workspace.root}/study.yaml: has no experiment {experiment!r}; traps init {experiment} adds it"
+        )
+    from traps_pipeline.orchestration.history import History
+    from traps_pipeline.orchestration.lineage import Lineage
+    from traps_pipeline.orchestration.run import dagster_history
+    from traps_pipeline.study.status import stage_statuses
+
+    load_definitions()
+    lineage = Lineage(workspace)
+    with dagster_history(workspace) as instance:
+        History(instance, lineage.graph).observe(lineage)  # so that Dagster's UI shows the same partitions stale
+    print(f"workspace {workspace.root}\n{'stage':<34} {'fresh':>6} {'stale':>6} {'missing':>8}")
+    for row in stage_statuses(workspace, lineage, experiment):
+        print(f"{row.stage:<34} {row.fresh:>6} {len(row.stale):>6} {row.missing:>8}")
+        for key, reasons in list(row.stale.items())[:SHOWN]:
+            print(f"    {key}: {'; '.join(reasons[:3])}{' ...' if len(reasons) > 3 else ''}")
+        if len(row.stale) > SHOWN:
+            print(f"    ... and {len(row.stale) - SHOWN} more")
+    for file in sorted((workspace.root / "checks").glob("*/*/*.json")):
+        stage, check = file.parts[-3:-1]
+        print(f"check {check} of {stage} {file.stem} does not pass: {file.read_text(encoding='utf-8')[:200]}")
+    print("stale means made from something that has changed since; `traps run EXPERIMENT` makes it anew")
+    return OK
+
+
+def why(arguments: argparse.Namespace) -> int:
+    """See `traps why --help`."""
+    from traps_pipeline.study.why import why as explain
+
+    for line in explain(open_workspace(arguments), arguments.item):
+        print(line)
+    return OK
