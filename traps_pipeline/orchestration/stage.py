@@ -233,9 +233,9 @@ class _Step:
         inputs = {key: lineage.inputs(name, key) for key in todo}  # noted before anything is read
         for key, made in self._make(todo):
             version = self._write(key, made, inputs[key])
-            yield from self._checks(key, made, lineage)
+            yield from self._checks(key, made)
             progress.current().partition(name, key or "", made.tally)
-            yield self.history.event(stage, key, version, provenance, self._metadata(key, made))
+            yield self.history.event(stage, key, version, provenance, self._metadata(made))
         for key, error in self.unmade.items():
             reached = isinstance(error, BudgetReached)
             yield self._evaluation(CURRENT, key, {"not made": str(error), REACHED: reached})
@@ -310,7 +310,7 @@ class _Step:
         write_report_state(self.workspace, stage, State(version, dict(inputs), 0, 0, stage.code))
         return version
 
-    def _checks(self, key: str | None, made: Made, lineage: Lineage) -> Iterator[dg.AssetCheckEvaluation]:
+    def _checks(self, key: str | None, made: Made) -> Iterator[dg.AssetCheckEvaluation]:
         """Every check of a partition. A failure is kept in the workspace until the partition passes, so that each later
         run and `traps status` tell of it, even if this run dies before it reports to Dagster."""
         stage, failed = self.stage, made.tally.errors
@@ -352,7 +352,7 @@ class _Step:
             self.failing[check, key] = wrong
         return _evaluation(self.stage, check, key, wrong)
 
-    def _metadata(self, key: str | None, made: Made) -> dict[str, Any]:
+    def _metadata(self, made: Made) -> dict[str, Any]:
         """What Dagster shows of a partition."""
         shown: dict[str, Any] = {**made.shown}
         if self.stage.table is None:

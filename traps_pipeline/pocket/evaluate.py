@@ -64,11 +64,6 @@ class Cell:
         low, _ = wilson(np.array([self.correct], float), np.array([self.n], float))
         return float(low[0])
 
-    @property
-    def above_prior(self) -> bool:
-        """Whether that end is above what `prior` gets on the same scenes."""
-        return self.accuracy_low > self.prior / self.n
-
 
 def entry_of(checkpoint: Path) -> ModelEntry:
     """The registry's entry of the pocket model with the weights of a folder."""

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 FAMILY = "qwen3-vl"
 VOCABULARY = 2000  # at most; words of prompts, questions and answers come to fewer
-MOST_PARAMETERS = 3_000_000
 PATCH = 8  # pixels; two by two patches make a token
 TEXT = {
     "hidden_size": 128,
@@ -80,11 +79,6 @@ def make_model(tokenizer: Tokenizer, seed: int) -> tuple[Any, Any]:
     model.generation_config.pad_token_id = wrapped.pad_token_id
     size = {"shortest_edge": (2 * PATCH) ** 2, "longest_edge": 64 * 480 * 360}
     return model, make_processor(FAMILY, wrapped, {"patch_size": PATCH, "size": size})
-
-
-def parameter_count(model: Any) -> int:
-    """Parameters, those that are shared counted once."""
-    return sum(p.numel() for p in model.parameters())
 
 
 def save(model: Any, processor: Any, folder: Path) -> None:
