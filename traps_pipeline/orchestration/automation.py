@@ -21,7 +21,8 @@ from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.run import failed_checks, walk
-from traps_pipeline.orchestration.stage import CURRENT, WorkspaceResource
+from traps_pipeline.orchestration.stage import WorkspaceResource
+from traps_pipeline.orchestration.step import CURRENT
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.workspace import Workspace
 

@@ -23,7 +23,7 @@ from traps_pipeline.orchestration.graph import name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.schemes import Scheme
-from traps_pipeline.orchestration.stage import EXPERIMENT_TAG, MAKE_TAG, OUTDATED, STALE, to_make
+from traps_pipeline.orchestration.step import EXPERIMENT_TAG, MAKE_TAG, OUTDATED, STALE, to_make
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.workspace import Workspace
 

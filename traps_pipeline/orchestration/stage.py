@@ -1,56 +1,25 @@
-"""The one declaration of a stage, and the one way to make a partition.
+"""The one declaration of a stage or source: what people edit, what is made of it, and how Dagster shows both.
 
-`stage(...)` gives the Dagster asset of a table (or of files for people). Whoever starts a run, the same protocol makes
-its partitions, in the one order that is sound: what the inputs are is noted before anything is read; what cannot be
-made yet, or would be made from something damaged, is left with the reason; each partition is written, read again,
-checked and told to Dagster as soon as it is done, with a data version made from its content. Below a partition that is
-not made nothing is made, everything else is; the last step of a run raises with all that is missing.
+`stage(...)` gives the Dagster asset of a table (or of files for people), `source(...)` that of something that people
+edit. `orchestration.step` makes its partitions.
 """
 
-import hashlib
-import json
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import dagster as dg
 
-from traps_pipeline import progress
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.budget import BudgetReached
-from traps_pipeline.orchestration.graph import (
-    DECLARED,
-    Check,
-    Cost,
-    Need,
-    Node,
-    Source,
-    Stage,
-    name_of,
-    the_graph,
-)
-from traps_pipeline.orchestration.history import History
-from traps_pipeline.orchestration.lineage import Lineage, write_report_state
+from traps_pipeline.orchestration.graph import DECLARED, Check, Cost, Need, Source, Stage
 from traps_pipeline.orchestration.schemes import LEFT_OUT, Scheme, study_here
+from traps_pipeline.orchestration.step import CURRENT, CURRENT_DOC, Event, Step
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.storage.parquet import Made, State
-from traps_pipeline.storage.workspace import Workspace, write_bytes, write_text
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import Table
 
 OWNERS = ["team:benchmark"]
-CURRENT = "current"  # the check that every stage has
-CURRENT_DOC = "Made from what is there now, whole, with no failed call: read again after writing."
-MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # of runs: what to make of what is selected, and for whom
-STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
-REACHED = "a budget is reached"  # in a check's metadata
-STILL = "still failing"  # in a check's metadata: of a partition that the run did not touch
-PREVIEWED = 5  # rows
-SHOWN = 12  # unmade partitions named in an error
-# Dagster skips a step below one that hands on no output, and writes an event with one version for all partitions for
-# an output that is handed on, unless it carries this mark: observable sources that tell their own versions carry it.
-_TOLD_ALREADY = {"__source_asset_observation__": True}
-Event = dg.AssetMaterialization | dg.AssetCheckEvaluation | dg.MaterializeResult | dg.Output
 
 
 class WorkspaceResource(dg.ConfigurableResource):
@@ -180,7 +149,7 @@ def stage(
         ],
     )
     def asset(context: dg.AssetExecutionContext, workspace: WorkspaceResource) -> Iterator[Event]:
-        yield from _Step(declared, context, workspace.open()).run()
+        yield from Step(declared, context, workspace.open()).run()
 
     return asset
 
@@ -201,241 +170,3 @@ def _table_metadata(table: Table, made_from: Mapping[str, Collection[str]]) -> d
         }
         metadata["dagster/column_lineage"] = dg.TableColumnLineage(sources)
     return metadata
-
-
-class _Step:
-    """One stage in one run."""
-
-    def __init__(self, stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> None:
-        self.stage, self.context, self.workspace = stage, context, workspace
-        self.graph = the_graph()
-        self.history = History(context.instance, self.graph)
-        self.unmade: dict[str | None, TrapsError] = {}
-        self.failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}  # checks, with what is wrong
-
-    def run(self) -> Iterator[Event]:
-        """See the module."""
-        stage, name = self.stage, self.stage.name
-        lineage = Lineage(self.workspace, thorough=True)
-        self.history.observe(lineage, [p for p in self.graph.parents_of[name] if self.graph.source(p)])
-        provenance = self.history.provenance(stage)
-        todo = list[str | None]()
-        for key in (yield from self._asked(lineage, provenance)):
-            yield from self._tell_damage(lineage, key)
-            if self.context.run.tags.get(MAKE_TAG) == OUTDATED and lineage.waits(name, key):
-                continue  # for what is above it: it would be made twice
-            if reason := lineage.blocked(name, key, current=MAKE_TAG in self.context.run.tags):
-                self.unmade[key] = TrapsError(reason)
-            else:
-                todo.append(key)
-        if todo:
-            progress.current().stage(name, len(todo))
-        inputs = {key: lineage.inputs(name, key) for key in todo}  # noted before anything is read
-        for key, made in self._make(todo):
-            version = self._write(key, made, inputs[key])
-            yield from self._checks(key, made)
-            progress.current().partition(name, key or "", made.tally)
-            yield self.history.event(stage, key, version, provenance, self._metadata(made))
-        for key, error in self.unmade.items():
-            reached = isinstance(error, BudgetReached)
-            yield self._evaluation(CURRENT, key, {"not made": str(error), REACHED: reached})
-        yield from self._still_failing(lineage, {*todo, *self.unmade})
-        for output in self.context.op_def.output_dict:
-            if output != "result":
-                yield dg.Output(None, output_name=output)
-        if not self._below():
-            self._raise_for_all()
-        yield dg.MaterializeResult(metadata=_TOLD_ALREADY)
-
-    # --- what to make -------------------------------------------------------------------------------------------------
-
-    def _asked(self, lineage: Lineage, provenance: Mapping[str, str]) -> Iterator[Any]:
-        """The keys of this run that are to be made (the generator's value); tells Dagster of those that are not wanted.
-
-        A range may hold cells that no experiment of the study asks for; they count as done, so that a backfill ends.
-        """
-        stage, tags = self.stage, self.context.run.tags
-        keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in self.context.partition_keys]
-        wanted = {*stage.wanted(Wanted(self.workspace, tags.get(EXPERIMENT_TAG)))}
-        if MAKE_TAG in tags:
-            recorded = self.history.recorded(stage.name)
-            existing = tags[MAKE_TAG] == OUTDATED
-            return [k for k in keys if k in wanted and to_make(lineage, recorded, stage.name, k, existing=existing)]
-        for key in keys:
-            if key not in wanted:
-                why = f"nothing: no experiment in {self.workspace.root / 'study.yaml'} asks for it"
-                yield self.history.event(stage, key, "not wanted", provenance, {"made": why})
-        return [key for key in keys if key in wanted]
-
-    def _tell_damage(self, lineage: Lineage, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
-        """A failed check for each parent that is not what was written, before anything is made from it."""
-        for parent, keys in self.graph.parents(self.stage.name, key).items():
-            if self.graph.source(parent) is None:
-                for above in keys:
-                    if damage := lineage.damage(parent, above):
-                        yield _evaluation(self.graph[parent], CURRENT, above, {"damaged": damage})
-
-    # --- making it ----------------------------------------------------------------------------------------------------
-
-    def _make(self, todo: Sequence[str | None]) -> Iterator[tuple[str | None, Made]]:
-        """Each partition as it is done. One that ends in a sentence leaves the others to be made."""
-        if self.stage.make is not None:
-            for key in todo:
-                try:
-                    yield key, self.stage.make(self.workspace, key)
-                except TrapsError as error:
-                    self.unmade[key] = error
-            return
-        assert self.stage.collect is not None, "a stage makes or collects"
-        left = [*todo]
-        try:
-            for key, made in self.stage.collect(self.workspace, [str(key) for key in todo]) if todo else ():
-                left.remove(key)
-                yield key, made
-        except TrapsError as error:
-            self.unmade |= dict.fromkeys(left, error)
-
-    def _write(self, key: str | None, made: Made, inputs: Mapping[str, str]) -> str:
-        """Write what was made; returns its data version."""
-        stage, tables, content = self.stage, self.workspace.tables, made.content
-        if stage.table is not None:
-            rows = cast(Any, content)
-            return tables.write(
-                stage.table, stage.columns(key), rows, inputs, failed=made.tally.errors, code=stage.code
-            )
-        files = cast(Mapping[str, bytes], content)
-        for path, data in files.items():
-            write_bytes(self.workspace.reports / path, data)
-        version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
-        write_report_state(self.workspace, stage, State(version, dict(inputs), 0, 0, stage.code))
-        return version
-
-    def _checks(self, key: str | None, made: Made) -> Iterator[dg.AssetCheckEvaluation]:
-        """Every check of a partition. A failure is kept in the workspace until the partition passes, so that each later
-        run and `traps status` tell of it, even if this run dies before it reports to Dagster."""
-        stage, failed = self.stage, made.tally.errors
-        damage = ""
-        if stage.table is not None:
-            damage = self.workspace.tables.damage(stage.table, stage.columns(key), thorough=True)
-        wrong: dict[str, Any] = {}
-        if damage:
-            wrong["damaged"] = damage
-        if failed:
-            wrong["failed"] = _failed_calls(failed)
-        yield self._evaluation(CURRENT, key, wrong)
-        for check in stage.checks:
-            problems = check.wrong(self.workspace, key, made)
-            file = self.workspace.failed_check(stage.name, check.name, key)
-            if problems:
-                write_text(file, json.dumps(problems, default=str))
-            else:
-                file.unlink(missing_ok=True)
-            yield self._evaluation(check.name, key, {"failing": _plain(problems)} if problems else {})
-
-    def _still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
-        """Failed checks once more, those of partitions that this run has not made, too: Dagster shows the newest result
-        of a check, and one that passes elsewhere must not hide them."""
-        name = self.stage.name
-        for key in self.graph.keys(name):
-            if key not in seen:
-                for check in self.workspace.failed_checks(name, key):
-                    text = self.workspace.failed_check(name, check, key).read_text(encoding="utf-8")
-                    self.failing[check, key] = {STILL: json.loads(text)}
-                state = lineage.state(name, key)
-                if state is not None and state.failed:
-                    self.failing[CURRENT, key] = {STILL: _failed_calls(state.failed)}
-        for (check, key), wrong in [*self.failing.items()]:
-            yield self._evaluation(check, key, wrong)
-
-    def _evaluation(self, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
-        if wrong:
-            self.failing[check, key] = wrong
-        return _evaluation(self.stage, check, key, wrong)
-
-    def _metadata(self, made: Made) -> dict[str, Any]:
-        """What Dagster shows of a partition."""
-        shown: dict[str, Any] = {**made.shown}
-        if self.stage.table is None:
-            files = cast(Mapping[str, bytes], made.content)
-            paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in files}
-            return {path: value for path, value in paths.items() if path.count("/") < 2} | shown
-        count = "dagster/row_count" if self.stage.scheme is None else "dagster/partition_row_count"
-        preview = _preview(self.stage.table, made)
-        return {count: len(made.content)} | ({"first rows": preview} if preview else {}) | shown
-
-    # --- the end ------------------------------------------------------------------------------------------------------
-
-    def _below(self) -> set[str]:
-        """The stages of this run that are made directly from this one."""
-        selected = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
-        return self.graph.below(self.stage.name) & {key.path[-1] for key in selected}
-
-    def _raise_for_all(self) -> None:
-        """Raises TrapsError, or BudgetReached, for all that this run has not made or whose checks do not pass, here and
-        above: had the step above raised, Dagster would have made nothing below it, not even what is sound."""
-        above = self.graph.above([self.stage.name])
-        failed = dict[tuple[str, Node], dg.AssetCheckEvaluation]()
-        of_type = dg.DagsterEventType.ASSET_CHECK_EVALUATION
-        for entry in self.context.instance.all_logs(self.context.run_id, of_type=of_type):
-            event = entry.get_dagster_event().asset_check_evaluation_data
-            node = (event.asset_key.path[-1], event.partition)
-            if node[0] in above and STILL not in event.metadata:
-                failed[event.check_name, node] = event
-        alike: dict[tuple[str, str], list[str]] = {}  # by stage and what is said: a reason is told once
-        for (check, node), event in failed.items():
-            for line in _lines(check, node, event):
-                alike.setdefault((node[0], line.replace(name_of(node), "")), []).append(line)
-        if alike:
-            shown = [f"{first} (and {len(more)} more)" if more else first for first, *more in alike.values()]
-            more = [f"... and {len(shown) - SHOWN} more"] if len(shown) > SHOWN else []
-            reached = any(e.metadata[REACHED].value for e in failed.values() if REACHED in e.metadata)
-            raise (BudgetReached if reached else TrapsError)("\n".join([*shown[:SHOWN], *more]))
-
-
-def to_make(
-    lineage: Lineage, recorded: Mapping[str | None, str | None], name: str, key: str | None, *, existing: bool = False
-) -> bool:
-    """Whether a partition is missing, stale, or unknown to Dagster: a crash between a table and its event leaves such a
-    table, which is made once more. existing: only what is there and made from what has changed since."""
-    status = lineage.status(name, key)
-    if existing or status.kind == "missing":
-        return bool(status.outdated) if existing else True
-    return status.kind == "stale" or recorded.get(key) != lineage.version(name, key)
-
-
-def _evaluation(stage: Stage, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
-    return dg.AssetCheckEvaluation(
-        asset_key=stage.spec.key, check_name=check, passed=not wrong, partition=key, metadata={**wrong}
-    )
-
-
-def _failed_calls(count: int) -> str:
-    return f"{count} calls failed and can be asked again"
-
-
-def _preview(table: Table, made: Made) -> dg.TableMetadataValue | None:
-    """The first rows without long texts: what a model wrote is shown on the report's pages, where it is escaped."""
-    content = cast(Any, made.content)
-    rows = content.head(PREVIEWED).to_dict("records") if hasattr(content, "head") else content[:PREVIEWED]
-    names = [c.name for c in table.columns if c.name in table.key or c.type.rstrip("?") in ("int", "float", "bool")]
-    records = [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows]
-    return dg.MetadataValue.table(records) if records else None
-
-
-def _plain(problems: Any) -> Any:
-    return json.loads(json.dumps(problems, default=str))
-
-
-def _lines(check: str, node: Node, event: dg.AssetCheckEvaluation) -> Iterable[str]:
-    """What a failed check says, a line each."""
-    if event.passed:
-        return
-    values = {name: value.value for name, value in event.metadata.items() if name != REACHED}
-    for name, value in values.items():
-        if check != CURRENT:
-            text = value if isinstance(value, str) else json.dumps(value)
-            yield f"check {check} of {name_of(node)} does not pass: {text}"
-        elif name == "not made":
-            yield f"{name_of(node)} is not made: {value}"
-        else:
-            yield f"{name_of(node)}: {value}"
