@@ -25,8 +25,10 @@ class Commands:
     """The commands of a parser, or those of one noun of it."""
 
     def __init__(self, parser: argparse.ArgumentParser, *, title: str | None = None) -> None:
-        named = {"title": title, "metavar": "COMMAND"} if title else {}
-        self._parsers = parser.add_subparsers(required=True, **named)
+        if title:
+            self._parsers = parser.add_subparsers(title=title, required=True, metavar="COMMAND")
+        else:
+            self._parsers = parser.add_subparsers(required=True)
 
     def add(self, name: str, run: Run, text: str, *, workspace: bool = True) -> argparse.ArgumentParser:
         """A command; returns its parser, which takes its further arguments. workspace: whether it works in a study."""
