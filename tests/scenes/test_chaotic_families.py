@@ -24,10 +24,10 @@ from traps_pipeline.scenes.ensemble import (
     entropy_bits,
     latest_open_cut,
 )
-from traps_pipeline.scenes.kit import Family, Physics
+from traps_pipeline.scenes.kit import Family, Motion, Physics
 from traps_pipeline.scenes.outcome import Outcome, compile_scene, read_outcome
 from traps_pipeline.scenes.registry import families, get_family
-from traps_pipeline.scenes.simulate import Motion, replay, simulate
+from traps_pipeline.scenes.simulate import replay, simulate
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
 
 RELEASED = Path(__file__).parents[2] / "scene_specs" / "released"

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.scenes.camera import Panel
-from traps_pipeline.scenes.kit import PANEL_GROUP, Family, Physics, Scene, add_box
-from traps_pipeline.scenes.simulate import Motion
+from traps_pipeline.scenes.kit import PANEL_GROUP, Family, Motion, Physics, Scene, add_box
 
 if TYPE_CHECKING:
     import mujoco
