@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from traps_pipeline.scenes.certificates import certificates_for, pair_of, stored_evidence
-from traps_pipeline.scenes.evidence import Claim, Part
+from traps_pipeline.scenes.evidence import About, Claim
 from traps_pipeline.scenes.spec import SceneSpec
 
 _NO_FRAMES = np.empty((0, 0), np.float32)  # words are certified without a trajectory
@@ -26,10 +26,10 @@ def answerable_voids(specs: Iterable[SceneSpec]) -> list[str]:
     return list(_lost(specs, "void", "twin"))
 
 
-def _lost(specs: Iterable[SceneSpec], *parts: Part) -> Iterator[str]:
+def _lost(specs: Iterable[SceneSpec], *about: About) -> Iterator[str]:
     for spec in specs:
         evidence, claim = stored_evidence(spec), Claim.of_record(spec)
-        for certificate in certificates_for(spec.void_kind, *parts):
+        for certificate in certificates_for(spec.void_kind, *about):
             failure = certificate.failure(evidence, claim)
             if failure is not None:
                 yield f"{spec.scenario_id}: {certificate.name}: {failure}"

@@ -16,7 +16,7 @@ import numpy as np
 
 from traps_pipeline.scenes import checks, ensemble
 from traps_pipeline.scenes.camera import in_frame
-from traps_pipeline.scenes.evidence import Certificate, Claim, Evidence, Judged, Number, Pair, Part, VoidKind
+from traps_pipeline.scenes.evidence import About, Certificate, Claim, Evidence, Judged, Number, Pair, VoidKind
 from traps_pipeline.scenes.kit import Family, Motion, Physics, Scene
 from traps_pipeline.scenes.outcome import Outcome, Rejected, decisive_geoms, read_outcome
 from traps_pipeline.scenes.simulate import swept_points
@@ -55,9 +55,9 @@ def least_entropy_bits(labels: int) -> float:
 # --- records ----------------------------------------------------------------------------------------------------------
 
 
-def certificates_for(kind: VoidKind, *parts: Part) -> list[Certificate]:
-    """The certificates of pairs with a kind of void, in order; those of some parts only if parts are named."""
-    return [c for c in CERTIFICATES if kind in c.kinds and (not parts or c.part in parts)]
+def certificates_for(kind: VoidKind, *about: About) -> list[Certificate]:
+    """The certificates of pairs with a kind of void, in order; if things are named, only those about them."""
+    return [c for c in CERTIFICATES if kind in c.kinds and (not about or c.about in about)]
 
 
 def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Pair:
@@ -112,7 +112,7 @@ def _judge_outcome(e: Evidence, claim: Claim) -> Judged:
 
 OUTCOME = Certificate(
     name="outcome",
-    part="control",
+    about="control",
     promises=f"replayed, the control ends in the ground truth, constant for the last {COMMITTED_BEFORE_END_S} s, a "
     "stated distance (m) from another outcome, which is at least its family's least; measured again, settling time and "
     "margin are those of the record: exactly where simulating gives the frozen trajectory bit by bit, to one unit of "
@@ -170,7 +170,7 @@ def _judge_physics(e: Evidence, claim: Claim) -> Judged:
 
 PHYSICS = Certificate(
     name="physics",
-    part="control",
+    about="control",
     promises="simulating the scene gives the frozen trajectory; on another CPU or version: the same start (for "
     f"{SAME_START_S} s within {SAME_START_M} m), the same outcome (occlusion), and it says so",
     does_not_promise="that chaotic futures are the same on every machine",
@@ -197,7 +197,7 @@ def _judge_in_frame(e: Evidence, claim: Claim) -> Judged:
 
 IN_FRAME = Certificate(
     name="in_frame",
-    part="control",
+    about="control",
     promises="all that moves, and the outcome zone, stays inside the picture",
     does_not_promise="",
     numbers=(Number("in_frame", kept=False),),
@@ -241,7 +241,7 @@ def _judge_legible(e: Evidence, claim: Claim) -> Judged:
 
 LEGIBLE = Certificate(
     name="legible",
-    part="control",
+    about="control",
     promises=f"each decisive body has {LEGIBLE_PIXELS:.0f} pixels in each of the last three sampled frames, or the "
     "family's own groups of geoms (of a die, the top face) have what the family asks for",
     does_not_promise="that a model's own resizing keeps them",
@@ -276,7 +276,7 @@ def _judge_hidden(e: Evidence, claim: Claim) -> Judged:
 
 HIDDEN = Certificate(
     name="hidden",
-    part="void",
+    about="void",
     promises="no pixel of a decisive body is seen from hiding on, which begins before the outcome is settled; none of "
     "the hidden element in any void frame",
     does_not_promise="",
@@ -302,7 +302,7 @@ def _judge_ablation(e: Evidence, claim: Claim) -> Judged:
 
 ABLATION = Certificate(
     name="ablation",
-    part="void",
+    about="void",
     promises="from hiding on, taking away the decisive bodies and the hidden element changes no pixel of the void: not "
     "even a shadow shows",
     does_not_promise="",
@@ -341,7 +341,7 @@ def _judge_twin_behind_panel(e: Evidence, claim: Claim) -> Judged:
 
 TWIN_BEHIND_PANEL = Certificate(
     name="twin",
-    part="twin",
+    about="twin",
     promises="another world, different in the hidden element alone and with another answer, has the same void frames "
     "byte for byte: two worlds, one video, so no observer can know",
     does_not_promise="that the two worlds are equally likely a priori",
@@ -366,7 +366,7 @@ def _judge_cut(e: Evidence, claim: Claim) -> Judged:
 
 CUT = Certificate(
     name="cut",
-    part="void",
+    about="void",
     promises=f"the void ends at {EARLIEST_CUT_S} s or later, and before the outcome is settled",
     does_not_promise="",
     numbers=(Number("last_shown_s", kept=False), Number("cut_s", kept=False)),
@@ -399,7 +399,7 @@ def _judge_open(e: Evidence, claim: Claim) -> Judged:
 
 OPEN = Certificate(
     name="open",
-    part="void",
+    about="void",
     promises=f"of {ensemble.BATCHES[1]} or {ensemble.TRIED} starts, perturbed by one stated scale, at least "
     f"{MIN_ACCEPTED} stay within {MAX_DEVIATION_PX} px of the control up to the cut and end in an outcome: its entropy "
     f"is {MIN_ENTROPY_BITS} bit or more ({MIN_ENTROPY_THREE_LABELS_BITS} with three answers), no answer has more than "
@@ -437,7 +437,7 @@ def _judge_twin_of_cut(e: Evidence, claim: Claim) -> Judged:
 
 TWIN_OF_CUT = Certificate(
     name="twin",
-    part="twin",
+    about="twin",
     promises="one of those futures, with another answer; its largest pixel difference before the cut is reported",
     does_not_promise="byte-identical frames",
     numbers=(
@@ -471,7 +471,7 @@ def _judge_words(e: Evidence, claim: Claim) -> Judged:
 
 WORDS = Certificate(
     name="words",
-    part="words",
+    about="words",
     promises="the ill-posed question asks what no video shows (occlusion) or presumes what the inventory refutes "
     "(chaotic); the well-posed one does neither",
     does_not_promise="",

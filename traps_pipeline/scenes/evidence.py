@@ -19,7 +19,7 @@ from traps_pipeline.scenes.world import World
 
 Evidence = Mapping[str, Any]
 VoidKind = Literal["occluder", "truncation"]
-Part = Literal["control", "void", "twin", "words"]
+About = Literal["control", "void", "twin", "words"]
 Judged = Iterator[str]  # the failures, in words
 
 
@@ -107,7 +107,7 @@ class Number:
 class Certificate:
     """A promise about a pair.
 
-    part: what must be there to measure it; words come last, after a draw has its place in its family.
+    about: what must be there to measure it; words come last, after a draw has its place in its family.
     measure(pair): all its `numbers`, or None where this machine cannot measure them. judge(evidence, claim): what is
     wrong with the evidence, gravest first; a number that records do not keep may be missing, and is then not judged
     (it was when the record was drawn, and is by `certify`).
@@ -115,7 +115,7 @@ class Certificate:
     """
 
     name: str
-    part: Part
+    about: About
     promises: str
     does_not_promise: str
     numbers: tuple[Number, ...]
