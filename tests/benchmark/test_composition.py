@@ -55,6 +55,7 @@ def race(answers: str) -> list[SceneSpec]:
                 "ground_truth": "yes" if answer == "y" else "no",
                 "ill_posed_question": f"How many grams does domino {i} weigh?",
                 "trajectory_sha256": f"{i:064d}",
+                "evidence": spec.evidence | {"margin_m": 0.05 + i / 1000},
             }
         )
         for i, answer in enumerate(answers)
@@ -79,6 +80,13 @@ def test_a_text_or_a_scene_that_occurs_twice_is_named() -> None:
     ]
     copied = [*specs[:3], specs[0].model_copy(update={"scenario_id": "domino_chain-0099", "ill_posed_question": "?"})]
     assert problems(copied) == ["domino_chain-0000, domino_chain-0099: the same trajectory"]
+
+
+def test_a_family_whose_margin_is_a_constant_is_named() -> None:
+    constant = [spec.model_copy(update={"evidence": spec.evidence | {"margin_m": 1.0}}) for spec in race("ynyn")]
+    assert problems(constant) == ["domino_chain: every scenario has the margin 1.0 m"]
+    assert problems(constant[:1]) == []
+    assert problems([*constant[:3], race("ynyn")[3]]) == []
 
 
 def test_missing_scenarios_are_counted() -> None:
@@ -108,17 +116,28 @@ def test_no_released_family_has_an_answer_or_a_text_too_often() -> None:
 @pytest.mark.parametrize(
     ("evidence", "found"),
     [
-        ({"twin_px": 3}, "twin does not hold"),
-        ({"ablation_px": 1}, "nothing leaks does not hold"),
-        ({"hidden_from_s": 4.8}, "hidden before it is settled does not hold"),
+        ({"twin_px": 3}, "twin: the twin's void differs from the void: in 3 pixels"),
+        ({"ablation_px": 1}, "ablation: something decisive reaches the eye past the panel: taking it away changes 1"),
+        ({"hidden_from_s": 4.8}, "hidden: the panel does not hide the outcome before it is committed"),
     ],
 )
 def test_evidence_beyond_its_threshold_is_found(evidence: dict[str, Any], found: str) -> None:
     spec = load_released()["domino_chain-0001"]
     worse = spec.model_copy(update={"evidence": spec.evidence | evidence})
-    assert answerable_voids([worse]) == [f"domino_chain-0001: {found}"]
-    bare = spec.model_copy(update={"evidence": {}})
-    assert len(answerable_voids([bare])) == 3
+    (said,) = answerable_voids([worse])
+    assert said.startswith(f"domino_chain-0001: {found}")
+
+
+def test_a_record_without_evidence_loses_every_certificate_that_stores_some() -> None:
+    bare = load_released()["domino_chain-0001"].model_copy(update={"evidence": {}})
+    lost = [said.split(": ")[1:] for said in (*unanswerable_controls([bare]), *answerable_voids([bare]))]
+    assert lost == [
+        ["outcome", "no evidence 'commit_s'"],
+        ["legible", "no evidence 'least_visible_px'"],
+        ["hidden", "no evidence 'hidden_from_s'"],
+        ["ablation", "no evidence 'ablation_px'"],
+        ["twin", "no evidence 'twin_px'"],
+    ]
 
 
 @pytest.fixture

@@ -23,9 +23,10 @@ import numpy as np
 from tests.scenes.released import Released, load
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.digests import canonical_json
+from traps_pipeline.scenes.certificates import legible_groups
 from traps_pipeline.scenes.encode import decode_sampled, encode
 from traps_pipeline.scenes.kit import Family, Scene, params_to_dict
-from traps_pipeline.scenes.outcome import compile_scene, legible_groups
+from traps_pipeline.scenes.outcome import compile_scene
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.simulate import replay

@@ -1,16 +1,25 @@
-"""One scenario of every occlusion family is certified on its sampled frames; whatever is altered is found out."""
+"""The certificates judge numbers; one scenario of every occlusion family is certified on its sampled frames; whatever
+is altered is found out."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.scenes import certificate_table
 from tests.scenes.released import Released, first_of_each, load
+from traps_pipeline.benchmark.evidence import unanswerable_controls
+from traps_pipeline.scenes import certificates
+from traps_pipeline.scenes.certificates import CERTIFICATES, OPEN, OUTCOME, pair_of, settled_outcome
 from traps_pipeline.scenes.certify import certify
-from traps_pipeline.scenes.outcome import Rejected, compile_scene, read_outcome
+from traps_pipeline.scenes.evidence import Certificate, Claim, Evidence, Number
+from traps_pipeline.scenes.kit import Reading
+from traps_pipeline.scenes.outcome import Rejected, compile_scene
+from traps_pipeline.scenes.resolve import resolve
 from traps_pipeline.scenes.simulate import replay
 from traps_pipeline.scenes.spec import SceneSpec, trajectory_digest
 
@@ -95,11 +104,145 @@ def test_a_clip_that_ends_before_the_outcome_has_settled_is_refused(race: Releas
     settled = round(race.spec.evidence["commit_s"] * race.physics.fps)
     for cut in (settled, settled + 3):
         with pytest.raises(Rejected, match=r"undecided|before the end"):
-            read_outcome(race.family, replay(model, race.qpos[:cut], race.physics), race.params)
+            settled_outcome(race.family, replay(model, race.qpos[:cut], race.physics), race.params)
 
 
 def test_a_margin_below_the_familys_is_refused(race: Released) -> None:
     strict = replace(race.family, min_margin_m=9.0)
     model, _ = compile_scene(race.family, race.params, race.physics)
     with pytest.raises(Rejected, match="has a margin of"):
-        read_outcome(strict, replay(model, race.qpos, race.physics), race.params)
+        settled_outcome(strict, replay(model, race.qpos, race.physics), race.params)
+
+
+def test_a_margin_that_is_not_the_records_is_refused(race: Released) -> None:
+    margin = race.spec.evidence["margin_m"]
+    wider = altered(race.spec, evidence=race.spec.evidence | {"margin_m": round(margin + 1e-5, 5)})
+    assert f"the record says {wider.evidence['margin_m']}" in failures(race, wider)["outcome"]
+    without = {name: value for name, value in race.spec.evidence.items() if name != "margin_m"}
+    measured = OUTCOME.measured(pair_of(race.spec, race.qpos, race.twin))
+    assert OUTCOME.contradiction(measured, without, exact=True) == "the record has no evidence 'margin_m'"
+
+
+def test_on_another_machine_a_margin_may_differ_in_its_last_stored_digit_alone(race: Released) -> None:
+    margin = race.spec.evidence["margin_m"]
+    measured = OUTCOME.measured(pair_of(race.spec, race.qpos, race.twin))
+    for off, said in ((1e-5, None), (2e-5, "margin_m is")):
+        stored = race.spec.evidence | {"margin_m": round(margin + off, 5)}
+        found = OUTCOME.contradiction(measured, stored, exact=False)
+        assert found == said or (said is not None and found is not None and found.startswith(said))
+
+
+@pytest.mark.parametrize("scenario_id", [*first_of_each("occluder"), *first_of_each("truncation")])
+def test_a_family_whose_margin_is_a_constant_does_not_give_its_records(scenario_id: str) -> None:
+    case = load(scenario_id)
+    outcome = case.family.outcome
+    constant = replace(case.family, outcome=lambda motion, p: Reading(outcome(motion, p).labels, 1.0))
+    pair = pair_of(case.spec, case.qpos, case.twin)
+    measured = OUTCOME.measured(replace(pair, control=replace(pair.control, family=constant)))
+    assert OUTCOME.failure(measured, pair.claim) is None
+    found = OUTCOME.contradiction(measured, case.spec.evidence, exact=True)
+    assert found == f"margin_m is 1.0, the record says {case.spec.evidence['margin_m']}"
+    assert OUTCOME.contradiction(OUTCOME.measured(pair), case.spec.evidence, exact=True) is None
+
+
+# --- judging ----------------------------------------------------------------------------------------------------------
+
+CLAIM = Claim.of_record(load("hidden_race-0001").spec)
+CHAOTIC = Claim.of_record(load("plinko-0001").spec)
+GOOD: dict[str, Any] = {
+    "outcome": {"label": CLAIM.answer, "commit_s": 2.3, "margin_m": 0.17},
+    "physics": {"same_physics": False, "simulated_answer": CLAIM.answer, "parted_m": 0.005},
+    "in_frame": {"in_frame": True},
+    "legible": {"too_small": [], "least_visible_px": 150.0},
+    "hidden": {"past_panel_px": 0.0, "hidden_from_s": 2.2, "commit_s": 2.3},
+    "ablation": {"ablation_px": 0},
+    "twin behind panel": {"hidden_alone": True, "twin_answer": CLAIM.twin_answer, "twin_px": 0},
+    "cut": {"last_shown_s": 1.0, "cut_s": 1.1, "commit_s": 1.1},
+    "open": {"entropy_bits": 1.0, "top_share": 0.65, "accepted": 64},
+    "twin of cut": {"twin_answer": CHAOTIC.twin_answer, "twin_deviation_px": 0.5, "twin_largest_difference": 255},
+    "words": {"ill_posed_for": "mass", "question_refuted": None},
+}
+BAD: list[tuple[str, dict[str, Any], str]] = [
+    ("outcome", {"label": None}, "the outcome is undecided"),
+    ("outcome", {"label": "teal"}, "the control shows 'teal'"),
+    ("outcome", {"commit_s": 4.4}, "is committed only 0.5 s before the end"),
+    ("outcome", {"margin_m": 0.0}, "has a margin of 0.0000 m, below"),
+    ("outcome", {"margin_m": float("nan")}, "has a margin of nan m, below"),
+    ("physics", {"simulated_answer": "teal"}, "simulated here, the scene ends in 'teal'"),
+    ("physics", {"parted_m": 0.0051}, "parts from its trajectory at once"),
+    ("in_frame", {"in_frame": False}, "leaves the frame"),
+    ("legible", {"too_small": ["149 of 150 pixels of ball"]}, "too small at the end: 149 of 150 pixels of ball"),
+    ("legible", {"least_visible_px": 149.75}, "too small at the end"),
+    ("hidden", {"past_panel_px": 0.25}, "seen past it"),
+    ("hidden", {"hidden_from_s": 2.3}, "does not hide the outcome before it is committed"),
+    ("ablation", {"ablation_px": 1}, "changes 1 pixels"),
+    ("twin behind panel", {"hidden_alone": False}, "in more, or in less, than the hidden element"),
+    ("twin behind panel", {"twin_answer": CLAIM.answer}, "the twin ends in"),
+    ("twin behind panel", {"twin_answer": None}, "the twin ends in None"),
+    ("twin behind panel", {"twin_px": 1}, "differs from the void: in 1 pixels"),
+    ("cut", {"last_shown_s": 0.9, "cut_s": 1.0}, "is before 1.0 s or after commitment"),
+    ("cut", {"cut_s": 1.2}, "is before 1.0 s or after commitment"),
+    ("open", {"accepted": 63}, "63 futures"),
+    ("open", {"entropy_bits": 0.99}, "disagree by 0.99 bits, 1.0 wanted"),
+    ("open", {"top_share": 0.651}, "65.1% of the futures end alike"),
+    ("twin of cut", {"twin_answer": CHAOTIC.answer}, "the twin ends in"),
+    ("twin of cut", {"twin_deviation_px": 0.51}, "0.51 pixels off before the cut"),
+    ("words", {"ill_posed_for": None}, "has no answer"),
+    ("words", {"question_refuted": "mass"}, "reads as ill-posed: mass"),
+]
+JUDGES = dict(zip(GOOD, CERTIFICATES, strict=True))
+
+
+def judged(name: str, evidence: dict[str, Any]) -> str | None:
+    certificate = JUDGES[name]
+    return certificate.failure(evidence, CHAOTIC if certificate.kinds == ("truncation",) else CLAIM)
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_evidence_at_its_thresholds_is_enough(name: str) -> None:
+    assert judged(name, GOOD[name]) is None
+    assert name in {bad for bad, _, _ in BAD}
+
+
+@pytest.mark.parametrize(("name", "worse", "said"), BAD, ids=lambda value: value if isinstance(value, str) else "")
+def test_evidence_beyond_a_threshold_is_not(name: str, worse: dict[str, Any], said: str) -> None:
+    found = judged(name, GOOD[name] | worse)
+    assert found is not None and said in found
+
+
+def test_three_answers_need_less_entropy_than_two() -> None:
+    evidence = GOOD["open"] | {"entropy_bits": 0.9}
+    assert OPEN.failure(evidence, replace(CHAOTIC, labels=3)) is None
+    assert "1.0 wanted" in str(OPEN.failure(evidence, replace(CHAOTIC, labels=2)))
+
+
+# --- adding one -------------------------------------------------------------------------------------------------------
+
+
+def test_a_certificate_that_is_added_reaches_draws_records_asset_checks_and_the_page(
+    race: Released, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def judge(e: Evidence, claim: Claim) -> Iterator[str]:
+        if e["elevation_deg"] < 0:
+            yield f"the camera looks down by {-e['elevation_deg']:.0f} degrees"
+
+    level = Certificate(
+        name="level",
+        about="control",
+        promises="the camera looks straight ahead",
+        does_not_promise="",
+        numbers=(Number("elevation_deg", 2),),
+        measure=lambda pair: {"elevation_deg": pair.control.camera.elevation_deg},
+        judge=judge,
+    )
+    monkeypatch.setattr(certificates, "CERTIFICATES", (*CERTIFICATES, level))
+    wording = race.family.word(race.params, np.random.default_rng(0))
+    with pytest.raises(Rejected, match="looks down by"):
+        resolve(race.family, race.params, wording, "?", scenario_id="race-1", seed=0)
+    assert "looks down by" in failures(race, race.spec)["level"]
+    assert unanswerable_controls([race.spec]) == ["hidden_race-0001: level: no evidence 'elevation_deg'"]
+    assert "| `level` | the camera looks straight ahead |  | `elevation_deg` |" in certificates.table()
+
+
+def test_the_table_on_the_page_is_that_of_the_definitions() -> None:
+    assert certificate_table.written() == certificates.table() + "\n", "python -m tests.scenes.certificate_table"

@@ -12,23 +12,24 @@ import numpy as np
 import pytest
 
 from traps_pipeline.scenes.camera import Camera
-from traps_pipeline.scenes.certify import certify
-from traps_pipeline.scenes.ensemble import (
+from traps_pipeline.scenes.certificates import (
     MIN_ACCEPTED,
     MIN_ENTROPY_BITS,
     TOP_SHARE,
-    Cut,
-    Rollout,
-    choose_cut,
     earliest_cut,
-    entropy_bits,
-    latest_open_cut,
+    futures_of,
+    settled_outcome,
 )
-from traps_pipeline.scenes.kit import Family, Physics
-from traps_pipeline.scenes.outcome import Outcome, compile_scene, read_outcome
+from traps_pipeline.scenes.certify import certify
+from traps_pipeline.scenes.ensemble import Cut, Rollout, entropy_bits
+from traps_pipeline.scenes.evidence import Claim
+from traps_pipeline.scenes.kit import Family, Motion, Physics
+from traps_pipeline.scenes.outcome import Outcome, compile_scene
 from traps_pipeline.scenes.registry import families, get_family
-from traps_pipeline.scenes.simulate import Motion, replay, simulate
+from traps_pipeline.scenes.resolve import choose_cut, latest_open_cut
+from traps_pipeline.scenes.simulate import replay, simulate
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.world import World
 
 RELEASED = Path(__file__).parents[2] / "scene_specs" / "released"
 CHAOTIC = tuple(family.name for family in families() if family.taxonomy == "chaotic")
@@ -50,8 +51,10 @@ class Stored:
 
     def cut(self, family: Family | None = None) -> Cut | None:
         """The cut chosen anew."""
-        commit, seed = self.outcome.commit_frame, self.spec.seed
-        found = choose_cut(family or self.family, self.params, self.physics, self.camera, self.qpos, commit, seed)
+        family = family or self.family
+        control = World(family, self.params, self.physics, self.qpos, self.camera, panel=None)
+        claim = replace(Claim.of_record(self.spec), family=family)
+        found = choose_cut(futures_of(control, self.spec.seed), claim, self.outcome.commit_frame)
         return found[0] if found else None
 
 
@@ -68,7 +71,7 @@ def load(name: str) -> Stored:
     camera = Camera.from_record(spec.camera)
     qpos = load_trajectory(RELEASED / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
     motion = replay(compile_scene(family, params, physics)[0], qpos, physics)
-    return Stored(spec, family, params, physics, camera, qpos, motion, read_outcome(family, motion, params))
+    return Stored(spec, family, params, physics, camera, qpos, motion, settled_outcome(family, motion, params))
 
 
 def test_the_stored_trajectory_ends_in_the_ground_truth(stored: Stored):
@@ -134,7 +137,9 @@ def test_a_board_without_pegs_has_one_certain_outcome_and_yields_no_cut():
     assert not [i for i in range(model.ngeom) if model.geom(i).name.startswith("peg")]
     assert labels[-1] is not None
     assert commit >= earliest_cut(plinko.physics)
-    assert choose_cut(plinko.family, bare, plinko.physics, plinko.camera, qpos, commit, plinko.spec.seed) is None
+    control = World(plinko.family, bare, plinko.physics, qpos, plinko.camera, panel=None)
+    futures = futures_of(control, plinko.spec.seed)
+    assert choose_cut(futures, Claim.of_record(plinko.spec), commit) is None
 
 
 def test_a_perturbation_that_shows_before_one_second_yields_no_cut(stored: Stored):
@@ -171,28 +176,33 @@ def rollouts(parted: int, **counts: int) -> list[Rollout]:
     return [Rollout(parted, None if key == "unresolved" else key) for key, n in counts.items() for _ in range(n)]
 
 
+def asking(labels: int) -> Claim:
+    """A question with so many answers, of a family whose starts are perturbed by 1e-5."""
+    return Claim(replace(get_family("plinko"), perturbation=1e-5), end_s=4.9, labels=labels, answer="left")
+
+
 def test_of_all_open_frames_the_latest_is_the_cut():
     futures = rollouts(20, left=32, right=32) + rollouts(15, left=40)
-    cut = latest_open_cut(futures, range(11, 31), 1.0, 1e-5)
+    cut = latest_open_cut(futures, range(11, 31), asking(2))
     assert cut == Cut(20, entropy_bits=1.0, top_share=0.5, accepted=64, tried=104, unresolved=0, perturbation=1e-5)
 
 
 def test_an_unresolved_rollout_is_counted_but_is_no_outcome():
     futures = rollouts(20, left=40, right=40, unresolved=48)
-    cut = latest_open_cut(futures, range(11, 31), 1.0, 1e-5)
+    cut = latest_open_cut(futures, range(11, 31), asking(2))
     assert cut is not None
     assert (cut.entropy_bits, cut.accepted, cut.unresolved) == (1.0, 80, 48)
-    assert latest_open_cut(rollouts(20, left=64, unresolved=64), range(11, 31), 1.0, 1e-5) is None
+    assert latest_open_cut(rollouts(20, left=64, unresolved=64), range(11, 31), asking(2)) is None
 
 
 def test_fewer_than_64_accepted_rollouts_make_no_cut():
-    assert latest_open_cut(rollouts(20, left=32, right=31), range(11, 31), 0.9, 1e-5) is None
+    assert latest_open_cut(rollouts(20, left=32, right=31), range(11, 31), asking(3)) is None
 
 
 def test_an_outcome_above_65_percent_makes_no_cut_however_high_the_entropy():
     futures = rollouts(20, a=66, b=8, c=8, d=9, e=9)  # 1.51 bits, but 66 %
-    assert latest_open_cut(futures, range(11, 31), 1.0, 1e-5) is None
-    assert latest_open_cut([*futures[1:], Rollout(20, "b")], range(11, 31), 1.0, 1e-5) is not None
+    assert latest_open_cut(futures, range(11, 31), asking(2)) is None
+    assert latest_open_cut([*futures[1:], Rollout(20, "b")], range(11, 31), asking(2)) is not None
 
 
 @pytest.mark.parametrize("name", CHAOTIC)

@@ -7,11 +7,10 @@ from dataclasses import dataclass, make_dataclass
 import numpy as np
 import pytest
 
-from traps_pipeline.scenes.kit import COLOURS, Physics
+from traps_pipeline.scenes.kit import COLOURS, Motion, Physics
 from traps_pipeline.scenes.parts import observers, outcome, questions, vary
 from traps_pipeline.scenes.parts.ramp import Ramp, SteppedRamp
 from traps_pipeline.scenes.parts.stage import Stage, Surface, brake
-from traps_pipeline.scenes.simulate import Motion
 
 PLAY = vary.apart("red", "green", "blue", "yellow")
 

@@ -71,6 +71,7 @@ def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None
     for family, members in families.items():
         found += _unbalanced(family, members)
         found += _repeated_questions(family, members)
+        found += _constant_margin(family, members)
     found += _repeated(families, "trajectory", lambda spec: spec.trajectory_sha256 + spec.scene_hash)
     if counts is not None:
         found += _predictable(specs)
@@ -99,6 +100,12 @@ def _repeated_questions(family: str, members: Sequence[SceneSpec]) -> list[str]:
     most = ill_posed_quota(members[0].taxonomy, len(members))
     texts = Counter(spec.ill_posed_question for spec in members)
     return [f"{family}: {text!r} is asked {n} times, at most {most} allowed" for text, n in texts.items() if n > most]
+
+
+def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
+    """A distance from another outcome that is the same in every scene is no distance: nothing is measured."""
+    margins = {spec.evidence.get("margin_m") for spec in members}
+    return [f"{family}: every scenario has the margin {margins.pop()} m"] if len(margins) == 1 < len(members) else []
 
 
 def _repeated(families: Mapping[str, Iterable[SceneSpec]], what: str, key: Callable[[SceneSpec], str]) -> list[str]:

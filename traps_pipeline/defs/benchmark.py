@@ -62,7 +62,8 @@ scene_specs = stage(
     checks=[
         Check(
             "outcome_settled",
-            "Replayed from the frozen trajectory, every outcome is the ground truth, settled 0.6 s before the end.",
+            "Replayed from the frozen trajectory, every outcome is the ground truth, settled in time and with the "
+            "margin that its record says.",
             lambda workspace, key, made: unsettled(made.beside),
         ),
         Check(

@@ -28,13 +28,13 @@ from traps_pipeline.pocket.recipe import Recipe, Split
 from traps_pipeline.pocket.words import guess
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel, fit_shot, in_frame
+from traps_pipeline.scenes.certificates import EARLIEST_CUT_S, settled_outcome, shown_points
 from traps_pipeline.scenes.encode import encode
-from traps_pipeline.scenes.ensemble import EARLIEST_CUT_S
 from traps_pipeline.scenes.kit import Family, Wording, params_to_dict
-from traps_pipeline.scenes.outcome import Outcome, Rejected, compile_scene, decisive_geoms, read_outcome
+from traps_pipeline.scenes.outcome import Outcome, Rejected, compile_scene, decisive_geoms, simulated
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.simulate import replay, simulate, swept_points
+from traps_pipeline.scenes.simulate import replay
 from traps_pipeline.scenes.wording import draw_ill_posed
 from traps_pipeline.scenes.workers import run_in_order
 from traps_pipeline.storage.media import MediaSpec, pick, resized
@@ -159,13 +159,10 @@ def _draw(family: Family, rng: np.random.Generator) -> _Shot:
     wording = family.word(params, rng)
     physics = family.physics
     model, scene = compile_scene(family, params, physics)
-    try:
-        qpos = simulate(model, scene, physics)
-    except FloatingPointError as error:
-        raise Rejected(str(error)) from error
+    qpos = simulated(model, scene, physics)
     motion = replay(model, qpos, physics)
-    outcome = read_outcome(family, motion, params)
-    points = np.concatenate([swept_points(model, qpos), *(box.corners() for box in scene.stage)])
+    outcome = settled_outcome(family, motion, params)
+    points = shown_points(model, scene, qpos)
     camera, panel = fit_shot(scene.view, points, scene.cover)
     if not in_frame(camera, points):
         raise Rejected("something decisive leaves the frame")
@@ -196,8 +193,8 @@ def _render(shot: _Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.nda
             before = pick(np.arange(shot.cut_frame) / fps, spec)
             return control, list(renderer.frames(shot.qpos[before]))
         last = shot.qpos[-1:]
-        geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
-        if checks.hidden_from(renderer, last, geoms) is None:
+        decisive = decisive_geoms(model, scene.decisive)
+        if checks.past_panel(renderer, last, decisive, scene.hidden).leaked(0):
             raise Rejected("the panel does not hide the outcome")
         return control, list(renderer.frames(shot.qpos[shown], panel=True))
 
@@ -217,7 +214,7 @@ def _record(shot: _Shot, abstain_share: float, rng: np.random.Generator) -> Scen
         aliases=dict(wording.aliases),
         answer_type=shot.family.answer_type,
         cut_frame=shot.cut_frame,
-        asked=Question(wording.question, shot.outcome.label),
+        asked=Question(wording.question, shot.outcome.answer),
         visual=void(wording.question, wording.labels),
         ill_posed=void(shot.ill_posed_question, ()),
         answerable=Question(both.question, both.answer),

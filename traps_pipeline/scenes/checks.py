@@ -1,8 +1,9 @@
-"""Pixel evidence: what is seen of a geom, what a panel hides, whether two worlds give one video."""
+"""Pixel evidence: what is seen of a geom, what is seen past a panel, whether two worlds give one video."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,23 +24,36 @@ def least_visible(renderer: Renderer, qpos: np.ndarray, groups: Sequence[tuple[t
     return [float(counts[:, [geoms.index(n) for n in names]].sum(axis=1).min()) for names, _ in groups]
 
 
-def hidden_from(
-    renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hidden: Sequence[str] = ()
-) -> int | None:
-    """First frame of the void from which no decisive geom has a pixel until the end; None if there is no such frame
-    or if the hidden element is visible in any frame."""
+@dataclass(frozen=True)
+class PastPanel:
+    """What is seen past the panel in frames of a void: pixels (F,) of the decisive bodies, and of the hidden
+    element."""
+
+    decisive: np.ndarray
+    hidden: np.ndarray
+
+    def hidden_from(self) -> int:
+        """First frame from which no decisive body has a pixel until the end; the number of frames if none is."""
+        seen = np.flatnonzero(self.decisive)
+        return int(seen[-1]) + 1 if seen.size else 0
+
+    def leaked(self, first: int) -> float:
+        """Pixels of decisive bodies from a frame on, and of the hidden element in any frame. 0: the panel hides."""
+        return float(self.decisive[first:].sum() + self.hidden.sum())
+
+
+def past_panel(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hidden: Sequence[str]) -> PastPanel:
+    """What is seen past the panel of the geoms of decisive bodies and of the hidden element, by segmentation."""
     counts = renderer.visible_pixels(qpos, [*decisive, *hidden], panel=True)
-    if counts[:, len(decisive) :].any():
-        return None
-    seen = np.flatnonzero(counts[:, : len(decisive)].any(axis=1))
-    first = int(seen[-1]) + 1 if seen.size else 0
-    return first if first < len(qpos) else None
+    return PastPanel(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
 
 
-def ablation_pixels(renderer: Renderer, qpos: np.ndarray, geoms: Sequence[str]) -> int:
+def ablation_pixels(
+    renderer: Renderer, qpos: np.ndarray, geoms: Sequence[str], void: Iterable[np.ndarray] | None = None
+) -> int:
     """How many void pixels change, over the given frames, when the geoms are taken away. 0 proves that nothing of
-    them, shadow included, reaches the eye."""
-    with_them = renderer.frames(qpos, panel=True)
+    them, shadow included, reaches the eye. void: the frames with them, if they are drawn already."""
+    with_them = renderer.frames(qpos, panel=True) if void is None else void
     return differing_pixels(with_them, renderer.frames(qpos, panel=True, without=geoms))[0]
 
 

@@ -18,7 +18,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import Camera, Panel
 from traps_pipeline.scenes.encode import DamagedClip, encode, frames_digest
-from traps_pipeline.scenes.kit import Family, Physics
+from traps_pipeline.scenes.kit import Family, Physics, Scene
 from traps_pipeline.scenes.outcome import compile_scene, decisive_geoms
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
@@ -131,20 +131,22 @@ def _render_control_and_void(job: Job, family: Family, physics: Physics, missing
         if job.control in missing:
             _save(job.control, control, physics.fps)
         if job.void in missing and panel is not None:
-            geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
+            decisive = decisive_geoms(model, scene.decisive)
             void = list(renderer.frames(job.qpos, panel=True))
-            drawn += _save(job.void, void, physics.fps, _leaked_pixels(renderer, geoms, job))
+            drawn += _save(job.void, void, physics.fps, _leaked_pixels(renderer, scene, decisive, job))
         elif job.void in missing:
             _save(job.void, control[: spec.void["cut_frame"]], physics.fps)
     return drawn
 
 
-def _leaked_pixels(renderer: Renderer, geoms: Sequence[str], job: Job) -> float:
-    """Pixels that decisive bodies and the hidden element have in the void from hiding on: 0 if the panel hides."""
-    hidden = np.arange(job.spec.void["hidden_from_frame"], len(job.qpos))
-    ablated = np.unique(np.linspace(hidden[0], hidden[-1], ABLATION_FRAMES).astype(int))
-    seen = renderer.visible_pixels(job.qpos[hidden[::2]], geoms, panel=True)
-    return float(seen.sum()) + checks.ablation_pixels(renderer, job.qpos[ablated], geoms)
+def _leaked_pixels(renderer: Renderer, scene: Scene, decisive: Sequence[str], job: Job) -> float:
+    """What the certificates `hidden` and `ablation` measure, on the sampled frames and on a few: 0 if the panel hides
+    decisive bodies from hiding on, and the hidden element, without a trace."""
+    step = job.spec.physics["fps"] // checks.SAMPLED_FPS
+    first = job.spec.void["hidden_from_frame"]
+    seen = checks.past_panel(renderer, job.qpos[::step], decisive, scene.hidden).leaked(-(-first // step))
+    ablated = np.unique(np.linspace(first, len(job.qpos) - 1, ABLATION_FRAMES).astype(int))
+    return seen + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden])
 
 
 def _save(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:

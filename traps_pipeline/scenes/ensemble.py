@@ -1,7 +1,7 @@
-"""Where a chaotic clip can be cut: the futures of many starts that look the same up to the cut.
+"""The futures of many starts that look the same as a control up to a cut.
 
-The initial state is perturbed far below what a pixel shows and simulated on. A rollout is accepted for a cut while it
-cannot be told from the control by eye; the cut is the latest one whose accepted rollouts still end differently.
+The initial state is perturbed far below what a pixel shows and simulated on. A rollout counts for a cut while it cannot
+be told from the control by eye. How many must count, and how they must disagree, is the certificate's (`certificates`).
 """
 
 from __future__ import annotations
@@ -11,31 +11,22 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from traps_pipeline.scenes.camera import Camera
-from traps_pipeline.scenes.kit import Family, Physics
+from traps_pipeline.scenes.outcome import last_run
 from traps_pipeline.scenes.simulate import initial_velocity, replay
+from traps_pipeline.scenes.world import World
 
 if TYPE_CHECKING:
     import mujoco
 
-EARLIEST_CUT_S = 1.0
-MAX_DEVIATION_PX = 0.5
-MIN_ACCEPTED = 64
-TRIED = 128
-BATCHES = (
-    24,
-    80,
-    TRIED,
-)  # rollouts tried in all after each batch; the next batch runs only if it can change the verdict
-TOP_SHARE = 0.65
-MIN_ENTROPY_BITS = 1.0
-MIN_ENTROPY_THREE_LABELS_BITS = 0.9
-HELD_S = 0.6  # a rollout's label must have stood this long at the end, like the control's
-HOPELESS_SHARE = 0.9  # of the scouts; a scene whose true top share is 65 % looks like that less than once in 300 times
+TRIED = 128  # starts at most
+# Rollouts tried in all after each batch; the next batch runs only if it can change the verdict.
+BATCHES = (24, 80, TRIED)
 THREADS = 2
 
 
@@ -56,15 +47,8 @@ class Cut:
     perturbation: float
 
     def evidence(self) -> dict[str, Any]:
-        """Plain values for the record."""
-        return {
-            "entropy_bits": round(self.entropy_bits, 4),
-            "top_share": round(self.top_share, 4),
-            "accepted": self.accepted,
-            "tried": self.tried,
-            "unresolved": self.unresolved,
-            "perturbation": self.perturbation,
-        }
+        """The numbers behind the certificate `open`."""
+        return {name: value for name, value in vars(self).items() if name != "frame"}
 
 
 @dataclass(frozen=True)
@@ -85,82 +69,89 @@ def entropy_bits(counts: Mapping[str, int]) -> float:
     return sum(-n / total * math.log2(n / total) for n in counts.values() if n)
 
 
-def earliest_cut(physics: Physics) -> int:
-    """The first admissible cut frame: its last shown frame, frame - 1, is at 1.0 s or later."""
-    return math.ceil(EARLIEST_CUT_S * physics.fps - 1e-9) + 1
+@dataclass(frozen=True)
+class _Prepared:
+    """What all rollouts of a control have in common. starts (TRIED, nq), shown: outline points (F, N, 2) of the
+    control."""
+
+    model: mujoco.MjModel
+    starts: np.ndarray
+    velocity: np.ndarray
+    silhouette: _Silhouette
+    shown: np.ndarray
 
 
-def choose_cut(
-    family: Family, params: Any, physics: Physics, camera: Camera, qpos: np.ndarray, commit_frame: int, seed: int
-) -> tuple[Cut, Rollout] | None:
-    """The latest cut from 1.0 s on and before commitment that leaves the outcome open, and a twin; None without one.
+class Futures:
+    """Rollouts of perturbed starts of a control, simulated as they are asked for, each once.
 
-    qpos (F, nq): the control. Of at most 128 perturbed starts at least 64 must be accepted, with an outcome entropy of
-    at least 1.0 bit (0.9 for families of three labels) and no outcome above 65 %. The twin is an accepted rollout that
-    ends otherwise than the control does.
+    first: the earliest cut; a rollout that has parted before it is given up. alike_px: a rollout parts from the control
+    when a point of it is further off than this. held_s: so long a label must have stood at the end to be an outcome.
     """
-    first = earliest_cut(physics)
-    if commit_frame < first:
-        return None
-    bound = bound_bits(family, params)
-    for rollouts in futures(family, params, physics, camera, qpos, seed):
-        if len(rollouts) == BATCHES[0]:
-            if _hopeless(rollouts, first):
-                return None
-            continue
-        cut = latest_open_cut(rollouts, range(first, commit_frame + 1), bound, family.perturbation)
-        if cut is not None:
-            model = family.build(params, physics).spec.compile()
-            truth = family.outcome(replay(model, qpos, physics), params).labels[-1]
-            return cut, twin_of(rollouts, cut.frame, truth)
-    return None
 
+    def __init__(self, control: World, seed: int, *, first: int, alike_px: float, held_s: float) -> None:
+        self.first = first
+        self._control, self._seed = control, seed
+        self._alike_px, self._held = alike_px, round(held_s * control.physics.fps)
+        self._rollouts: list[Rollout] = []
 
-def bound_bits(family: Family, params: Any) -> float:
-    """The least entropy (bits) that a cut must leave open: 1.0, or 0.9 where there are three outcomes."""
-    labels = len(family.word(params, np.random.default_rng(0)).labels)
-    return MIN_ENTROPY_THREE_LABELS_BITS if labels == 3 else MIN_ENTROPY_BITS
-
-
-def futures(
-    family: Family, params: Any, physics: Physics, camera: Camera, qpos: np.ndarray, seed: int
-) -> Iterator[list[Rollout]]:
-    """Rollouts of perturbed starts of a control qpos (F, nq): all so far after each batch of `BATCHES`."""
-    scene = family.build(params, physics)
-    model = scene.spec.compile()
-    silhouette = _Silhouette(model, camera)
-    shown = np.stack([silhouette.pixels(row) for row in qpos])
-    velocity = initial_velocity(model, scene.velocity)
-    starts = _perturbed_starts(model, np.asarray(qpos[0], float), family.perturbation, seed)
-    first = earliest_cut(physics)
-
-    def roll(start: np.ndarray) -> Rollout:
-        return _roll(family, params, physics, model, start, velocity, silhouette, shown, first)
-
-    rollouts: list[Rollout] = []
-    with ThreadPoolExecutor(THREADS) as pool:  # mj_step releases the GIL
+    def batches(self) -> Iterator[list[Rollout]]:
+        """All rollouts so far after each batch of `BATCHES`."""
         for tried in BATCHES:
-            rollouts += pool.map(roll, starts[len(rollouts) : tried])
-            yield rollouts
+            if len(self._rollouts) < tried:
+                self._rollouts += self._simulated(slice(len(self._rollouts), tried))
+            yield self._rollouts[:tried]
+
+    def _simulated(self, which: slice) -> list[Rollout]:
+        with ThreadPoolExecutor(THREADS) as pool:  # mj_step releases the GIL
+            return list(pool.map(self._roll, self._prepared.starts[which]))
+
+    @cached_property
+    def _prepared(self) -> _Prepared:
+        control = self._control
+        scene = control.family.build(control.params, control.physics)
+        model = scene.spec.compile()
+        silhouette = _Silhouette(model, control.camera)
+        start = np.asarray(control.qpos[0], float)
+        return _Prepared(
+            model=model,
+            starts=_perturbed_starts(model, start, control.family.perturbation, self._seed),
+            velocity=initial_velocity(model, scene.velocity),
+            silhouette=silhouette,
+            shown=np.stack([silhouette.pixels(row) for row in control.qpos]),
+        )
+
+    def _roll(self, start: np.ndarray) -> Rollout:
+        """Simulate one start to the end of the control; give up early if it parts before the earliest cut."""
+        import mujoco
+
+        control, prepared = self._control, self._prepared
+        shown, outline = prepared.shown, prepared.silhouette
+        data = mujoco.MjData(prepared.model)
+        data.qpos[:], data.qvel[:] = start, prepared.velocity
+        frames = np.empty((len(shown), prepared.model.nq))
+        parted = len(shown)
+        for i in range(len(shown)):
+            frames[i] = data.qpos
+            if parted == len(shown) and np.abs(outline.pixels(data.qpos) - shown[i]).max() > self._alike_px:
+                parted = i
+                if i < self.first:
+                    return Rollout(parted, None)
+            mujoco.mj_step(prepared.model, data, control.physics.substeps)
+        if not np.isfinite(frames).all():
+            return Rollout(parted, None)
+        motion = replay(prepared.model, frames, control.physics)
+        labels = control.family.outcome(motion, control.params).labels
+        settled = last_run(labels) <= len(labels) - 1 - self._held
+        return Rollout(parted, labels[-1] if settled else None, frames.astype(np.float32))
 
 
-def latest_open_cut(rollouts: Sequence[Rollout], frames: range, bound_bits: float, perturbation: float) -> Cut | None:
-    """The last of the frames at which the accepted rollouts leave the outcome open, or None."""
-    cuts = (open_at(rollouts, frame, bound_bits, perturbation) for frame in reversed(frames))
-    return next((cut for cut in cuts if cut is not None), None)
-
-
-def open_at(rollouts: Sequence[Rollout], frame: int, bound_bits: float, perturbation: float) -> Cut | None:
-    """The cut at one frame if it leaves the outcome open, else None."""
+def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
+    """What a cut at one frame leaves open."""
     alike = [r for r in rollouts if r.parted >= frame]
     counts = Counter(r.label for r in alike if r.label is not None)
     accepted = counts.total()
-    if accepted < MIN_ACCEPTED:
-        return None
-    entropy, top = entropy_bits(counts), max(counts.values()) / accepted
-    if entropy < bound_bits or top > TOP_SHARE:
-        return None
-    return Cut(frame, entropy, top, accepted, len(rollouts), len(alike) - accepted, perturbation)
+    top = max(counts.values(), default=0) / max(accepted, 1)
+    return Cut(frame, entropy_bits(counts), top, accepted, len(rollouts), len(alike) - accepted, perturbation)
 
 
 def twin_of(rollouts: Sequence[Rollout], frame: int, truth: str | None) -> Rollout:
@@ -176,13 +167,6 @@ def deviation_px(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray, twin: 
     )
 
 
-def _hopeless(scouts: Sequence[Rollout], first: int) -> bool:
-    """Whether hardly any scout looks like the control at the earliest cut, or nearly all of them end alike."""
-    counts = Counter(r.label for r in scouts if r.parted >= first and r.label is not None)
-    few = counts.total() < len(scouts) * MIN_ACCEPTED / TRIED / 2
-    return few or max(counts.values(), default=0) > HOPELESS_SHARE * counts.total()
-
-
 def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, seed: int) -> np.ndarray:
     """TRIED starts, shape (TRIED, nq): a normal step of one scale (m, rad) on every degree of freedom."""
     import mujoco
@@ -192,43 +176,6 @@ def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, se
     for row, step in zip(starts, steps, strict=True):
         mujoco.mj_integratePos(model, row, step, 1.0)
     return starts
-
-
-def _roll(
-    family: Family,
-    params: Any,
-    physics: Physics,
-    model: mujoco.MjModel,
-    start: np.ndarray,
-    velocity: np.ndarray,
-    silhouette: _Silhouette,
-    shown: np.ndarray,
-    first: int,
-) -> Rollout:
-    """Simulate one start to the end of the control; give up early if it parts before the earliest cut."""
-    import mujoco
-
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = start, velocity
-    frames = np.empty((len(shown), model.nq))
-    parted = len(shown)
-    for i in range(len(shown)):
-        frames[i] = data.qpos
-        if parted == len(shown) and np.abs(silhouette.pixels(data.qpos) - shown[i]).max() > MAX_DEVIATION_PX:
-            parted = i
-            if i < first:
-                return Rollout(parted, None)
-        mujoco.mj_step(model, data, physics.substeps)
-    if not np.isfinite(frames).all():
-        return Rollout(parted, None)
-    label = _settled(family.outcome(replay(model, frames, physics), params).labels, physics)
-    return Rollout(parted, label, frames.astype(np.float32))
-
-
-def _settled(labels: Sequence[str | None], physics: Physics) -> str | None:
-    """The label that holds at the end and has held for 0.6 s, else None."""
-    held = labels[-1 - round(HELD_S * physics.fps) :]
-    return labels[-1] if len(set(held)) == 1 else None
 
 
 class _Silhouette:

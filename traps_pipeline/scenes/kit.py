@@ -18,8 +18,6 @@ import numpy as np
 if TYPE_CHECKING:
     import mujoco
 
-    from traps_pipeline.scenes.simulate import Motion
-
 Vec3 = tuple[float, float, float]
 Taxonomy = Literal["occlusion", "chaotic"]
 AnswerType = Literal["binary", "direction", "colour", "count_range", "numeric"]
@@ -133,6 +131,26 @@ class Scene:
     cover: Box | None = None
     velocity: Mapping[str, Sequence[float]] = field(default_factory=dict)
     inventory: Inventory = Inventory()
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Poses of all named bodies at the frame times.
+
+    times: (F,) seconds. positions: body -> (F, 3) m. rotations: body -> (F, 3, 3), columns are the body's axes.
+    """
+
+    times: np.ndarray
+    positions: Mapping[str, np.ndarray]
+    rotations: Mapping[str, np.ndarray]
+
+    def pos(self, body: str) -> np.ndarray:
+        """World position of a body's frame, shape (F, 3)."""
+        return self.positions[body]
+
+    def rot(self, body: str) -> np.ndarray:
+        """Rotation matrices of a body, shape (F, 3, 3)."""
+        return self.rotations[body]
 
 
 @dataclass(frozen=True)

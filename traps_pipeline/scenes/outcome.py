@@ -1,4 +1,4 @@
-"""What a control shows: its compiled scene, its outcome, and what must be legible of it."""
+"""A compiled scene, what a run of it comes to, and which of its geoms decide that."""
 
 from __future__ import annotations
 
@@ -9,46 +9,48 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.scenes.camera import Panel
-from traps_pipeline.scenes.kit import PANEL_GROUP, Family, Physics, Scene, add_box
-from traps_pipeline.scenes.simulate import Motion
+from traps_pipeline.scenes.kit import PANEL_GROUP, Family, Motion, Physics, Scene, add_box
+from traps_pipeline.scenes.simulate import simulate
 
 if TYPE_CHECKING:
     import mujoco
 
-COMMITTED_BEFORE_END_S = 0.6
-LEGIBLE_PIXELS = 150.0  # of each decisive body at the end of the control
-
 
 class Rejected(ValueError):
-    """This draw makes no valid pair; the message says why."""
+    """This makes no valid pair; the message says why."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the control shows. commit_frame: first frame from which the label holds to the end."""
+    """What a run comes to, held against nothing yet.
 
-    label: str
+    label: None if it is undecided at the end. commit_frame: first frame from which the label holds to the end (the
+    number of frames if it is undecided). margin_m: distance (m) of the end from the nearest other outcome.
+    """
+
+    label: str | None
     commit_frame: int
     margin_m: float
 
+    @property
+    def answer(self) -> str:
+        """The label. Raises Rejected if the outcome is undecided."""
+        if self.label is None:
+            raise Rejected("the outcome is undecided at the end of the control")
+        return self.label
+
 
 def read_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
-    """The outcome of a trajectory, settled at least 0.6 s before the end. Raises Rejected."""
+    """The outcome of a trajectory as the family reads it; `certificates.settled_outcome` also holds it to account."""
     reading = family.outcome(motion, params)
-    labels, margin = reading.labels, reading.margin_m
-    label = labels[-1]
-    if label is None:
-        raise Rejected("the outcome is undecided at the end of the control")
-    commit = len(labels)
-    while commit > 0 and labels[commit - 1] == label:
-        commit -= 1
-    fps = 1.0 / float(motion.times[1] - motion.times[0])
-    left = (len(labels) - 1 - commit) / fps
-    if left < COMMITTED_BEFORE_END_S - 1e-9:
-        raise Rejected(f"outcome {label!r} is committed only {left:.1f} s before the end")
-    if margin < family.min_margin_m:
-        raise Rejected(f"outcome {label!r} has a margin of {margin:.4f} m, below {family.min_margin_m} m")
-    return Outcome(label, commit, float(margin))
+    commit = last_run(reading.labels)
+    label = reading.labels[-1]
+    return Outcome(label, len(reading.labels) if label is None else commit, float(reading.margin_m))
+
+
+def last_run(labels: Sequence[str | None]) -> int:
+    """The first frame from which the last label holds to the end."""
+    return next((i + 1 for i in reversed(range(len(labels))) if labels[i] != labels[-1]), 0)
 
 
 def compile_scene(
@@ -65,16 +67,15 @@ def compile_scene(
     return scene.spec.compile(), scene
 
 
+def simulated(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarray:
+    """The trajectory of a compiled scene, (F, nq). Raises Rejected if the solver diverges."""
+    try:
+        return simulate(model, scene, physics)
+    except FloatingPointError as error:
+        raise Rejected(str(error)) from error
+
+
 def decisive_geoms(model: mujoco.MjModel, bodies: Sequence[str]) -> tuple[str, ...]:
     """Names of the geoms of some bodies."""
     ids = {model.body(name).id for name in bodies}
     return tuple(model.geom(i).name for i in range(model.ngeom) if int(model.geom_bodyid[i]) in ids)
-
-
-def legible_groups(
-    family: Family, model: mujoco.MjModel, scene: Scene, motion: Motion, params: Any
-) -> list[tuple[tuple[str, ...], float]]:
-    """Groups of geoms that must be seen at the end of the control, each with its least number of pixels."""
-    if family.legible is not None:
-        return list(family.legible(motion, params))
-    return [(decisive_geoms(model, [body]), LEGIBLE_PIXELS) for body in scene.decisive]

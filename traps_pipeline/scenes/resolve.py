@@ -5,26 +5,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from traps_pipeline.scenes import checks, ensemble
-from traps_pipeline.scenes.camera import Camera, Panel, fit_shot, in_frame
-from traps_pipeline.scenes.kit import Family, Physics, Wording, params_to_dict
-from traps_pipeline.scenes.outcome import (
-    Outcome,
-    Rejected,
-    compile_scene,
-    decisive_geoms,
-    legible_groups,
-    read_outcome,
+from traps_pipeline.scenes import ensemble
+from traps_pipeline.scenes.camera import fit_shot
+from traps_pipeline.scenes.certificates import (
+    MIN_ACCEPTED,
+    OPEN,
+    certificates_for,
+    futures_of,
+    settled_answer,
+    shown_points,
 )
-from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.simulate import replay, simulate, swept_points
+from traps_pipeline.scenes.ensemble import Cut, Futures, Rollout
+from traps_pipeline.scenes.evidence import Claim, Evidence, Pair, VoidKind, required
+from traps_pipeline.scenes.kit import Family, Physics, Wording, params_to_dict
+from traps_pipeline.scenes.outcome import Rejected, compile_scene, simulated
 from traps_pipeline.scenes.spec import SceneSpec, Twin, trajectory_digest
+from traps_pipeline.scenes.world import World
+
+HOPELESS_SHARE = 0.9  # of the scouts; a scene whose true top share is 65 % looks like that less than once in 300 times
 
 
 @dataclass(frozen=True)
@@ -34,29 +39,6 @@ class Resolved:
     spec: SceneSpec
     qpos: np.ndarray
     twin: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Void:
-    """How the void is made, its twin, and the evidence for both."""
-
-    void: Mapping[str, Any]
-    twin: np.ndarray
-    twin_params: Mapping[str, Any] | None
-    twin_answer: str
-    evidence: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class _World:
-    """A simulated control."""
-
-    family: Family
-    params: Any
-    physics: Physics
-    qpos: np.ndarray
-    outcome: Outcome
-    camera: Camera
 
 
 def resolve(
@@ -71,24 +53,20 @@ def resolve(
 ) -> Resolved:
     """The record of a scenario with its trajectories. Raises Rejected when it makes no valid pair."""
     physics = physics or family.physics
-    model, scene = compile_scene(family, params, physics)
-    qpos = _simulated(family, params, physics)
-    motion = replay(model, qpos, physics)
-    outcome = read_outcome(family, motion, params)
-    if outcome.label not in wording.labels:
-        raise ValueError(f"{family.name}: reading {outcome.label!r} is not one of the labels {list(wording.labels)}")
-    points = np.concatenate([swept_points(model, qpos), *(box.corners() for box in scene.stage)])
-    camera, panel = fit_shot(scene.view, points, scene.cover)
-    if not in_frame(camera, points):
-        raise Rejected("something decisive leaves the frame")
-    groups = legible_groups(family, model, scene, motion, params)
-    with Renderer(model, camera) as renderer:
-        shown = checks.least_visible(renderer, qpos[checks.last_sampled(len(qpos), physics.fps)], groups)
-    for (names, least), pixels in zip(groups, shown, strict=True):
-        if pixels < least:
-            raise Rejected(f"too small at the end: {pixels:.0f} of {least:.0f} pixels of {names[0]}")
-    world = _World(family, params, physics, qpos, outcome, camera)
-    void = _occluder_void(world, panel) if panel is not None else _truncation_void(world, seed)
+    control = _control(family, params, physics)
+    answer = control.outcome.label
+    if answer is not None and answer not in wording.labels:
+        raise ValueError(f"{family.name}: reading {answer!r} is not one of the labels {list(wording.labels)}")
+    end_s = (physics.n_frames - 1) / physics.fps
+    claim = Claim(family, end_s, len(wording.labels), answer, None, wording.question, ill_posed_question)
+    pair = Pair(control, claim, futures_of(control, seed))
+    kind: VoidKind = "truncation" if control.panel is None else "occluder"
+    evidence = required(certificates_for(kind, "control"), pair, {})
+    candidates = _cut_short(pair) if control.panel is None else _covered(pair)
+    evidence = required(certificates_for(kind, "void"), candidates[0], evidence)
+    pair, evidence = _with_certified_twin(candidates, kind, evidence)
+    twin, frame = pair.other_world, pair.void_from
+    panel = None if control.panel is None else asdict(control.panel)
     spec = SceneSpec(
         scenario_id=scenario_id,
         taxonomy=family.taxonomy,
@@ -98,105 +76,121 @@ def resolve(
         seed=seed,
         params=_plain(params_to_dict(params)),
         physics=asdict(physics),
-        camera=_plain(asdict(camera)),
-        void_kind="occluder" if panel is not None else "truncation",
-        void=_plain(dict(void.void)),
+        camera=_plain(asdict(control.camera)),
+        void_kind=kind,
+        void=_plain({"cut_frame": frame} if panel is None else {"panel": panel, "hidden_from_frame": frame}),
         question=wording.question,
         labels=list(wording.labels),
         aliases=dict(wording.aliases),
         answer_type=family.answer_type,
-        ground_truth=outcome.label,
+        ground_truth=control.outcome.answer,
         ill_posed_question=ill_posed_question,
         answerable_question=_plain(asdict(wording.answerable_question)),
-        trajectory_sha256=trajectory_digest(qpos),
+        trajectory_sha256=trajectory_digest(control.qpos),
         twin=Twin(
-            params=None if void.twin_params is None else _plain(dict(void.twin_params)),
-            ground_truth=void.twin_answer,
-            trajectory_sha256=trajectory_digest(void.twin),
+            params=None if panel is None else _plain(params_to_dict(twin.params)),
+            ground_truth=twin.outcome.answer,
+            trajectory_sha256=trajectory_digest(twin.qpos),
         ),
-        evidence={
-            "commit_s": round(outcome.commit_frame / physics.fps, 3),
-            "margin_m": round(outcome.margin_m, 5),
-            "least_visible_px": min(shown),
-            **void.evidence,
-        },
+        evidence={name: value for each in certificates_for(kind) for name, value in each.kept(evidence).items()},
     )
-    return Resolved(spec, qpos, void.twin)
+    return Resolved(spec, control.qpos, twin.qpos)
 
 
-def _simulated(family: Family, params: Any, physics: Physics) -> np.ndarray:
+def _control(family: Family, params: Any, physics: Physics) -> World:
+    """The control of a draw: simulated, and with its camera and panel fitted."""
     model, scene = compile_scene(family, params, physics)
-    try:
-        return simulate(model, scene, physics)
-    except FloatingPointError as error:
-        raise Rejected(str(error)) from error
+    qpos = simulated(model, scene, physics)
+    camera, panel = fit_shot(scene.view, shown_points(model, scene, qpos), scene.cover)
+    return World(family, params, physics, qpos, camera, panel, simulated=qpos)
 
 
-def _occluder_void(world: _World, panel: Panel) -> _Void:
-    candidates = _twin_worlds(world)
-    if not candidates:
-        raise Rejected("no other hidden element gives another outcome")
-    model, scene = compile_scene(world.family, world.params, world.physics, panel)
-    decisive = decisive_geoms(model, scene.decisive)
-    with Renderer(model, world.camera) as renderer:
-        hidden_from = checks.hidden_from(renderer, world.qpos, decisive, scene.hidden)
-        if hidden_from is None or hidden_from >= world.outcome.commit_frame:
-            raise Rejected("the panel does not hide the outcome before it is committed")
-        void = list(renderer.frames(world.qpos, panel=True))
-        ablated = renderer.frames(world.qpos[hidden_from:], panel=True, without=[*decisive, *scene.hidden])
-        if checks.differing_pixels(void[hidden_from:], ablated)[0]:
-            raise Rejected("something decisive reaches the eye past the panel")
-    for params, qpos, label in candidates:
-        twin_model, _ = compile_scene(world.family, params, world.physics, panel)
-        with Renderer(twin_model, world.camera) as renderer:  # one GL context: renderers take turns
-            pixels, _ = checks.differing_pixels(void, renderer.frames(qpos, panel=True))
-        if pixels == 0:
-            return _Void(
-                void={"panel": asdict(panel), "hidden_from_frame": hidden_from},
-                twin=qpos,
-                twin_params=params_to_dict(params),
-                twin_answer=label,
-                evidence={"hidden_from_s": hidden_from / world.physics.fps, "ablation_px": 0, "twin_px": 0},
-            )
-    raise Rejected("the twin's void differs from the void")
-
-
-def _twin_worlds(world: _World) -> list[tuple[Any, np.ndarray, str]]:
-    """Scenes with another hidden element and another settled outcome: parameters, trajectory, answer."""
-    assert world.family.twins is not None, f"{world.family.name}: an occlusion family needs twins"
-    worlds = []
-    for params in world.family.twins(world.params):
+def _with_certified_twin(
+    candidates: Sequence[Pair], kind: VoidKind, so_far: Evidence
+) -> tuple[Pair, Mapping[str, Any]]:
+    """The first of some pairs, which differ in their twin, whose twin is certified. Raises Rejected if none is."""
+    *others, last = candidates
+    for pair in others:
         try:
-            qpos = _simulated(world.family, params, world.physics)
-            model, _ = compile_scene(world.family, params, world.physics)
-            label = read_outcome(world.family, replay(model, qpos, world.physics), params).label
+            return pair, required(certificates_for(kind, "twin"), pair, so_far)
         except Rejected:
-            continue  # this other world settles nothing; the next one may
-        if label != world.outcome.label:
-            worlds.append((params, qpos, label))
+            continue  # the next one may be alike
+    return last, required(certificates_for(kind, "twin"), last, so_far)
+
+
+# --- occlusion --------------------------------------------------------------------------------------------------------
+
+
+def _covered(pair: Pair) -> list[Pair]:
+    """The pair with its void, once for each other world that may be its twin."""
+    worlds = _other_worlds(pair.control)
+    if not worlds:
+        raise Rejected("no other hidden element gives another outcome")
+    frame = pair.control.past_panel.hidden_from()
+    return [_with_twin(pair, frame, world) for world in worlds]
+
+
+def _with_twin(pair: Pair, frame: int, twin: World) -> Pair:
+    claim = replace(pair.claim, twin_answer=twin.outcome.label)
+    return replace(pair, claim=claim, void_frame=frame, twin=twin)
+
+
+def _other_worlds(control: World) -> list[World]:
+    """Worlds with another hidden element and another settled outcome."""
+    family, physics = control.family, control.physics
+    assert family.twins is not None, f"{family.name}: an occlusion family needs twins"
+    worlds = []
+    for params in family.twins(control.params):
+        try:
+            qpos = simulated(*compile_scene(family, params, physics), physics)
+        except Rejected:
+            continue  # this other world diverges; the next one may not
+        world = replace(control, params=params, qpos=qpos, simulated=qpos)
+        if settled_answer(world) not in (None, control.outcome.label):
+            worlds.append(world)
     return worlds
 
 
-def _truncation_void(world: _World, seed: int) -> _Void:
-    found = ensemble.choose_cut(
-        world.family, world.params, world.physics, world.camera, world.qpos, world.outcome.commit_frame, seed
-    )
+# --- chaotic ----------------------------------------------------------------------------------------------------------
+
+
+def _cut_short(pair: Pair) -> list[Pair]:
+    """The pair with the latest cut that leaves its outcome open, and a future of that cut as its twin."""
+    found = choose_cut(pair.futures, pair.claim, pair.control.outcome.commit_frame)
     if found is None:
         raise Rejected("no cut at 1.0 s or later leaves the outcome open")
     cut, twin = found
-    assert twin.qpos is not None and twin.label is not None
-    model, _ = compile_scene(world.family, world.params, world.physics)
-    before = slice(0, cut.frame)
-    with Renderer(model, world.camera) as renderer:
-        control = list(renderer.frames(world.qpos[before]))
-        _, largest = checks.differing_pixels(control, renderer.frames(twin.qpos[before]))
-    return _Void(
-        void={"cut_frame": cut.frame},
-        twin=twin.qpos,
-        twin_params=None,
-        twin_answer=twin.label,
-        evidence={**cut.evidence(), "twin_largest_difference": largest},
-    )
+    assert twin.qpos is not None
+    return [_with_twin(pair, cut.frame, replace(pair.control, qpos=twin.qpos, simulated=None))]
+
+
+def choose_cut(futures: Futures, claim: Claim, commit_frame: int) -> tuple[Cut, Rollout] | None:
+    """The latest cut, not too early and not after commitment, that leaves the outcome open, and a twin: the first
+    rollout that looks like the control up to there and ends otherwise. None if there is no such cut."""
+    if commit_frame < futures.first:
+        return None
+    for rollouts in futures.batches():
+        if len(rollouts) == ensemble.BATCHES[0]:
+            if _hopeless(rollouts, futures.first):
+                return None
+            continue
+        cut = latest_open_cut(rollouts, range(futures.first, commit_frame + 1), claim)
+        if cut is not None:
+            return cut, ensemble.twin_of(rollouts, cut.frame, claim.answer)
+    return None
+
+
+def latest_open_cut(rollouts: Sequence[Rollout], frames: range, claim: Claim) -> Cut | None:
+    """The last of the frames at which a cut is certified to leave the outcome open, or None."""
+    cuts = (ensemble.at_cut(rollouts, frame, claim.family.perturbation) for frame in reversed(frames))
+    return next((cut for cut in cuts if OPEN.failure(cut.evidence(), claim) is None), None)
+
+
+def _hopeless(scouts: Sequence[Rollout], first: int) -> bool:
+    """Whether hardly any scout looks like the control at the earliest cut, or nearly all of them end alike."""
+    counts = Counter(r.label for r in scouts if r.parted >= first and r.label is not None)
+    few = counts.total() < len(scouts) * MIN_ACCEPTED / ensemble.TRIED / 2
+    return few or max(counts.values(), default=0) > HOPELESS_SHARE * counts.total()
 
 
 def _plain(value: Any) -> Any:

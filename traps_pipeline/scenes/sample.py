@@ -17,11 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from traps_pipeline.scenes.certificates import settled_outcome
 from traps_pipeline.scenes.kit import Family
-from traps_pipeline.scenes.outcome import Rejected, compile_scene, read_outcome
+from traps_pipeline.scenes.outcome import Rejected, compile_scene, simulated
 from traps_pipeline.scenes.registry import fit_to_sample, get_family
 from traps_pipeline.scenes.resolve import Resolved, resolve
-from traps_pipeline.scenes.simulate import replay, simulate
+from traps_pipeline.scenes.simulate import replay
 from traps_pipeline.scenes.spec import SceneSpec, save_trajectory
 from traps_pipeline.scenes.wording import draw_ill_posed
 from traps_pipeline.scenes.workers import run_in_order
@@ -211,8 +212,5 @@ def _named(family: Family, found: Resolved, draw: Draw, place: int, texts: Count
 def simulated_answer(family: Family, params: Any) -> str:
     """What the control of a draw shows: a second's work, so that a draw without a place costs no certificates."""
     model, scene = compile_scene(family, params, family.physics)
-    try:
-        qpos = simulate(model, scene, family.physics)
-    except FloatingPointError as error:
-        raise Rejected(str(error)) from error
-    return read_outcome(family, replay(model, qpos, family.physics), params).label
+    qpos = simulated(model, scene, family.physics)
+    return settled_outcome(family, replay(model, qpos, family.physics), params).answer

@@ -3,35 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
 
 if TYPE_CHECKING:
     import mujoco
-
-
-@dataclass(frozen=True)
-class Motion:
-    """Poses of all named bodies at the frame times.
-
-    times: (F,) seconds. positions: body -> (F, 3) m. rotations: body -> (F, 3, 3), columns are the body's axes.
-    """
-
-    times: np.ndarray
-    positions: Mapping[str, np.ndarray]
-    rotations: Mapping[str, np.ndarray]
-
-    def pos(self, body: str) -> np.ndarray:
-        """World position of a body's frame, shape (F, 3)."""
-        return self.positions[body]
-
-    def rot(self, body: str) -> np.ndarray:
-        """Rotation matrices of a body, shape (F, 3, 3)."""
-        return self.rotations[body]
 
 
 def initial_velocity(model: mujoco.MjModel, velocity: Mapping[str, Sequence[float]]) -> np.ndarray:

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, add_box
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading, lasting_from
 from traps_pipeline.scenes.parts.questions import Filled, Question, colour_of, comes_from
 from traps_pipeline.scenes.parts.stage import DEAD, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import colour_mask, largest
 
 BEAM_HALF_M = 0.012  # half thickness of the beam

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, uniform
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import past_far_edge
 from traps_pipeline.scenes.parts.outcome import Reading, came_through
@@ -27,7 +27,6 @@ from traps_pipeline.scenes.parts.vary import (
     one_of,
     shuffled,
 )
-from traps_pipeline.scenes.simulate import Motion
 
 DECK_M = 0.04
 TRAY_M = 0.02  # lower than the lane, so that no ball rolls back behind the wall

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from traps_pipeline.scenes.kit import Physics, Scene
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import reaches
 from traps_pipeline.scenes.parts.outcome import Reading, clear_m, still_from, yes_while
@@ -18,7 +18,6 @@ from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.ramp import SteppedRamp
 from traps_pipeline.scenes.parts.stage import SHADOW_BACK, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 
 DECK_M = 0.045
 STEP_M = 0.020  # the ramp ends this high over the deck

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Physics, Scene, listed
+from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, listed
 from traps_pipeline.scenes.parts.dominoes import BALL, BALL_AT, PLANK, STILL_M
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import upper_half_stays
@@ -22,7 +22,6 @@ from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.questions import left_or_right
 from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Stage
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, several_between
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import is_panel, largest
 
 STOP_AT = 2.9  # where the post stops the kicked ball's centre: behind the panel, out of the domino's reach

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.dominoes import Size, Standing
 from traps_pipeline.scenes.parts.family import scene_family
@@ -21,7 +21,6 @@ from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m, yes_
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import Stage
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, hidden, one_of
-from traps_pipeline.scenes.simulate import Motion
 
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.dominoes import Size, Standing
 from traps_pipeline.scenes.parts.family import scene_family
@@ -23,7 +23,6 @@ from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, either, how_many, range_of
 from traps_pipeline.scenes.parts.stage import Stage
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, one_of
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import blobs, colour_mask
 from traps_pipeline.scenes.wording import choices_in
 

@@ -13,14 +13,13 @@ from math import atan2, hypot
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Physics, Scene, uniform
+from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import rounded
 from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import Aside, choice_of, either, left_or_right
 from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface, coloured
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, in_front, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import at_rest, colour_mask
 
 GRAVITY = 9.81

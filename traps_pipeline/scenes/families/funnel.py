@@ -13,14 +13,13 @@ from math import cos, radians, sin
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, uniform
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import rounded
 from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, facing, one_of, shuffled, together
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import at_rest, largest
 
 FLOOR_M = 0.02  # thickness of the cup's floor

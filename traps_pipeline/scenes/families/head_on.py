@@ -13,13 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Physics, Scene, Vec3, listed
+from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, Vec3, listed
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading, held_from, still_from, undecided
 from traps_pipeline.scenes.parts.questions import which_colour
 from traps_pipeline.scenes.parts.stage import Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, several_between, shuffled
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import at_rest, is_panel, largest, track
 from traps_pipeline.scenes.wording import choices_in
 

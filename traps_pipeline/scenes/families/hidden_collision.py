@@ -12,14 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Physics, Scene, uniform
+from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import small
 from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import yes_no
 from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import at_rest
 
 DECK_M = 0.03

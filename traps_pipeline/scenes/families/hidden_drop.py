@@ -10,14 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import radians
 
-from traps_pipeline.scenes.kit import Physics, Scene
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import nearer_side
 from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, left_or_right
 from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 
 WALL_M = 0.012
 NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")

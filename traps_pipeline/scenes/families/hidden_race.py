@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading, first_past
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, either, which_colour
@@ -27,7 +27,6 @@ from traps_pipeline.scenes.parts.vary import (
     several_between,
     shuffled,
 )
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import blobs, colour_mask
 from traps_pipeline.scenes.wording import choices_in
 

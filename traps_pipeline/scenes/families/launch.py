@@ -13,14 +13,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import beyond
 from traps_pipeline.scenes.parts.outcome import Reading, crossed
 from traps_pipeline.scenes.parts.questions import colour_of, goes_to, yes_no
 from traps_pipeline.scenes.parts.stage import DEAD, Point, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 
 FLOOR_M = 0.02
 BARRIER_HALF_M = 0.014

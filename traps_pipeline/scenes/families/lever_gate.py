@@ -11,14 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, add_box
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import beyond
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 
 FLOOR_M = 0.03  # the lane behind the panel
 STEP_M = 0.02  # the visible lane lies higher by this

@@ -16,13 +16,22 @@ from typing import Any
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import Inventory, Physics, Scene, View, add_box, distinct_colours, listed, uniform
+from traps_pipeline.scenes.kit import (
+    Inventory,
+    Motion,
+    Physics,
+    Scene,
+    View,
+    add_box,
+    distinct_colours,
+    listed,
+    uniform,
+)
 from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball, turned
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, choice_of, either
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, together
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import Blob, colour_mask
 
 SILL_M = 0.03  # below the zones

@@ -14,13 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import Inventory, Physics, Scene, View, distinct_colours, listed, uniform
+from traps_pipeline.scenes.kit import Inventory, Motion, Physics, Scene, View, distinct_colours, listed, uniform
 from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, round_ball
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import NUMBERS, Filled, Question, colour_from, either
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, together
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.wording import choices_in
 
 APRON_M = 0.175  # strip below the buckets that carries their numbers

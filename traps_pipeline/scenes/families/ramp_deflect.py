@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import compact, nearer_side
 from traps_pipeline.scenes.parts.outcome import Reading, side_while
@@ -18,7 +18,6 @@ from traps_pipeline.scenes.parts.questions import colour_from, left_or_right, ma
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.stage import Stage
 from traps_pipeline.scenes.parts.vary import between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 
 BOARD_M = 0.016  # thickness of the ramp
 WALL_M = 0.012

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from traps_pipeline.scenes.kit import Physics, Scene, uniform
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import rests_over
 from traps_pipeline.scenes.parts.outcome import Reading
@@ -16,7 +16,6 @@ from traps_pipeline.scenes.parts.questions import colour_from, comes_from, mater
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 
 BOARD_M = 0.016  # thickness of ramp and board
 WALL_M = 0.012

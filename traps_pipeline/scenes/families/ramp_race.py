@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Physics, Scene, listed, uniform
+from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, listed, uniform
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import compact
 from traps_pipeline.scenes.parts.outcome import Reading, first_past
@@ -20,7 +20,6 @@ from traps_pipeline.scenes.parts.questions import which_colour
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.stage import Stage, brake
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, hidden, in_front
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import Blob, at_rest
 from traps_pipeline.scenes.wording import choices_in
 

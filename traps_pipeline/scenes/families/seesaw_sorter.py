@@ -16,14 +16,13 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import Inventory, Physics, Scene, View, add_box, listed, rgba, uniform
+from traps_pipeline.scenes.kit import Inventory, Motion, Physics, Scene, View, add_box, listed, rgba, uniform
 from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import Filled, Question, choice_of, either
 from traps_pipeline.scenes.parts.stage import Surface
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import Blob, blobs, colour_mask, largest
 
 SILL_M = 0.03  # below the bins

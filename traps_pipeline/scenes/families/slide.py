@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, uniform
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import compact, rests_over
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
@@ -20,7 +20,6 @@ from traps_pipeline.scenes.parts.questions import colour_from, comes_from, mater
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, hidden, one_of
-from traps_pipeline.scenes.simulate import Motion
 
 INCLINE_M = 0.02  # thickness of the incline
 OVERLAP_M = 0.05  # the incline ends inside the deck, so that no edge catches the block

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, add_box, distinct_colours
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box, distinct_colours
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading, lasting_from
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, which_colour
 from traps_pipeline.scenes.parts.stage import Stage, Surface
 from traps_pipeline.scenes.parts.vary import between, drawn_by, facing, hidden_index, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import Blob, at_rest, blobs, colour_mask
 from traps_pipeline.scenes.wording import choices_in
 

@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, add_box, rgba, uniform
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box, rgba, uniform
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import rounded
 from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, SOFT, Stage, Surface
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, facing, one_of, together
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import at_rest, blobs, colour_mask
 
 LANE_M = 0.02  # height of the lower lane

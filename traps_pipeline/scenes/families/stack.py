@@ -12,14 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, add_box
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading, still_from
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, how_many, range_of
 from traps_pipeline.scenes.parts.stage import Stage, Surface
 from traps_pipeline.scenes.parts.vary import between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import blobs, colour_mask, largest
 
 RANGES = ((0, 1), (2, 3), (4, 5))  # of standing blocks

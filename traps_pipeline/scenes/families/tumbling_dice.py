@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import AnswerableQuestion, Physics, Scene, add_box, uniform
+from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, add_box, uniform
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading, undecided
 from traps_pipeline.scenes.parts.questions import either, goes_to, which_colour
 from traps_pipeline.scenes.parts.stage import Stage
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, in_front, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import blobs, colour_mask
 
 FACES = ("red", "green", "blue", "cyan", "orange", "yellow")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import small
 from traps_pipeline.scenes.parts.outcome import Reading, side_while
@@ -20,7 +20,6 @@ from traps_pipeline.scenes.parts.questions import colour_from, left_or_right
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, shuffled
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import at_rest, largest
 
 FLOOR_M = 0.05

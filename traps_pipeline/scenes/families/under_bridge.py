@@ -11,14 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, Vec3
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, Vec3
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.observers import past_far_edge
 from traps_pipeline.scenes.parts.outcome import Reading, came_through
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.simulate import Motion
 
 ROAD_M = 0.02
 SLAB_M = 0.03

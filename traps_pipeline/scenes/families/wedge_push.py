@@ -12,13 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Physics, Scene, add_box, uniform
+from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box, uniform
 from traps_pipeline.scenes.parts.family import scene_family
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import at_rest, largest, track
 
 TRACK_M = 0.03  # thickness of the track

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Box, Physics, Vec3, add_ball, add_box, new_spec, rgba, uniform
+from traps_pipeline.scenes.kit import Box, Motion, Physics, Vec3, add_ball, add_box, new_spec, rgba, uniform
 from traps_pipeline.scenes.parts.vary import Drawn, Group, drawn_by, together
-from traps_pipeline.scenes.simulate import Motion
 from traps_pipeline.scenes.vision import Blob, blobs, colour_mask
 
 if TYPE_CHECKING:

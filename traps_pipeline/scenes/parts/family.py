@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Family, Physics, Reading, Scene
+from traps_pipeline.scenes.kit import Family, Motion, Physics, Reading, Scene
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
-from traps_pipeline.scenes.simulate import Motion
 
 USUAL_PHYSICS = Physics()
 

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from traps_pipeline.scenes.kit import Reading
-from traps_pipeline.scenes.simulate import Motion
+from traps_pipeline.scenes.kit import Motion, Reading
 
 Labels = list[str | None]
 

@@ -1,0 +1,511 @@
+"""The certificates of a pair: what each promises, how its evidence is measured, and what the evidence is held against.
+
+A certificate is one entry of `CERTIFICATES`. From there it is picked up by `resolve` (a draw that loses one is
+rejected, and what it measures goes into the record), by `certify` (all are measured again from the record and its two
+trajectories), by the asset checks (the stored evidence is judged again), and by the table in `docs/scenes.md`, which
+`python -m tests.scenes.certificate_table` writes. All thresholds are here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.scenes import checks, ensemble
+from traps_pipeline.scenes.camera import in_frame
+from traps_pipeline.scenes.evidence import About, Certificate, Claim, Evidence, Judged, Number, Pair, VoidKind
+from traps_pipeline.scenes.kit import Family, Motion, Physics, Scene
+from traps_pipeline.scenes.outcome import Outcome, Rejected, decisive_geoms, read_outcome
+from traps_pipeline.scenes.simulate import swept_points
+from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.wording import refutation
+from traps_pipeline.scenes.world import World
+
+if TYPE_CHECKING:
+    import mujoco
+
+# --- thresholds: a family has its own `min_margin_m`, and may have its own `legible` ----------------------------------
+
+COMMITTED_BEFORE_END_S = 0.6  # so long the outcome must have stood at the end
+LEGIBLE_PIXELS = 150.0  # of each decisive body at the end of the control
+SAME_START_S = 0.3  # so long any machine's physics agrees
+SAME_START_M = 0.005
+EARLIEST_CUT_S = 1.0  # the last frame that a cut void shows is not before this
+MAX_DEVIATION_PX = 0.5  # futures less far from the control than this look like it
+MIN_ACCEPTED = 64  # futures that look like the control up to the cut and have an outcome
+TOP_SHARE = 0.65  # of the commonest outcome among them
+MIN_ENTROPY_BITS = 1.0
+MIN_ENTROPY_THREE_LABELS_BITS = 0.9
+_NOISE_S = 1e-6  # far below a frame
+
+
+def earliest_cut(physics: Physics) -> int:
+    """The first admissible cut frame: its last shown frame, frame - 1, is at 1.0 s or later."""
+    return math.ceil(EARLIEST_CUT_S * physics.fps - 1e-9) + 1
+
+
+def least_entropy_bits(labels: int) -> float:
+    """The least entropy (bits) that a cut must leave open, by the number of answers that the question offers."""
+    return MIN_ENTROPY_THREE_LABELS_BITS if labels == 3 else MIN_ENTROPY_BITS
+
+
+# --- records ----------------------------------------------------------------------------------------------------------
+
+
+def certificates_for(kind: VoidKind, *about: About) -> list[Certificate]:
+    """The certificates of pairs with a kind of void, in order; if things are named, only those about them."""
+    return [c for c in CERTIFICATES if kind in c.kinds and (not about or c.about in about)]
+
+
+def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Pair:
+    """The pair of a record from its trajectories, each (F, nq); nothing of its evidence is read.
+
+    frame_step: pixel certificates look at every so many frames (1: full rate; 2: the 5 FPS sample).
+    """
+    control = World.of_record(spec, qpos, frame_step=frame_step)
+    return Pair(
+        control=control,
+        claim=Claim.of_record(spec),
+        futures=futures_of(control, spec.seed),
+        void_frame=spec.void["hidden_from_frame" if spec.void_kind == "occluder" else "cut_frame"],
+        twin=World.of_record(spec, twin, twin=True, frame_step=frame_step),
+    )
+
+
+def futures_of(control: World, seed: int) -> ensemble.Futures:
+    """The futures of a control by which a cut is chosen and certified."""
+    first = earliest_cut(control.physics)
+    return ensemble.Futures(control, seed, first=first, alike_px=MAX_DEVIATION_PX, held_s=COMMITTED_BEFORE_END_S)
+
+
+def stored_evidence(spec: SceneSpec) -> dict[str, Any]:
+    """The evidence that a record holds, and what it says of void and twin elsewhere."""
+    evidence = spec.evidence | {"twin_answer": spec.twin.ground_truth}
+    if spec.void_kind == "truncation":
+        evidence |= _cut_evidence(spec.void["cut_frame"], spec.physics["fps"])
+    return evidence
+
+
+# --- outcome ----------------------------------------------------------------------------------------------------------
+
+
+def _outcome_evidence(outcome: Outcome, fps: float) -> Evidence:
+    return {"label": outcome.label, "commit_s": outcome.commit_frame / fps, "margin_m": outcome.margin_m}
+
+
+def _judge_outcome(e: Evidence, claim: Claim) -> Judged:
+    if "label" in e:
+        if e["label"] is None:
+            yield "the outcome is undecided at the end of the control"
+        if e["label"] != claim.answer:
+            yield f"the control shows {e['label']!r}, the record says {claim.answer!r}"
+    left = claim.end_s - e["commit_s"]
+    if left < COMMITTED_BEFORE_END_S - _NOISE_S:
+        yield f"outcome {claim.answer!r} is committed only {left:.1f} s before the end"
+    least = claim.family.min_margin_m
+    if not e["margin_m"] >= least:
+        yield f"outcome {claim.answer!r} has a margin of {e['margin_m']:.4f} m, below {least} m"
+
+
+OUTCOME = Certificate(
+    name="outcome",
+    about="control",
+    promises=f"replayed, the control ends in the ground truth, constant for the last {COMMITTED_BEFORE_END_S} s, a "
+    "stated distance (m) from another outcome, which is at least its family's least; measured again, settling time and "
+    "margin are those of the record: exactly where simulating gives the frozen trajectory bit by bit, to one unit of "
+    "the last stored digit where it does not (another CPU or version)",
+    does_not_promise="that a person reads the question as we do: that is what review and corrections are for",
+    numbers=(Number("label", kept=False), Number("commit_s", 3), Number("margin_m", 5)),
+    measure=lambda pair: _outcome_evidence(pair.control.outcome, pair.control.physics.fps),
+    judge=_judge_outcome,
+)
+
+
+def settled_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
+    """The outcome of a trajectory, if it could be certified whatever it is. Raises Rejected."""
+    outcome = read_outcome(family, motion, params)
+    fps = 1.0 / float(motion.times[1] - motion.times[0])
+    claim = Claim(family, float(motion.times[-1]), 0, outcome.label)
+    failure = OUTCOME.failure(_outcome_evidence(outcome, fps), claim)
+    if failure is not None:
+        raise Rejected(failure)
+    return outcome
+
+
+def settled_answer(world: World) -> str | None:
+    """What a world ends in; None if it ends in nothing that could be certified."""
+    try:
+        return settled_outcome(world.family, world.motion, world.params).label
+    except Rejected:
+        return None
+
+
+# --- physics, picture -------------------------------------------------------------------------------------------------
+
+
+def _physics(pair: Pair) -> Evidence:
+    control = pair.control
+    if control.same_physics:
+        return {"same_physics": True, "simulated_answer": None, "parted_m": 0.0}
+    here = control.resimulated
+    if here.shape != control.qpos.shape:
+        raise Rejected(f"the scene has {here.shape[1]} coordinates, its trajectory others")
+    start = round(SAME_START_S * control.physics.fps) + 1
+    parted = float(np.abs(here[:start] - control.qpos[:start]).max())
+    answer = settled_answer(replace(control, qpos=here))
+    return {"same_physics": False, "simulated_answer": answer, "parted_m": parted}
+
+
+def _judge_physics(e: Evidence, claim: Claim) -> Judged:
+    if e.get("same_physics", True):
+        return
+    if claim.family.taxonomy == "occlusion" and e["simulated_answer"] != claim.answer:
+        yield f"simulated here, the scene ends in {e['simulated_answer']!r}, its trajectory is of another scene"
+    if e["parted_m"] > SAME_START_M:
+        yield f"simulated here, the scene parts from its trajectory at once ({e['parted_m']:.3f})"
+
+
+PHYSICS = Certificate(
+    name="physics",
+    about="control",
+    promises="simulating the scene gives the frozen trajectory; on another CPU or version: the same start (for "
+    f"{SAME_START_S} s within {SAME_START_M} m), the same outcome (occlusion), and it says so",
+    does_not_promise="that chaotic futures are the same on every machine",
+    numbers=tuple(Number(name, kept=False) for name in ("same_physics", "simulated_answer", "parted_m")),
+    measure=_physics,
+    judge=_judge_physics,
+)
+
+
+def shown_points(model: mujoco.MjModel, scene: Scene, qpos: np.ndarray) -> np.ndarray:
+    """What a picture of a scene must hold: everything that moves over a trajectory, and the stage. Shape (N, 3)."""
+    return np.concatenate([swept_points(model, qpos), *(box.corners() for box in scene.stage)])
+
+
+def _in_frame(pair: Pair) -> Evidence:
+    control = pair.control
+    return {"in_frame": in_frame(control.camera, shown_points(control.model, control.scene, control.qpos))}
+
+
+def _judge_in_frame(e: Evidence, claim: Claim) -> Judged:
+    if not e.get("in_frame", True):
+        yield "something decisive leaves the frame"
+
+
+IN_FRAME = Certificate(
+    name="in_frame",
+    about="control",
+    promises="all that moves, and the outcome zone, stays inside the picture",
+    does_not_promise="",
+    numbers=(Number("in_frame", kept=False),),
+    measure=_in_frame,
+    judge=_judge_in_frame,
+)
+
+
+def legible_groups(
+    family: Family, model: mujoco.MjModel, scene: Scene, motion: Motion, params: Any
+) -> list[tuple[tuple[str, ...], float]]:
+    """Groups of geoms that must be seen at the end of the control, each with its least number of pixels."""
+    if family.legible is not None:
+        return list(family.legible(motion, params))
+    return [(decisive_geoms(model, [body]), LEGIBLE_PIXELS) for body in scene.decisive]
+
+
+def _legible(pair: Pair) -> Evidence:
+    control = pair.control
+    groups = legible_groups(control.family, control.model, control.scene, control.motion, control.params)
+    if not groups:
+        raise Rejected("nothing says what must be seen at the end of the control")
+    with control.renderer() as renderer:
+        frames = control.qpos[checks.last_sampled(len(control.qpos), control.physics.fps)]
+        shown = checks.least_visible(renderer, frames, groups)
+    too_small = [
+        f"{pixels:.0f} of {least:.0f} pixels of {names[0]}"
+        for (names, least), pixels in zip(groups, shown, strict=True)
+        if pixels < least
+    ]
+    return {"too_small": too_small, "least_visible_px": min(shown)}
+
+
+def _judge_legible(e: Evidence, claim: Claim) -> Judged:
+    if e.get("too_small"):
+        yield f"too small at the end: {e['too_small'][0]}"
+    least = LEGIBLE_PIXELS if claim.family.legible is None else 1  # a family's own groups are told by `too_small` alone
+    if e["least_visible_px"] < least:
+        yield f"too small at the end: {e['least_visible_px']:.0f} of {least:.0f} pixels"
+
+
+LEGIBLE = Certificate(
+    name="legible",
+    about="control",
+    promises=f"each decisive body has {LEGIBLE_PIXELS:.0f} pixels in each of the last three sampled frames, or the "
+    "family's own groups of geoms (of a die, the top face) have what the family asks for",
+    does_not_promise="that a model's own resizing keeps them",
+    numbers=(Number("too_small", kept=False), Number("least_visible_px", compared=False)),
+    measure=_legible,
+    judge=_judge_legible,
+)
+
+
+# --- occlusion --------------------------------------------------------------------------------------------------------
+
+
+def _first_hidden(pair: Pair) -> int:
+    """The first frame, of those looked at, from which the void hides what decides."""
+    return -(-pair.void_from // pair.control.frame_step)
+
+
+def _hidden(pair: Pair) -> Evidence:
+    return {
+        "past_panel_px": pair.control.past_panel.leaked(_first_hidden(pair)),
+        "hidden_from_s": pair.void_from / pair.control.physics.fps,
+    }
+
+
+def _judge_hidden(e: Evidence, claim: Claim) -> Judged:
+    late = "the panel does not hide the outcome before it is committed"
+    if e.get("past_panel_px"):
+        yield f"{late}: {e['past_panel_px']:.0f} pixels of decisive bodies or the hidden element are seen past it"
+    if e["hidden_from_s"] >= e["commit_s"]:
+        yield late
+
+
+HIDDEN = Certificate(
+    name="hidden",
+    about="void",
+    promises="no pixel of a decisive body is seen from hiding on, which begins before the outcome is settled; none of "
+    "the hidden element in any void frame",
+    does_not_promise="",
+    numbers=(Number("past_panel_px", kept=False), Number("hidden_from_s")),
+    measure=_hidden,
+    judge=_judge_hidden,
+    kinds=("occluder",),
+)
+
+
+def _ablation(pair: Pair) -> Evidence:
+    control, first = pair.control, _first_hidden(pair)
+    void = control.void_frames[first:]
+    with control.renderer() as renderer:
+        return {"ablation_px": checks.ablation_pixels(renderer, control.looked_at[first:], control.concealed, void)}
+
+
+def _judge_ablation(e: Evidence, claim: Claim) -> Judged:
+    if e["ablation_px"] != 0:
+        change = f"taking it away changes {e['ablation_px']} pixels of the void"
+        yield f"something decisive reaches the eye past the panel: {change}"
+
+
+ABLATION = Certificate(
+    name="ablation",
+    about="void",
+    promises="from hiding on, taking away the decisive bodies and the hidden element changes no pixel of the void: not "
+    "even a shadow shows",
+    does_not_promise="",
+    numbers=(Number("ablation_px"),),
+    measure=_ablation,
+    judge=_judge_ablation,
+    kinds=("occluder",),
+)
+
+
+def _judge_answer_of_twin(e: Evidence, claim: Claim) -> Judged:
+    if e["twin_answer"] in (None, claim.answer) or e["twin_answer"] != claim.twin_answer:
+        recorded = f"recorded {claim.twin_answer!r}, the scenario ends in {claim.answer!r}"
+        yield f"the twin ends in {e['twin_answer']!r}; {recorded}"
+
+
+def _twin_behind_panel(pair: Pair) -> Evidence:
+    control, twin, twins = pair.control, pair.other_world, pair.control.family.twins
+    void = control.void_frames
+    with twin.renderer() as renderer:
+        pixels, _ = checks.differing_pixels(void, renderer.frames(twin.looked_at, panel=True))
+    return {
+        "hidden_alone": twins is not None and twin.params in list(twins(control.params)),
+        "twin_answer": settled_answer(twin),
+        "twin_px": pixels,
+    }
+
+
+def _judge_twin_behind_panel(e: Evidence, claim: Claim) -> Judged:
+    if not e.get("hidden_alone", True):
+        yield "the twin differs in more, or in less, than the hidden element"
+    yield from _judge_answer_of_twin(e, claim)
+    if e["twin_px"] != 0:
+        yield f"the twin's void differs from the void: in {e['twin_px']} pixels"
+
+
+TWIN_BEHIND_PANEL = Certificate(
+    name="twin",
+    about="twin",
+    promises="another world, different in the hidden element alone and with another answer, has the same void frames "
+    "byte for byte: two worlds, one video, so no observer can know",
+    does_not_promise="that the two worlds are equally likely a priori",
+    numbers=(Number("hidden_alone", kept=False), Number("twin_answer", kept=False), Number("twin_px")),
+    measure=_twin_behind_panel,
+    judge=_judge_twin_behind_panel,
+    kinds=("occluder",),
+)
+
+
+# --- chaotic ----------------------------------------------------------------------------------------------------------
+
+
+def _cut_evidence(frame: int, fps: float) -> Evidence:
+    return {"last_shown_s": (frame - 1) / fps, "cut_s": frame / fps}
+
+
+def _judge_cut(e: Evidence, claim: Claim) -> Judged:
+    if e["last_shown_s"] < EARLIEST_CUT_S - _NOISE_S or e["cut_s"] > e["commit_s"] + _NOISE_S:
+        yield f"the cut at {e['cut_s']:.1f} s is before {EARLIEST_CUT_S} s or after commitment"
+
+
+CUT = Certificate(
+    name="cut",
+    about="void",
+    promises=f"the void ends at {EARLIEST_CUT_S} s or later, and before the outcome is settled",
+    does_not_promise="",
+    numbers=(Number("last_shown_s", kept=False), Number("cut_s", kept=False)),
+    measure=lambda pair: _cut_evidence(pair.void_from, pair.control.physics.fps),
+    judge=_judge_cut,
+    kinds=("truncation",),
+)
+
+
+def _open(pair: Pair) -> Evidence | None:
+    if not pair.control.same_physics:
+        return None  # these would be futures of another machine's physics; the twin still shows one of them
+    evidence: Evidence = {}
+    for rollouts in pair.futures.batches():
+        evidence = ensemble.at_cut(rollouts, pair.void_from, pair.control.family.perturbation).evidence()
+        if OPEN.failure(evidence, pair.claim) is None:
+            break
+    return evidence
+
+
+def _judge_open(e: Evidence, claim: Claim) -> Judged:
+    if e["accepted"] < MIN_ACCEPTED:
+        yield f"{e['accepted']} futures that look alike up to the cut have an outcome, {MIN_ACCEPTED} wanted"
+    least = least_entropy_bits(claim.labels)
+    if e["entropy_bits"] < least:
+        yield f"the futures disagree by {e['entropy_bits']:.2f} bits, {least} wanted"
+    if e["top_share"] > TOP_SHARE:
+        yield f"{e['top_share']:.1%} of the futures end alike, at most {TOP_SHARE:.0%} allowed"
+
+
+OPEN = Certificate(
+    name="open",
+    about="void",
+    promises=f"of {ensemble.BATCHES[1]} or {ensemble.TRIED} starts, perturbed by one stated scale, at least "
+    f"{MIN_ACCEPTED} stay within {MAX_DEVIATION_PX} px of the control up to the cut and end in an outcome: its entropy "
+    f"is {MIN_ENTROPY_BITS} bit or more ({MIN_ENTROPY_THREE_LABELS_BITS} with three answers), no answer has more than "
+    f"{TOP_SHARE * 100:.0f} %; measured again only where simulating gives the frozen trajectory",
+    does_not_promise="that no one could ever compute the future from exact pixels: the perturbation is far below one",
+    numbers=(
+        Number("entropy_bits", 4),
+        Number("top_share", 4),
+        *map(Number, ("accepted", "tried", "unresolved", "perturbation")),
+    ),
+    measure=_open,
+    judge=_judge_open,
+    kinds=("truncation",),
+)
+
+
+def _twin_of_cut(pair: Pair) -> Evidence:
+    control, twin, cut = pair.control, pair.other_world, slice(0, pair.void_from)
+    shown = slice(0, pair.void_from, control.frame_step)
+    with control.renderer() as renderer:
+        frames = list(renderer.frames(control.qpos[shown]))
+        _, largest = checks.differing_pixels(frames, renderer.frames(twin.qpos[shown]))
+    return {
+        "twin_answer": settled_answer(twin),
+        "twin_deviation_px": ensemble.deviation_px(control.model, control.camera, control.qpos[cut], twin.qpos[cut]),
+        "twin_largest_difference": largest,
+    }
+
+
+def _judge_twin_of_cut(e: Evidence, claim: Claim) -> Judged:
+    yield from _judge_answer_of_twin(e, claim)
+    if e.get("twin_deviation_px", 0) > MAX_DEVIATION_PX:
+        yield f"the twin is {e['twin_deviation_px']:.2f} pixels off before the cut"
+
+
+TWIN_OF_CUT = Certificate(
+    name="twin",
+    about="twin",
+    promises="one of those futures, with another answer; its largest pixel difference before the cut is reported",
+    does_not_promise="byte-identical frames",
+    numbers=(
+        Number("twin_answer", kept=False),
+        Number("twin_deviation_px", kept=False),
+        Number("twin_largest_difference", compared=False),
+    ),
+    measure=_twin_of_cut,
+    judge=_judge_twin_of_cut,
+    kinds=("truncation",),
+)
+
+
+# --- words ------------------------------------------------------------------------------------------------------------
+
+
+def _words(pair: Pair) -> Evidence:
+    taxonomy, inventory = pair.control.family.taxonomy, pair.control.inventory
+    return {
+        "ill_posed_for": refutation(taxonomy, pair.claim.ill_posed_question, inventory),
+        "question_refuted": refutation(taxonomy, pair.claim.question, inventory),
+    }
+
+
+def _judge_words(e: Evidence, claim: Claim) -> Judged:
+    if e["ill_posed_for"] is None:
+        yield f"nothing shows that {claim.ill_posed_question!r} has no answer"
+    if e["question_refuted"] is not None:
+        yield f"the question {claim.question!r} reads as ill-posed: {e['question_refuted']}"
+
+
+WORDS = Certificate(
+    name="words",
+    about="words",
+    promises="the ill-posed question asks what no video shows (occlusion) or presumes what the inventory refutes "
+    "(chaotic); the well-posed one does neither",
+    does_not_promise="",
+    numbers=(Number("ill_posed_for", kept=False), Number("question_refuted", kept=False)),
+    measure=_words,
+    judge=_judge_words,
+)
+
+
+# --- all of them ------------------------------------------------------------------------------------------------------
+
+CERTIFICATES = (
+    OUTCOME,
+    PHYSICS,
+    IN_FRAME,
+    LEGIBLE,
+    HIDDEN,
+    ABLATION,
+    TWIN_BEHIND_PANEL,
+    CUT,
+    OPEN,
+    TWIN_OF_CUT,
+    WORDS,
+)
+
+
+def table() -> str:
+    """The certificates as the Markdown table of `docs/scenes.md`; a number in brackets depends on the OpenGL."""
+    lines = ["| certificate | promises | does not promise | stored |", "| --- | --- | --- | --- |"]
+    for certificate in CERTIFICATES:
+        kinds = {"occluder": " (occlusion)", "truncation": " (chaotic)"}
+        kind = kinds[certificate.kinds[0]] if len(certificate.kinds) == 1 else ""
+        kept = [number for number in certificate.numbers if number.kept]
+        stored = ", ".join(f"`{number.name}`" if number.compared else f"[`{number.name}`]" for number in kept)
+        cells = (f"`{certificate.name}`{kind}", certificate.promises, certificate.does_not_promise, stored)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
