@@ -7,7 +7,6 @@ import re
 
 import numpy as np
 import pandas as pd
-import pytest
 
 from traps_pipeline.report.writing import (
     Behind,
@@ -18,7 +17,6 @@ from traps_pipeline.report.writing import (
     not_run_figure,
     table_files,
     table_html,
-    write_bytes,
 )
 
 HOSTILE = r"<b>\input{/etc/passwd}</b> $x_1$ & 5 % #~^{|`*"
@@ -134,15 +132,3 @@ def test_files_have_the_same_bytes_on_a_second_build():
     assert [content[:4] for content in files.values()] == [b"%PDF", b"<?xm", b"\x89PNG"]
     assert b"CreationDate" not in files["f.pdf"]
     assert b"<dc:date>" not in files["f.svg"]
-
-
-def test_a_file_that_cannot_be_written_leaves_the_former_one(tmp_path, monkeypatch):
-    write_bytes(tmp_path / "a" / "page.html", b"former")
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pathlib.Path.replace", full)
-    with pytest.raises(OSError, match="No space"):
-        write_bytes(tmp_path / "a" / "page.html", b"next")
-    assert [file.read_bytes() for file in (tmp_path / "a").iterdir()] == [b"former"]

@@ -16,11 +16,12 @@ from traps_pipeline.benchmark.records import load_released, parse_record
 from traps_pipeline.benchmark.versions import spec_content, version_of
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
 from traps_pipeline.paths import CHECKOUT, CORRECTIONS, RELEASED
 from traps_pipeline.scenes.kit import Physics, Wording
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory
-from traps_pipeline.storage.workspace import Workspace, write_text
+from traps_pipeline.storage.workspace import Workspace
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.storage.workspace import write_bytes, write_text
+from traps_pipeline.files import write_bytes, write_text
 
 KINDS = ("void", "random", "shuffled")
 SITE = "output of the block, before the next one (residual stream); layer 0: embeddings"

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -29,6 +28,7 @@ import numpy as np
 from traps_pipeline import progress
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import replacing, write_bytes
 from traps_pipeline.models.local.capture import Pooling
 from traps_pipeline.storage.media import MediaSpec, profile_digest, sample
 
@@ -224,10 +224,11 @@ def _flush(
     raw = torch.from_numpy(np.stack([states.raw for _, _, states in shard], axis=1)).to(dtype)  # (layers, n, d)
     tensors = {f"layer_{layer:03d}": rows.contiguous() for layer, rows in enumerate(raw)}
     tensors[NORMED] = torch.from_numpy(np.stack([states.normed for _, _, states in shard])).to(dtype)
-    _write(folder / f"{name}.safetensors", lambda part: part.write_bytes(save(tensors)))
+    write_bytes(folder / f"{name}.safetensors", save(tensors), durable=True)
     rows = [(item.item_id, item.side, key) for item, key, _ in shard]
     table = pd.DataFrame(rows, columns=["item_id", "side", "key"]).assign(device=model.device_name)
-    _write(folder / f"{name}.parquet", lambda part: table.to_parquet(part, index=False))
+    with replacing(folder / f"{name}.parquet", durable=True) as part:
+        table.to_parquet(part, index=False)
     known.update({key: (name, row, model.device_name) for row, (_, _, key) in enumerate(rows)})
     return number + 1
 
@@ -261,7 +262,8 @@ def _write_ids(
     rows = [(item.item_id, item.side, key, *known[key]) for item, key in zip(items, keys, strict=True)]
     table = pa.Table.from_pandas(pd.DataFrame(rows, columns=list(_COLUMNS)), preserve_index=False)
     table = table.replace_schema_metadata({_RECORD: json.dumps(record).encode()})
-    _write(folder / _IDS, lambda part: pq.write_table(table, part))
+    with replacing(folder / _IDS, durable=True) as part:
+        pq.write_table(table, part)
 
 
 def _ids(folder: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -313,19 +315,3 @@ def _tell_devices(folder: Path, devices: Sequence[str]) -> None:
             f"{folder}: its states were made on {' and '.join(devices)} (column `device` of hidden_states), whose "
             "rounding differs; to have all of one device, delete the folder and run again"
         )
-
-
-def _write(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file whole or not at all. Raises TrapsError."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        write(part)
-        with part.open("rb") as stream:
-            os.fsync(stream.fileno())
-        part.replace(path)
-    except OSError as error:
-        raise TrapsError(
-            f"{path}: cannot be written ({error.strerror or error}); free some space and run again"
-        ) from error
-    finally:
-        part.unlink(missing_ok=True)

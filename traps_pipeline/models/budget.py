@@ -19,11 +19,12 @@ from pathlib import Path
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_models
 from traps_pipeline.models.request import Request
 from traps_pipeline.storage.study import Study
-from traps_pipeline.storage.workspace import Workspace, write_text
+from traps_pipeline.storage.workspace import Workspace
 
 OVERHEAD_TOKENS = 200  # roles, separators, JSON around the text
 BYTES_A_TOKEN = 1  # some tokenizers make a token of every digit, and judges are shown arbitrary text

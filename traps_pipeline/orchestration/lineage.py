@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Literal
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
 from traps_pipeline.orchestration.graph import Graph, Stage, name_of, the_graph
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import State
-from traps_pipeline.storage.workspace import Workspace, write_text
+from traps_pipeline.storage.workspace import Workspace
 
 DAMAGED = "damaged"  # the version of what cannot be believed
 

@@ -16,13 +16,14 @@ import dagster as dg
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_bytes, write_text
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made, State
-from traps_pipeline.storage.workspace import Workspace, write_bytes, write_text
+from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import Table
 
 CURRENT = "current"  # the check that every stage has

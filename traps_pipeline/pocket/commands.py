@@ -10,6 +10,7 @@ from pathlib import Path
 
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
 from traps_pipeline.pocket import evaluate as evaluation
 from traps_pipeline.pocket import inside
 from traps_pipeline.pocket.data import data_digest, render
@@ -60,7 +61,7 @@ def train(recipe: Recipe, data: Path, out: Path, seed: int, *, workers: int | No
         "weights": file_digest(weights / "model.safetensors"),
         "versions": {name: version(name) for name in ("mujoco", "tokenizers", "torch", "transformers")},
     }
-    (out / FACTS).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    write_text(out / FACTS, json.dumps(facts, indent=1) + "\n")
     report(f"{weights}: trained in {(time.monotonic() - began) / 60:.1f} minutes")
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -24,6 +23,7 @@ import numpy as np
 
 from traps_pipeline.digests import canonical_json, digest, file_digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import replacing, write_text
 from traps_pipeline.pocket.recipe import Recipe, Split
 from traps_pipeline.pocket.words import guess
 from traps_pipeline.scenes import checks
@@ -250,14 +250,10 @@ def draw_shard(job: ShardJob) -> int:
         records.append(record)
     if len(records) < job.count:
         raise TrapsError(f"{job.family}: {len(records)} of {job.count} scenes after {_MOST_DRAWS * job.count} draws")
-    job.lines.parent.mkdir(parents=True, exist_ok=True)
     if frames:
-        part = job.pixels.with_suffix(f".{os.getpid()}.part.npy")
-        np.save(part, np.stack(frames), allow_pickle=False)
-        part.replace(job.pixels)
-    part = job.lines.with_suffix(f".{os.getpid()}.part")
-    part.write_text("".join(canonical_json(asdict(record)) + "\n" for record in records), encoding="utf-8")
-    part.replace(job.lines)
+        with replacing(job.pixels) as part, part.open("wb") as stream:
+            np.save(stream, np.stack(frames), allow_pickle=False)
+    write_text(job.lines, "".join(canonical_json(asdict(record)) + "\n" for record in records))
     return len(records)
 
 
@@ -308,9 +304,8 @@ def _check_recipe(recipe: Recipe, folder: Path) -> None:
     # The numbers of scenes may change: a shard's first scenes do not depend on how many there are.
     made = digest(recipe.model_dump(mode="json", include={"data_seed", "media", "abstain_share"}))
     note = folder / "recipe.sha256"
-    folder.mkdir(parents=True, exist_ok=True)
     if not note.is_file():
-        note.write_text(made + "\n", encoding="utf-8")
+        write_text(note, made + "\n")
     elif note.read_text(encoding="utf-8").strip() != made:
         raise TrapsError(f"{folder}: holds scenes of another recipe; give another folder, or delete it")
 

@@ -8,6 +8,8 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.files import replacing
+
 
 def write_seeds(path: Path, rows: Sequence[Any], read: Callable[[Path], Sequence[Any]]) -> None:
     """Write rows (dataclasses with a field `seed`) as CSV, in the place of those of the same seeds.
@@ -16,10 +18,7 @@ def write_seeds(path: Path, rows: Sequence[Any], read: Callable[[Path], Sequence
     """
     seeds = {row.seed for row in rows}
     kept = [row for row in (read(path) if path.is_file() else []) if row.seed not in seeds]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    with part.open("w", encoding="utf-8", newline="") as stream:
+    with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(stream, [field.name for field in fields(rows[0])], lineterminator="\n")
         table.writeheader()
         table.writerows(asdict(row) for row in sorted([*kept, *rows], key=lambda row: row.seed))
-    part.replace(path)

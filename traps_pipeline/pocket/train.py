@@ -13,6 +13,7 @@ import numpy as np
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import replacing
 from traps_pipeline.pocket.data import Question, SceneRecord, data_digest, read_shards
 from traps_pipeline.pocket.model import PATCH, make_model, save, train_tokenizer
 from traps_pipeline.pocket.recipe import Recipe, Training
@@ -331,10 +332,8 @@ class _State:
         tensors = {f"weight.{name}": p.detach().contiguous() for name, p in self._parameters.items()}
         for name, p in self._parameters.items():
             tensors |= {f"{kind}.{name}": value for kind, value in self._optimizer.state.get(p, {}).items()}
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        part = self._path.with_suffix(".part")
-        save_file(tensors, part, {"step": str(step), "identity": self._identity})
-        part.replace(self._path)
+        with replacing(self._path) as part:
+            save_file(tensors, part, {"step": str(step), "identity": self._identity})
 
     def load(self) -> int:
         """Put what is in the file into model and optimizer; returns the steps that made it, 0 without a file."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import html
 import io
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -338,17 +337,3 @@ def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
 def figure_files(name: str, figure: Figure) -> dict[str, bytes]:
     """The figure as `name.pdf`, `name.svg` and `name.png`."""
     return {f"{name}.{kind}": figure_bytes(figure, kind) for kind in FIGURE_KINDS}
-
-
-# --- files ------------------------------------------------------------------------------------------------------------
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, its folders too."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(content)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

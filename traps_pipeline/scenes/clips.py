@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from traps_pipeline.digests import file_digest
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import Camera, Panel
 from traps_pipeline.scenes.encode import DamagedClip, encode, frames_digest
@@ -153,16 +153,7 @@ def _save(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: flo
     """Encode frames and write the note that vouches for them; returns how many there are."""
     encode(frames, path, fps)
     clip = Clip(file_digest(path), frames_digest(frames), len(frames), fps, path.stat().st_size, leaked_pixels)
-    part = note_of(path).with_suffix(f".{os.getpid()}.part")
-    try:
-        part.write_text(json.dumps(asdict(clip)), encoding="utf-8")
-        part.replace(note_of(path))
-    except OSError as error:
-        raise TrapsError(
-            f"{note_of(path)}: cannot be written ({error.strerror}); free some space and run again"
-        ) from error
-    finally:
-        part.unlink(missing_ok=True)
+    write_text(note_of(path), json.dumps(asdict(clip)))
     return len(frames)
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from traps_pipeline.files import write_text
 from traps_pipeline.scenes.certificates import settled_outcome
 from traps_pipeline.scenes.kit import Family
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, simulated
@@ -152,7 +153,7 @@ class Records:
             except ValueError:  # a line that a kill tore
                 break
         kept = [spec for spec in specs if spec.seed < tally.draws]
-        self._lines.write_text("".join(_line(spec) for spec in kept), encoding="utf-8")
+        write_text(self._lines, "".join(_line(spec) for spec in kept))
         return kept
 
     def append(self, found: Resolved, tally: Tally) -> None:
@@ -162,9 +163,7 @@ class Records:
             lines.write(_line(found.spec))
         tallies = load_tallies(self._released) | {self._family: tally}
         notes = {name: vars(each) | {"rejected": dict(each.rejected)} for name, each in tallies.items()}
-        part = self._released / f".{DRAWS}.part"
-        part.write_text(json.dumps(notes, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-        part.replace(self._released / DRAWS)
+        write_text(self._released / DRAWS, json.dumps(notes, indent=1, sort_keys=True) + "\n")
 
 
 def _line(spec: SceneSpec) -> str:

@@ -15,7 +15,7 @@ import os
 import struct
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,6 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_bytes, write_text
 from traps_pipeline.scenes.encode import ENCODER, DamagedClip, decode, encode
 
 Profile = Literal["video", "images", "frames"]
@@ -238,15 +239,17 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
         sha256, size = _sha256([header, sampled.frames.tobytes()]), sampled.frames.nbytes
     elif spec.profile == "video":
         rate = _rate(clip, sampled, spec)
-        data = _written(path, lambda part: encode(list(sampled.frames), part, rate))
-        sha256, size = _sha256([data]), len(data)
+        encode(list(sampled.frames), path, rate)
+        sha256, size = file_digest(path), path.stat().st_size
     else:
         jpegs = [_jpeg(frame) for frame in sampled.frames]
-        sha256, size = _sha256(jpegs), len(_written(path, lambda part: part.write_bytes(_zipped(jpegs))))
+        data = _zipped(jpegs)
+        write_bytes(path, data)
+        sha256, size = _sha256(jpegs), len(data)
     times = tuple(sampled.times_s.tolist())
     media = Media(spec.profile, path, sha256, len(times), times, rate, size)
     record = {name: value for name, value in asdict(media).items() if name not in ("profile", "path")}
-    _written(note, lambda part: part.write_text(json.dumps(record), encoding="utf-8"))
+    write_text(note, json.dumps(record))
     return media
 
 
@@ -307,42 +310,21 @@ def _unzipped(data: bytes) -> list[bytes]:
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise TrapsError(
-            f"{path}: cannot be written ({error.strerror or error}); free some space and run again"
-        ) from error
-
-
-@contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Hold a folder's lock, so that of several threads and processes one prepares and the others find it done.
 
     The system frees it when its holder dies. Raises TrapsError.
     """
-    with _writing(folder):
+    try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise TrapsError(f"{folder}: cannot be written ({error.strerror}); free some space and run again") from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
     finally:
         os.close(descriptor)
-
-
-def _written(path: Path, write: Callable[[Path], object]) -> bytes:
-    """Write a file whole or not at all; returns its bytes. Raises TrapsError."""
-    part = path.with_name(f".{os.getpid()}-{path.name}")  # encode wants the ending; the lock keeps other threads out
-    try:
-        with _writing(path):
-            write(part)
-            data = part.read_bytes()
-            part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-    return data
 
 
 # --- as text ----------------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import replacing
 from traps_pipeline.progress import Tally
 from traps_pipeline.tables import VOLATILE, Table
 
@@ -97,20 +97,8 @@ class TableStore:
         state = State(version, dict(inputs), len(data), failed, code)
         data = data.replace_schema_metadata({_FOOTER: json.dumps(asdict(state)).encode()})
         path = self.path(table, partition)
-        part = path.with_name(f".{path.name}.{os.getpid()}.part")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path, durable=True) as part:
             pq.write_table(data, part, compression="zstd")
-            with part.open("rb") as stream:
-                os.fsync(stream.fileno())
-            part.replace(path)
-        except OSError as error:
-            raise TrapsError(
-                f"{path}: cannot be written ({error.strerror or error}); free some space and run the same command "
-                "again (nothing was half-written, no answer is lost)"
-            ) from error
-        finally:
-            part.unlink(missing_ok=True)
         return version
 
     def _checked(

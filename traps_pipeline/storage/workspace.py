@@ -12,6 +12,7 @@ import yaml
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
 from traps_pipeline.paths import CHECKOUT, require_checkout
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.parquet import TableStore
@@ -22,24 +23,6 @@ if TYPE_CHECKING:
     from traps_pipeline.storage.media import MediaStore
 
 VARIABLE = "TRAPS_WORKSPACE"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a small file whole or not at all. Raises TrapsError naming it."""
-    write_bytes(path, text.encode())
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all. Raises TrapsError naming it."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(content)
-        part.replace(path)
-    except OSError as error:
-        raise TrapsError(f"{path}: cannot be written ({error.strerror}); free some space and run again") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _name_of(root: Path) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import shutil
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import replacing, write_bytes
 from traps_pipeline.models.answers import prepare_media, wanted_questions
 from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import ModelEntry, get_model
@@ -84,12 +84,11 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
         raise TrapsError(f"{out / REQUESTS} is there already; give another folder, or delete it")
     (out / MEDIA).mkdir(parents=True, exist_ok=True)
     prepare_media(workspace, _cells(workspace, experiment))
-    part, count = out / f".{REQUESTS}.part", 0
-    with part.open("w", encoding="utf-8") as stream:
+    count = 0
+    with replacing(out / REQUESTS) as part, part.open("w", encoding="utf-8") as stream:
         for request in _missing(workspace, experiment):
             stream.write(json.dumps(_line(request, out), ensure_ascii=False) + "\n")
             count += 1
-    part.replace(out / REQUESTS)
     return count
 
 
@@ -117,7 +116,7 @@ def _line(request: Request, out: Path) -> dict[str, Any]:
         source = request.sent.path or request.media
         file = out / MEDIA / f"{request.sent.sha256}{source.suffix}"
         if not file.exists():
-            shutil.copyfile(source, file)
+            write_bytes(file, source.read_bytes())
         sent = request.sent
         media = {"profile": sent.profile, "file": f"{MEDIA}/{file.name}", "sha256": sent.sha256}
         media |= {"n_frames": sent.n_frames, "times_s": list(sent.times_s), "fps": sent.fps}

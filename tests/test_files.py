@@ -1,0 +1,112 @@
+"""A file is written whole or not at all, whatever ends the writing."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import replacing, write_bytes, write_text
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """A file with former content, alone in its folder."""
+    file = tmp_path / "folder" / "table.bin"
+    write_text(file, "former")
+    return file
+
+
+def alone(file: Path) -> bool:
+    return list(file.parent.iterdir()) == [file]
+
+
+def test_what_the_block_wrote_takes_the_place_of_the_file_when_the_block_ends(file: Path) -> None:
+    with replacing(file) as part:
+        part.write_text("next")
+        assert part.parent == file.parent  # a rename between file systems is a copy
+        assert file.read_text() == "former"
+    assert file.read_text() == "next"
+    assert alone(file)
+
+
+@pytest.mark.parametrize("end", [ValueError("wrong"), KeyboardInterrupt()])
+def test_an_error_or_ctrl_c_in_the_middle_leaves_the_former_content_and_nothing_else(
+    file: Path, end: BaseException
+) -> None:
+    with pytest.raises(type(end)), replacing(file) as part:
+        part.write_text("half of what")
+        raise end
+    assert file.read_text() == "former"
+    assert alone(file)
+
+
+def test_a_kill_in_the_middle_leaves_the_former_content_and_the_next_write_goes_through(file: Path) -> None:
+    code = (
+        "import sys, time; from pathlib import Path; from traps_pipeline.files import replacing\n"
+        "with replacing(Path(sys.argv[1])) as part, part.open('w') as stream:\n"
+        "    stream.write('half of what'); stream.flush(); print('writing', flush=True); time.sleep(600)"
+    )
+    writer = subprocess.Popen([sys.executable, "-c", code, file], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert writer.stdout is not None
+    assert writer.stdout.readline() == "writing\n"
+    writer.kill()
+    assert writer.wait() == -signal.SIGKILL
+    writer.stdout.close()
+    assert file.read_text() == "former"
+    left = [path.name for path in file.parent.iterdir() if path != file]
+    assert len(left) == 1 and left[0].startswith(".") and left[0].endswith(".part")
+    write_text(file, "next")
+    assert file.read_text() == "next"
+
+
+def test_a_full_disk_leaves_the_former_content_and_is_told_with_the_remedy(tiny_disk: Path) -> None:
+    file = tiny_disk / "table.bin"
+    write_text(file, "former")
+    with pytest.raises(TrapsError, match=r"table\.bin: cannot be written \(No space left on device\); free some space"):
+        write_bytes(file, os.urandom(200_000))
+    assert file.read_text() == "former"
+    assert alone(file)
+
+
+def test_a_durable_file_that_does_not_reach_the_disk_does_not_take_the_place(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(descriptor: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fsync", broken)
+    with pytest.raises(TrapsError, match=r"table\.bin: cannot be written \(Input/output error\)"):
+        write_bytes(file, b"next", durable=True)
+    assert file.read_text() == "former"
+    assert alone(file)
+
+
+def test_many_threads_that_write_one_file_leave_one_of_their_contents_whole(file: Path) -> None:
+    contents = [bytes([k]) * 100_000 for k in range(32)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda content: write_bytes(file, content), contents))
+    assert file.read_bytes() in contents
+    assert alone(file)
+
+
+def test_a_folder_that_is_a_file_is_named(tmp_path: Path) -> None:
+    write_text(tmp_path / "results", "a file")
+    with pytest.raises(TrapsError, match=r"results/table\.csv: cannot be written"):
+        write_text(tmp_path / "results" / "table.csv", "content")
+    assert (tmp_path / "results").read_text() == "a file"
+
+
+def test_a_missing_file_that_the_block_reads_is_not_taken_for_one_that_cannot_be_written(file: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no-such-clip\.mp4"), replacing(file) as part:
+        part.write_bytes((file.parent / "no-such-clip.mp4").read_bytes())
+    assert file.read_text() == "former"
+    assert alone(file)
