@@ -15,8 +15,8 @@ from traps_pipeline.errors import TrapsError
 def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """A path beside `path` for the block to write to. At the block's end the file there takes the place of `path`.
 
-    Until then, and after an error, Ctrl-C or a kill, `path` is what it was before. An unfinished file is removed. Only a
-    kill leaves it, hidden and named `*.part`; nothing reads it. Missing folders are made.
+    Until then, and after an error, Ctrl-C or a kill, `path` is what it was before. An unfinished file is removed. Only
+    a kill leaves it, hidden and named `*.part`; nothing reads it. Missing folders are made.
 
     durable: the content is on the disk before it gets its name, so that not even a power cut leaves a torn file under
     that name. Raises TrapsError that names `path` when it cannot be written; an OSError about another file, which the

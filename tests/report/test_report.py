@@ -10,21 +10,19 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
 from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet
 from traps_pipeline.report.figures.labels import Label, merged_labels
 from traps_pipeline.report.figures.landscape import landscape_figure
-from traps_pipeline.report.page import (
-    entries_of,
-    leaderboard_markdown,
-    leaderboard_text,
-    report_html,
-)
+from traps_pipeline.report.leaderboard import leaderboard_markdown, leaderboard_text, leaderboards
+from traps_pipeline.report.page import report_html
+from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import figure_bytes, fraction, percent
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.tables import LEADERBOARD
 
+NO_BREAK = "\u2011"  # a hyphen at which no line ends
 HOSTILE = "<script>alert(1)</script>|[x](http://evil.example)\x1b[2J"
 REFERENCES = {  # Acc, FalseAbs, AbsRec
     "oracle": (1, 0, 1),
@@ -95,28 +93,28 @@ def test_text_lists_models_by_overall_pecs_with_their_interval(board):
     shown = board[board["model"] != HOSTILE]
     shown = pd.concat([shown, board_of(board_row("mid", pecs_ci_low=0.2, pecs_ci_high=0.3))])
     lines = leaderboard_text(shown).splitlines()
-    assert lines[0] == "PECS, overall. Benchmark version v1; epoch e1."
-    assert lines[4].split()[:6] == ["oracle", "standard", "1.000", "[1.000,", "1.000]", "100.0"]
+    assert lines[0] == "Overall. Benchmark version v1; epoch e1."
+    assert lines[3].split()[:6] == ["oracle", "standard", "1.000", "[1.000,", "1.000]", "100.0"]
     # Acc 0.5, J 0.6 - 0.1 = 0.5, PECS 0.25; no dataset of its own is on the board.
     assert next(x for x in lines if x.startswith("mid")).split() == [
         "mid", "standard", "0.250", "[0.200,", "0.300]", "50.0", "60.0", "10.0", "0.500", *"––––", "1404", "0",
     ]  # fmt: skip
-    assert [x.split()[0] for x in lines[4:8]] == ["oracle"] * 3 + ["mid"]
-    assert len({len(x) for x in lines[2:]}) == 1
+    assert [x.split()[0] for x in lines[3:7]] == ["oracle"] * 3 + ["mid"]
+    assert len({len(x) for x in lines[2:-2]}) == 1
+    assert lines[-1] == "– not all four datasets evaluated, or nothing decided"
 
 
 def test_ties_keep_the_regimes_order(board):
-    _, entries = entries_of(board)
-    assert [e.regime for e in entries[:3]] == list(REGIMES)
+    assert list(leaderboards(board)[0].rows["regime"][:3]) == list(REGIMES)
 
 
 def test_missing_items_are_marked_wherever_the_model_stands():
     board = board_of(
         board_row("whole"), board_row("gaps", n_missing=7), board_row("gaps", dataset="occlusion", n_missing=7)
     )
-    for text in (leaderboard_text(board), leaderboard_markdown(board), report_html(board)):
-        assert "7 †" in text
-        assert "0 †" not in text
+    for table in tables(board):
+        assert [row["Missing"] for row in table if row["Model"] == "gaps"] == ["7 †"]
+        assert [row["Missing"] for row in table if row["Model"] == "whole"] == ["0"]
     assert "†" not in leaderboard_text(board_of(board_row("whole")))
 
 
@@ -144,18 +142,25 @@ class Rows(HTMLParser):
 
 
 def tables(board):
-    """Header and rows of the ranked table in a terminal, in Markdown and in HTML: model first, then from the PECS of
-    the datasets on (HTML's runs left out)."""
+    """Header and rows of the ranked table in a terminal, in Markdown and in HTML, each row by heading, without the
+    columns that HTML alone has or names otherwise."""
     text = [re.split(r"\s{2,}", line.strip()) for line in leaderboard_text(board).split("\n\n")[1].splitlines()]
-    text = [text[0], *text[2:]]
     lines = [line for line in leaderboard_markdown(board).splitlines() if line.startswith("|")]
     markdown = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in [lines[0], *lines[2:]]]
-    html = [[cell.strip() for cell in row] for row in Rows(report_html(board)).rows[: len(text)]]
-    return (
-        [[row[0], *row[8:]] for row in text],
-        [[row[0], *row[8:]] for row in markdown],
-        [[row[0], *row[9:14], *row[15:]] for row in html],
-    )
+    html = [[" ".join(cell.split()) for cell in row] for row in Rows(report_html(board)).rows[: len(text)]]
+    return [by_heading(rows) for rows in (text, markdown, html)]
+
+
+def by_heading(rows):
+    """Rows as mappings, without deviations, bars and escapes."""
+    names = {f"PECS {TITLES[name].replace('-', NO_BREAK)}": f"PECS {short}" for name, short in SHORT.items()}
+    headings = [names.get(heading, heading).replace("\\", "") for heading in rows[0]]
+    found = []
+    for row in rows[1:]:
+        cells = [re.sub(r" ± [\d.]+", "", cell.replace("\\", "")) for cell in row]
+        cells = dict(zip(headings, cells, strict=False))  # a terminal's line ends before what is empty at its end
+        found.append({name: cell for name, cell in cells.items() if name not in ("", "Runs") and cell})
+    return found
 
 
 def cells_with_gaps(model="gaps"):
@@ -173,23 +178,28 @@ def cells_with_gaps(model="gaps"):
 def test_text_markdown_and_html_show_the_same_marks_counts_and_bounds():
     whole = [board_row("whole", dataset=d, shares=(1, 0, 1)) for d in ("overall", *DATASETS)]
     text, markdown, page = tables(board_of(*cells_with_gaps(), *whole))
-    assert text[0][5:] == markdown[0][5:] == ["n", "missing", "refused", "empty", "if missing: worst, best"]
-    assert page[0][5:] == ["n", "Missing", "Refused", "Empty", "If missing: worst, best"]
-    assert text[1:] == markdown[1:] == page[1:]
-    assert text[1] == ["whole", *["1.000"] * 4, "1404", "0", "0", "0", "–"]
-    assert text[2] == ["gaps", "0.250", "0.250", "0.250 ‡", "0.250", "1404 ‡", "61 †", "41", "7", "[0.200, 0.310]"]
+    assert text == markdown == page
+    first, second = (list(row.values()) for row in text)
+    assert first == [
+        *("whole", "standard", "1.000", "[1.000, 1.000]", "100.0", "100.0", "0.0", "1.000"),
+        *(*["1.000"] * 4, "1404", "0", "0", "0"),
+    ]
+    assert second[8:] == ["0.250", "0.250", "0.250 ‡", "0.250", "1404 ‡", "61 †", "41", "7", "[0.200, 0.310]"]
+    assert list(text[1])[8:] == [
+        *(f"PECS {short}" for short in SHORT.values()), "n", "Missing", "Refused", "Empty", "If missing: worst, best",
+    ]  # fmt: skip
 
 
 def test_an_incomplete_cell_is_marked_at_every_pecs_and_n():
     board = board_of(*cells_with_gaps())
-    for table in (leaderboard_text(board), leaderboard_markdown(board)):
-        # PECS overall, PECS chaotic, n; then the note or the legend.
-        assert table.count("‡") == 4
+    for table, count in ((leaderboard_text(board), 4), (leaderboard_markdown(board), 5)):
+        # PECS overall, PECS chaotic, n; then the note, and the legend.
+        assert table.count("‡") == count
         assert "incomplete: fewer than 99 % of items answered" in table
     page = report_html(board)
     assert page.count('<span class="mark">‡</span>') == 5  # PECS and n of the dataset's own table too
     own = page.split("<h2>Chaotic</h2>")[1].split("</section>")[0]
-    assert own.count("‡") == 2
+    assert own.count("‡") == 3  # and what it means
     assert "‡" not in page.split("<h2>Occlusion</h2>")[1].split("</section>")[0]
     assert "[0.249, 0.251]" in page.split("<h2>Occlusion</h2>")[1].split("</section>")[0]
 
@@ -200,7 +210,7 @@ def test_marks_and_columns_are_away_where_nothing_calls_for_them():
             assert not re.search("‡|refused|Refused|empty|Empty|worst|incomplete:", shown)
     undecided = board_of(board_row("m", n_missing=1))
     for shown in (leaderboard_text(undecided), leaderboard_markdown(undecided), report_html(undecided)):
-        assert "[0.250, 0.250]" in shown
+        assert "[0.250, 0.250]" in shown.replace("\\", "")
         assert not re.search("‡|refused|Refused|Empty", shown)
 
 
@@ -210,21 +220,22 @@ def test_a_cell_of_errors_alone_is_marked_at_its_dash():
     text, markdown, page = tables(
         board_of(*(board_row("m", dataset=d, **null, **lost) for d in ("overall", *DATASETS)))
     )
-    assert text[1] == markdown[1] == page[1]
-    assert text[1] == ["m", *["– ‡"] * 4, "1404 ‡", "8424 †", "[0.000, 1.000]"]
+    assert text == markdown == page
+    assert list(text[0].values()) == [
+        "m", "standard", "– ‡", *"–––––", *["– ‡"] * 4, "1404 ‡", "8424 †", "[0.000, 1.000]",
+    ]  # fmt: skip
 
 
 def test_an_incomplete_dataset_marks_a_model_without_an_overall_row():
     board = board_of(board_row("whole"), board_row("part", dataset="chaotic", n_missing=50, incomplete=True))
-    text, markdown, _ = tables(board)
-    assert text[2] == markdown[2] == ["part", "–", "–", "0.250 ‡", "–", "1404 ‡", "50 †", "–"]
-    page = Rows(report_html(board)).rows[2]  # its seven figures are one cell, its dataset is the only one
-    assert page[3:] == ["0.250 ‡", "1404 ‡", "–", "50 †", "–"]
+    text, markdown, page = tables(board)
+    assert text == markdown == page
+    assert list(text[1].values()) == ["part", "standard", *"––––––", "0.250 ‡", "1404 ‡", "50 †"]
 
 
 def test_marks_hang_behind_the_figures_of_a_terminal_table():
     whole = [board_row("whole", dataset=d) for d in ("overall", *DATASETS)]
-    lines = leaderboard_text(board_of(*cells_with_gaps(), *whole)).splitlines()[4:6]
+    lines = leaderboard_text(board_of(*cells_with_gaps(), *whole)).splitlines()[3:5]
     assert [m.start() for m in re.finditer(r"0\.250|1404", lines[0])] == [
         m.start() for m in re.finditer(r"0\.250|1404", lines[1])
     ]
@@ -242,16 +253,16 @@ def test_a_model_without_an_overall_row_is_listed_last_with_what_it_has():
     board = board_of(
         board_row("partial", dataset="chaotic", shares=(1, 0, 1), n_pairs=500, n_missing=3), board_row("weak")
     )
-    last = leaderboard_text(board).splitlines()[5]
-    assert last.split() == ["partial", "standard", *["–"] * 8, "1.000", "–", "500", "3", "†", "–"]
+    last = leaderboard_text(board).splitlines()[4]
+    assert last.split() == ["partial", "standard", *["–"] * 6, "1.000", "500", "3", "†"]
     assert "not all four datasets evaluated" in report_html(board)
 
 
 def test_a_board_of_one_dataset_is_ranked_by_that_dataset():
     board = board_of(board_row("a", dataset="chaotic"), board_row("b", dataset="chaotic", shares=(1, 0, 1)))
     lines = leaderboard_text(board).splitlines()
-    assert lines[0].startswith("PECS, chaotic.")
-    assert [x.split()[0] for x in lines[4:6]] == ["b", "a"]
+    assert lines[0].startswith("Chaotic.")
+    assert [x.split()[0] for x in lines[3:5]] == ["b", "a"]
 
 
 def test_null_figures_are_dashes_and_negative_ones_have_a_true_minus():
@@ -293,9 +304,9 @@ def test_html_shows_every_dataset_version_epoch_n_and_the_legend(board):
     page = report_html(board)
     for title in ("Overall", "Occlusion", "Occlusion, ill-posed", "Chaotic", "Chaotic, ill-posed"):
         assert f"<h2>{title}</h2>" in page
-    for term in ("Acc", "AbsRec", "FalseAbs", "J", "PECS", "n", "missing", "epoch"):
+    for term in ("Acc", "AbsRec", "FalseAbs", "J", "PECS", "n", "Missing", "Epoch"):
         assert f"<dt>{term}</dt>" in page
-    assert page.count("Benchmark version v1.") == page.count("Epoch e1.") == 5
+    assert page.count("Benchmark version v1; epoch e1.") == 6  # the page, overall, and each dataset
 
 
 def test_every_number_of_the_leaderboard_is_a_link_to_its_items():
@@ -306,7 +317,7 @@ def test_every_number_of_the_leaderboard_is_a_link_to_its_items():
     assert cells
     shown = [re.sub(r"<span class=\"(sd|bar)\".*?</span>", "", cell) for cell in cells]
     assert not [cell for cell in shown if re.search(r"\d", re.sub(r"<[^>]*>", "", cell))]
-    for text, to in (("0.250–0.250", "to--gaps-"), ("1404", "to--gaps-"), ("61 †", "to--gaps-"), ("77", "to--part-")):
+    for text, to in (("[0.250, 0.250]", "to--gaps-"), ("1404", "to--gaps-"), ("61", "to--gaps-"), ("77", "to--part-")):
         assert f'<a href="{to}">{text}</a>' in page
 
 
@@ -319,7 +330,7 @@ def test_html_names_the_epoch_in_each_row_where_rows_differ():
 def test_an_empty_board_still_gives_a_page_a_table_and_a_figure():
     board = pd.DataFrame(columns=pd.Index([c.name for c in LEADERBOARD.columns]))
     assert "Overall" in report_html(board)
-    assert leaderboard_text(board).startswith("PECS, overall.")
+    assert "not run: this study has no leaderboard yet" in leaderboard_text(board)
     assert figure_bytes(landscape_figure(points(board), "Overall")).startswith(b"\x89PNG")
 
 

@@ -92,7 +92,7 @@ def _make_regime_tests(workspace: Workspace, _: None) -> Made:
 
 def _make_leaderboard(workspace: Workspace, _: None) -> Made:
     """Every model under every regime, per dataset and overall: mean and spread over runs, 95 % intervals, ranks."""
-    from traps_pipeline.report.page import leaderboard_markdown
+    from traps_pipeline.report.leaderboard import leaderboard_markdown
     from traps_pipeline.scoring.bootstrap import intervals, resample
     from traps_pipeline.scoring.leaderboard import leaderboard as rank
 

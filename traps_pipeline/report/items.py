@@ -15,7 +15,7 @@ from typing import Any
 from traps_pipeline.files import write_bytes
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
-from traps_pipeline.report.page import TITLES
+from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import TEMPLATES, Behind, environment
 from traps_pipeline.scoring import Frame
 from traps_pipeline.storage.workspace import Workspace

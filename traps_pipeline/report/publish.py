@@ -11,10 +11,10 @@ from traps_pipeline.report.catalogue import FIGURES, TABLES
 from traps_pipeline.report.contact_sheet import PAGE as SIX_PAIRS
 from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
 from traps_pipeline.report.items import FOLDER, addresses, write_item_pages
+from traps_pipeline.report.leaderboard import leaderboard_markdown
 from traps_pipeline.report.page import (
     Block,
     Card,
-    leaderboard_markdown,
     picture_block,
     report_html,
     table_block,

@@ -1,8 +1,8 @@
 """How every table and every figure is written: one way for each, the same bytes on every build.
 
 A `Table` is a frame of numbers with the columns that are printed; it becomes Parquet and CSV (numbers as they are),
-LaTeX, Markdown and an HTML fragment (numbers as printed). Its texts are untrusted: each medium escapes them. A figure
-becomes PDF, SVG and PNG.
+LaTeX, Markdown, text for a terminal and an HTML fragment (numbers as printed). Its texts are untrusted: each medium
+escapes them. A figure becomes PDF, SVG and PNG.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import io
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import pandas as pd
 
 from traps_pipeline.paths import ASSETS
-from traps_pipeline.scoring import Frame
+from traps_pipeline.terminal import plain, text_table
 
 if TYPE_CHECKING:
     import jinja2
@@ -75,11 +75,6 @@ def percent(value: float | None, digits: int = 1) -> str:
     return NONE if value is None or pd.isna(value) else fraction(100 * value, digits)
 
 
-def plain(text: object) -> str:
-    """Text on one line that cannot steer a terminal."""
-    return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in str(text))
-
-
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
@@ -88,7 +83,9 @@ class Column:
     """A printed column: the frame's field, its heading, and how its values are printed.
 
     Shares are fractions in the frame; `percent` prints them times 100. `spread` names the field of a standard deviation
-    printed behind ±, `mark` a field of text (a dagger, say) that hangs behind the number.
+    printed behind ±, `mark` a field of text (a dagger, say) that hangs behind the number. The last three are for pages:
+    how cells look (a row's head, a number that stands out, a tag), whether a fraction is also drawn as a bar, and
+    whether a group of columns begins here.
     """
 
     field: str
@@ -97,6 +94,9 @@ class Column:
     digits: int | None = None
     spread: str = ""
     mark: str = ""
+    look: Literal["", "head", "strong", "tag"] = ""
+    bar: bool = False
+    group: bool = False
 
     @property
     def is_number(self) -> bool:
@@ -105,15 +105,18 @@ class Column:
 
     def text(self, row: Mapping[str, Any]) -> str:
         """The cell as printed; a dash where there is no number."""
+        figure, spread, mark = self.parts(row)
+        return figure + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
+
+    def parts(self, row: Mapping[str, Any]) -> tuple[str, str, str]:
+        """The text or number of a cell, its spread and its mark, as printed; empty where there is none of them."""
         value = row.get(self.field)
         if self.unit in ("text", "range"):
-            return "" if value is None or value is pd.NA or value != value else plain(value)
-        shown = self._number(value)
-        if self.spread and shown != NONE:
-            spread = self._number(row.get(self.spread))
-            shown += f" ± {spread}" if spread != NONE else ""
+            return "" if value is None or value is pd.NA or value != value else plain(value), "", ""
+        figure = self._number(value)
+        spread = self._number(row.get(self.spread)) if self.spread and figure != NONE else NONE
         mark = row.get(self.mark) if self.mark else ""
-        return f"{shown} {mark}" if isinstance(mark, str) and mark else shown
+        return figure, "" if spread == NONE else spread, mark if isinstance(mark, str) else ""
 
     def _number(self, value: Any) -> str:
         digits = DIGITS[self.unit] if self.digits is None else self.digits
@@ -127,28 +130,36 @@ class Table:
     """A table for people: a frame, what of it is printed, and what a reader must know (epoch, n, what is missing).
 
     A table without rows says that it was not run, and `why`; or `none`, where it was run and is rightly empty. `trace`
-    tells which items stand behind a number, where any do; `dash` is what a dash means.
+    tells which items stand behind a number, where any do; `dash` is what a dash means; `lead` is a sentence that goes
+    with the title.
     """
 
     name: str
     title: str
-    rows: Frame
+    rows: pd.DataFrame
     columns: Sequence[Column]
     notes: Sequence[str] = ()
     why: str = ""
     trace: Trace | None = None
     none: str = ""
     dash: str = f"{NOT_RUN}, or undefined for want of decided items"
+    lead: str = ""
 
     @property
     def cells(self) -> list[list[str]]:
         """Printed cells (rows, columns)."""
         return [[column.text(row) for column in self.columns] for row in self.records]
 
-    @property
+    @cached_property
     def records(self) -> list[dict[str, Any]]:
         """The rows as mappings."""
         return self.rows.to_dict("records")  # pyright: ignore[reportReturnType]
+
+    @cached_property
+    def marked(self) -> set[Column]:
+        """The columns in which a mark hangs behind some number. The other cells of such a column keep room for one, so
+        that numbers stay below each other."""
+        return {column for column in self.columns if any(column.parts(row)[2] for row in self.records)}
 
     @property
     def absence(self) -> str:
@@ -164,7 +175,7 @@ class Table:
         return [*(note for note in self.notes if note), *spreads, *dashes]
 
     @property
-    def data(self) -> Frame:
+    def data(self) -> pd.DataFrame:
         """The numbers behind what is printed: fields of the columns and their spreads, then what else the rows hold."""
         printed = [field for column in self.columns for field in (column.field, column.spread) if field]
         fields = dict.fromkeys([*printed, *map(str, self.rows.columns)])
@@ -184,7 +195,8 @@ def table_files(table: Table) -> dict[str, bytes]:
 
 def table_markdown(table: Table) -> str:
     """Title, table, notes; texts escaped."""
-    lines = [f"**{markdown(table.title)}**", ""]
+    title = f"**{markdown(table.title)}.** {markdown(table.lead)}" if table.lead else f"**{markdown(table.title)}**"
+    lines = [title, ""]
     if table.absence:
         lines += [markdown(table.absence)]
     else:
@@ -196,9 +208,35 @@ def table_markdown(table: Table) -> str:
     return "\n".join([*lines, *([""] if notes else []), *(f"- {note}" for note in notes)]) + "\n"
 
 
+def table_text(table: Table) -> str:
+    """Title, table and notes for standard output, as `terminal.text_table` prints there."""
+    lines = [plain(f"{table.title}. {table.lead}" if table.lead else table.title), ""]
+    if table.absence:
+        lines += [plain(table.absence)]
+    else:
+        columns = [_hung(c, table.records) if c in table.marked else _flush(c, table.records) for c in table.columns]
+        headings, *rows = zip(*columns, strict=True)
+        left = [k for k, c in enumerate(table.columns) if not c.is_number or c in table.marked]
+        lines += [text_table(headings, rows, left)]
+    notes = [plain(note) for note in table.remarks]
+    return "\n".join([*lines, *([""] if notes else []), *notes]) + "\n"
+
+
+def _flush(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:
+    return [column.heading, *(column.text(row) for row in records)]
+
+
+def _hung(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Heading and cells of a column with marks: numbers end below each other, marks hang behind them."""
+    marks = ["", *(column.parts(row)[2] for row in records)]
+    numbers = _flush(replace(column, mark=""), records)
+    return [f"{number:>{max(map(len, numbers))}} {mark:1}" for number, mark in zip(numbers, marks, strict=True)]
+
+
 def table_latex(table: Table) -> str:
     """A floating `table` environment with booktabs rules (`\\usepackage{booktabs}`); notes stand in the caption."""
-    caption = latex(". ".join([table.title.rstrip("."), *(n.rstrip(".") for n in table.remarks)]) + ".")
+    parts = [table.title, *([table.lead] if table.lead else []), *table.remarks]
+    caption = latex(". ".join(part.rstrip(".") for part in parts) + ".")
     cells = [[latex(table.absence)]] if table.absence else [[latex(cell) for cell in row] for row in table.cells]
     headings = [""] if table.absence else [latex(column.heading) for column in table.columns]
     frame = pd.DataFrame(cells, columns=pd.RangeIndex(len(headings)))
@@ -219,11 +257,11 @@ def table_html(table: Table, address: Callable[[Behind], str] | None = None) -> 
     behind it is a link to them."""
 
     def link(row: Mapping[str, Any], column: Column) -> str | None:
-        shown = column.is_number and not column.text(row).startswith(NONE) and column.text(row) != ""
+        shown = column.is_number and column.parts(row)[0] not in ("", NONE)
         behind = table.trace(row, column.field) if shown and table.trace and address else None
         return address(behind) if behind and address else None
 
-    return environment().get_template("table.html.j2").render(table=table, link=link)
+    return environment().get_template("table.html.j2").render(table=table, marked=table.marked, link=link)
 
 
 @cache

@@ -9,8 +9,8 @@ import pandas as pd
 
 from traps_pipeline.partitions import taxonomy_of
 from traps_pipeline.report.figures.looks import families, family_colour, family_of, looks
-from traps_pipeline.report.page import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.results import Results
+from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import (
     COLUMN_IN,
     INK,

@@ -10,7 +10,6 @@ import pandas as pd
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.partitions import DATASETS, REGIMES
-from traps_pipeline.report.page import SIDE_OF, TITLES
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
     COUNTED,
@@ -20,6 +19,7 @@ from traps_pipeline.report.tables.shared import (
     PECS,
     REGIME,
     SHARES,
+    J,
     cell_trace,
     counted,
     entries,
@@ -32,6 +32,7 @@ from traps_pipeline.report.tables.shared import (
     said,
     together,
 )
+from traps_pipeline.report.terms import SIDE_OF, TITLES
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
 from traps_pipeline.scoring import Frame, analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
@@ -153,7 +154,7 @@ def zero_boundary(results: Results) -> list[Table]:
 def frontier(results: Results) -> list[Table]:
     """The Pareto frontier in (Acc, J) under each regime, after averaging over datasets."""
     rows = ordered(marked(analyses.frontier(results.overall)), ["regime"])
-    columns = [REGIME, MODEL, SHARES[0], Column("j", "J", "fraction", spread="j_std"), PECS, *COUNTS]
+    columns = [REGIME, MODEL, SHARES[0], J, PECS, *COUNTS]
     notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *marks(rows)]
     return [Table("frontier", "Pareto frontier", rows, columns, notes, no_overall(results, False), cell_trace)]
 

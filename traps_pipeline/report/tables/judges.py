@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from traps_pipeline.report.page import TITLES
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
     MISSING,
@@ -17,6 +16,7 @@ from traps_pipeline.report.tables.shared import (
     epochs,
     ordered,
 )
+from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
 from traps_pipeline.scoring import Frame
 

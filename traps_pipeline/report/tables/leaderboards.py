@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import pandas as pd
 
 from traps_pipeline.partitions import DATASETS, REGIMES
-from traps_pipeline.report.page import TITLES
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
     COUNTS,
@@ -16,6 +15,7 @@ from traps_pipeline.report.tables.shared import (
     PECS,
     REGIME,
     SHARES,
+    J,
     best_first,
     cell_trace,
     epochs,
@@ -26,6 +26,7 @@ from traps_pipeline.report.tables.shared import (
     ordered,
     ranks,
 )
+from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
 from traps_pipeline.scoring import Frame, analyses
 from traps_pipeline.scoring.published import published_overall
@@ -44,7 +45,7 @@ def replication_overall(results: Results) -> list[Table]:
 def _overall(results: Results, name: str, title: str, replication: bool) -> Table:
     rows = marked(results.overall)
     rows = rows.loc[rows["model"].isin(analyses.models_of(group="replication")) == replication]
-    columns = [MODEL, REGIME, PECS, *SHARES, Column("j", "J", "fraction", spread="j_std")]
+    columns = [MODEL, REGIME, PECS, *SHARES, J]
     notes = [epochs(results.cells), "equal-weight mean over the four datasets", *marks(rows)]
     if results.is_study:
         shown = rows.to_dict("records")

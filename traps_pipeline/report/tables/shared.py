@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,12 +11,12 @@ import pandas as pd
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
-from traps_pipeline.report.page import INCOMPLETE_MARK, MISSING_MARK, SIDE_OF
 from traps_pipeline.report.results import Results
+from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF
 from traps_pipeline.report.writing import Behind, Column, Table, fraction
 from traps_pipeline.scoring import Frame
 
-MODEL, REGIME = Column("model", "Model"), Column("regime", "Regime")
+MODEL, REGIME = Column("model", "Model", look="head"), Column("regime", "Regime", look="tag")
 N, MISSING, RUNS = (
     Column("n_pairs", "n", "count"),
     Column("n_missing", "Missing", "count"),
@@ -28,7 +28,8 @@ SHARES = (
     Column("abs_rec", "AbsRec %", "percent", spread="abs_rec_std"),
     Column("false_abs", "FalseAbs %", "percent", spread="false_abs_std"),
 )
-PECS = Column("pecs", "PECS", "fraction", spread="pecs_std", mark="mark")
+J = Column("j", "J", "fraction", spread="j_std")
+PECS = Column("pecs", "PECS", "fraction", spread="pecs_std", mark="mark", look="strong")
 COUNTS = (N, RUNS, MISSING)
 COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
@@ -74,12 +75,13 @@ def entries(results: Results) -> Frame:
 
 def marks(rows: Frame) -> list[str]:
     """What the marks in these rows mean."""
-    there = set(rows["mark"])
-    words = {
-        MISSING_MARK: "some items have no answer or no majority; shares rest on the others",
-        INCOMPLETE_MARK: "incomplete: fewer than 99 % of items answered",
-    }
-    return [f"{mark} {text}" for mark, text in words.items() if mark in there]
+    return meanings(rows["mark"])
+
+
+def meanings(marks: Iterable[str]) -> list[str]:
+    """What these marks mean, each once."""
+    there = set(marks)
+    return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in there]
 
 
 def epochs(rows: Frame) -> str:

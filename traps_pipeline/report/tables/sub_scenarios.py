@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from traps_pipeline.partitions import taxonomy_of
-from traps_pipeline.report.page import SIDE_OF, TITLES
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
     MISSING,
@@ -17,6 +16,7 @@ from traps_pipeline.report.tables.shared import (
     marked,
     marks,
 )
+from traps_pipeline.report.terms import SIDE_OF, TITLES
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
 from traps_pipeline.scoring import Frame, analyses
 
