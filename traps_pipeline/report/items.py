@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from traps_pipeline.files import write_bytes
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import TEMPLATES, Behind, environment
-from traps_pipeline.scoring import Frame
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
 
@@ -132,11 +133,11 @@ def _item_rows(workspace: Workspace, cell: Cell) -> Iterator[Mapping[str, Any]]:
             }
 
 
-def _by_item(rows: Frame) -> dict[str, Mapping[str, Any]]:
+def _by_item(rows: pd.DataFrame) -> dict[str, Mapping[str, Any]]:
     return {row["item_id"]: row for row in _records(rows)}
 
 
-def _records(rows: Frame) -> list[dict[str, Any]]:
+def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """Rows as mappings, with None for everything missing."""
     return rows.astype(object).where(rows.notna(), None).to_dict("records")
 

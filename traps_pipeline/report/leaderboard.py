@@ -87,7 +87,7 @@ def leaderboards(board: pd.DataFrame, *, brief: bool = False) -> list[Table]:
 def legend(board: pd.DataFrame) -> dict[str, str]:
     """LEGEND without the mark and the columns that nothing on the board calls for."""
     needed = {column.heading: field for column, field in OPTIONAL.items()} | {INCOMPLETE_MARK: "incomplete"}
-    absent = {term for term, field in needed.items() if not (board[field] > 0).any()}
+    absent = {term for term, field in needed.items() if not (board.loc[:, field] > 0).any()}
     return {term: meaning for term, meaning in LEGEND.items() if term not in absent}
 
 
@@ -112,9 +112,9 @@ def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], brief
         heading = f"PECS {SHORT[name] if brief else TITLES[name]}"
         columns.append(Column(name, heading, "fraction", mark=f"{name}_mark", group=name == others[0]))
     columns += [replace(N, mark="n_mark", group=True), RUNS, replace(MISSING, mark="missing_mark")]
-    columns += [column for column, field in OPTIONAL.items() if (rows[field] > 0).any()]
+    columns += [column for column, field in OPTIONAL.items() if (rows.loc[:, field] > 0).any()]
     columns += [
-        column for column in (EPOCH, Column("benchmark_version", "Version")) if rows[column.field].nunique() > 1
+        column for column in (EPOCH, Column("benchmark_version", "Version")) if rows.loc[:, column.field].nunique() > 1
     ]
     notes = meanings([*rows["n_mark"], *rows["missing_mark"]])
     if brief:

@@ -6,7 +6,6 @@ import pandas as pd
 
 from traps_pipeline.mechanism.effects import REGIME_COLUMNS
 from traps_pipeline.partitions import LONG
-from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.published import published
 from traps_pipeline.tables import COSINES, PROBES, STEERING_EFFECTS, Table
 
@@ -16,7 +15,7 @@ NOT_STATED = "not stated"
 _FLAGS = ("own_best", "all_sample_best", "source_best")
 
 
-def published_probes() -> Frame:
+def published_probes() -> pd.DataFrame:
     """PROBES rows: transfer, confabulated (at the layer of the transfer value: the paper names no other), shuffled (of
     no dataset) and centroid_void (of no source)."""
     rows = _long(published("probe_transfer")).rename(columns={"best_layer": "layer"})
@@ -31,7 +30,7 @@ def published_probes() -> Frame:
     return table.assign(**{flag: table[flag].eq(True) for flag in _FLAGS})
 
 
-def published_cosines() -> Frame:
+def published_cosines() -> pd.DataFrame:
     """COSINES rows: qwen3-vl-8b's matrix, and the few of the other two that the text has."""
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
     told = published("other")
@@ -44,7 +43,7 @@ def published_cosines() -> Frame:
     return _as(COSINES, [both.assign(layer=_steered(both), prompt="standard", other_prompt="standard")])
 
 
-def published_effects() -> Frame:
+def published_effects() -> pd.DataFrame:
     """STEERING_EFFECTS rows of the dose-response tables. Of gemma-4-e4b's the paper states no regimes."""
     qwen = published("steering_dose_qwen").assign(
         model="qwen3-vl-8b", directions="standard", regime="guided", epoch="original"
@@ -58,7 +57,7 @@ def published_effects() -> Frame:
     return _as(STEERING_EFFECTS, sides)
 
 
-def published_regimes() -> Frame:
+def published_regimes() -> pd.DataFrame:
     """Rows of `regime_matrix` (family all) and of `family_asymmetry`, as printed."""
     rows = published("steering_regime")
     names = {"direction_regime": "directions", "inference_regime": "regime", "direction_family": "family"}
@@ -71,7 +70,7 @@ def published_regimes() -> Frame:
     return table.reindex(columns=pd.Index(REGIME_COLUMNS)).assign(epoch="original")
 
 
-def published_domains(recomputed: Frame) -> Frame:
+def published_domains(recomputed: pd.DataFrame) -> pd.DataFrame:
     """Rows of `effects.domains`, with the two same-domain figures of qwen3-vl-8b that the text has, marked."""
     told = published("other").set_index("id")["value"]
     same = {LONG[short]: float(str(told[f"same-{short}"]).split(" / ")[0]) / 100 for short in ("ch", "oc")}
@@ -80,7 +79,7 @@ def published_domains(recomputed: Frame) -> Frame:
     return recomputed.assign(same=recomputed["same"].mask(mine, values), mark=mine.map(lambda m: "*" if m else ""))
 
 
-def published_layers() -> Frame:
+def published_layers() -> pd.DataFrame:
     """Rows of `effects.sweep`: gemma-4-e4b at three layers, alpha 0 and 10, regimes not stated."""
     told = published("other")
     told = told.loc[told["id"].str.fullmatch(r"depth-gemma-\d+")]
@@ -92,13 +91,13 @@ def published_layers() -> Frame:
     return pd.DataFrame(rows).assign(directions=NOT_STATED, regime=NOT_STATED, n_splits=4)
 
 
-def _long(rows: Frame) -> Frame:
+def _long(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.replace({name: LONG for name in ("source", "target", "other") if name in rows})
 
 
-def _steered(rows: Frame) -> list[int]:
+def _steered(rows: pd.DataFrame) -> list[int]:
     return [STEERED_LAYERS[model] for model in rows["model"]]
 
 
-def _as(table: Table, parts: list[Frame]) -> Frame:
+def _as(table: Table, parts: list[pd.DataFrame]) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True).reindex(columns=pd.Index([c.name for c in table.columns]))

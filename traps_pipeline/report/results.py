@@ -1,18 +1,32 @@
-"""What tables and figures are made from, whosesoever the results are: tidy frames with the same columns.
+"""What tables and figures are made from, from a study or from the paper: tidy frames with the same columns.
 
 A frame without rows means that this was not run. Shares are fractions; every frame with figures has a column `epoch`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
+from typing import Any, ClassVar
 
 import pandas as pd
 
 from traps_pipeline.mechanism import effects
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.scoring import Frame
+from traps_pipeline.tables import (
+    AGREEMENT,
+    CONFABULATION_PREVALENCE,
+    CONTRASTS,
+    JUDGE_BIAS,
+    JUDGE_VALIDATION,
+    LEADERBOARD,
+    LEAVE_ONE_OUT,
+    PROBES,
+    REGIME_TESTS,
+    STEERING_EFFECTS,
+    STEERING_SHARES,
+    Table,
+)
 
 CELL_COLUMNS = (
     *("model", "dataset", "regime", "epoch", "n_pairs", "n_runs", "n_missing", "incomplete"),
@@ -29,122 +43,89 @@ SUB_COLUMNS = (
 )
 
 
+Makers = Mapping[str, Callable[[Any], pd.DataFrame]]  # by the name of a frame; each gets the results
+
+
+class Made:
+    """A frame of `Results`, made when it is first asked for: by the results' own maker of that name, else by `derive`
+    from the other frames, else it is the rows of `table`."""
+
+    def __init__(
+        self, doc: str = "", *, table: Table | None = None, derive: Callable[[Results], pd.DataFrame] | None = None
+    ) -> None:
+        self.__doc__, self.table, self.derive = doc or (f"{table.name.upper()} rows." if table else ""), table, derive
+
+    def __set_name__(self, owner: type[Results], name: str) -> None:
+        self.name = name
+
+    def __get__(self, results: Results, owner: type[Results]) -> pd.DataFrame:
+        if self.name not in results.made:
+            results.made[self.name] = self._make(results)
+        return results.made[self.name]
+
+    def _make(self, results: Results) -> pd.DataFrame:
+        make = results.makers.get(self.name, self.derive)
+        if make is not None:
+            return make(results)
+        if self.table is None:
+            raise NotImplementedError(f"{type(results).__name__} has no maker of {self.name!r}")
+        return results.rows(self.table)
+
+
 class Results:
-    """One set of results; every property is a frame, without rows where that was not run."""
+    """One set of results; every frame is without rows where that was not run.
+
+    A further frame is an attribute here, and a function of that name among the `makers` of a study's and of the paper's
+    results.
+    """
 
     source = ""  # in words, for titles
     is_study = False
+    makers: ClassVar[Makers] = {}
 
-    @cached_property
-    def cells(self) -> Frame:
-        """CELL_COLUMNS, one row a (model, dataset, regime), averaged over runs."""
-        raise NotImplementedError
+    board = Made(table=LEADERBOARD)
+    cells = Made("CELL_COLUMNS, one row a (model, dataset, regime), averaged over runs.")
+    overall = Made(
+        "One row a (model, regime) that has all four datasets: the columns of cells but dataset, and j; a study's also "
+        "have j_std, the intervals and ranks of LEADERBOARD. epoch joins those of the datasets by +."
+    )
+    rates = Made("RATE_COLUMNS: visual and textual AbsRec under standard, a row a model and taxonomy (or pooled).")
+    sub_scenarios = Made("SUB_COLUMNS: means over models, a row a sub-scenario.")
+    sub_cells = Made("A row a (model, dataset, regime) and sub-scenario (column scope).")
+    labels = Made("Mean Acc over models by the control's answer: dataset, label, acc, n_pairs, n_models.")
+    agreement = Made(table=AGREEMENT)
+    bias = Made(table=JUDGE_BIAS)
+    leave_one_out = Made(table=LEAVE_ONE_OUT)
+    contrasts = Made(table=CONTRASTS)
+    regime_tests = Made(table=REGIME_TESTS)
+    confabulation = Made(table=CONFABULATION_PREVALENCE)
+    validation = Made(table=JUDGE_VALIDATION)
+    composition = Made("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
+    probes = Made("PROBES rows; the paper's have transfer, confabulated, shuffled, centroid_void alone.", table=PROBES)
+    cosines = Made("COSINES rows at the steered layer of each model.")
+    effects = Made(table=STEERING_EFFECTS)
+    shares = Made(table=STEERING_SHARES)
+    steering_regimes = Made(
+        "Rows of `mechanism.effects.regime_matrix`.", derive=lambda results: effects.regime_matrix(results.effects)
+    )
+    steering_families = Made(
+        "Rows of `mechanism.effects.family_asymmetry`.",
+        derive=lambda results: effects.family_asymmetry(results.effects),
+    )
+    steering_domains = Made(
+        "Rows of `mechanism.effects.domains`, and `mark` for those judged in another way.",
+        derive=lambda results: effects.domains(results.effects).assign(mark=""),
+    )
+    steering_layers = Made("Rows of `mechanism.effects.sweep`.", derive=lambda results: effects.sweep(results.effects))
 
-    @cached_property
-    def overall(self) -> Frame:
-        """One row a (model, regime) that has all four datasets: the columns of cells but dataset, and j; a study's also
-        have j_std, the intervals and ranks of LEADERBOARD. epoch joins those of the datasets by +."""
-        raise NotImplementedError
+    def __init__(self) -> None:
+        self.made: dict[str, pd.DataFrame] = {}
+        # What was not computed because its sides are of different epochs: reasons by analysis.
+        self.refused: dict[str, list[str]] = {}
 
-    @cached_property
-    def rates(self) -> Frame:
-        """RATE_COLUMNS: visual and textual AbsRec under standard, a row a model and taxonomy (or pooled)."""
-        raise NotImplementedError
-
-    @cached_property
-    def sub_scenarios(self) -> Frame:
-        """SUB_COLUMNS: means over models, a row a sub-scenario."""
-        raise NotImplementedError
-
-    @cached_property
-    def sub_cells(self) -> Frame:
-        """A row a (model, dataset, regime) and sub-scenario (column scope)."""
-        raise NotImplementedError
-
-    @cached_property
-    def labels(self) -> Frame:
-        """Mean Acc over models by the control's answer: dataset, label, acc, n_pairs, n_models."""
-        raise NotImplementedError
-
-    @cached_property
-    def agreement(self) -> Frame:
-        """AGREEMENT rows."""
-        raise NotImplementedError
-
-    @cached_property
-    def bias(self) -> Frame:
-        """JUDGE_BIAS rows."""
-        raise NotImplementedError
-
-    @cached_property
-    def leave_one_out(self) -> Frame:
-        """LEAVE_ONE_OUT rows."""
-        raise NotImplementedError
-
-    @cached_property
-    def contrasts(self) -> Frame:
-        """CONTRASTS rows."""
-        raise NotImplementedError
-
-    @cached_property
-    def regime_tests(self) -> Frame:
-        """REGIME_TESTS rows."""
-        raise NotImplementedError
-
-    @cached_property
-    def confabulation(self) -> Frame:
-        """CONFABULATION_PREVALENCE rows."""
-        raise NotImplementedError
-
-    @cached_property
-    def validation(self) -> Frame:
-        """JUDGE_VALIDATION rows."""
-        raise NotImplementedError
-
-    @cached_property
-    def composition(self) -> Frame:
-        """taxonomy, category, void, n (well-posed pairs), n_ill_posed."""
-        raise NotImplementedError
-
-    @cached_property
-    def probes(self) -> Frame:
-        """PROBES rows; the paper's have transfer, confabulated, shuffled and centroid_void alone."""
-        raise NotImplementedError
-
-    @cached_property
-    def cosines(self) -> Frame:
-        """COSINES rows at the steered layer of each model."""
-        raise NotImplementedError
-
-    @cached_property
-    def effects(self) -> Frame:
-        """STEERING_EFFECTS rows."""
-        raise NotImplementedError
-
-    @cached_property
-    def shares(self) -> Frame:
-        """STEERING_SHARES rows."""
-        raise NotImplementedError
-
-    @cached_property
-    def steering_regimes(self) -> Frame:
-        """Rows of `mechanism.effects.regime_matrix`."""
-        return effects.regime_matrix(self.effects)
-
-    @cached_property
-    def steering_families(self) -> Frame:
-        """Rows of `mechanism.effects.family_asymmetry`."""
-        return effects.family_asymmetry(self.effects)
-
-    @cached_property
-    def steering_domains(self) -> Frame:
-        """Rows of `mechanism.effects.domains`, and `mark` for those judged in another way."""
-        return effects.domains(self.effects).assign(mark="")
-
-    @cached_property
-    def steering_layers(self) -> Frame:
-        """Rows of `mechanism.effects.sweep`."""
-        return effects.sweep(self.effects)
+    def rows(self, table: Table) -> pd.DataFrame:
+        """All rows of a table of a study; without rows here."""
+        return pd.DataFrame(columns=pd.Index([column.name for column in table.columns]))
 
     def refusal(self, dataset: str, left: tuple[str, str], right: tuple[str, str]) -> str | None:
         """Why two (model, regime) may not be compared on a dataset or `overall`, as the contrasts found item by item;
@@ -157,11 +138,6 @@ class Results:
         sides = [frozenset((r[f"{side}_model"], r[f"{side}_regime"]) for side in ("left", "right")) for r in rows]
         return {(row["dataset"], pair): row["refused"] for row, pair in zip(rows, sides, strict=True)}
 
-    @cached_property
-    def refused(self) -> dict[str, list[str]]:
-        """What was not computed because its sides are of different epochs: reasons by analysis."""
-        return {}
-
     def why(self, what: str) -> str:
         """Why a frame has no rows, in words."""
         return "; ".join(self.refused.get(what, [])) or (
@@ -169,12 +145,12 @@ class Results:
         )
 
 
-def datasets_of(cells: Frame) -> list[str]:
+def datasets_of(cells: pd.DataFrame) -> list[str]:
     """The datasets that cells are of, in the benchmark's order."""
     there = set(cells["dataset"])
     return [name for name in DATASETS if name in there]
 
 
-def joined(parts: Iterable[Frame]) -> Frame:
+def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
     """One below the other; a frame without rows or columns where there are none."""
     return pd.concat([pd.DataFrame(), *parts], ignore_index=True)

@@ -21,7 +21,7 @@ from traps_pipeline.report.writing import (
     not_run_figure,
     plain,
 )
-from traps_pipeline.scoring import Frame, analyses
+from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +45,7 @@ def visual_textual(results: Results) -> Figure:
     return figure
 
 
-def _draw_rates(axes: Axes, rates: Frame) -> None:
+def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
     look = looks(rates["model"])
     axes.plot([0, 100], [0, 100], color=SOFT, linewidth=0.7, linestyle=(0, (4, 2.5)), zorder=1)
     for row in rates.loc[rates["taxonomy"] != "pooled"].to_dict("records"):
@@ -60,9 +60,9 @@ def _draw_rates(axes: Axes, rates: Frame) -> None:
     axes.set_title("hollow: occlusion, filled: chaotic", weight="normal", size=7)
 
 
-def _draw_families(axes: Axes, rates: Frame) -> None:
+def _draw_families(axes: Axes, rates: pd.DataFrame) -> None:
     """Means over a family's models of both rates, pooled over taxonomies; of a model without both, of what it has."""
-    whole = set(rates.loc[rates["taxonomy"] == "pooled", "model"])
+    whole = rates.loc[rates["taxonomy"] == "pooled", "model"]
     used = rates.loc[(rates["taxonomy"] == "pooled") | ~rates["model"].isin(whole)]
     means = used.assign(family=used["model"].map(family_of)).groupby("family")[["visual", "textual"]].mean()
     names = [name for name in families() if name in means.index]
@@ -165,7 +165,7 @@ def _no_doubt(results: Results) -> str:
     return "no confabulation labels of a reasoning pair’s thinking member; they need a configured judge"
 
 
-def doubt_points(results: Results) -> tuple[Frame, str]:
+def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
     """thinking, other, dataset, doubt, gain (fractions), a row a pair and dataset; and what was refused, in words.
 
     AbsRec is that of `results.rates` (standard), whose epoch must be that of the doubt labels (docs/spec.md 9.2).

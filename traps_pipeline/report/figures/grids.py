@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.writing import COLOURS, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
-from traps_pipeline.scoring import Frame, analyses
+from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +46,7 @@ def sub_scenarios(results: Results) -> Figure:
     return figure
 
 
-def _by_model(results: Results, rows: Frame) -> list[tuple[str, list[str], np.ndarray]]:
+def _by_model(results: Results, rows: pd.DataFrame) -> list[tuple[str, list[str], np.ndarray]]:
     """Title, column names and values (sub-scenarios, models) in percent, under standard and under guided."""
     cells = results.sub_cells
     cells = cells.loc[cells["dataset"].isin(analyses.TAXONOMIES)]
@@ -64,7 +65,7 @@ def _by_model(results: Results, rows: Frame) -> list[tuple[str, list[str], np.nd
     return panels
 
 
-def _means(rows: Frame) -> list[tuple[str, list[str], np.ndarray]]:
+def _means(rows: pd.DataFrame) -> list[tuple[str, list[str], np.ndarray]]:
     shown = {"abs_rec": "AbsRec, standard", "guided_abs_rec": "AbsRec, guided", "false_abs": "FalseAbs", "acc": "Acc"}
     return [("means over models", [*shown.values()], 100 * rows[[*shown]].to_numpy(float))]
 

@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from traps_pipeline.report.figures.labels import LINES, Label, merged_labels, place_labels, short
 from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, looks
@@ -20,7 +21,7 @@ from traps_pipeline.report.writing import (
     new_figure,
     not_run_figure,
 )
-from traps_pipeline.scoring import Frame, analyses
+from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +40,7 @@ def landscape(results: Results) -> Figure:
     return landscape_figure(points.assign(j=points["abs_rec"] - points["false_abs"]), TITLES[first])
 
 
-def landscape_figure(points: Frame, scope: str) -> Figure:
+def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     """Acc (x) against J (y) of every model with iso-PECS contours, one column wide.
 
     points has the columns model, regime, acc, j, pecs, incomplete. Hollow is standard, filled is guided, an arrow joins
@@ -88,7 +89,7 @@ def reasoning(results: Results) -> Figure:
     return figure
 
 
-def _draw_models(axes: Axes, points: Frame) -> list[Label]:
+def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
     """Markers of every model; returns a label a model, at its guided point, else at the first it has."""
     labels, look = [], looks(points["model"])
     for model, rows in points.groupby("model", sort=True):
@@ -114,7 +115,7 @@ def _draw_models(axes: Axes, points: Frame) -> list[Label]:
     return labels
 
 
-def _draw_frontier(axes: Axes, guided: Frame) -> None:
+def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
     """Dashed steps around everything that some model under guided is as good as in both Acc and J."""
     at = guided.sort_values(["acc", "j"], ascending=False)[["acc", "j"]].to_numpy(float)
     steps, best = [], 0.0
@@ -132,11 +133,11 @@ def _draw_frontier(axes: Axes, guided: Frame) -> None:
         )
 
 
-def _draw_rings(axes: Axes, guided: Frame) -> None:
+def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
     families = guided["model"].map(family_of)
     for family, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
-        if family != "reference" and rows["pecs"].max() > 0:
-            best = rows.loc[rows["pecs"].idxmax()]
+        best = rows.loc[rows["pecs"].idxmax()]
+        if family != "reference" and best["pecs"] > 0:
             axes.scatter(best["acc"], best["j"], s=75, facecolors="none", edgecolors=INK, linewidths=0.7, zorder=6)
 
 
@@ -158,7 +159,7 @@ def _draw_key(figure: Figure) -> None:
     )
 
 
-def _draw_chains(axes: Axes, points: Frame, chains: list[list[str]]) -> list[Label]:
+def _draw_chains(axes: Axes, points: pd.DataFrame, chains: list[list[str]]) -> list[Label]:
     at = {row["model"]: (float(row["acc"]), float(row["j"])) for row in points.to_dict("records")}
     look, labels = looks(at), []
     for chain in chains:

@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.report.writing import COLOURS, GRID, MARKERS, SOFT
-from traps_pipeline.scoring import Frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,10 +44,10 @@ def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
     return {m: (colours[m], MARKERS[alike[colours[m]].index(m) % len(MARKERS)]) for m in set(models)}
 
 
-def frame_plane(axes: Axes, points: Frame, xlabel: str) -> None:
+def frame_plane(axes: Axes, points: pd.DataFrame, xlabel: str) -> None:
     """Limits around points (columns acc and j), never less than half of either axis, with contours of PECS."""
-    left, right = _limits(points["acc"], 0.0, 0.0)
-    low, high = _limits(points["j"], min([-0.08, *(points["j"] - 0.08)]), 0.3)
+    left, right = _limits(points.loc[:, "acc"], 0.0, 0.0)
+    low, high = _limits(points.loc[:, "j"], min([-0.08, *(points["j"] - 0.08)]), 0.3)
     axes.set(xlim=(left - 0.03, right + 0.03), ylim=(low, high + 0.04), xlabel=xlabel, ylabel="J = AbsRec − FalseAbs")
     axes.axhline(0, color="#98a2b3", linewidth=0.8, zorder=0.5)
     edge: dict[str, Any] = {"annotation_clip": False, "va": "center", "color": SOFT, "size": 6}
@@ -60,12 +60,12 @@ def frame_plane(axes: Axes, points: Frame, xlabel: str) -> None:
     axes.annotate("PECS", (right, high), (labelled, high + 0.035), **edge)
 
 
-def _limits(values: Frame, low: float, least: float) -> tuple[float, float]:
+def _limits(values: pd.Series, low: float, least: float) -> tuple[float, float]:
     """Ends of an axis of fractions: tenths around the values, at most [low, 1]; up to at least `least`."""
     if not len(values):
         return low, 1.0
-    bottom = low if least else max(low, np.floor(10 * values.min() - 0.8) / 10)
-    top = min(1.0, max(least, np.ceil(10 * values.max() + 0.8) / 10))
+    bottom = low if least else max(low, float(np.floor(10 * values.min() - 0.8)) / 10)
+    top = min(1.0, max(least, float(np.ceil(10 * values.max() + 0.8)) / 10))
     return min(bottom, top - 0.5) if not least else bottom, top
 
 

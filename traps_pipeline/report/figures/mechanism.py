@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.paths import PATH_SETS, TRANSFER_TYPES, path_name
@@ -13,7 +14,6 @@ from traps_pipeline.partitions import DATASETS, SHORT, transfer_type
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.mechanism import NOT_LOOKED, best_layers
 from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
-from traps_pipeline.scoring import Frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +28,7 @@ CROSSING = TRANSFER_TYPES[:3]
 SETS = {"transfer": "transfer", "within_domain": "within"}
 
 
-def _why(results: Results, frame: Frame) -> str:
+def _why(results: Results, frame: pd.DataFrame) -> str:
     return NOT_LOOKED if results.is_study and not len(frame) else results.why("probes")
 
 
@@ -83,7 +83,7 @@ def probe_curves(results: Results) -> Figure:
     return figure
 
 
-def _curves(ax: Axes, curves: Frame, crossing: str) -> None:
+def _curves(ax: Axes, curves: pd.DataFrame, crossing: str) -> None:
     from matplotlib.ticker import MaxNLocator
 
     for key, curve in curves.groupby(["source", "target"], sort=False):
@@ -102,8 +102,8 @@ def _curves(ax: Axes, curves: Frame, crossing: str) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def _shuffled_band(ax: Axes, rows: Frame) -> None:
-    if not len(rows) or rows["layer"].isna().any():
+def _shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
+    if not len(rows) or rows.loc[:, "layer"].isna().any():
         return
     at = rows.groupby("layer").agg(mean=("value", "mean"), spread=("spread", "mean"))
     low, high = at["mean"] - 2 * at["spread"], at["mean"] + 2 * at["spread"]
@@ -114,7 +114,7 @@ def confabulated_strip(results: Results) -> Figure:
     """AUROC of every ordered pair on all samples (hollow) and on confabulated voids with their controls (filled), both
     at the all-sample best layer; a bar is the median of the filled ones."""
     rows = best_layers(results.probes)
-    if not len(rows) or rows["cf_value"].isna().all():
+    if not len(rows) or rows.loc[:, "cf_value"].isna().all():
         why = "no dataset has confabulated voids" if len(rows) else _why(results, rows)
         return not_run_figure("Cf→Cf probes", why, PAGE_IN)
     models = list(dict.fromkeys(rows["model"]))
@@ -130,7 +130,7 @@ def confabulated_strip(results: Results) -> Figure:
     return figure
 
 
-def _strip(ax: Axes, rows: Frame) -> None:
+def _strip(ax: Axes, rows: pd.DataFrame) -> None:
     for place, crossing in enumerate(CROSSING):
         part = rows.loc[rows["transfer_type"] == crossing]
         for k, row in enumerate(part.to_dict("records")):
@@ -179,21 +179,21 @@ def dose_response(results: Results) -> Figure:
     return figure
 
 
-def _of_panel(shares: Frame, part: Frame, path_set: str, side: str) -> Frame:
+def _of_panel(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:
     """The shares over a panel's paths along void directions, by alpha."""
     mine = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
     return mine.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
 
 
-def _mean_band(ax: Axes, shares: Frame) -> None:
+def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
     alphas, percent = shares["alpha"].to_numpy(float), 100 * shares[["low", "high", "abstention"]].astype(float)
     ax.fill_between(alphas, percent["low"], percent["high"], color=GRID, alpha=0.7, linewidth=0, zorder=0.2)
     ax.plot(alphas, percent["abstention"], color=SOFT, linewidth=2.2, zorder=0.3)
 
 
-def _panels(rows: Frame) -> Mapping[tuple[str, str], Frame]:
+def _panels(rows: pd.DataFrame) -> Mapping[tuple[str, str], pd.DataFrame]:
     """Rows of each model and path set in which every path is there, of the most guided regimes that the model has."""
-    found: dict[tuple[str, str], Frame] = {}
+    found: dict[tuple[str, str], pd.DataFrame] = {}
     for model, of in rows.groupby("model", sort=False):
         guided = (of["directions"] == "guided").astype(int) + 2 * (of["regime"] == "guided").astype(int)
         of = of.loc[guided == guided.max()]
@@ -204,7 +204,7 @@ def _panels(rows: Frame) -> Mapping[tuple[str, str], Frame]:
     return found
 
 
-def _doses(ax: Axes, part: Frame, side: str) -> None:
+def _doses(ax: Axes, part: pd.DataFrame, side: str) -> None:
     alphas = sorted(set(part["alpha"]))
     for key, line in part.groupby(["source", "target"], sort=False):
         source, target = str(key[0]), str(key[1])  # pyright: ignore[reportIndexIssue]
@@ -238,7 +238,7 @@ def cosine_heatmaps(results: Results) -> Figure:
     return figure
 
 
-def _heatmap(ax: Axes, part: Frame) -> Any:
+def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
     wide = part.pivot_table(index="dataset", columns="other_dataset", values="cosine")
     values = wide.reindex(index=list(DATASETS), columns=list(DATASETS)).to_numpy(float)
     image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1)

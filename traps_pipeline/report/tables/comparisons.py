@@ -14,6 +14,7 @@ from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
     COUNTED,
     COUNTS,
+    DATASET,
     EPOCH,
     MODEL,
     PECS,
@@ -30,11 +31,12 @@ from traps_pipeline.report.tables.shared import (
     no_overall,
     ordered,
     said,
+    titled,
     together,
 )
-from traps_pipeline.report.terms import SIDE_OF, TITLES
+from traps_pipeline.report.terms import SIDE_OF
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
-from traps_pipeline.scoring import Frame, analyses
+from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 
 NAIVE_THRESHOLD = 0.03
@@ -43,7 +45,9 @@ NAIVE_THRESHOLD = 0.03
 def visual_textual(results: Results) -> list[Table]:
     """AbsRec under standard on visual and on ill-posed voids, and their ratio, by taxonomy and pooled."""
     rates = marked(results.rates)
-    rows = rates.drop_duplicates("model", keep="last")[["model", *COUNTED, "mark"]]  # the pooled row is a model's last
+    rows = rates.drop_duplicates("model", keep="last").loc[
+        :, ["model", *COUNTED, "mark"]
+    ]  # the pooled row is a model's last
     columns = [MODEL]
     for taxonomy in (*analyses.TAXONOMIES, "pooled"):
         names = {kind: f"{taxonomy}_{kind}" for kind in ("visual", "textual", "gap", "epoch", "mark")}
@@ -122,10 +126,9 @@ def naive(results: Results) -> list[Table]:
     cells = results.cells.loc[results.cells["regime"] == "guided"]
     rows = marked(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
     above = analyses.naive_gap(cells, NAIVE_THRESHOLD)
-    rows = rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable")
-    rows["title"] = rows["dataset"].map(TITLES)
+    rows = titled(rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable"))
     columns = [
-        MODEL, Column("title", "Dataset"), SHARES[0], SHARES[1], SHARES[2], PECS,
+        MODEL, DATASET, SHARES[0], SHARES[1], SHARES[2], PECS,
         Column("naive", "Naive", "fraction"), Column("gap", "Naive − PECS", "fraction"), *COUNTS, EPOCH,
     ]  # fmt: skip
     notes = [
@@ -139,9 +142,8 @@ def naive(results: Results) -> list[Table]:
 
 def zero_boundary(results: Results) -> list[Table]:
     """Cells whose PECS is 0: where a model does not tell void from control at all."""
-    rows = marked(analyses.zero_boundary(results.cells)).assign(title=lambda f: f["dataset"].map(TITLES))
-    rows = ordered(rows, ["regime", "dataset", "model"])
-    columns = [MODEL, Column("title", "Dataset"), REGIME, *SHARES, PECS, *COUNTS, EPOCH]
+    rows = ordered(titled(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
+    columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
     asked = results.cells.groupby("regime", sort=False).size()
     zero = rows.groupby("regime").size().reindex(asked.index, fill_value=0)
     notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in asked.items()), epochs(rows)]
@@ -168,7 +170,7 @@ def reasoning(results: Results) -> list[Table]:
             rows.append(analyses.pair_differences(cells.loc[cells["model"].isin(pair)]))
         except EpochMismatch as error:
             refused.append(str(error))
-    table: Frame = pd.concat(rows, ignore_index=True)
+    table: pd.DataFrame = pd.concat(rows, ignore_index=True)
     reasons = [
         results.refusal(row["dataset"], *((row[member], row["regime"]) for member in ("thinking", "other")))
         for row in table.to_dict("records")
@@ -176,9 +178,9 @@ def reasoning(results: Results) -> list[Table]:
     refused += sorted({reason for reason in reasons if reason})
     table = table.loc[[reason is None for reason in reasons]].reset_index(drop=True)
     table = counted(table, cells, [(member, "regime", "dataset") for member in ("thinking", "other")])
-    table = ordered(table.assign(title=table["dataset"].replace(TITLES)), ["thinking", "regime", "dataset"])
+    table = ordered(titled(table), ["thinking", "regime", "dataset"])
     columns = [
-        Column("thinking", "Thinking"), Column("other", "Other"), REGIME, Column("title", "Dataset"),
+        Column("thinking", "Thinking"), Column("other", "Other"), REGIME, DATASET,
         *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARES),
         Column("pecs", "Δ PECS", "fraction", mark="mark"), *COUNTS,
     ]  # fmt: skip
@@ -214,10 +216,9 @@ def contrasts(results: Results) -> list[Table]:
 
 def regime_tests(results: Results) -> list[Table]:
     """McNemar's test of two regimes on the same items, by dataset, model and run."""
-    rows = results.regime_tests
-    rows = ordered(rows.assign(title=rows["dataset"].map(TITLES)), ["dataset", "model", "run", "decision"])
+    rows = ordered(titled(results.regime_tests), ["dataset", "model", "run", "decision"])
     columns = [
-        Column("title", "Dataset"), MODEL, Column("run", "Run", "count"), Column("decision", "Decision"),
+        DATASET, MODEL, Column("run", "Run", "count"), Column("decision", "Decision"),
         Column("left_regime", "Left"), Column("right_regime", "Right"), Column("n", "n", "count"),
         Column("only_left", "Yes, left alone", "count"), Column("only_right", "Yes, right alone", "count"),
         Column("p", "p", "p"), Column("p_holm", "p, Holm", "p"), Column("refused", "Refused"),
@@ -229,10 +230,10 @@ def regime_tests(results: Results) -> list[Table]:
 
 def spreads(results: Results) -> list[Table]:
     """Quartiles of the standard deviations of PECS over runs, by family."""
-    cells: Frame = results.cells
+    cells: pd.DataFrame = results.cells
     families = {entry.id: entry.groups.family for entry in load_models().values()}
     rows = []
-    for family, part in [*cells.assign(family=cells["model"].map(families)).groupby("family"), ("all", cells)]:
+    for family, part in [*cells.assign(family=cells.loc[:, "model"].map(families)).groupby("family"), ("all", cells)]:
         several = part.loc[part["n_runs"] > 1]
         if len(several):
             rows.append({"family": family, **analyses.spread(several).iloc[0].to_dict()})

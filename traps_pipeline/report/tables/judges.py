@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import pandas as pd
+
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
+    DATASET,
     MISSING,
     MODEL,
     REGIME,
@@ -15,10 +18,9 @@ from traps_pipeline.report.tables.shared import (
     cell_trace,
     epochs,
     ordered,
+    titled,
 )
-from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
-from traps_pipeline.scoring import Frame
 
 
 def agreement(results: Results) -> list[Table]:
@@ -26,9 +28,9 @@ def agreement(results: Results) -> list[Table]:
     rows = results.agreement
     pairs = rows.loc[rows["judges"] != "panel"].groupby(["dataset", "task"])["agreement"].min().rename("lowest_pair")
     rows = rows.loc[rows["judges"] == "panel"].merge(pairs.reset_index(), on=["dataset", "task"], how="left")
-    rows = ordered(rows.assign(title=rows["dataset"].map(TITLES)), ["dataset", "task"])
+    rows = ordered(titled(rows), ["dataset", "task"])
     columns = [
-        Column("title", "Dataset"), Column("task", "Task"), Column("agreement", "Unanimous %", "percent"),
+        DATASET, Column("task", "Task"), Column("agreement", "Unanimous %", "percent"),
         Column("fleiss_kappa", "Fleiss’ κ", "fraction"), Column("alpha", "Krippendorff’s α", "fraction"),
         Column("lowest_pair", "Lowest pair %", "percent"), Column("prevalence", "Yes %", "percent"),
         Column("invalid", "Invalid %", "percent", 2), Column("n_items", "n", "count"),
@@ -43,26 +45,25 @@ def _task_trace(row: Mapping[str, Any], field: str) -> Behind:
     return Behind(row["dataset"], "", "", "void" if row["task"] == "void_abstention" else "control")
 
 
-def _undefined(rows: Frame) -> list[str]:
+def _undefined(rows: pd.DataFrame) -> list[str]:
     reasons = [str(reason) for reason in rows["undefined"].dropna().unique()]
     return [f"undefined: {'; '.join(sorted(reasons))}"] if reasons else []
 
 
 def judge_bias(results: Results) -> list[Table]:
     """Every judge against the panel, and PECS without it."""
-    bias = results.bias.assign(title=results.bias["dataset"].map(TITLES))
-    bias = ordered(bias, ["dataset", "task", "judge"])
+    bias = ordered(titled(results.bias), ["dataset", "task", "judge"])
     columns = [
-        Column("title", "Dataset"), Column("task", "Task"), Column("judge", "Judge"), Column("yes", "Yes %", "percent"),
+        DATASET, Column("task", "Task"), Column("judge", "Judge"), Column("yes", "Yes %", "percent"),
         Column("panel_yes", "Panel’s yes %", "percent"), Column("bias", "Bias, points", "percent"),
         Column("dissent_yes", "Yes against it %", "percent", 2), Column("dissent_no", "No against it %", "percent", 2),
         Column("n_votes", "Votes", "count"), Column("n_invalid", "Invalid", "count"),
     ]  # fmt: skip
     left = results.leave_one_out
     left = left.loc[left["dataset"] == "overall"] if "overall" in set(left["dataset"]) else left
-    left = ordered(left.assign(title=left["dataset"].map(TITLES)), ["model", "regime", "without"])
+    left = ordered(titled(left), ["model", "regime", "without"])
     without = [
-        MODEL, REGIME, Column("title", "Dataset"), Column("without", "Without"),
+        MODEL, REGIME, DATASET, Column("without", "Without"),
         Column("pecs", "PECS of two", "fraction"), Column("pecs_panel", "PECS of three", "fraction"),
         Column("difference", "Difference", "fraction"), N, RUNS, MISSING,
     ]  # fmt: skip

@@ -10,6 +10,7 @@ from traps_pipeline.partitions import DATASETS, REGIMES
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
     COUNTS,
+    DATASET,
     EPOCH,
     MODEL,
     PECS,
@@ -25,10 +26,11 @@ from traps_pipeline.report.tables.shared import (
     no_overall,
     ordered,
     ranks,
+    titled,
 )
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
-from traps_pipeline.scoring import Frame, analyses
+from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.published import published_overall
 
 
@@ -52,7 +54,7 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Tabl
         rows = rows.assign(ci=[interval(row) for row in shown], ranks=[ranks(row) for row in shown])
         columns[3:3] = [Column("ci", "95 % CI", "range"), Column("ranks", "Rank", "range")]
         notes.append("rank by PECS within the regime; of 2–4, paired contrasts (Holm) leave these ranks open")
-        printed = published_overall()[["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
+        printed = published_overall().loc[:, ["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
         rows = rows.merge(printed, on=["model", "regime"], how="left")
         if rows["published_pecs"].notna().any():
             columns.append(Column("published_pecs", "published PECS", "fraction"))
@@ -70,11 +72,9 @@ def per_dataset(results: Results) -> list[Table]:
 def replication_per_dataset(results: Results) -> list[Table]:
     """The replication families' figures on each dataset."""
     cells = marked(results.cells)
-    rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))].assign(
-        title=lambda frame: frame["dataset"].map(TITLES)
-    )
-    rows = ordered(rows, ["model", "dataset", "regime"])
-    columns = [MODEL, Column("title", "Dataset"), REGIME, PECS, *SHARES, *COUNTS, EPOCH]
+    rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))]
+    rows = ordered(titled(rows), ["model", "dataset", "regime"])
+    columns = [MODEL, DATASET, REGIME, PECS, *SHARES, *COUNTS, EPOCH]
     notes = [epochs(rows), *marks(rows)]
     why = "no model of the replication families"
     return [Table("replication_per_dataset", "Replication families, by dataset", rows, columns, notes, why, cell_trace)]
@@ -105,7 +105,7 @@ def _by_dataset(results: Results, name: str, title: str, replication: bool) -> T
     return Table(name, title, rows, columns, notes, results.why("cells"), trace)
 
 
-def _n(title: str, part: Frame, names: Mapping[str, str]) -> str:
+def _n(title: str, part: pd.DataFrame, names: Mapping[str, str]) -> str:
     """A heading with the number of pairs, where all rows have the same."""
     counts = part[names["n_pairs"]].dropna().unique()
     return f"{title} (n = {int(counts[0])})" if len(counts) == 1 else title

@@ -13,7 +13,6 @@ from traps_pipeline.partitions import SHORT, transfer_type
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import MODEL, epochs, said
 from traps_pipeline.report.writing import Column, Table
-from traps_pipeline.scoring import Frame
 
 PATH, TYPE = Column("path", "Path"), Column("transfer_type", "Transfer")
 DIRECTIONS, INFERENCE = Column("directions", "Directions"), Column("regime", "Inference")
@@ -22,7 +21,7 @@ NOT_LOOKED = "no local model was looked into: the experiment has no `mechanism` 
 SETS = {"transfer": "transfer", "within_domain": "within domain"}
 
 
-def _why(results: Results, frame: Frame) -> str:
+def _why(results: Results, frame: pd.DataFrame) -> str:
     return NOT_LOOKED if results.is_study and not len(frame) else results.why("probes")
 
 
@@ -34,7 +33,7 @@ def probes(results: Results) -> list[Table]:
     return [_transfer(results), _means(results), _within(results), _catch(results), _answerable(results)]
 
 
-def best_layers(rows: Frame) -> Frame:
+def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
     """One row a model and ordered pair: the paper's best layer, the source's own choice, and Cf->Cf at both layers."""
     made: list[dict[str, Any]] = []
     for model, of in rows.groupby("model", sort=False):
@@ -61,7 +60,7 @@ def best_layers(rows: Frame) -> Frame:
     return pd.DataFrame(made)
 
 
-def _at(rows: Frame, name: str, fields: tuple[str, ...]) -> dict[str, Any]:
+def _at(rows: pd.DataFrame, name: str, fields: tuple[str, ...]) -> dict[str, Any]:
     return {f"{name}_{field}": rows[field].iloc[0] if len(rows) else np.nan for field in fields}
 
 
@@ -90,7 +89,8 @@ def _means(results: Results) -> Table:
     if len(rows):
         figures = ["best_value", "source_value", "held_out_value", "cf_value", "cf_own_value"]
         grouped = rows.groupby(["model", "transfer_type"], sort=False)
-        rows = grouped[figures].mean().join(grouped["path"].count().rename("n_paths")).reset_index()
+        means = {name: (name, "mean") for name in figures}
+        rows = grouped.agg(**means, n_paths=("path", "count")).reset_index()
     columns = [
         MODEL, TYPE, Column("best_value", "AUROC", "fraction"), Column("source_value", "Source’s layer", "fraction"),
         *_held_out(results), Column("cf_value", "Cf→Cf", "fraction"),
@@ -247,7 +247,7 @@ def _shares(results: Results) -> Table:
 
 
 def _regimes(results: Results, name: str, title: str) -> Table:
-    rows: Frame = getattr(results, name)
+    rows: pd.DataFrame = getattr(results, name)
     rows = rows.assign(path_set=rows["path_set"].replace(SETS))
     columns = [
         MODEL, SET, *([Column("family", "Family")] if name.endswith("families") else [DIRECTIONS, INFERENCE]), KIND,
@@ -316,7 +316,7 @@ def _layers(results: Results) -> Table:
 _SIDES = (Column("control", "Controls abstained on %", "percent"), Column("void", "Voids abstained on %", "percent"))
 
 
-def _named(rows: Frame) -> Frame:
+def _named(rows: pd.DataFrame) -> pd.DataFrame:
     names = [path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)]
     return rows.assign(path=names).reset_index(drop=True)
 

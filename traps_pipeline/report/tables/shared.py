@@ -12,11 +12,11 @@ import pandas as pd
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF
+from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
 from traps_pipeline.report.writing import Behind, Column, Table, fraction
-from traps_pipeline.scoring import Frame
 
 MODEL, REGIME = Column("model", "Model", look="head"), Column("regime", "Regime", look="tag")
+DATASET = Column("title", "Dataset")
 N, MISSING, RUNS = (
     Column("n_pairs", "n", "count"),
     Column("n_missing", "Missing", "count"),
@@ -43,11 +43,16 @@ def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
     return Behind(dataset if dataset in DATASETS else "", row["model"], row["regime"], side)
 
 
-def marked(rows: Frame) -> Frame:
+def marked(rows: pd.DataFrame) -> pd.DataFrame:
     """With `mark`: ‡ on incomplete rows, † on others that miss some items."""
     incomplete = rows["incomplete"].eq(True).to_numpy(bool)
     missing = rows["n_missing"].fillna(0).to_numpy(float) > 0
     return rows.assign(mark=np.where(incomplete, INCOMPLETE_MARK, np.where(missing, MISSING_MARK, "")))
+
+
+def titled(rows: pd.DataFrame) -> pd.DataFrame:
+    """With `title`, the dataset's for people."""
+    return rows.assign(title=rows.loc[:, "dataset"].map(TITLES))
 
 
 def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -59,7 +64,7 @@ def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {**counts, "n_missing": missing, "incomplete": any(side["incomplete"] for side in sides)}
 
 
-def counted(rows: Frame, entries: Frame, sides: Sequence[Sequence[str]]) -> Frame:
+def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
     """Rows that compare entries, `marked` and with COUNTED. sides: the columns of rows that hold model, regime and
     dataset of either side; entries: cells, and those of the dataset `overall`."""
     known = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
@@ -68,12 +73,12 @@ def counted(rows: Frame, entries: Frame, sides: Sequence[Sequence[str]]) -> Fram
     return marked(rows.join(pd.DataFrame(counts, index=rows.index, columns=pd.Index(COUNTED))))
 
 
-def entries(results: Results) -> Frame:
+def entries(results: Results) -> pd.DataFrame:
     """The cells, and below them the overall rows as those of a dataset `overall`."""
     return pd.concat([results.cells, results.overall.assign(dataset="overall")], ignore_index=True)
 
 
-def marks(rows: Frame) -> list[str]:
+def marks(rows: pd.DataFrame) -> list[str]:
     """What the marks in these rows mean."""
     return meanings(rows["mark"])
 
@@ -84,7 +89,7 @@ def meanings(marks: Iterable[str]) -> list[str]:
     return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in there]
 
 
-def epochs(rows: Frame) -> str:
+def epochs(rows: pd.DataFrame) -> str:
     """What a header says of epochs: the one there is, or that they are mixed, and how; empty without rows."""
     known = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
     single = sorted({part for epoch in known["epoch"] for part in str(epoch).split("+")})
@@ -101,22 +106,22 @@ def epochs(rows: Frame) -> str:
     return f"mixed epochs ({'; '.join([*parts, f'else {most}'])})"
 
 
-def printed(results: Results, rows: Frame, columns: Sequence[Column]) -> list[Column]:
+def printed(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
     """The columns that are shown: of the paper's numbers, those that it prints at all."""
     whole = results.is_study or not len(rows)
-    return [c for c in columns if whole or c.field not in rows or not rows[c.field].isna().all()]
+    return [c for c in columns if whole or c.field not in rows or not rows.loc[:, c.field].isna().all()]
 
 
-def best_first(rows: Frame) -> Frame:
+def best_first(rows: pd.DataFrame) -> pd.DataFrame:
     """By falling PECS, nulls last."""
     return rows.sort_values("pecs", ascending=False, na_position="last", ignore_index=True, kind="stable")
 
 
-def ordered(rows: Frame, by: Sequence[str]) -> Frame:
+def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Sorted with datasets and regimes in the benchmark's order, models in the registry's."""
     orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
 
-    def place(values: Frame) -> Frame:
+    def place(values: pd.Series) -> pd.Series:
         order = orders.get(str(values.name))
         return values if order is None else values.map({v: k for k, v in enumerate(order)}).fillna(len(order))
 
@@ -135,7 +140,7 @@ def ranks(row: Mapping[str, Any]) -> str:
     return "" if pd.isna(low) else f"{low:.0f}" if low == high else f"{low:.0f}–{high:.0f}"
 
 
-def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Frame:
+def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
     """Rows as a frame; one with these columns where there are none."""
     return pd.DataFrame(list(rows)) if rows else pd.DataFrame(columns=pd.Index(list(columns)))
 

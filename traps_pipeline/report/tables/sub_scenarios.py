@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import pandas as pd
+
 from traps_pipeline.partitions import taxonomy_of
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
+    DATASET,
     MISSING,
     PECS,
     SHARES,
@@ -15,10 +18,11 @@ from traps_pipeline.report.tables.shared import (
     epochs,
     marked,
     marks,
+    titled,
 )
-from traps_pipeline.report.terms import SIDE_OF, TITLES
+from traps_pipeline.report.terms import SIDE_OF
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
-from traps_pipeline.scoring import Frame, analyses
+from traps_pipeline.scoring import analyses
 
 
 def occlusion_sub_scenarios(results: Results) -> list[Table]:
@@ -44,9 +48,8 @@ def chaotic_sub_scenarios(results: Results) -> list[Table]:
     """Means over models of every chaotic family, and Acc by the control's answer."""
     rows = _sub_rows(results, "chaotic")
     labels = results.labels
-    labels = labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"].copy()
-    labels["title"] = labels["dataset"].map(TITLES)
-    columns = [Column("title", "Dataset"), Column("label", "Ground truth"), Column("acc", "Acc %", "percent")]
+    labels = titled(labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"])
+    columns = [DATASET, Column("label", "Ground truth"), Column("acc", "Acc %", "percent")]
     notes = ["mean over models under standard"]
     if results.is_study:
         columns += [N, Column("n_models", "Models", "count"), MISSING]
@@ -60,13 +63,13 @@ def chaotic_sub_scenarios(results: Results) -> list[Table]:
     ]
 
 
-def _sub_rows(results: Results, taxonomy: str) -> Frame:
+def _sub_rows(results: Results, taxonomy: str) -> pd.DataFrame:
     rows = results.sub_scenarios
     rows = marked(rows.loc[rows["dataset"] == taxonomy].assign(incomplete=False))
     return rows.sort_values(["acc", "sub_scenario"], ignore_index=True)
 
 
-def _sub_table(results: Results, rows: Frame, name: str, title: str) -> Table:
+def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> Table:
     columns = [
         Column("sub_scenario", "Sub-scenario"), Column("answer_type", "Answer"), N,
         Column("n_models", "Models", "count"), *SHARES, PECS,
