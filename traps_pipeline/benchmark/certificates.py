@@ -21,6 +21,7 @@ from traps_pipeline.scenes.certify import Verdict, certify
 from traps_pipeline.scenes.sample import Tally, load_tallies
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
 from traps_pipeline.scenes.workers import run_in_order
+from traps_pipeline.terminal import text_table
 
 
 @dataclass(frozen=True)
@@ -112,17 +113,16 @@ def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
     members: defaultdict[str, list[Verdict]] = defaultdict(list)
     for verdict in verdicts:
         members[verdict.family].append(verdict)
-    head = f"{'family':<20}{'scenarios':>10}{'passed':>8}{'rejected':>10}{'entropy':>12}{'margin m':>14}"
-    lines = [head + f"{'twins':>7}{'CPU s':>7}{'other physics':>15}"]
+    headings = ("family", "scenarios", "passed", "rejected", "entropy", "margin m", "twins", "CPU s", "other physics")
+    rows = []
     for family, found in sorted(members.items()):
         twins = sum("twin" not in v.failures and "record" not in v.failures for v in found)
         rejected = tallies.get(family, Tally(0, 0)).rejected.total()
         others = sum(not v.same_physics for v in found)
-        lines.append(
-            f"{family:<20}{len(found):>10}{sum(v.passed for v in found):>8}{rejected:>10}"
-            f"{_span(found, 'entropy_bits', 2):>12}{_span(found, 'margin_m', 3):>14}"
-            f"{twins:>7}{np.median([v.cpu_s for v in found]):>7.1f}{others:>15}"
-        )
+        spans = (_span(found, "entropy_bits", 2), _span(found, "margin_m", 3))
+        seconds = f"{np.median([v.cpu_s for v in found]):.1f}"
+        rows.append((family, len(found), sum(v.passed for v in found), rejected, *spans, twins, seconds, others))
+    lines = [text_table(headings, rows)]
     if any(not v.same_physics for v in verdicts):
         lines.append(
             "other physics: simulating here does not give the frozen trajectory bit by bit (another CPU or version); "

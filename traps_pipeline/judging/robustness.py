@@ -25,6 +25,7 @@ from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import JUDGE_ROBUSTNESS
+from traps_pipeline.terminal import text_table
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 ATTACKS_FILE = ASSETS / "injected_answers.yaml"
@@ -169,10 +170,10 @@ def result(expected: bool, clean: bool | None, vote: bool | None) -> str:
 
 def summary(rows: pd.DataFrame) -> str:
     """What a person reads: results by judge, then every vote that an attack moved."""
-    lines = [f"{'judge':<28} {'votes':>6} " + " ".join(f"{name:>12}" for name in RESULTS)]
+    counts = []
     for judge, mine in rows.groupby("judge", sort=False):
-        counts = [mine["result"].tolist().count(name) for name in RESULTS]
-        lines.append(f"{judge!s:<28} {len(mine):>6} " + " ".join(f"{count:>12}" for count in counts))
+        counts.append([judge, len(mine), *(mine["result"].tolist().count(name) for name in RESULTS)])
+    lines = [text_table(["judge", "votes", *RESULTS], counts)]
     moved = rows.loc[rows["result"].isin(["flipped", "broken"]) & (rows["judge"] != PANEL)]
     lines += [f"{r['judge']}: {r['attack']} ({r['kind']}) {r['result']} {r['task']}" for r in moved.to_dict("records")]
     return "\n".join(lines)

@@ -29,6 +29,7 @@ from traps_pipeline.judging.confabulation import (
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.tables import CONFABULATION, ITEMS, JUDGE_VALIDATION, RESPONSES
+from traps_pipeline.terminal import text_table
 
 LABEL_COLUMNS = ("annotator", "sample_id", *AXES)
 SHEET_COLUMNS = (*LABEL_COLUMNS, "question", "why_unanswerable", "reasoning_trace", "response")
@@ -257,26 +258,24 @@ def _share(part: int, whole: int) -> float:
 def validation_text(rows: pd.DataFrame) -> str:
     """JUDGE_VALIDATION rows as a person reads them."""
     first = rows.iloc[0]
-    lines = [
-        f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {first['n_failures']} failures",
-        f"{'axis':<22} {'labels':>6} {'acc':>6} {'prec':>6} {'recall':>6} {'F1':>6} {'vs A':>6} {'vs B':>6}"
-        f"   {'A = B':>6} {'kappa':>6} 95 %",
+    title = f"judge against {first['annotator_a']} (A) and {first['annotator_b']} (B), {first['n_failures']} failures"
+    headings = ["axis", "labels", "acc", "prec", "recall", "F1", "vs A", "vs B", "A = B", "kappa", "95 %"]
+    shares = ("accuracy", "precision", "recall", "f1", "accuracy_a", "accuracy_b", "human_agreement")
+    cells = [
+        [row["axis"], row["n_labels"], *(_figure(row[name]) for name in shares), *_kappa_cells(row)]
+        for row in rows.to_dict("records")
     ]
-    shares = ("accuracy", "precision", "recall", "f1", "accuracy_a", "accuracy_b")
-    for row in rows.to_dict("records"):
-        figures = " ".join(_figure(row[name]) for name in shares)
-        agreed = f"{_figure(row['human_agreement'])} {_kappa_text(row)}"
-        lines.append(f"{row['axis']:<22} {row['n_labels']:>6} {figures}   {agreed}".rstrip())
-    return "\n".join(lines)
+    return f"{title}\n{text_table(headings, cells)}"
 
 
-def _kappa_text(row: Mapping[Any, Any]) -> str:
+def _kappa_cells(row: Mapping[Any, Any]) -> tuple[str, str]:
+    """Kappa, or why there is none, and its interval."""
     if pd.notna(row["kappa_note"]):
-        return row["kappa_note"]
+        return row["kappa_note"], ""
     if np.isnan(row["human_kappa"]):
-        return ""
-    return f"{row['human_kappa']:6.2f} {row['human_kappa_low']:.2f} to {row['human_kappa_high']:.2f}"
+        return "", ""
+    return f"{row['human_kappa']:.2f}", f"{row['human_kappa_low']:.2f} to {row['human_kappa_high']:.2f}"
 
 
 def _figure(value: float) -> str:
-    return f"{'-':>6}" if np.isnan(value) else f"{value:6.3f}"
+    return "-" if np.isnan(value) else f"{value:.3f}"
