@@ -16,9 +16,6 @@ from traps_pipeline.terminal import text_table
 HEADINGS = ("model", "n", "what was refused")
 REFUSED = "[red]calls[/red] " + "after a time-out " * 8 + "end"
 ROWS = (("oracle", 7, "nothing"), ("a-model-of-a-long-name", 1234, REFUSED))
-    ("oracle", 7, "nothing"),
-    ("a-model-of-a-long-name", 1234, "[red]calls[/red] " + "after a time-out " * 8 + "end"),
-)
 
 
 def test_columns_of_a_pipe_are_apart_by_blanks_alone_and_numbers_stand_to_the_right() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from traps_pipeline.cli.command import OK, Commands, experiment_of, load_definitions, open_workspace, root_of
+from traps_pipeline.terminal import text_table
 
 if TYPE_CHECKING:
     from traps_pipeline.models.forecast import Forecast
@@ -29,19 +30,14 @@ def plan(arguments: argparse.Namespace) -> int:
     planned = make_plan(workspace, experiment)
     total = (Count(), Count())
     print(f"{experiment.name} in {root if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
-    print(f"{'model':<24} {'answers':>9} {'known':>9} {'new':>9}   {'votes':>9} {'known':>9} {'new':>9}")
-    for model, counts in planned.calls.items():
-        for sum_, count in zip(total, counts, strict=True):
-            sum_.add(count.wanted, count.known)
-        print(_plan_line(model, counts))
-    for model, counts in planned.steered.items():
-        for sum_, count in zip(total, counts, strict=True):
-            sum_.add(count.wanted, count.known)
-        print(_plan_line(f"{model}, steered", counts))
+    rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
     if planned.labels is not None:
-        total[1].add(planned.labels.wanted, planned.labels.known)
-        print(_plan_line("confabulation labels", (Count(), planned.labels)))
-    print(_plan_line("all", total))
+        rows["confabulation labels"] = (Count(), planned.labels)
+    for counts in rows.values():
+        for sum_, count in zip(total, counts, strict=True):
+            sum_.add(count.wanted, count.known)
+    headings = ("model", "answers", "known", "new", "votes", "known", "new")
+    print(text_table(headings, [_plan_row(name, counts) for name, counts in [*rows.items(), ("all", total)]]))
     if planned.forecasts:
         _print_forecasts(planned.forecasts)
     if planned.uncertain:
@@ -52,32 +48,33 @@ def plan(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _plan_line(name: str, counts: tuple[Count, Count]) -> str:
-    answers, votes = ((count.wanted, count.known, count.new) for count in counts)
-    return (
-        f"{name:<24} {answers[0]:>9,} {answers[1]:>9,} {answers[2]:>9,}   {votes[0]:>9,} {votes[1]:>9,} {votes[2]:>9,}"
-    )
+def _plan_row(name: str, counts: tuple[Count, Count]) -> list[str]:
+    return [name, *(f"{number:,}" for count in counts for number in (count.wanted, count.known, count.new))]
 
 
 def _print_forecasts(forecasts: Sequence[Forecast]) -> None:
     """Tokens, dollars and minutes of the new calls over the network; an unknown price stays unknown in the sum."""
-    print(
-        f"\n{'over the network':<24} {'new calls':>9} {'M tokens in, out':>18}   {'USD low':>10} {'expected':>10}",
-        end="",
-    )
-    print(f" {'high':>10} {'minutes':>8}")
-    for row in forecasts:
-        tokens = f"{row.prompt_tokens / 1e6:.2f}, {row.completion_tokens / 1e6:.2f}"
-        print(f"{row.participant:<24} {row.calls:>9,} {tokens:>18}   {_dollars(row.dollars)} {row.minutes:>8,.0f}")
     known = [row.dollars for row in forecasts if row.dollars is not None]
     total = (sum(d[0] for d in known), sum(d[1] for d in known), sum(d[2] for d in known))
     longest = max(row.minutes for row in forecasts)
     calls = sum(row.calls for row in forecasts)
-    print(f"{'all, side by side':<24} {calls:>9,} {'':>18}   {_dollars(total)} {longest:>8,.0f}")
+    rows = [
+        (
+            row.participant,
+            f"{row.calls:,}",
+            f"{row.prompt_tokens / 1e6:.2f}, {row.completion_tokens / 1e6:.2f}",
+            *_dollars(row.dollars),
+            f"{row.minutes:,.0f}",
+        )
+        for row in forecasts
+    ]
+    rows.append(("all, side by side", f"{calls:,}", "", *_dollars(total), f"{longest:,.0f}"))
+    headings = ("over the network", "new calls", "M tokens in, out", "USD low", "expected", "high", "minutes")
+    print(f"\n{text_table(headings, rows)}")
     if len(known) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(f"price unknown, not in the sum: {unknown}")
 
 
-def _dollars(amounts: tuple[float, float, float] | None) -> str:
-    return " ".join(f"{'unknown' if amounts is None else f'{amounts[k]:,.2f}':>10}" for k in range(3))
+def _dollars(amounts: tuple[float, float, float] | None) -> list[str]:
+    return ["unknown" if amounts is None else f"{amounts[k]:,.2f}" for k in range(3)]

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from traps_pipeline.cli.command import OK, Commands, open_workspace, root_of
+from traps_pipeline.terminal import text_table
 
 
 def add(commands: Commands) -> None:
@@ -61,5 +62,12 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     if arguments.csv:
         table.to_csv(arguments.csv, index=False)
     shown = table.assign(refused=table["refused"].fillna(""))
-    print(shown.to_string(index=False, na_rep="-", float_format=lambda value: f"{value:.4f}"))
+    print(text_table(list(shown), [[_cell(value) for value in row] for row in shown.itertuples(index=False)]))
     return OK
+
+
+def _cell(value: object) -> str:
+    """A figure with four digits, a dash for one that is missing."""
+    if not isinstance(value, float):
+        return str(value)
+    return "-" if value != value else f"{value:.4f}"

@@ -6,6 +6,7 @@ import argparse
 
 from traps_pipeline.cli.command import OK, Commands, experiment_of, load_definitions, open_workspace
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.terminal import text_table
 
 SHOWN = 8  # stale partitions of a stage
 
@@ -35,9 +36,12 @@ def status(arguments: argparse.Namespace) -> int:
     lineage = Lineage(workspace)
     with dagster_history(workspace) as instance:
         History(instance, lineage.graph).observe(lineage)  # so that Dagster's UI shows the same partitions stale
-    print(f"workspace {workspace.root}\n{'stage':<34} {'fresh':>6} {'stale':>6} {'missing':>8}")
-    for row in stage_statuses(workspace, lineage, experiment):
-        print(f"{row.stage:<34} {row.fresh:>6} {len(row.stale):>6} {row.missing:>8}")
+    rows = list(stage_statuses(workspace, lineage, experiment))
+    counts = [(row.stage, row.fresh, len(row.stale), row.missing) for row in rows]
+    lines = text_table(("stage", "fresh", "stale", "missing"), counts).splitlines()
+    print("\n".join([f"workspace {workspace.root}", *lines[: -len(rows)]]))
+    for line, row in zip(lines[-len(rows) :], rows, strict=True):
+        print(line)
         for key, reasons in list(row.stale.items())[:SHOWN]:
             print(f"    {key}: {'; '.join(reasons[:3])}{' ...' if len(reasons) > 3 else ''}")
         if len(row.stale) > SHOWN:
