@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -198,11 +199,12 @@ def cosines(results: Results) -> list[Table]:
     ]
 
 
-def _place(values: Any) -> Any:
+def _place(values: pd.Series) -> pd.Series:
     if values.name == "name":
         return values.map({short: place for place, short in enumerate(SHORT.values())})
     orders = {"prompt": ("standard", "guided"), "kind": ("void", "shuffled", "random")}
-    return values.map(orders[values.name].index) if values.name in orders else values
+    order = orders.get(str(values.name))
+    return values if order is None else values.map(order.index)
 
 
 # --- steering ---------------------------------------------------------------------------------------------------------
@@ -321,5 +323,5 @@ def _named(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(path=names).reset_index(drop=True)
 
 
-def _short(names: Any) -> list[str]:
+def _short(names: Iterable[str]) -> list[str]:
     return [SHORT.get(name, "not stated") for name in names]
