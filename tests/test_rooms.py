@@ -16,11 +16,13 @@ PACKAGE = Path(traps_pipeline.__file__).parent
 # of a file nor inside a function nor for types alone.
 ROOMS = (
     "errors",
+    "files",
     "digests",
     "paths",
     "yamlfile",
     "partitions",
     "progress",
+    "terminal",
     "tables",
     "scenes",
     "storage",
