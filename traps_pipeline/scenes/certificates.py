@@ -323,7 +323,7 @@ def _twin_behind_panel(pair: Pair) -> Evidence:
     control, twin, twins = pair.control, pair.other_world, pair.control.family.twins
     void = control.void_frames
     with twin.renderer() as renderer:
-        pixels, _ = checks.differing_pixels(void, renderer.frames(twin.looked_at, panel=True))
+        pixels, _ = checks.differing_pixels(void, checks.void_frames(renderer, twin.looked_at))
     return {
         "hidden_alone": twins is not None and twin.params in list(twins(control.params)),
         "twin_answer": settled_answer(twin),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,13 +48,22 @@ def past_panel(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hi
     return PastPanel(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
 
 
+def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
+    """The void that a trajectory makes, without the geoms that are named.
+
+    Its first frame is drawn twice: what a renderer draws first may differ by a pixel from what it draws later on.
+    """
+    next(renderer.frames(qpos[:1], panel=True, without=without), None)
+    yield from renderer.frames(qpos, panel=True, without=without)
+
+
 def ablation_pixels(
     renderer: Renderer, qpos: np.ndarray, geoms: Sequence[str], void: Iterable[np.ndarray] | None = None
 ) -> int:
     """How many void pixels change, over the given frames, when the geoms are taken away. 0 proves that nothing of
     them, shadow included, reaches the eye. void: the frames with them, if they are drawn already."""
-    with_them = renderer.frames(qpos, panel=True) if void is None else void
-    return differing_pixels(with_them, renderer.frames(qpos, panel=True, without=geoms))[0]
+    with_them = void_frames(renderer, qpos) if void is None else void
+    return differing_pixels(with_them, void_frames(renderer, qpos, without=geoms))[0]
 
 
 def differing_pixels(frames: Iterable[np.ndarray], others: Iterable[np.ndarray]) -> tuple[int, int]:

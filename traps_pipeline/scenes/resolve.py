@@ -22,6 +22,7 @@ from traps_pipeline.scenes.certificates import (
     settled_answer,
     shown_points,
 )
+from traps_pipeline.scenes.checks import differing_pixels
 from traps_pipeline.scenes.ensemble import Cut, Futures, Rollout
 from traps_pipeline.scenes.evidence import Claim, Evidence, Pair, VoidKind, required
 from traps_pipeline.scenes.kit import Family, Physics, Wording, params_to_dict
@@ -109,13 +110,16 @@ def _with_certified_twin(
     candidates: Sequence[Pair], kind: VoidKind, so_far: Evidence
 ) -> tuple[Pair, Mapping[str, Any]]:
     """The first of some pairs, which differ in their twin, whose twin is certified. Raises Rejected if none is."""
-    *others, last = candidates
-    for pair in others:
+    rejected = Rejected("there is no twin")
+    for pair in candidates:
         try:
-            return pair, required(certificates_for(kind, "twin"), pair, so_far)
-        except Rejected:
-            continue  # the next one may be alike
-    return last, required(certificates_for(kind, "twin"), last, so_far)
+            evidence = required(certificates_for(kind, "twin"), pair, so_far)
+            if kind == "occluder":
+                _reject_if_unlike_when_drawn_first(pair)
+            return pair, evidence
+        except Rejected as failure:
+            rejected = failure  # the next one may be alike
+    raise rejected
 
 
 # --- occlusion --------------------------------------------------------------------------------------------------------
@@ -133,6 +137,16 @@ def _covered(pair: Pair) -> list[Pair]:
 def _with_twin(pair: Pair, frame: int, twin: World) -> Pair:
     claim = replace(pair.claim, twin_answer=twin.outcome.label)
     return replace(pair, claim=claim, void_frame=frame, twin=twin)
+
+
+def _reject_if_unlike_when_drawn_first(pair: Pair) -> None:
+    """Raises Rejected if the twin's first void frame, drawn by a fresh renderer, differs from the void's, which was not
+    drawn first: such a scene looks a pixel different by what was drawn before it, and is not worth the doubt."""
+    twin = pair.other_world
+    with twin.renderer() as renderer:
+        pixels, _ = differing_pixels(pair.control.void_frames[:1], renderer.frames(twin.qpos[:1], panel=True))
+    if pixels:
+        raise Rejected(f"the twin's void differs from the void: in {pixels} pixels when it is drawn first")
 
 
 def _other_worlds(control: World) -> list[World]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.scenes.camera import Camera, Panel
-from traps_pipeline.scenes.checks import PastPanel, past_panel
+from traps_pipeline.scenes.checks import PastPanel, past_panel, void_frames
 from traps_pipeline.scenes.kit import Family, Inventory, Motion, Physics, Scene
 from traps_pipeline.scenes.outcome import Outcome, compile_scene, decisive_geoms, read_outcome, simulated
 from traps_pipeline.scenes.registry import get_family
@@ -119,4 +119,4 @@ class World:
     def void_frames(self) -> list[np.ndarray]:
         """The world with its panel, as it is drawn."""
         with self.renderer() as renderer:
-            return list(renderer.frames(self.looked_at, panel=True))
+            return list(void_frames(renderer, self.looked_at))
