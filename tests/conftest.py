@@ -119,8 +119,8 @@ def copy_workspace(source: Path, target: Path) -> None:
     shutil.copytree(source, target, symlinks=True)
 
 
-# What a test gets from these takes a study, a server or a browser: it is slow, and comes after all that needs none.
-SERVICES = {"demo", "small", "shared_provider", "page"}
+# A test with one of these fixtures needs a study, a server, a browser or scenarios drawn for it: it is slow.
+SERVICES = {"demo", "small", "shared_provider", "page", "stored", "whole"}
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

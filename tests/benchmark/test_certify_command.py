@@ -13,6 +13,8 @@ import pytest
 from tests.conftest import ROOT, Checkout, Finished
 from traps_pipeline.paths import RELEASED
 
+pytestmark = pytest.mark.slow
+
 Record = dict[str, Any]
 
 

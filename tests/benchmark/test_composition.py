@@ -158,6 +158,7 @@ def alter(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
     load_released.cache_clear()
 
 
+@pytest.mark.slow
 def test_certify_passes_what_is_released_and_names_what_is_altered(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -28,6 +28,7 @@ def corrected(*changes: dict) -> Scenario:
     return folded[decisions[0].scenario_id]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario_id", ["hidden_race-0003", "domino_chain-0002"])
 def test_another_camera_keeps_every_word(workspace: Workspace, scenario_id: str) -> None:
     released = load_released()[scenario_id]
@@ -38,6 +39,7 @@ def test_another_camera_keeps_every_word(workspace: Workspace, scenario_id: str)
     assert spec.scene_hash != released.scene_hash
 
 
+@pytest.mark.slow
 def test_another_colour_brings_the_words_for_it(workspace: Workspace) -> None:
     released = load_released()["domino_chain-0001"]
     old = released.params["last_colour"]

@@ -24,6 +24,7 @@ from traps_pipeline.scenes.simulate import replay
 from traps_pipeline.scenes.spec import SceneSpec, trajectory_digest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario_id", first_of_each("occluder"))
 def test_a_scenario_of_every_occlusion_family_is_certified(scenario_id: str) -> None:
     case = load(scenario_id)

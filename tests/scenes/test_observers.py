@@ -21,6 +21,7 @@ PATCH = 56  # pixels of a panel that hides nothing
 ALL = [*first_of_each("occluder"), *first_of_each("truncation")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario_id", ALL)
 def test_the_observer_answers_the_control_and_abstains_on_the_void(scenario_id: str) -> None:
     case = load(scenario_id)
@@ -36,6 +37,7 @@ def test_the_observer_answers_the_control_and_abstains_on_the_void(scenario_id: 
         assert observe(padded, question) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario_id", first_of_each("occluder"))
 def test_the_colour_of_the_panel_tells_the_observer_nothing(scenario_id: str) -> None:
     case = load(scenario_id)
