@@ -21,7 +21,6 @@ ROOMS = (
     "yamlfile",
     "partitions",
     "progress",
-    "tables",
     "scenes",
     "storage",
     "benchmark",

@@ -13,16 +13,18 @@ import pytest
 
 from tests.conftest import KEY
 from tests.providers.server import Provider
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.tables import VOTES
 from traps_pipeline.models import api, participants
 from traps_pipeline.models.answers import answer_request, response_row
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import Account, Limits, Prices, get_model
 from traps_pipeline.models.request import Outcome
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell, is_ill_posed, taxonomy_of
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VOTES
 
 DECISIONS = {"y": True, "n": False, "-": None}
 

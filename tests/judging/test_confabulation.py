@@ -32,14 +32,15 @@ from traps_pipeline.judging.confabulation import (
     void_kind,
 )
 from traps_pipeline.judging.panel import parse_judgement
+from traps_pipeline.judging.tables import CONFABULATION, VERDICTS
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.scoring.prevalence import prevalence
+from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import load_experiment
 from traps_pipeline.study.plan import make_plan
-from traps_pipeline.tables import CONFABULATION, CONFABULATION_PREVALENCE, VERDICTS
 
 THINKS, SPEAKS = "gemini-2.5-flash", "gemini-2.5-flash-nt"  # trace and output, output alone
 JUDGE = "labeller"

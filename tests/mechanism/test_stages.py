@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_items, write_verdicts
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.directions import vector_digest
@@ -24,23 +25,15 @@ from traps_pipeline.mechanism.steering import (
     count_answers,
     strengths,
 )
+from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES, STEERING, STEERING_VOTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import MechanismSettings
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import (
-    DIRECTIONS,
-    HIDDEN_STATES,
-    ITEMS,
-    PROBE_ITEMS,
-    PROBES,
-    STEERING,
-    STEERING_VOTES,
-    Table,
-)
 
 pytestmark = pytest.mark.slow
 

@@ -15,6 +15,7 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.models.local.checkpoint import folder_digest
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pocket import inside
@@ -34,7 +35,6 @@ from traps_pipeline.pocket.words import PROMPTS, say
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 
 pytestmark = pytest.mark.slow
 

@@ -22,8 +22,8 @@ from traps_pipeline.report.page import (
 )
 from traps_pipeline.report.writing import figure_bytes, fraction, percent
 from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.parquet import TableStore
-from traps_pipeline.tables import LEADERBOARD
 
 HOSTILE = "<script>alert(1)</script>|[x](http://evil.example)\x1b[2J"
 REFERENCES = {  # Acc, FalseAbs, AbsRec

@@ -12,8 +12,10 @@ from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
 
 from tests.judging.conftest import item_row
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
@@ -28,7 +30,6 @@ from traps_pipeline.scoring.leaderboard import leaderboard
 from traps_pipeline.scoring.metrics import cell_metrics, wilson
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, VERDICTS
 
 
 def pairs_with(n, acc, false_abs, abs_rec):

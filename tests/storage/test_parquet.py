@@ -12,9 +12,10 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.storage.parquet import State, TableStore
-from traps_pipeline.tables import RESPONSES, VIDEOS
 
 PARTITION = {"category": "plinko"}
 CELL = {"dataset": "chaotic", "model": "m", "regime": "standard", "run": 1}

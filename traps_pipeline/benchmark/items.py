@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from traps_pipeline.benchmark.specs import released_in_study
+from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
@@ -15,7 +16,6 @@ from traps_pipeline.partitions import CATEGORIES, SIDES, datasets_of_category, i
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import SCENE_SPECS, VIDEOS
 
 Record = Mapping[str, Any]
 

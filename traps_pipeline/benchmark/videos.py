@@ -7,13 +7,13 @@ from typing import Any
 
 from traps_pipeline import progress
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
+from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.clips import Job, read_clip, render_pairs, rendered
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import SCENE_SPECS, VIDEOS
 
 CLIPS = ("control", "void", "twin")
 

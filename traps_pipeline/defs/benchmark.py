@@ -7,6 +7,7 @@ import dagster as dg
 
 from traps_pipeline.benchmark.composition import problems
 from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, unsettled
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET, to_keys
@@ -15,7 +16,6 @@ from traps_pipeline.partitions import datasets_of_category
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, SCENE_SPECS, VIDEOS
 
 GROUP = "benchmark"
 released_specs = source(

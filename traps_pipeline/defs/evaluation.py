@@ -5,20 +5,22 @@ from typing import Any
 
 import dagster as dg
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.judging.panel import collect_votes
+from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.answers import collect_answers
 from traps_pipeline.models.judges import panel_version
 from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.registry import answering_version
 from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.schemes import CELL, EVALUATION, by_dataset, by_evaluation
 from traps_pipeline.orchestration.stage import source, stage
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
 
 GROUP = "evaluation"
 MAX_INVALID_SHARE = 0.05

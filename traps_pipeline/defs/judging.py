@@ -10,22 +10,13 @@ from traps_pipeline.defs.scoring import leaderboard
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
+from traps_pipeline.judging.tables import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
 from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import CELL, these_keys
 from traps_pipeline.orchestration.stage import source, stage
+from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import (
-    AGREEMENT,
-    CONFABULATION,
-    CONFABULATION_PREVALENCE,
-    JUDGE_BIAS,
-    JUDGE_VALIDATION,
-    LEADERBOARD,
-    LEAVE_ONE_OUT,
-    VERDICTS,
-    VOTES,
-)
 
 if TYPE_CHECKING:
     import pandas as pd

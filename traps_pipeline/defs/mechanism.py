@@ -8,6 +8,17 @@ import dagster as dg
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
+from traps_pipeline.mechanism.tables import (
+    COSINES,
+    DIRECTIONS,
+    HIDDEN_STATES,
+    PROBE_ITEMS,
+    PROBES,
+    STEERING_EFFECTS,
+    STEERING_SHARES,
+    STEERING_VOTES,
+)
+from traps_pipeline.mechanism.tables import STEERING as STEERING_TABLE
 from traps_pipeline.mechanism.versions import (
     directions_are_there,
     extraction_version,
@@ -47,17 +58,6 @@ from traps_pipeline.partitions import (
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import (
-    COSINES,
-    DIRECTIONS,
-    HIDDEN_STATES,
-    PROBE_ITEMS,
-    PROBES,
-    STEERING_EFFECTS,
-    STEERING_SHARES,
-    STEERING_VOTES,
-)
-from traps_pipeline.tables import STEERING as STEERING_TABLE
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -6,13 +6,14 @@ from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import verdicts
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import DATASET, by_dataset
 from traps_pipeline.orchestration.stage import stage
 from traps_pipeline.scoring import Frame
+from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS, VERDICTS
 
 GROUP = "scoring"
 _SHARES = {name: ["verdicts.abstained", "verdicts.correct"] for name in ("pecs", "naive")}

@@ -17,21 +17,23 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, StrictBool
 
 from traps_pipeline import progress
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import ask_judges, judge_request, parse_judgement, quoted
+from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.models.ask import Call, Settled
 from traps_pipeline.models.judges import JudgeEntry, load_judges
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, get_model, structured
 from traps_pipeline.models.request import Request
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation, is_ill_posed
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 PROTOCOL_FILE = ASSETS / "confabulation.yaml"

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, StrictBool, StrictFloat, StrictInt, StrictStr, ValidationError
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.answers import is_correct, strip_fence
@@ -25,10 +26,11 @@ from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, Backend, Request
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell
 from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, Table
 from traps_pipeline.yamlfile import explain
 
 # --- what a judge is asked --------------------------------------------------------------------------------------------

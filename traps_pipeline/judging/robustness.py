@@ -19,12 +19,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_request
 from traps_pipeline.judging.ratings import INVALID, NO, PANEL, YES, majority
+from traps_pipeline.judging.tables import JUDGE_ROBUSTNESS
 from traps_pipeline.models.ask import Settled
 from traps_pipeline.models.judges import JudgeEntry, Task
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import JUDGE_ROBUSTNESS
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 ATTACKS_FILE = ASSETS / "injected_answers.yaml"

@@ -13,8 +13,10 @@ import pandas as pd
 
 from traps_pipeline import progress
 from traps_pipeline.benchmark.items import categories_of_dataset
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.mechanism.directions import (
     KINDS,
     Directions,
@@ -29,6 +31,7 @@ from traps_pipeline.mechanism.directions import (
 )
 from traps_pipeline.mechanism.paths import CURVES
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
+from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.mechanism.versions import states_folder
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
@@ -42,7 +45,6 @@ from traps_pipeline.partitions import (
     is_ill_posed,
 )
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import DIRECTIONS, HIDDEN_STATES, ITEMS, PROBE_ITEMS, PROBES, SCENE_SPECS, VERDICTS, VIDEOS
 
 Rows = list[dict[str, Any]]
 COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "question", "clip", "media_digest")

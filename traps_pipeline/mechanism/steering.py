@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, vote_columns, vote_request
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.paths import sources_of
+from traps_pipeline.mechanism.tables import STEERING
 from traps_pipeline.mechanism.versions import loaded_params
 from traps_pipeline.models.answers import Question
 from traps_pipeline.models.ask import Settled, collect
@@ -33,7 +35,6 @@ from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, STEERING
 
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import Prompt

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline import progress
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.participants import Row, when_asked
@@ -21,7 +22,6 @@ from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS
 
 
 @dataclass(frozen=True)

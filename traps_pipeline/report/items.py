@@ -12,13 +12,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.report.page import TITLES
 from traps_pipeline.report.writing import TEMPLATES, Behind, environment, write_bytes
 from traps_pipeline.scoring import Frame
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
 
 FOLDER = "items"
 MADE = "made.json"  # digest of what each page was made from

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.partitions import Cell
 from traps_pipeline.report.catalogue import FIGURES, TABLES
 from traps_pipeline.report.contact_sheet import PAGE as SIX_PAIRS
@@ -23,7 +24,6 @@ from traps_pipeline.report.results import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.writing import Behind, environment, figure_files, write_bytes
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS
 
 PAGE, MARKDOWN, INDEX = "report.html", "leaderboard.md", "index.html"
 SHEETS = {

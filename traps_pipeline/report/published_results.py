@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS
 from traps_pipeline.mechanism import effects
+from traps_pipeline.mechanism.tables import STEERING_SHARES
 from traps_pipeline.report.mechanism import (
     published_cosines,
     published_domains,
@@ -21,7 +23,8 @@ from traps_pipeline.report.results import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMN
 from traps_pipeline.scoring import Frame, analyses
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.published import published, published_cells
-from traps_pipeline.tables import AGREEMENT, CONTRASTS, JUDGE_BIAS, LEAVE_ONE_OUT, REGIME_TESTS, STEERING_SHARES, Table
+from traps_pipeline.scoring.tables import CONTRASTS, LEAVE_ONE_OUT, REGIME_TESTS
+from traps_pipeline.storage.tables import Table
 
 _AXES = ("hp", "ii", "hp_and_ii", "es", "doubt")
 

@@ -7,28 +7,23 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATION
+from traps_pipeline.mechanism.tables import COSINES, PROBES, STEERING_EFFECTS, STEERING_SHARES
 from traps_pipeline.partitions import taxonomy_of
 from traps_pipeline.report.results import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Results, joined
 from traps_pipeline.scoring import Frame, analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 from traps_pipeline.scoring.metrics import joined_epochs
-from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import (
-    AGREEMENT,
+from traps_pipeline.scoring.tables import (
     CONFABULATION_PREVALENCE,
     CONTRASTS,
-    COSINES,
-    ITEMS,
-    JUDGE_BIAS,
-    JUDGE_VALIDATION,
     LEADERBOARD,
     LEAVE_ONE_OUT,
     METRICS,
-    PROBES,
     REGIME_TESTS,
-    STEERING_EFFECTS,
-    STEERING_SHARES,
 )
+from traps_pipeline.storage.workspace import Workspace
 
 
 class StudyResults(Results):

@@ -22,7 +22,7 @@ from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED, RESAMPLES, Resamp
 from traps_pipeline.scoring.epochs import answered, refusal
 from traps_pipeline.scoring.leaderboard import means_over_runs, standings
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
-from traps_pipeline.tables import CONTRASTS, REGIME_TESTS
+from traps_pipeline.scoring.tables import CONTRASTS, REGIME_TESTS
 
 FIGURES = ("pecs", "j")
 SEPARABLE_BELOW = 0.05

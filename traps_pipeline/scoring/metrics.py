@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.models.request import JUDGED
-from traps_pipeline.tables import METRICS
+from traps_pipeline.scoring.tables import METRICS
 
 CELL = ["dataset", "model", "regime", "run"]
 FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.progress import Tally
-from traps_pipeline.tables import VOLATILE, Table
+from traps_pipeline.storage.tables import VOLATILE, Table
 
 if TYPE_CHECKING:
     import pandas as pd
