@@ -59,7 +59,7 @@ class PublishedResults(Results):
         parts = []
         for taxonomy in analyses.TAXONOMIES:
             names = {f"{taxonomy}_{kind}_pct": kind for kind in ("visual", "textual")} | {f"{taxonomy}_gap": "gap"}
-            part = rows[["model", *names]].rename(columns=names).assign(taxonomy=taxonomy)
+            part = rows.loc[:, ["model", *names]].rename(columns=names).assign(taxonomy=taxonomy)
             part[["visual", "textual"]] /= 100
             parts.append(part)
         pooled = joined(parts).groupby("model", sort=False)[["visual", "textual"]].mean().reset_index()

@@ -13,7 +13,7 @@ from traps_pipeline.scoring.leaderboard import standings
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
 from traps_pipeline.scoring.tables import LEAVE_ONE_OUT
 
-_COLUMNS = pd.Index([c.name for c in LEAVE_ONE_OUT.columns])
+_COLUMNS = pd.Index(LEAVE_ONE_OUT.names)
 
 
 def leave_one_out(

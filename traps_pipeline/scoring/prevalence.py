@@ -26,7 +26,7 @@ def prevalence(labels: pd.DataFrame) -> pd.DataFrame:
     """CONFABULATION_PREVALENCE rows of CONFABULATION rows: shares of validly labelled failures, with Wilson intervals;
     null where a model has none. A model without a sampled failure has no row: not run is not 0."""
     rows = [_row(str(model), group) for model, group in labels.groupby("model", sort=True)]
-    return pd.DataFrame(rows, columns=pd.Index([c.name for c in CONFABULATION_PREVALENCE.columns]))
+    return pd.DataFrame(rows, columns=pd.Index(CONFABULATION_PREVALENCE.names))
 
 
 def _row(model: str, group: pd.DataFrame) -> dict[str, Any]:

@@ -51,7 +51,7 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Tabl
         rows = rows.assign(ci=[interval(row) for row in shown], ranks=[ranks(row) for row in shown])
         columns[3:3] = [Column("ci", "95 % CI", "range"), Column("ranks", "Rank", "range")]
         notes.append("rank by PECS within the regime; of 2–4, paired contrasts (Holm) leave these ranks open")
-        printed = published_overall()[["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
+        printed = published_overall().loc[:, ["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
         rows = rows.merge(printed, on=["model", "regime"], how="left")
         if rows["published_pecs"].notna().any():
             columns.append(Column("published_pecs", "published PECS", "fraction"))
