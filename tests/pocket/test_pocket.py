@@ -127,8 +127,8 @@ def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -
 def test_other_numbers_of_scenes_draw_what_is_missing_and_read_what_is_wanted(
     recipe: Recipe, data: Path, tmp_path: Path
 ) -> None:
+    from traps_pipeline.pocket.batches import Scenes
     from traps_pipeline.pocket.data import data_digest, read_shards, render
-    from traps_pipeline.pocket.train import Scenes
 
     fewer = recipe.model_copy(update={"scenes": {"drop_split": FEW - 1}})
     render(fewer, "train", tmp_path, workers=1)
@@ -161,8 +161,9 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
     import torch
     from torch.nn.functional import cross_entropy
 
+    from traps_pipeline.pocket.batches import Batches, Look, Scenes
     from traps_pipeline.pocket.model import make_model, train_tokenizer
-    from traps_pipeline.pocket.train import Batches, Look, Scenes, answer_loss, look_at
+    from traps_pipeline.pocket.train import answer_loss, look_at
 
     scenes = Scenes(recipe, data)
     model, processor = make_model(train_tokenizer(scenes.records), seed=1)
