@@ -105,8 +105,8 @@ def said(word: str) -> str:
 def vote(workspace: Workspace) -> pd.DataFrame:
     """Ask the panel what is missing; the votes and the verdicts of the cell are then written."""
     ((cell, made),) = collect_votes(workspace, [CELL])
-    assert cell == CELL and len(made.rows) == 2 * 3 * 27
-    workspace.tables.write(VOTES, CELL.partition, made.rows, {}, failed=made.tally.errors)
+    assert cell == CELL and len(made.rows(VOTES)) == 2 * 3 * 27
+    workspace.tables.write(VOTES, CELL.partition, made.rows(VOTES), {}, failed=made.tally.errors)
     workspace.tables.write(VERDICTS, CELL.partition, decide_cell(workspace, CELL), {})
     return workspace.tables.read(VERDICTS, CELL.partition)
 

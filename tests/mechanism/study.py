@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, SceneSpecRow
 from traps_pipeline.digests import file_digest
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.models import registry
@@ -19,7 +19,7 @@ from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.partitions import DATASETS, SIDES, is_ill_posed, taxonomy_of
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.storage.study import MechanismSettings, Study
-from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.tables import Row, Table
 from traps_pipeline.storage.workspace import Workspace
 
 CATEGORY = {"occlusion": "hidden", "chaotic": "plinko"}
@@ -34,10 +34,11 @@ SETTINGS = {
 }
 
 
-def filled(table: Table, **values: Any) -> dict[str, Any]:
+def filled(table: Table[Row], **values: Any) -> Row:
     """A row of a table: the values given, else empty ones of the column's type."""
     empty = {str: "", int: 0, float: 0.0, bool: False, list[str]: [], datetime: None}
-    return {c.name: values.get(c.name, None if c.nullable else empty[c.type]) for c in table.columns}
+    nothing = {c.name: None if c.nullable else empty[c.type] for c in table.columns}
+    return table.row_type(**(nothing | values))
 
 
 def make_study(root: Path) -> Workspace:
@@ -68,7 +69,7 @@ def make_study(root: Path) -> Workspace:
     return workspace
 
 
-def _spec(name: str, taxonomy: str, category: str) -> dict[str, Any]:
+def _spec(name: str, taxonomy: str, category: str) -> SceneSpecRow:
     asked = json.dumps({"question": f"Which colour is the floor of {name}?", "labels": ["grey"], "answer": "grey"})
     return filled(SCENE_SPECS, scenario_id=name, taxonomy=taxonomy, category=category, sub_scenario=category,
                   answerable_question=asked)  # fmt: skip

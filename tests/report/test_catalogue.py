@@ -76,14 +76,13 @@ def broken(tmp_path_factory):
         )
     )
     overall = {"dataset": "overall", "figure": "pecs", "left_model": SPEAKS, "separable": False}
-    guided = {"left_regime": "guided", "right_regime": "guided", "right_model": THINKS}
+    guided, standard = ({"left_regime": r, "right_regime": r, "right_model": THINKS} for r in ("guided", "standard"))
+    regimes = {"left_regime": "standard", "right_regime": "guided", "right_model": SPEAKS}
     contrasts = [
         row(CONTRASTS, kind="models", **overall, **guided, refused="chaotic: of epoch e1 against epoch e2"),
-        row(CONTRASTS, kind="models", difference=-0.1, p=0.01, p_holm=0.02, **overall, **guided)
-        | {"left_regime": "standard", "right_regime": "standard"},
-        row(CONTRASTS, kind="regimes", refused="chaotic: 3 items", **overall, **guided) | {"right_model": SPEAKS}
-        | {"left_regime": "standard"},
-    ]  # fmt: skip
+        row(CONTRASTS, kind="models", difference=-0.1, p=0.01, p_holm=0.02, **overall, **standard),
+        row(CONTRASTS, kind="regimes", refused="chaotic: 3 items", **overall, **regimes),
+    ]
     validated = dict.fromkeys(("precision", "recall", "f1", "human_kappa"), 0.9)
     workspace.tables.write(LEADERBOARD, {}, board, {})
     workspace.tables.write(CONTRASTS, {}, contrasts, {})

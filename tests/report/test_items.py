@@ -23,7 +23,7 @@ DEFAULTS = {str: "x", int: 1, float: 0.5, bool: True, list[str]: ["x"], datetime
 def row(table, **values):
     """A row of a table with these values; nullable columns are null, others hold some value of their type."""
     filled = {c.name: None if c.nullable else DEFAULTS[c.type] for c in table.columns}
-    return {**filled, **values}
+    return table.row_type(**(filled | values))
 
 
 def write_cell(workspace, cell=CELL, text=HOSTILE):

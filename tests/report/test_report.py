@@ -65,7 +65,7 @@ def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6
 
 
 def board_of(*rows):
-    return pd.DataFrame(list(rows))[[c.name for c in LEADERBOARD.columns]]
+    return pd.DataFrame(list(rows))[LEADERBOARD.names]
 
 
 @pytest.fixture(scope="module")
@@ -317,7 +317,7 @@ def test_html_names_the_epoch_in_each_row_where_rows_differ():
 
 
 def test_an_empty_board_still_gives_a_page_a_table_and_a_figure():
-    board = pd.DataFrame(columns=pd.Index([c.name for c in LEADERBOARD.columns]))
+    board = pd.DataFrame(columns=pd.Index(LEADERBOARD.names))
     assert "Overall" in report_html(board)
     assert leaderboard_text(board).startswith("PECS, overall.")
     assert figure_bytes(landscape_figure(points(board), "Overall")).startswith(b"\x89PNG")

@@ -55,7 +55,7 @@ def verdict_rows(
                     "benchmark_version": "v1",
                 }
             )
-    return pd.DataFrame(rows, columns=pd.Index([c.name for c in VERDICTS.columns]))
+    return pd.DataFrame(rows, columns=pd.Index(VERDICTS.names))
 
 
 def strategy_pairs(name: str, n: int, seed: int = 0) -> list[Pair]:

@@ -12,7 +12,7 @@ from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
 
 from tests.judging.conftest import item_row
-from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS
@@ -308,7 +308,8 @@ def test_the_command_compares_what_both_benchmarks_still_hold(rows, tmp_path, ca
     for name, scenarios in (("then", 4), ("now", 3)):  # one was discarded since; its verdict is still there
         workspace = Workspace.create(tmp_path / name, Study(epoch="e1"))
         places = [(number, side) for number in range(scenarios) for side in ("control", "void")]
-        items = [item_row("occlusion", *at) | {"item_id": f"occlusion:s{at[0]}:{at[1]}"} for at in places]
+        named = [item_row("occlusion", *at) | {"item_id": f"occlusion:s{at[0]}:{at[1]}"} for at in places]
+        items = [ItemRow(**item) for item in named]
         workspace.tables.write(ITEMS, {"dataset": "occlusion"}, items, {})
         verdicts = rows([(True, False, True)] * 4)
         cell = Cell("occlusion", Evaluation("m", "standard", 1))

@@ -106,8 +106,8 @@ def _make_videos(workspace: Workspace, category: str) -> Made:
 
 
 def _alike(workspace: Workspace, key: str | None, made: Made) -> list[str]:
-    shown = [(row.side, row.frames_sha256) for row in made.rows_of(VIDEOS)]
-    return [row.path for row, one in zip(made.rows_of(VIDEOS), shown, strict=True) if shown.count(one) > 1]
+    shown = [(row.side, row.frames_sha256) for row in made.rows(VIDEOS)]
+    return [row.path for row, one in zip(made.rows(VIDEOS), shown, strict=True) if shown.count(one) > 1]
 
 
 videos = stage(
@@ -140,7 +140,7 @@ def _make_items(workspace: Workspace, dataset: str) -> Made:
 
 def _odd_pairs(workspace: Workspace, key: str | None, made: Made) -> dict[str, list[str]]:
     sides: dict[str, list[str]] = {}
-    for row in made.rows_of(ITEMS):
+    for row in made.rows(ITEMS):
         sides.setdefault(row.pair_id, []).append(row.side)
     return {pair: found for pair, found in sides.items() if sorted(found) != ["control", "void"]}
 
@@ -162,7 +162,7 @@ items = stage(
             "clips_present",
             "Every clip is there with its digest (checked while building; a damaged one fails the step).",
             lambda workspace, key, made: sorted(
-                {row.clip for row in made.rows_of(ITEMS) if not workspace.resolve(row.clip).is_file()}
+                {row.clip for row in made.rows(ITEMS) if not workspace.resolve(row.clip).is_file()}
             ),
         ),
     ],

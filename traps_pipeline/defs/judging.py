@@ -100,8 +100,9 @@ def _make_confabulation(workspace: Workspace, _: None) -> Made:
 
 
 def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
-    invalid = sum(not row["valid"] for row in made.rows)
-    return f"{invalid} of {len(made.rows)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(made.rows) else ""
+    labels = made.rows(CONFABULATION)
+    invalid = sum(not label.valid for label in labels)
+    return f"{invalid} of {len(labels)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(labels) else ""
 
 
 def _make_prevalence(workspace: Workspace, _: None) -> Made:

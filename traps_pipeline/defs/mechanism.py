@@ -129,7 +129,7 @@ def _make_hidden_states(workspace: Workspace, key: str) -> Made:
 def _unsound_layers(workspace: Workspace, key: str | None, made: Made) -> list[int]:
     from traps_pipeline.mechanism.stages import unsound_layers
 
-    return unsound_layers(workspace, StatesCell.parse(str(key)), made.rows_of(HIDDEN_STATES)[0].n_layers)
+    return unsound_layers(workspace, StatesCell.parse(str(key)), made.rows(HIDDEN_STATES)[0].n_layers)
 
 
 hidden_states = stage(
@@ -160,7 +160,7 @@ def _outside_shares(workspace: Workspace, key: str | None, made: Made) -> str:
         figures = (row.value, row.low, row.high)
         return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
 
-    wrong = sum(is_wrong(row) for row in made.rows_of(PROBES))
+    wrong = sum(is_wrong(row) for row in made.rows(PROBES))
     return f"{wrong} rows are wrong" if wrong else ""
 
 

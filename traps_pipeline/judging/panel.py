@@ -18,6 +18,7 @@ from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.answers import is_correct, strip_fence
+from traps_pipeline.judging.tables import VoteRow
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
@@ -236,13 +237,13 @@ def vote_columns(ballot: Ballot, vote: Vote, row: Row) -> dict[str, Any]:
     }
 
 
-def _vote_row(cell: Cell, ballot: Ballot, row: Row) -> dict[str, Any]:
+def _vote_row(cell: Cell, ballot: Ballot, row: Row) -> VoteRow:
     vote = ballot.vote(row)
-    return {
+    return VoteRow(
         **{name: ballot.item[name] for name in ("item_id", "side", "benchmark_version")},
         **cell.partition,
         **vote_columns(ballot, vote, row),
-        "correct": vote.decision if ballot.task == "correctness" else None,
-        "judge_correct": vote.judge_correct,
-        "extracted_value": vote.extracted_value,
-    }
+        correct=vote.decision if ballot.task == "correctness" else None,
+        judge_correct=vote.judge_correct,
+        extracted_value=vote.extracted_value,
+    )

@@ -149,7 +149,7 @@ def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes)
                     | {"result": result(expected, clean, vote)}
                     | {"invalid_reason": cast and cast.invalid_reason, "rationale": cast and cast.rationale}
                 )
-    return pd.DataFrame(rows, columns=pd.Index([c.name for c in JUDGE_ROBUSTNESS.columns]))
+    return pd.DataFrame(rows, columns=pd.Index(JUDGE_ROBUSTNESS.names))
 
 
 def _said(votes: Sequence[Vote]) -> bool | None:

@@ -200,7 +200,7 @@ def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
         | {"accuracy_a": agreed[0], "accuracy_b": agreed[1]}
         | {"human_agreement": float(np.mean(human.labels[0] == human.labels[1]))}
     )
-    return pd.DataFrame(rows, columns=pd.Index([c.name for c in JUDGE_VALIDATION.columns]))
+    return pd.DataFrame(rows, columns=pd.Index(JUDGE_VALIDATION.names))
 
 
 def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:

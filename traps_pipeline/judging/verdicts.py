@@ -71,7 +71,7 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     rows["n_valid_correctness"] = (correctness != INVALID).sum(axis=1)
     rows["unanimous"] = judged & _unanimous(abstention) & (~on_control | _unanimous(correctness))
     rows["undecided"] = judged & undecided
-    return rows.loc[:, [c.name for c in VERDICTS.columns]]
+    return rows.loc[:, VERDICTS.names]
 
 
 def _unanimous(values: np.ndarray) -> np.ndarray:

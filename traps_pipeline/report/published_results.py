@@ -100,7 +100,7 @@ class PublishedResults(Results):
         """See `Results.agreement`."""
         rows = published("judge_agreement")
         table = rows[["dataset", "task", "fleiss_kappa"]].assign(judges="panel", agreement=rows["unanimous_pct"] / 100)
-        return table.reindex(columns=pd.Index([c.name for c in AGREEMENT.columns])).assign(epoch="not stated")
+        return table.reindex(columns=pd.Index(AGREEMENT.names)).assign(epoch="not stated")
 
     @cached_property
     def bias(self) -> Frame:
@@ -160,7 +160,7 @@ class PublishedResults(Results):
     @cached_property
     def shares(self) -> Frame:
         """See `Results.shares`: the paper has none, since it prints no answers."""
-        return pd.DataFrame(columns=pd.Index([c.name for c in STEERING_SHARES.columns]))
+        return pd.DataFrame(columns=pd.Index(STEERING_SHARES.names))
 
     @cached_property
     def steering_regimes(self) -> Frame:

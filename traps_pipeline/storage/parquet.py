@@ -47,13 +47,8 @@ class Made:
     shown: Mapping[str, Any] = field(default_factory=dict)
     beside: Any = None
 
-    @property
-    def rows(self) -> Sequence[Mapping[str, Any]]:
-        """The rows of a table that is made row by row, as mappings."""
-        return cast("Sequence[Mapping[str, Any]]", self.content)
-
-    def rows_of(self, table: Table[Row]) -> Sequence[Row]:
-        """The rows of a table that is made row by row, as values of its dataclass."""
+    def rows(self, table: Table[Row]) -> Sequence[Row]:
+        """The rows of a table that is made row by row."""
         return cast("Sequence[Row]", self.content)
 
     @property
@@ -81,7 +76,7 @@ class TableStore:
         self,
         table: Table[Row],
         partition: Mapping[str, Any],
-        rows: Sequence[Row | Mapping[str, Any]] | pd.DataFrame,
+        rows: Sequence[Row] | pd.DataFrame,
         inputs: Mapping[str, str],
         *,
         failed: int = 0,
@@ -89,11 +84,10 @@ class TableStore:
     ) -> str:
         """Write one partition and return its data version (a digest of its content, volatile columns aside).
 
-        Rows are values of the table's dataclass, mappings from column to value, or a frame. They are sorted by the
-        table's key. `inputs` (versions of what the rows were made from) and `failed` (answers
-        that a next run should ask again) go into the file's footer with the version. Raises TrapsError when a row
-        breaks the schema or a key repeats, and when the disk is full; the partition's former file then still stands.
-        code is the version of what made the rows.
+        Rows are values of the table's dataclass, or a frame. They are sorted by the table's key. `inputs` (versions of
+        what the rows were made from) and `failed` (answers that a next run should ask again) go into the file's footer
+        with the version. Raises TrapsError when a row breaks the schema or a key repeats, and when the disk is full;
+        the partition's former file then still stands. code is the version of what made the rows.
         """
         import pyarrow.parquet as pq
 
@@ -118,13 +112,11 @@ class TableStore:
             part.unlink(missing_ok=True)
         return version
 
-    def _checked(
-        self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row | Mapping[str, Any]] | pd.DataFrame
-    ) -> pa.Table:
+    def _checked(self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame) -> pa.Table:
         import pyarrow as pa
 
         schema = table.arrow_schema()
-        listed = [_without_nan(as_mapping(row)) for row in rows] if isinstance(rows, Sequence) else None
+        listed = [_without_nan(vars(row)) for row in rows] if isinstance(rows, Sequence) else None
         names = {str(name) for name in (rows if listed is None else (name for row in listed for name in row))}
         try:
             if names - set(schema.names):
@@ -230,11 +222,6 @@ class TableStore:
             raise TrapsError(f"{path}: not there yet; materialize {table.name} for this partition first") from None
         except (pa.ArrowException, OSError) as error:
             raise _unreadable(path, table, error) from error
-
-
-def as_mapping(row: Any) -> Mapping[str, Any]:
-    """A row from column to value."""
-    return row if isinstance(row, Mapping) else vars(row)
 
 
 def _without_nan(row: Mapping[str, Any]) -> dict[str, Any]:
