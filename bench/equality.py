@@ -44,7 +44,7 @@ def _files(folder: Path, pattern: str) -> dict[str, Path]:
 
 def _table(old: Path, new: Path) -> str:
     """What differs between two Parquet files; empty if nothing does."""
-    a, b = pq.read_table(old, partitioning=None), pq.read_table(new, partitioning=None)
+    a, b = pq.ParquetFile(old).read(), pq.ParquetFile(new).read()
     if a.schema.names != b.schema.names:
         return f"columns {sorted(set(a.schema.names) ^ set(b.schema.names)) or 'in another order'}"
     differing = [name for name in a.schema.names if name not in VOLATILE and not _same(a[name], b[name])]

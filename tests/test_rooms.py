@@ -23,7 +23,6 @@ ROOMS = (
     "partitions",
     "progress",
     "terminal",
-    "tables",
     "scenes",
     "storage",
     "benchmark",

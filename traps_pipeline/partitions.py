@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 OCCLUSION_CATEGORIES = (
     "ramps_rolling",
@@ -101,7 +102,7 @@ class Cell:
         return f"{self.dataset}|{self.evaluation.key}"
 
     @property
-    def partition(self) -> dict[str, str | int]:
+    def partition(self) -> dict[str, Any]:
         """Values of the tables' partition columns."""
         e = self.evaluation
         return {"dataset": self.dataset, "model": e.model, "regime": e.regime, "run": e.run}
@@ -131,7 +132,7 @@ class Extraction:
         return f"{self.model}__{self.prompt}"
 
     @property
-    def partition(self) -> dict[str, str]:
+    def partition(self) -> dict[str, Any]:
         """Values of the tables' partition columns."""
         return {"model": self.model, "prompt": self.prompt}
 
@@ -157,7 +158,7 @@ class StatesCell:
         return f"{self.dataset}|{self.extraction.key}"
 
     @property
-    def partition(self) -> dict[str, str]:
+    def partition(self) -> dict[str, Any]:
         """Values of the tables' partition columns."""
         return {"dataset": self.dataset, **self.extraction.partition}
 
@@ -197,7 +198,7 @@ class SteeringCell(Cell):
         return f"{self.dataset}|{self.run}"
 
     @property
-    def partition(self) -> dict[str, str | int]:
+    def partition(self) -> dict[str, Any]:
         """Values of the tables' partition columns."""
         e = self.evaluation
         return {"dataset": self.dataset, "model": e.model, "directions": self.directions, "regime": e.regime}

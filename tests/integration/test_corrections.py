@@ -11,8 +11,11 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import EXPERIMENT, Checkout
+from tests.tables import TABLES
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.scoring.tables import METRICS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, METRICS, RESPONSES, SCENE_SPECS, TABLES, VIDEOS
 
 pytestmark = pytest.mark.slow
 EVALUATIONS = 3 * 2 * 1  # models x regimes x runs of the small study

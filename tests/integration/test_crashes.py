@@ -15,8 +15,9 @@ import pandas as pd
 import pytest
 
 from tests.conftest import EXPERIMENT, Checkout
+from tests.tables import TABLES
+from traps_pipeline.storage.tables import VOLATILE
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import TABLES, VOLATILE
 
 ONE_REGIME = "tests/experiments/one_regime.yaml"
 pytestmark = pytest.mark.slow

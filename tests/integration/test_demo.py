@@ -7,22 +7,15 @@ import re
 import pytest
 
 from tests.conftest import Checkout
+from tests.tables import TABLES
+from traps_pipeline.benchmark.tables import ITEMS, VIDEOS
+from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS, VERDICTS
 from traps_pipeline.scoring.leaderboard import pooled_j
+from traps_pipeline.scoring.tables import LEADERBOARD, LEAVE_ONE_OUT, METRICS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import (
-    AGREEMENT,
-    ITEMS,
-    JUDGE_BIAS,
-    LEADERBOARD,
-    LEAVE_ONE_OUT,
-    METRICS,
-    TABLES,
-    VERDICTS,
-    VIDEOS,
-)
 
 pytestmark = pytest.mark.slow
-NOT_RUN = ("confabulation", "confabulation_prevalence")  # empty, never zeros
+NOT_RUN = ("confabulation", "confabulation_prevalence", "judge_validation", "judge_robustness")  # empty, never zeros
 INSIDE = ("probe_items", "hidden_states", "probes", "directions", "cosines", "steering", "steering_votes")
 INSIDE += ("steering_effects", "steering_shares")
 DEGENERATE = ("always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle")

@@ -12,8 +12,9 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished, forget_answers, make_checkout
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.scoring.tables import METRICS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import METRICS, RESPONSES
 
 pytestmark = pytest.mark.slow
 

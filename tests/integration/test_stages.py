@@ -11,8 +11,11 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.scoring.tables import METRICS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, METRICS, RESPONSES, VERDICTS
 
 pytestmark = pytest.mark.slow
 CELL = "occlusion|oracle__standard__run1"

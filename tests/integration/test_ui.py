@@ -19,9 +19,11 @@ import pytest
 from playwright.sync_api import Page, expect, sync_playwright
 
 from tests.conftest import EXPERIMENT, Checkout, copied
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.automation import INTERVAL_S
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, Table
 
 pytestmark = pytest.mark.slow
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"

@@ -13,16 +13,18 @@ import pytest
 
 from tests.conftest import KEY
 from tests.providers.server import Provider
+from traps_pipeline.benchmark.tables import ITEMS, ItemRow
+from traps_pipeline.judging.tables import VOTES
 from traps_pipeline.models import api, participants
 from traps_pipeline.models.answers import answer_request, response_row
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import Account, Limits, Prices, get_model
 from traps_pipeline.models.request import Outcome
+from traps_pipeline.models.tables import RESPONSES, ResponseRow
 from traps_pipeline.partitions import Cell, is_ill_posed, taxonomy_of
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VOTES
 
 DECISIONS = {"y": True, "n": False, "-": None}
 
@@ -42,7 +44,7 @@ def vote_rows(
     for k, answer in enumerate(answers):
         for judge, word in zip(judges, answer, strict=True):
             decision = DECISIONS[word]
-            row = dict.fromkeys((c.name for c in VOTES.columns), None) | about
+            row = dict.fromkeys(VOTES.names) | about
             row |= {"item_id": f"{dataset}:s-{k:04d}:{side}", "side": side, "dataset": dataset, "task": kind}
             row |= {"judge": judge, "valid": decision is not None}
             row |= {"abstained": decision} if kind == "abstention" else {"correct": decision}
@@ -87,7 +89,7 @@ def answered_study(
     workspace = Workspace.create(root, Study(panel=panel, epoch="e1", **study))
     for dataset in {cell.dataset for cell in answers}:
         numbers = {place for cell, texts in answers.items() if cell.dataset == dataset for place in texts}
-        items = [item_row(dataset, number, side) for number, side in sorted(numbers)]
+        items = [ItemRow(**item_row(dataset, number, side)) for number, side in sorted(numbers)]
         workspace.tables.write(ITEMS, {"dataset": dataset}, items, {})
     for cell, texts in answers.items():
         rows = [_response(workspace, cell, *place, text) for place, text in texts.items()]
@@ -95,7 +97,7 @@ def answered_study(
     return workspace
 
 
-def _response(workspace: Workspace, cell: Cell, number: int, side: str, text: str) -> dict[str, Any]:
+def _response(workspace: Workspace, cell: Cell, number: int, side: str, text: str) -> ResponseRow:
     item = item_row(cell.dataset, number, side)
     trace, _, answer = text.rpartition("<think>")
     request = answer_request(workspace, get_model("oracle"), item, cell.evaluation)

@@ -23,8 +23,8 @@ from traps_pipeline.judging.agreement import (
     unanimous_share,
 )
 from traps_pipeline.judging.ratings import INVALID, NO, YES, majority, ratings
+from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS
 from traps_pipeline.storage.parquet import TableStore
-from traps_pipeline.tables import AGREEMENT, JUDGE_BIAS
 
 VALUES = {"y": YES, "n": NO, "-": INVALID}
 

@@ -32,14 +32,15 @@ from traps_pipeline.judging.confabulation import (
     void_kind,
 )
 from traps_pipeline.judging.panel import parse_judgement
+from traps_pipeline.judging.tables import CONFABULATION, VERDICTS, VerdictRow
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.scoring.prevalence import prevalence
+from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import load_experiment
 from traps_pipeline.study.plan import make_plan
-from traps_pipeline.tables import CONFABULATION, CONFABULATION_PREVALENCE, VERDICTS
 
 THINKS, SPEAKS = "gemini-2.5-flash", "gemini-2.5-flash-nt"  # trace and output, output alone
 JUDGE = "labeller"
@@ -54,12 +55,10 @@ def decide(workspace: Workspace, at: Cell, failures: set[int], numbers: range) -
     rows = []
     for number in numbers:
         abstained = None if number == numbers[-1] else number not in failures
-        rows.append(
-            dict.fromkeys((c.name for c in VERDICTS.columns), "x")
-            | at.partition
-            | {"item_id": f"{at.dataset}:s-{number:04d}:void", "side": "void", "abstained": abstained, "correct": None}
-            | {"n_valid": 3, "n_valid_correctness": 0, "unanimous": True, "undecided": abstained is None}
-        )
+        row = dict.fromkeys(VERDICTS.names, "x") | at.partition
+        row |= {"item_id": f"{at.dataset}:s-{number:04d}:void", "side": "void", "abstained": abstained, "correct": None}
+        row |= {"n_valid": 3, "n_valid_correctness": 0, "unanimous": True, "undecided": abstained is None}
+        rows.append(VerdictRow(**row))
     workspace.tables.write(VERDICTS, at.partition, rows, {})
 
 
@@ -225,8 +224,8 @@ def test_failures_are_labelled_over_http_once_and_counted(
     voids = {"occlusion": {1}, "occlusion_ill_posed": {2}, "chaotic": {3, 4}, "chaotic_ill_posed": set()}
     workspace = study(tmp_path, {THINKS: voids, SPEAKS: voids}, budget_usd=1)
     done = collect_labels(workspace)
-    assert (done.tally.asked, done.tally.errors, len(done.rows)) == (8, 0, 8)
-    workspace.tables.write(CONFABULATION, {}, done.rows, {})
+    assert (done.tally.asked, done.tally.errors, len(done.rows(CONFABULATION))) == (8, 0, 8)
+    workspace.tables.write(CONFABULATION, {}, done.rows(CONFABULATION), {})
     rows = workspace.tables.read(CONFABULATION, {}).set_index(["model", "item_id"])
     assert set(rows["evidence"].xs(THINKS)) == {"trace_and_output"}
     assert set(rows["evidence"].xs(SPEAKS)) == {"output"}
@@ -262,8 +261,8 @@ def test_where_the_panel_has_no_judge_for_it_nothing_is_asked_and_the_tables_are
     assert load_protocol().judge("rules") is None
     workspace = study(tmp_path, {THINKS: {d: {0, 1} for d in DATASETS}})
     done = collect_labels(workspace)
-    assert (done.rows, done.tally.asked) == ([], 0)
-    workspace.tables.write(CONFABULATION, {}, done.rows, {})
+    assert (done.rows(CONFABULATION), done.tally.asked) == ([], 0)
+    workspace.tables.write(CONFABULATION, {}, done.rows(CONFABULATION), {})
     assert prevalence(workspace.tables.read(CONFABULATION, {})).empty
     assert provider.stats()["requests"] == 0
 

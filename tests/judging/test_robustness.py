@@ -14,10 +14,10 @@ from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.ratings import PANEL
 from traps_pipeline.judging.robustness import ATTACKS_FILE, check_panel, load_attacks, result, summary
+from traps_pipeline.judging.tables import JUDGE_ROBUSTNESS
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import JUDGE_ROBUSTNESS
 
 # A judge of phrases reads words that are dictated to it as the answer's own. These two attacks are known to move it.
 MOVES_THE_RULES = {("dictated-reason", "abstention"), ("dictated-value", "correctness")}

@@ -14,9 +14,11 @@ from sklearn.metrics import accuracy_score, cohen_kappa_score, precision_recall_
 from statsmodels.stats.inter_rater import cohens_kappa
 
 from tests.judging.conftest import answered_study
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import AXES, sample_id
+from traps_pipeline.judging.tables import CONFABULATION, JUDGE_VALIDATION, ConfabulationRow
 from traps_pipeline.judging.validation import (
     LABEL_COLUMNS,
     HumanLabels,
@@ -24,9 +26,9 @@ from traps_pipeline.judging.validation import (
     is_degenerate,
     read_labels,
 )
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import CONFABULATION, ITEMS, JUDGE_VALIDATION, RESPONSES
 
 MODEL = "qwen3-vl-think"
 
@@ -146,16 +148,20 @@ def labelled_study(root: Path, texts: Sequence[str]) -> Workspace:
     cell = Cell("chaotic", Evaluation(MODEL, "standard", 1))
     workspace = answered_study(root, {cell: {(k, "void"): text for k, text in enumerate(texts)}})
     rows = [
-        dict.fromkeys((c.name for c in CONFABULATION.columns), "x")
-        | cell.partition
-        | {
-            "sample_id": sample_id(cell, f"chaotic:s-{k:04d}:void", text.rpartition("<think>")[2], None),
-            "item_id": f"chaotic:s-{k:04d}:void",
-            "n_failures": 9,
-            "created_at": datetime.now(UTC),
-        }
-        | {"void_kind": "truncation", "evidence": "output", "valid": True}
-        | {axis: axis == "hallucinated_premise" for axis in AXES}
+        ConfabulationRow(
+            **(
+                dict.fromkeys(CONFABULATION.names, "x")
+                | cell.partition
+                | {
+                    "sample_id": sample_id(cell, f"chaotic:s-{k:04d}:void", text.rpartition("<think>")[2], None),
+                    "item_id": f"chaotic:s-{k:04d}:void",
+                    "n_failures": 9,
+                    "created_at": datetime.now(UTC),
+                }
+                | {"void_kind": "truncation", "evidence": "output", "valid": True}
+                | {axis: axis == "hallucinated_premise" for axis in AXES}
+            )
+        )
         for k, text in enumerate(texts)
     ]
     workspace.tables.write(CONFABULATION, {}, rows, {})

@@ -13,15 +13,16 @@ import pytest
 
 from tests.judging.conftest import answered_study, vote_rows
 from tests.providers.server import Provider
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging import panel as judging
 from traps_pipeline.judging.panel import collect_votes
+from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import decide, decide_cell
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, VERDICTS, VOTES
 
 CELL = Cell("occlusion", Evaluation("oracle", "standard", 1))
 COMBINATIONS = list(product(("yes", "no", "invalid"), repeat=3))
@@ -104,8 +105,8 @@ def said(word: str) -> str:
 def vote(workspace: Workspace) -> pd.DataFrame:
     """Ask the panel what is missing; the votes and the verdicts of the cell are then written."""
     ((cell, made),) = collect_votes(workspace, [CELL])
-    assert cell == CELL and len(made.rows) == 2 * 3 * 27
-    workspace.tables.write(VOTES, CELL.partition, made.rows, {}, failed=made.tally.errors)
+    assert cell == CELL and len(made.rows(VOTES)) == 2 * 3 * 27
+    workspace.tables.write(VOTES, CELL.partition, made.rows(VOTES), {}, failed=made.tally.errors)
     workspace.tables.write(VERDICTS, CELL.partition, decide_cell(workspace, CELL), {})
     return workspace.tables.read(VERDICTS, CELL.partition)
 

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import json
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, SceneSpecRow
 from traps_pipeline.digests import file_digest
+from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.models import registry
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.partitions import DATASETS, SIDES, is_ill_posed, taxonomy_of
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.storage.study import MechanismSettings, Study
+from traps_pipeline.storage.tables import Row, Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, SCENE_SPECS, VERDICTS, VIDEOS, Table
 
 CATEGORY = {"occlusion": "hidden", "chaotic": "plinko"}
 PAIRS = 4
@@ -31,10 +34,11 @@ SETTINGS = {
 }
 
 
-def filled(table: Table, **values: Any) -> dict[str, Any]:
+def filled(table: Table[Row], **values: Any) -> Row:
     """A row of a table: the values given, else empty ones of the column's type."""
-    empty = {"str": "", "int": 0, "float": 0.0, "bool": False, "strs": [], "time": None}
-    return {c.name: values.get(c.name, None if c.nullable else empty[c.type]) for c in table.columns}
+    empty = {str: "", int: 0, float: 0.0, bool: False, list[str]: [], datetime: None}
+    nothing = {c.name: None if c.nullable else empty[c.type] for c in table.columns}
+    return table.row_type(**(nothing | values))
 
 
 def make_study(root: Path) -> Workspace:
@@ -65,7 +69,7 @@ def make_study(root: Path) -> Workspace:
     return workspace
 
 
-def _spec(name: str, taxonomy: str, category: str) -> dict[str, Any]:
+def _spec(name: str, taxonomy: str, category: str) -> SceneSpecRow:
     asked = json.dumps({"question": f"Which colour is the floor of {name}?", "labels": ["grey"], "answer": "grey"})
     return filled(SCENE_SPECS, scenario_id=name, taxonomy=taxonomy, category=category, sub_scenario=category,
                   answerable_question=asked)  # fmt: skip

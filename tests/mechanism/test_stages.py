@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_items, write_verdicts
+from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.directions import vector_digest
@@ -24,23 +25,15 @@ from traps_pipeline.mechanism.steering import (
     count_answers,
     strengths,
 )
+from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES, STEERING, STEERING_VOTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import MechanismSettings
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import (
-    DIRECTIONS,
-    HIDDEN_STATES,
-    ITEMS,
-    PROBE_ITEMS,
-    PROBES,
-    STEERING,
-    STEERING_VOTES,
-    Table,
-)
 
 pytestmark = pytest.mark.slow
 
@@ -122,7 +115,7 @@ def test_two_items_with_the_same_clip_and_question_have_the_same_states(own: Wor
     items = own.tables.read(ITEMS, {"dataset": "chaotic"}).to_dict("records")
     first, twin = (next(r for r in items if r["item_id"] == f"chaotic:plinko-{n}:void") for n in (0, 1))
     twin |= {name: first[name] for name in ("clip", "media_digest", "question")}
-    own.tables.write(ITEMS, {"dataset": "chaotic"}, items, {})
+    own.tables.write(ITEMS, {"dataset": "chaotic"}, [ItemRow(**item) for item in items], {})
     extract_all(own)
     states = stages.States.of(own, STANDARD)
     at = dict(zip(states.dataset("chaotic")["item_id"], states.read("chaotic", 3), strict=True))
@@ -218,7 +211,7 @@ def test_probes_take_confabulated_items_from_the_verdicts_and_are_fitted_once(
     assert len(notes) == 10
     assert "confabulated on none of the 4 judged void items" in notes["chaotic", "chaotic_ill_posed"]
     assert "verdicts occlusion_ill_posed|tiny__standard__run1 are not there" in notes["chaotic", "occlusion_ill_posed"]
-    own.tables.write(PROBES, STANDARD.partition, rows.to_dict("records"), {})
+    own.tables.write(PROBES, STANDARD.partition, rows, {})
     monkeypatch.setattr(probing.ProbeRun, "rows", lambda *_: pytest.fail("fitted again"))
     again = pd.DataFrame(stages.probe_rows(own, STANDARD))
     assert len(again) == len(rows) and set(again["made_of"]) == set(rows["made_of"])
@@ -255,7 +248,7 @@ def written(
     """Write each cell as it is done."""
     kept = []
     for cell, made in done:
-        workspace.tables.write(table, cell.partition, made.rows, {}, failed=made.tally.errors)
+        workspace.tables.write(table, cell.partition, made.rows(table), {}, failed=made.tally.errors)
         kept.append((cell, made))
     return kept
 
@@ -267,15 +260,15 @@ def steered(study: Workspace, entry: ModelEntry) -> Workspace:
     along = {"standard": stages.saved_directions(study, STANDARD)}
     done = written(study, STEERING, collect_steered(study, entry, cells, along))
     # chaotic: 4 sources x (void, random) x 2 alphas x 4 rows, the sweep's 2 x 2 controls, 4 rows as they are
-    rows = {cell.dataset: (len(made.rows), made.tally.asked) for cell, made in done}
+    rows = {cell.dataset: (len(made.rows(STEERING)), made.tally.asked) for cell, made in done}
     assert rows["chaotic"] == rows["occlusion"] == (72, 72)
     # ill-posed: 3 sources, whose controls the well-posed cell has asked: its voids are new, and its sweep's controls
     assert rows["chaotic_ill_posed"] == rows["occlusion_ill_posed"] == (56, 3 * 2 * 2 * 2 + 2 + 2 * 2)
     planned = count_answers(study.mechanism, "tiny", DATASETS, {"occlusion": PAIRS, "chaotic": PAIRS})
     assert planned == {"guided": sum(asked for _, asked in rows.values())}
     votes = written(study, STEERING_VOTES, collect_steering_votes(study, cells))
-    judged = [[row for row in made.rows if row["outcome"] in JUDGED] for _, made in done]
-    assert [len(made.rows) for _, made in votes] == [3 * len(rows) for rows in judged]
+    judged = [[row for row in made.rows(STEERING) if row.outcome in JUDGED] for _, made in done]
+    assert [len(made.rows(STEERING_VOTES)) for _, made in votes] == [3 * len(rows) for rows in judged]
     return study
 
 

@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, Checkout, Finished
+from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_VOTES
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import PROBES, STEERING_EFFECTS, STEERING_VOTES
 
 pytestmark = pytest.mark.slow
 ENTRY = """

@@ -7,10 +7,10 @@ import random
 import dagster as dg
 import pytest
 
+from tests.tables import TABLES
 from traps_pipeline.definitions import defs
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.tables import TABLES
 
 DAGSTER = defs.get_repository_def().asset_graph
 GRAPH = the_graph()

@@ -15,6 +15,7 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.models.local.checkpoint import folder_digest
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pocket import inside
@@ -34,7 +35,6 @@ from traps_pipeline.pocket.words import PROMPTS, say
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 
 pytestmark = pytest.mark.slow
 
@@ -127,8 +127,8 @@ def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -
 def test_other_numbers_of_scenes_draw_what_is_missing_and_read_what_is_wanted(
     recipe: Recipe, data: Path, tmp_path: Path
 ) -> None:
+    from traps_pipeline.pocket.batches import Scenes
     from traps_pipeline.pocket.data import data_digest, read_shards, render
-    from traps_pipeline.pocket.train import Scenes
 
     fewer = recipe.model_copy(update={"scenes": {"drop_split": FEW - 1}})
     render(fewer, "train", tmp_path, workers=1)
@@ -161,8 +161,9 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
     import torch
     from torch.nn.functional import cross_entropy
 
+    from traps_pipeline.pocket.batches import Batches, Look, Scenes
     from traps_pipeline.pocket.model import make_model, train_tokenizer
-    from traps_pipeline.pocket.train import Batches, Look, Scenes, answer_loss, look_at
+    from traps_pipeline.pocket.train import answer_loss, look_at
 
     scenes = Scenes(recipe, data)
     model, processor = make_model(train_tokenizer(scenes.records), seed=1)

@@ -14,6 +14,7 @@ from tests.report.test_items import row
 from tests.report.test_report import board_of, board_row
 from tests.report.test_writing import latex_cells
 from traps_pipeline.cli import main
+from traps_pipeline.judging.tables import JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report import publish
@@ -22,9 +23,9 @@ from traps_pipeline.report.figures.abstention import doubt_points
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.writing import figure_files, freeze_layout, table_files, table_latex
+from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import CONTRASTS, JUDGE_BIAS, JUDGE_VALIDATION, LEADERBOARD
 
 PAPER = PublishedResults()
 BY_NAME = {table.name: table for report in TABLES if report.published for table in report.tables(PAPER)}
@@ -75,14 +76,13 @@ def broken(tmp_path_factory):
         )
     )
     overall = {"dataset": "overall", "figure": "pecs", "left_model": SPEAKS, "separable": False}
-    guided = {"left_regime": "guided", "right_regime": "guided", "right_model": THINKS}
+    guided, standard = ({"left_regime": r, "right_regime": r, "right_model": THINKS} for r in ("guided", "standard"))
+    regimes = {"left_regime": "standard", "right_regime": "guided", "right_model": SPEAKS}
     contrasts = [
         row(CONTRASTS, kind="models", **overall, **guided, refused="chaotic: of epoch e1 against epoch e2"),
-        row(CONTRASTS, kind="models", difference=-0.1, p=0.01, p_holm=0.02, **overall, **guided)
-        | {"left_regime": "standard", "right_regime": "standard"},
-        row(CONTRASTS, kind="regimes", refused="chaotic: 3 items", **overall, **guided) | {"right_model": SPEAKS}
-        | {"left_regime": "standard"},
-    ]  # fmt: skip
+        row(CONTRASTS, kind="models", difference=-0.1, p=0.01, p_holm=0.02, **overall, **standard),
+        row(CONTRASTS, kind="regimes", refused="chaotic: 3 items", **overall, **regimes),
+    ]
     validated = dict.fromkeys(("precision", "recall", "f1", "human_kappa"), 0.9)
     workspace.tables.write(LEADERBOARD, {}, board, {})
     workspace.tables.write(CONTRASTS, {}, contrasts, {})

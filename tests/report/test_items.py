@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-import datetime
+from datetime import datetime
 
 import pytest
 
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.report.items import addresses, index_page, item_page, page_name, write_item_pages
 from traps_pipeline.report.writing import Behind
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
 
 HOSTILE = '<script>alert(1)</script> \\textbf{bold} $x$ <img src="http://evil.example/x.png"> & "quoted"'
 CELL = Cell("chaotic", Evaluation("oracle", "standard", 1))
-DEFAULTS = {"str": "x", "int": 1, "float": 0.5, "bool": True, "strs": ["x"], "time": datetime.datetime(2026, 1, 1)}
+DEFAULTS = {str: "x", int: 1, float: 0.5, bool: True, list[str]: ["x"], datetime: datetime(2026, 1, 1)}
 
 
 def row(table, **values):
     """A row of a table with these values; nullable columns are null, others hold some value of their type."""
     filled = {c.name: None if c.nullable else DEFAULTS[c.type] for c in table.columns}
-    return {**filled, **values}
+    return table.row_type(**(filled | values))
 
 
 def write_cell(workspace, cell=CELL, text=HOSTILE):

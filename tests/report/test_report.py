@@ -19,8 +19,8 @@ from traps_pipeline.report.page import report_html
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import figure_bytes, fraction, percent
 from traps_pipeline.scenes.encode import encode
+from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.parquet import TableStore
-from traps_pipeline.tables import LEADERBOARD
 
 NO_BREAK = "\u2011"  # a hyphen at which no line ends
 HOSTILE = "<script>alert(1)</script>|[x](http://evil.example)\x1b[2J"
@@ -63,7 +63,7 @@ def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6
 
 
 def board_of(*rows):
-    return pd.DataFrame(list(rows))[[c.name for c in LEADERBOARD.columns]]
+    return pd.DataFrame(list(rows))[LEADERBOARD.names]
 
 
 @pytest.fixture(scope="module")
@@ -328,7 +328,7 @@ def test_html_names_the_epoch_in_each_row_where_rows_differ():
 
 
 def test_an_empty_board_still_gives_a_page_a_table_and_a_figure():
-    board = pd.DataFrame(columns=pd.Index([c.name for c in LEADERBOARD.columns]))
+    board = pd.DataFrame(columns=pd.Index(LEADERBOARD.names))
     assert "Overall" in report_html(board)
     assert "not run: this study has no leaderboard yet" in leaderboard_text(board)
     assert figure_bytes(landscape_figure(points(board), "Overall")).startswith(b"\x89PNG")

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.tables import VERDICTS
+from traps_pipeline.judging.tables import VERDICTS
 
 Flag = bool | None
 Pair = tuple[Flag, Flag, Flag]  # correct on control, abstained on control, abstained on void
@@ -55,7 +55,7 @@ def verdict_rows(
                     "benchmark_version": "v1",
                 }
             )
-    return pd.DataFrame(rows, columns=pd.Index([c.name for c in VERDICTS.columns]))
+    return pd.DataFrame(rows, columns=pd.Index(VERDICTS.names))
 
 
 def strategy_pairs(name: str, n: int, seed: int = 0) -> list[Pair]:

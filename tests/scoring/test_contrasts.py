@@ -12,8 +12,10 @@ from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
 
 from tests.judging.conftest import item_row
+from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
@@ -28,7 +30,6 @@ from traps_pipeline.scoring.leaderboard import leaderboard
 from traps_pipeline.scoring.metrics import cell_metrics, wilson
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, VERDICTS
 
 
 def pairs_with(n, acc, false_abs, abs_rec):
@@ -307,7 +308,8 @@ def test_the_command_compares_what_both_benchmarks_still_hold(rows, tmp_path, ca
     for name, scenarios in (("then", 4), ("now", 3)):  # one was discarded since; its verdict is still there
         workspace = Workspace.create(tmp_path / name, Study(epoch="e1"))
         places = [(number, side) for number in range(scenarios) for side in ("control", "void")]
-        items = [item_row("occlusion", *at) | {"item_id": f"occlusion:s{at[0]}:{at[1]}"} for at in places]
+        named = [item_row("occlusion", *at) | {"item_id": f"occlusion:s{at[0]}:{at[1]}"} for at in places]
+        items = [ItemRow(**item) for item in named]
         workspace.tables.write(ITEMS, {"dataset": "occlusion"}, items, {})
         verdicts = rows([(True, False, True)] * 4)
         cell = Cell("occlusion", Evaluation("m", "standard", 1))

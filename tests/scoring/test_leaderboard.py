@@ -11,8 +11,8 @@ from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts
 from traps_pipeline.scoring.leaderboard import leaderboard, pooled_j
 from traps_pipeline.scoring.metrics import cell_metrics
+from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.parquet import TableStore
-from traps_pipeline.tables import LEADERBOARD
 
 STRATEGIES = ["oracle", "always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle"]
 

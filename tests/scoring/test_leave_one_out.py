@@ -13,8 +13,8 @@ from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.scoring.leaderboard import standings
 from traps_pipeline.scoring.leave_one_out import leave_one_out, two_judge_verdicts
 from traps_pipeline.scoring.metrics import cell_metrics
+from traps_pipeline.scoring.tables import LEAVE_ONE_OUT
 from traps_pipeline.storage.parquet import TableStore
-from traps_pipeline.tables import LEAVE_ONE_OUT
 
 TASKS = ("correctness", "control_abstention", "void_abstention")
 

@@ -6,9 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, cell_metrics, wrong_figures
+from traps_pipeline.scoring.tables import METRICS
 from traps_pipeline.storage.parquet import TableStore
-from traps_pipeline.tables import METRICS, VERDICTS
 
 
 def one(metrics: pd.DataFrame, **equal: object) -> pd.Series:

@@ -12,27 +12,35 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from traps_pipeline.benchmark.tables import VIDEOS, VideoRow
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.tables import RESPONSES, ResponseRow
 from traps_pipeline.storage.parquet import State, TableStore
-from traps_pipeline.tables import RESPONSES, VIDEOS
 
 PARTITION = {"category": "plinko"}
 CELL = {"dataset": "chaotic", "model": "m", "regime": "standard", "run": 1}
 
 
-def clip(scenario: str, side: str = "control", **changes: Any) -> dict[str, Any]:
+def clip(scenario: str, side: str = "control", **changes: Any) -> VideoRow:
     """A row of the videos table."""
     texts = {name: f"{name} of {scenario}" for name in ("path", "file_sha256", "frames_sha256", "scene_hash")}
     numbers = {"n_frames": 50, "fps": 10, "width": 480, "height": 360, "duration_s": 5.0, "size_bytes": 1000}
     row = {"scenario_id": scenario, "category": "plinko", "side": side, "benchmark_version": "0.1.0"}
-    return row | texts | numbers | changes
+    return VideoRow(**(row | texts | numbers | changes))
 
 
-def answer(item: str, **changes: Any) -> dict[str, Any]:
+def answer(item: str, **changes: Any) -> ResponseRow:
     """A row of the responses table."""
-    row = {"item_id": item, "pair_id": item, "side": "void", "outcome": "answer", "text": "left", "latency_s": 1.0}
+    row = dict.fromkeys(RESPONSES.names) | {
+        "item_id": item,
+        "pair_id": item,
+        "side": "void",
+        "outcome": "answer",
+        "text": "left",
+        "latency_s": 1.0,
+    }
     row |= {"attempts": 1, "request_key": "k", "epoch": "1", "created_at": datetime(2026, 1, 1, tzinfo=UTC)}
-    return row | CELL | {"benchmark_version": "0.1.0"} | changes
+    return ResponseRow(**(row | CELL | {"benchmark_version": "0.1.0"} | changes))
 
 
 @pytest.fixture
@@ -44,11 +52,11 @@ def leftovers(folder: Path) -> list[str]:
     return [path.name for path in folder.rglob("*") if path.is_file() and path.name != "part-0.parquet"]
 
 
-@pytest.mark.parametrize("as_frame", [False, True])
-def test_an_unknown_column_is_refused_by_name(store: TableStore, as_frame: bool) -> None:
-    rows = [clip("plinko-0001", colour="red")]
-    with pytest.raises(TrapsError, match=r"table videos .*colour"):
-        store.write(VIDEOS, PARTITION, pd.DataFrame(rows) if as_frame else rows, {})
+def test_an_unknown_column_is_refused_by_name(store: TableStore) -> None:
+    coloured = pd.DataFrame([clip("plinko-0001")]).assign(colour="red")
+    for rows, stranger in ((coloured, "colour"), ([answer("a")], "request_key")):
+        with pytest.raises(TrapsError, match=rf"table videos .*{stranger}"):
+            store.write(VIDEOS, PARTITION, rows, {})
     assert store.state(VIDEOS, PARTITION) is None
 
 
@@ -60,11 +68,8 @@ def test_a_missing_value_is_refused_in_a_column_that_must_hold_one(store: TableS
 
 
 def test_a_missing_column_is_refused_by_name(store: TableStore) -> None:
-    row = clip("plinko-0001")
-    del row["fps"]
-    for rows in ([row], pd.DataFrame([row])):
-        with pytest.raises(TrapsError, match=r"table videos .*fps"):
-            store.write(VIDEOS, PARTITION, rows, {})
+    with pytest.raises(TrapsError, match=r"table videos .*fps"):
+        store.write(VIDEOS, PARTITION, pd.DataFrame([clip("plinko-0001")]).drop(columns="fps"), {})
 
 
 def test_a_value_of_another_type_is_refused(store: TableStore) -> None:
@@ -88,7 +93,7 @@ def test_a_table_is_sorted_by_its_key_and_comes_back_as_it_was_written(store: Ta
     rows = [clip("plinko-0002"), clip("plinko-0001", "void"), clip("plinko-0001")]
     store.write(VIDEOS, PARTITION, rows, {})
     read = store.read(VIDEOS, PARTITION)
-    assert read.to_dict("records") == [rows[2], rows[1], rows[0]]
+    assert [VideoRow(**row) for row in read.to_dict("records")] == [rows[2], rows[1], rows[0]]
 
 
 def test_the_footer_says_version_inputs_rows_and_failures(store: TableStore) -> None:
@@ -111,7 +116,7 @@ def test_the_version_changes_with_any_other_content(store: TableStore, change: d
 def test_a_table_of_no_rows_is_a_table(store: TableStore) -> None:
     store.write(VIDEOS, PARTITION, [], {})
     assert len(store.read(VIDEOS, PARTITION)) == 0
-    assert list(store.read(VIDEOS, PARTITION).columns) == [column.name for column in VIDEOS.columns]
+    assert list(store.read(VIDEOS, PARTITION).columns) == VIDEOS.names
 
 
 def test_a_full_disk_leaves_the_former_file_and_nothing_half_written(

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from traps_pipeline.benchmark.specs import released_in_study
+from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
@@ -15,7 +16,6 @@ from traps_pipeline.partitions import CATEGORIES, SIDES, datasets_of_category, i
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import SCENE_SPECS, VIDEOS
 
 Record = Mapping[str, Any]
 
@@ -25,7 +25,7 @@ def categories_of_dataset(dataset: str) -> list[str]:
     return [category for category in CATEGORIES if dataset in datasets_of_category(category)]
 
 
-def build_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
+def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
     """Rows of a dataset's items. Clips are checked against their digests. Raises TrapsError."""
     specs: list[Record] = []
     clips: dict[tuple[str, str], Record] = {}
@@ -78,10 +78,10 @@ def _item(
     clips: Mapping[tuple[str, str], Record],
     commonest: Mapping[str, str],
     version: str,
-) -> dict[str, Any]:
+) -> ItemRow:
     unanswerable = side == "void" and is_ill_posed(dataset)
     clip = clips[spec["scenario_id"], "control" if is_ill_posed(dataset) else side]
-    item: dict[str, Any] = {
+    decisive: dict[str, Any] = {
         "item_id": f"{dataset}:{spec['scenario_id']}:{side}",
         "pair_id": f"{dataset}:{spec['scenario_id']}",
         "dataset": dataset,
@@ -98,9 +98,10 @@ def _item(
         "control_answer": spec["ground_truth"],
         "media_digest": clip["file_sha256"],
     }
-    return item | {
-        "item_hash": digest(item | {"aliases": json.loads(item["aliases"])}),
-        "commonest_answer": commonest[spec["sub_scenario"]],
-        "clip": clip["path"],
-        "benchmark_version": version,
-    }
+    return ItemRow(
+        **decisive,
+        item_hash=digest(decisive | {"aliases": json.loads(spec["aliases"])}),
+        commonest_answer=commonest[spec["sub_scenario"]],
+        clip=clip["path"],
+        benchmark_version=version,
+    )

@@ -13,6 +13,7 @@ import numpy as np
 from traps_pipeline import progress
 from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, fold, load_scenarios, subset
 from traps_pipeline.benchmark.records import load_released, parse_record
+from traps_pipeline.benchmark.tables import SceneSpecRow
 from traps_pipeline.benchmark.versions import spec_content, version_of
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
@@ -125,7 +126,7 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
         ) from error
 
 
-def build_specs(workspace: Workspace, category: str) -> tuple[list[dict[str, Any]], list[Resolved]]:
+def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[Resolved]]:
     """Rows of scene_specs of a category, and the resolved records behind them. Trajectories are checked by digest."""
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
     resolved = [resolve_scenario(workspace, scenario) for scenario in scenarios]
@@ -163,21 +164,22 @@ def void_from_s(spec: SceneSpec) -> float:
     return frame / spec.physics["fps"]
 
 
-def _row(workspace: Workspace, item: Resolved, version: str) -> dict[str, Any]:
+def _row(workspace: Workspace, item: Resolved, version: str) -> SceneSpecRow:
     spec = item.spec
     record = spec.model_dump(mode="json", exclude={"evidence"})
     for name in ("params", "physics", "camera", "void", "aliases", "answerable_question", "twin"):
         record[name] = json.dumps(record[name], sort_keys=True, ensure_ascii=False)
-    return record | {
-        "scene_hash": spec.scene_hash,
-        "spec_hash": spec.spec_hash,
-        "trajectory": _relative(item.trajectory, workspace.root, CHECKOUT),
-        "commit_s": float(spec.evidence["commit_s"]),
-        "margin_m": float(spec.evidence["margin_m"]),
-        "void_from_s": void_from_s(spec),
-        "evidence": json.dumps(spec.evidence, sort_keys=True),
-        "benchmark_version": version,
-    }
+    return SceneSpecRow(
+        **record,
+        scene_hash=spec.scene_hash,
+        spec_hash=spec.spec_hash,
+        trajectory=_relative(item.trajectory, workspace.root, CHECKOUT),
+        commit_s=float(spec.evidence["commit_s"]),
+        margin_m=float(spec.evidence["margin_m"]),
+        void_from_s=void_from_s(spec),
+        evidence=json.dumps(spec.evidence, sort_keys=True),
+        benchmark_version=version,
+    )
 
 
 def _relative(path: Path, *roots: Path) -> str:

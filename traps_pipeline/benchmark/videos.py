@@ -7,18 +7,18 @@ from typing import Any
 
 from traps_pipeline import progress
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
+from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.clips import Job, read_clip, render_pairs, rendered
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import SCENE_SPECS, VIDEOS
 
 CLIPS = ("control", "void", "twin")
 
 
-def build_videos(workspace: Workspace, category: str) -> tuple[list[dict[str, Any]], int, dict[str, float]]:
+def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], int, dict[str, float]]:
     """Rows of the category's clips (three a scenario), frames drawn for them, leaked pixels of each occluded void."""
     specs: list[dict[str, Any]] = workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
     jobs = [_job(workspace, row) for row in specs]
@@ -44,29 +44,29 @@ def _job(workspace: Workspace, row: dict[str, Any]) -> Job:
     return Job(spec, trajectory_of(workspace, row), trajectory_of(workspace, row, "twin"), control, void, twin)
 
 
-def _rows(workspace: Workspace, row: dict[str, Any], job: Job, version: str) -> list[dict[str, Any]]:
+def _rows(workspace: Workspace, spec: dict[str, Any], job: Job, version: str) -> list[VideoRow]:
     rows = []
     for side, path in zip(CLIPS, job.clips, strict=True):
         clip = read_clip(path)
         if clip is None:
             raise TrapsError(f"{path}: was not rendered; run again")
         rows.append(
-            {
-                "scenario_id": row["scenario_id"],
-                "category": row["category"],
-                "side": side,
-                "path": workspace.relative(path),
-                "file_sha256": clip.file_sha256,
-                "frames_sha256": clip.frames_sha256,
-                "n_frames": clip.n_frames,
-                "fps": clip.fps,
-                "width": WIDTH,
-                "height": HEIGHT,
-                "duration_s": clip.duration_s,
-                "size_bytes": clip.size_bytes,
-                "scene_hash": row["scene_hash"],
-                "benchmark_version": version,
-            }
+            VideoRow(
+                scenario_id=spec["scenario_id"],
+                category=spec["category"],
+                side=side,
+                path=workspace.relative(path),
+                file_sha256=clip.file_sha256,
+                frames_sha256=clip.frames_sha256,
+                n_frames=clip.n_frames,
+                fps=clip.fps,
+                width=WIDTH,
+                height=HEIGHT,
+                duration_s=clip.duration_s,
+                size_bytes=clip.size_bytes,
+                scene_hash=spec["scene_hash"],
+                benchmark_version=version,
+            )
         )
     return rows
 

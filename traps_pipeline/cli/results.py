@@ -51,10 +51,10 @@ def export_results(arguments: argparse.Namespace) -> int:
 
 def compare_studies(arguments: argparse.Namespace) -> int:
     """See `traps compare --help`."""
+    from traps_pipeline.judging.tables import VERDICTS
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.contrasts import version_contrasts
     from traps_pipeline.storage.workspace import Workspace
-    from traps_pipeline.tables import VERDICTS
 
     studies = Workspace.open(arguments.other), Workspace.open(root_of(arguments))
     then, now = (current(study, VERDICTS) for study in studies)

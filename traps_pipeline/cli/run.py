@@ -120,7 +120,7 @@ def _check_participant(name: str) -> None:
 
 def _print_results(workspace: Workspace) -> None:
     from traps_pipeline.report.leaderboard import leaderboard_text
-    from traps_pipeline.tables import LEADERBOARD
+    from traps_pipeline.scoring.tables import LEADERBOARD
 
     print(leaderboard_text(workspace.tables.read(LEADERBOARD, {})))
     pictures = ("figures/pecs_landscape.png", "contact_sheet.png", "shortcuts.png")

@@ -7,6 +7,7 @@ import dagster as dg
 
 from traps_pipeline.benchmark.composition import problems
 from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, unsettled
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET, to_keys
@@ -15,7 +16,6 @@ from traps_pipeline.partitions import datasets_of_category
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, SCENE_SPECS, VIDEOS
 
 GROUP = "benchmark"
 released_specs = source(
@@ -100,14 +100,14 @@ def _make_videos(workspace: Workspace, category: str) -> Made:
     from traps_pipeline.benchmark.videos import build_videos
 
     rows, drawn, leaks = build_videos(workspace, category)
-    size = sum(row["size_bytes"] for row in rows) / 1e6
+    size = sum(row.size_bytes for row in rows) / 1e6
     shown = {"frames rendered": drawn, "megabytes": round(size, 2)}
     return Made(rows, Tally(frames=drawn), shown, beside=leaks)
 
 
 def _alike(workspace: Workspace, key: str | None, made: Made) -> list[str]:
-    shown = [(row["side"], row["frames_sha256"]) for row in made.rows]
-    return [row["path"] for row, one in zip(made.rows, shown, strict=True) if shown.count(one) > 1]
+    shown = [(row.side, row.frames_sha256) for row in made.rows(VIDEOS)]
+    return [row.path for row, one in zip(made.rows(VIDEOS), shown, strict=True) if shown.count(one) > 1]
 
 
 videos = stage(
@@ -135,13 +135,13 @@ def _make_items(workspace: Workspace, dataset: str) -> Made:
     from traps_pipeline.benchmark.items import build_items
 
     rows = build_items(workspace, dataset)
-    return Made(rows, shown={"benchmark version": rows[0]["benchmark_version"]})
+    return Made(rows, shown={"benchmark version": rows[0].benchmark_version})
 
 
 def _odd_pairs(workspace: Workspace, key: str | None, made: Made) -> dict[str, list[str]]:
     sides: dict[str, list[str]] = {}
-    for row in made.rows:
-        sides.setdefault(row["pair_id"], []).append(row["side"])
+    for row in made.rows(ITEMS):
+        sides.setdefault(row.pair_id, []).append(row.side)
     return {pair: found for pair, found in sides.items() if sorted(found) != ["control", "void"]}
 
 
@@ -162,7 +162,7 @@ items = stage(
             "clips_present",
             "Every clip is there with its digest (checked while building; a damaged one fails the step).",
             lambda workspace, key, made: sorted(
-                {row["clip"] for row in made.rows if not workspace.resolve(row["clip"]).is_file()}
+                {row.clip for row in made.rows(ITEMS) if not workspace.resolve(row.clip).is_file()}
             ),
         ),
     ],

@@ -1,24 +1,26 @@
 """The evaluation group: answers of models, votes of judges, verdicts of the panel. A cell is dataset x evaluation."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, cast
 
 import dagster as dg
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.judging.panel import collect_votes
+from traps_pipeline.judging.tables import VERDICTS, VOTES, VoteRow
 from traps_pipeline.models.answers import collect_answers
 from traps_pipeline.models.judges import panel_version
 from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.registry import answering_version
 from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.tables import RESPONSES, ResponseRow
 from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.schemes import CELL, EVALUATION, by_dataset, by_evaluation
 from traps_pipeline.orchestration.stage import source, stage
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
 
 GROUP = "evaluation"
 MAX_INVALID_SHARE = 0.05
@@ -56,23 +58,23 @@ def _cells(
 
     def collected(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
         for cell, made in collect(workspace, [Cell.parse(key) for key in keys]):
-            shown = {**made.shown, **_items_shown(workspace, cell, made)}
+            shown = {**made.shown, **_items_shown(workspace, cell, cast(Sequence[ResponseRow | VoteRow], made.content))}
             yield cell.key, Made(made.content, made.tally, shown)
 
     collected.__doc__ = collect.__doc__
     return collected
 
 
-def _items_shown(workspace: Workspace, cell: Cell, made: Made) -> dict[str, Any]:
+def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
     """The items behind a cell: those without an answer, as a table, and the page of all of them."""
     from traps_pipeline.report.items import FOLDER, page_name
 
     page = workspace.reports / FOLDER / page_name(cell)
     columns = ("item_id", "side", "outcome", "error", "attempts")
-    rows = [row for row in made.rows if "outcome" in row and row["outcome"] not in JUDGED]
-    records = [dg.TableRecord({name: str(row[name]) for name in columns}) for row in rows[:ITEMS_SHOWN]]
+    without = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
+    records = [dg.TableRecord({name: str(getattr(row, name)) for name in columns}) for row in without[:ITEMS_SHOWN]]
     table = {"without an answer": dg.MetadataValue.table(records)} if records else {}
-    why = {"one item": f"traps why {made.rows[0]['item_id']}"} if made.rows else {}
+    why = {"one item": f"traps why {rows[0].item_id}"} if rows else {}
     links = {"items": dg.MetadataValue.asset(items.key), "all items": dg.MetadataValue.path(str(page))}
     return {**table, **links, **why}
 
@@ -80,7 +82,8 @@ def _items_shown(workspace: Workspace, cell: Cell, made: Made) -> dict[str, Any]
 def _answers_missing(workspace: Workspace, key: str | None, made: Made) -> str:
     state = workspace.tables.state(ITEMS, {"dataset": Cell.parse(str(key)).dataset})
     n_items = state.rows if state else 0
-    return "" if len(made.rows) == n_items else f"{len(made.rows)} rows for {n_items} items"
+    n_rows = len(made.rows(RESPONSES))
+    return "" if n_rows == n_items else f"{n_rows} rows for {n_items} items"
 
 
 responses = stage(
@@ -101,9 +104,10 @@ responses = stage(
 
 
 def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
-    invalid = sum(not row["valid"] for row in made.rows)
-    many = invalid > MAX_INVALID_SHARE * len(made.rows)
-    return f"{invalid} of {len(made.rows)} votes are invalid" if many else ""
+    cast_votes = made.rows(VOTES)
+    invalid = sum(not vote.valid for vote in cast_votes)
+    many = invalid > MAX_INVALID_SHARE * len(cast_votes)
+    return f"{invalid} of {len(cast_votes)} votes are invalid" if many else ""
 
 
 votes = stage(

@@ -10,22 +10,13 @@ from traps_pipeline.defs.scoring import leaderboard
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
+from traps_pipeline.judging.tables import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
 from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import CELL, these_keys
 from traps_pipeline.orchestration.stage import source, stage
+from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE, LEADERBOARD, LEAVE_ONE_OUT
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import (
-    AGREEMENT,
-    CONFABULATION,
-    CONFABULATION_PREVALENCE,
-    JUDGE_BIAS,
-    JUDGE_VALIDATION,
-    LEADERBOARD,
-    LEAVE_ONE_OUT,
-    VERDICTS,
-    VOTES,
-)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -109,8 +100,9 @@ def _make_confabulation(workspace: Workspace, _: None) -> Made:
 
 
 def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
-    invalid = sum(not row["valid"] for row in made.rows)
-    return f"{invalid} of {len(made.rows)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(made.rows) else ""
+    labels = made.rows(CONFABULATION)
+    invalid = sum(not label.valid for label in labels)
+    return f"{invalid} of {len(labels)} labels are invalid" if invalid > MAX_INVALID_SHARE * len(labels) else ""
 
 
 def _make_prevalence(workspace: Workspace, _: None) -> Made:

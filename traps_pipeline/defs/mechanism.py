@@ -1,13 +1,25 @@
 """The mechanism group: hidden states of local models, probes, void directions, steering (docs/spec.md 7 and 8)."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import dagster as dg
 
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
+from traps_pipeline.mechanism.tables import (
+    COSINES,
+    DIRECTIONS,
+    HIDDEN_STATES,
+    PROBE_ITEMS,
+    PROBES,
+    STEERING_EFFECTS,
+    STEERING_SHARES,
+    STEERING_VOTES,
+    ProbeRow,
+)
+from traps_pipeline.mechanism.tables import STEERING as STEERING_TABLE
 from traps_pipeline.mechanism.versions import (
     directions_are_there,
     extraction_version,
@@ -47,17 +59,6 @@ from traps_pipeline.partitions import (
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import (
-    COSINES,
-    DIRECTIONS,
-    HIDDEN_STATES,
-    PROBE_ITEMS,
-    PROBES,
-    STEERING_EFFECTS,
-    STEERING_SHARES,
-    STEERING_VOTES,
-)
-from traps_pipeline.tables import STEERING as STEERING_TABLE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -128,7 +129,7 @@ def _make_hidden_states(workspace: Workspace, key: str) -> Made:
 def _unsound_layers(workspace: Workspace, key: str | None, made: Made) -> list[int]:
     from traps_pipeline.mechanism.stages import unsound_layers
 
-    return unsound_layers(workspace, StatesCell.parse(str(key)), made.rows[0]["n_layers"])
+    return unsound_layers(workspace, StatesCell.parse(str(key)), made.rows(HIDDEN_STATES)[0].n_layers)
 
 
 hidden_states = stage(
@@ -155,11 +156,11 @@ def _make_probes(workspace: Workspace, key: str) -> Made:
 
 
 def _outside_shares(workspace: Workspace, key: str | None, made: Made) -> str:
-    def is_wrong(row: Mapping[str, Any]) -> bool:
-        figures = [row[name] for name in ("value", "low", "high")]
+    def is_wrong(row: ProbeRow) -> bool:
+        figures = (row.value, row.low, row.high)
         return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
 
-    wrong = sum(is_wrong(row) for row in made.rows)
+    wrong = sum(is_wrong(row) for row in made.rows(PROBES))
     return f"{wrong} rows are wrong" if wrong else ""
 
 

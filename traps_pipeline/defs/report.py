@@ -5,6 +5,7 @@ from typing import Any
 
 import dagster as dg
 
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.defs import judging, mechanism, scoring
 from traps_pipeline.defs.shown import thumbnail
 from traps_pipeline.errors import TrapsError
@@ -15,7 +16,6 @@ from traps_pipeline.report.results import Results
 from traps_pipeline.scoring.published import published_digest
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, SCENE_SPECS, VIDEOS
 
 GROUP = "report"
 READ = (judging, mechanism, scoring)  # declared before: what is printed is printed from them

@@ -1,18 +1,23 @@
 """The scoring group: metrics of cells, contrasts, the leaderboard."""
 
+from typing import TYPE_CHECKING
+
 import dagster as dg
 
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import verdicts
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import DATASET, by_dataset
 from traps_pipeline.orchestration.stage import stage
-from traps_pipeline.scoring import Frame
+from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS, VERDICTS
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 GROUP = "scoring"
 _SHARES = {name: ["verdicts.abstained", "verdicts.correct"] for name in ("pecs", "naive")}
@@ -59,7 +64,7 @@ metrics = stage(
 )
 
 
-def _scored(workspace: Workspace, name: str) -> tuple[Frame, Frame]:
+def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
     """All METRICS rows, and the VERDICTS rows that they are made of."""
     from traps_pipeline.judging.verdicts import current
 
@@ -76,9 +81,9 @@ def _make_contrasts(workspace: Workspace, _: None) -> Made:
 
     cells, judged = _scored(workspace, "contrasts")
     table = paired(resample(judged), cells, judged)
-    told = table[table["separable"] & (table["dataset"] == "overall")]
-    refused = int(table["refused"].notna().sum())
-    shown = {"contrasts": rows_shown(told), "separable": int(table["separable"].sum()), "refused": refused}
+    separable, refused = table["separable"].to_numpy(bool), len(table.loc[table["refused"].notna()])
+    told = table.loc[separable & (table["dataset"] == "overall")]
+    shown = {"contrasts": rows_shown(told), "separable": int(separable.sum()), "refused": refused}
     return Made(table, shown=shown)
 
 

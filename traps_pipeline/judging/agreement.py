@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.judging.ratings import INVALID, NO, PANEL, TASKS, YES, Ratings, majority, ratings
+from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.tables import AGREEMENT, JUDGE_BIAS
 
 
 def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
@@ -26,7 +26,7 @@ def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.Da
         for one, other in combinations(sorted(range(len(group.judges)), key=group.judges.__getitem__), 2):
             name = f"{group.judges[one]}+{group.judges[other]}"
             rows.append(about | {"judges": name} | _pair_row(group.values[:, [one, other]]))
-    return pd.DataFrame(rows, columns=pd.Index([c.name for c in AGREEMENT.columns]))
+    return pd.DataFrame(rows, columns=pd.Index(AGREEMENT.names))
 
 
 def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
@@ -37,7 +37,7 @@ def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.D
         rows += [
             about | {"judge": judge} | _bias(group.values[:, seat], verdict) for seat, judge in enumerate(group.judges)
         ]
-    return pd.DataFrame(rows, columns=pd.Index([c.name for c in JUDGE_BIAS.columns]))
+    return pd.DataFrame(rows, columns=pd.Index(JUDGE_BIAS.names))
 
 
 def _groups(whole: Ratings) -> Iterator[tuple[dict[str, Any], Ratings]]:

@@ -17,21 +17,23 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, StrictBool
 
 from traps_pipeline import progress
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import ask_judges, judge_request, parse_judgement, quoted
+from traps_pipeline.judging.tables import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.models.ask import Call, Settled
 from traps_pipeline.models.judges import JudgeEntry, load_judges
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, get_model, structured
 from traps_pipeline.models.request import Request
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation, is_ill_posed
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 PROTOCOL_FILE = ASSETS / "confabulation.yaml"
@@ -204,7 +206,7 @@ def collect_labels(workspace: Workspace) -> Made:
 
     Nothing where the study's panel has no judge for it.
     """
-    protocol, table, total = load_protocol(), list[Mapping[str, Any]](), Tally()
+    protocol, table, total = load_protocol(), list[ConfabulationRow](), Tally()
     judge = protocol.judge(workspace.study.panel)
     if judge is None:
         return Made(table)
@@ -216,27 +218,27 @@ def collect_labels(workspace: Workspace) -> Made:
         return settled.made(_label_row)
 
     for _, made in ask_judges(workspace, TASK, [judge], list(samples), samples.__getitem__, finish):
-        table.extend(made.rows)
+        table.extend(made.rows(CONFABULATION))
         total.add(made.tally)
     return Made(table, total, {"asked": total.asked, "known": total.cached, "failed": total.errors})
 
 
-def _label_row(cell: Cell, failure: Failure, row: Row) -> dict[str, Any]:
+def _label_row(cell: Cell, failure: Failure, row: Row) -> ConfabulationRow:
     labels = parse_judgement(Labels, row)
     valid = isinstance(labels, Labels)
     item_id = failure.item["item_id"]
-    return {
-        "sample_id": sample_id(cell, item_id, failure.text, failure.trace),
-        "item_id": item_id,
+    return ConfabulationRow(
         **cell.partition,
-        "void_kind": void_kind(cell.dataset),
-        "evidence": TRACE_AND_OUTPUT if failure.trace else OUTPUT,
-        "n_failures": failure.n_failures,
-        "judge": failure.request.participant,
-        "valid": valid,
-        "invalid_reason": None if valid else labels,
         **{axis: getattr(labels, axis) if valid else None for axis in (*AXES, "rationale")},
-        "label_key": row["key"],
         **when_asked(row),
-        "benchmark_version": failure.item["benchmark_version"],
-    }
+        sample_id=sample_id(cell, item_id, failure.text, failure.trace),
+        item_id=item_id,
+        void_kind=void_kind(cell.dataset),
+        evidence=TRACE_AND_OUTPUT if failure.trace else OUTPUT,
+        n_failures=failure.n_failures,
+        judge=failure.request.participant,
+        valid=valid,
+        invalid_reason=labels if isinstance(labels, str) else None,
+        label_key=row["key"],
+        benchmark_version=failure.item["benchmark_version"],
+    )

@@ -14,9 +14,11 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, StrictBool, StrictFloat, StrictInt, StrictStr, ValidationError
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.answers import is_correct, strip_fence
+from traps_pipeline.judging.tables import VoteRow
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
@@ -25,10 +27,11 @@ from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, Backend, Request
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell
 from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, Table
 from traps_pipeline.yamlfile import explain
 
 # --- what a judge is asked --------------------------------------------------------------------------------------------
@@ -234,13 +237,13 @@ def vote_columns(ballot: Ballot, vote: Vote, row: Row) -> dict[str, Any]:
     }
 
 
-def _vote_row(cell: Cell, ballot: Ballot, row: Row) -> dict[str, Any]:
+def _vote_row(cell: Cell, ballot: Ballot, row: Row) -> VoteRow:
     vote = ballot.vote(row)
-    return {
+    return VoteRow(
         **{name: ballot.item[name] for name in ("item_id", "side", "benchmark_version")},
         **cell.partition,
         **vote_columns(ballot, vote, row),
-        "correct": vote.decision if ballot.task == "correctness" else None,
-        "judge_correct": vote.judge_correct,
-        "extracted_value": vote.extracted_value,
-    }
+        correct=vote.decision if ballot.task == "correctness" else None,
+        judge_correct=vote.judge_correct,
+        extracted_value=vote.extracted_value,
+    )

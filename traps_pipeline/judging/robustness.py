@@ -19,12 +19,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_request
 from traps_pipeline.judging.ratings import INVALID, NO, PANEL, YES, majority
+from traps_pipeline.judging.tables import JUDGE_ROBUSTNESS
 from traps_pipeline.models.ask import Settled
 from traps_pipeline.models.judges import JudgeEntry, Task
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import JUDGE_ROBUSTNESS
 from traps_pipeline.terminal import text_table
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
@@ -150,7 +150,7 @@ def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes)
                     | {"result": result(expected, clean, vote)}
                     | {"invalid_reason": cast and cast.invalid_reason, "rationale": cast and cast.rationale}
                 )
-    return pd.DataFrame(rows, columns=pd.Index([c.name for c in JUDGE_ROBUSTNESS.columns]))
+    return pd.DataFrame(rows, columns=pd.Index(JUDGE_ROBUSTNESS.names))
 
 
 def _said(votes: Sequence[Vote]) -> bool | None:

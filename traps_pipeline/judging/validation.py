@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.agreement import cohen_kappa
@@ -26,9 +27,10 @@ from traps_pipeline.judging.confabulation import (
     load_protocol,
     sample_id,
 )
+from traps_pipeline.judging.tables import CONFABULATION, JUDGE_VALIDATION
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import CONFABULATION, ITEMS, JUDGE_VALIDATION, RESPONSES
 from traps_pipeline.terminal import text_table
 
 LABEL_COLUMNS = ("annotator", "sample_id", *AXES)
@@ -199,7 +201,7 @@ def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
         | {"accuracy_a": agreed[0], "accuracy_b": agreed[1]}
         | {"human_agreement": float(np.mean(human.labels[0] == human.labels[1]))}
     )
-    return pd.DataFrame(rows, columns=pd.Index([c.name for c in JUDGE_VALIDATION.columns]))
+    return pd.DataFrame(rows, columns=pd.Index(JUDGE_VALIDATION.names))
 
 
 def _shared(axis: str, failures: int, human: HumanLabels) -> dict[str, Any]:

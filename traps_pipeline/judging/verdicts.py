@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.ratings import (
     ABSTENTION,
@@ -19,11 +20,13 @@ from traps_pipeline.judging.ratings import (
     majority,
     ratings,
 )
+from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.judges import PANEL_SIZE
 from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES, Table
 
 ITEM_COLUMNS = ["item_id", "scenario_id", "category", "sub_scenario", "control_answer", "benchmark_version"]
 RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "epoch"]
@@ -68,7 +71,7 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     rows["n_valid_correctness"] = (correctness != INVALID).sum(axis=1)
     rows["unanimous"] = judged & _unanimous(abstention) & (~on_control | _unanimous(correctness))
     rows["undecided"] = judged & undecided
-    return rows.loc[:, [c.name for c in VERDICTS.columns]]
+    return rows.loc[:, VERDICTS.names]
 
 
 def _unanimous(values: np.ndarray) -> np.ndarray:

@@ -14,7 +14,6 @@ import pandas as pd
 from traps_pipeline.mechanism.paths import FAMILIES, PATH_SETS
 from traps_pipeline.partitions import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 
-Frame = pd.DataFrame
 CELL = ["model", "directions", "regime"]
 REGIME_COLUMNS = (
     *("model", "path_set", "family", "directions", "regime", "kind", "n_paths", "alpha"),
@@ -22,18 +21,18 @@ REGIME_COLUMNS = (
 )
 
 
-def on_both_sides(effects: Frame) -> Frame:
+def on_both_sides(effects: pd.DataFrame) -> pd.DataFrame:
     """The effects at the steered layer: further layers of a sweep have controls alone."""
     layers = effects.loc[effects["side"] == "void", [*CELL, "layer"]].drop_duplicates()
     return effects.merge(layers, on=[*CELL, "layer"])
 
 
-def paths(effects: Frame) -> Frame:
+def paths(effects: pd.DataFrame) -> pd.DataFrame:
     """One row a path and strength at the steered layer: abstention of control and void side by side, where effects have
     intervals `control_low` and so on, transfer_type."""
     keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
     rows, columns = on_both_sides(effects), keys.copy()
-    parts: list[Frame] = []
+    parts: list[pd.DataFrame] = []
     for value, suffix in (("abstention", ""), ("low", "_low"), ("high", "_high")):
         if value in rows:
             wide = rows.pivot_table(index=keys, columns="side", values=value, dropna=False, observed=True)
@@ -44,24 +43,24 @@ def paths(effects: Frame) -> Frame:
     return _in_order(wide.assign(transfer_type=types))
 
 
-def regime_matrix(effects: Frame) -> Frame:
+def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
     """REGIME_COLUMNS: mean abstention over the paths of each set at alpha 0 and at the largest alpha, by direction
     regime, inference regime and kind of direction; family `all`."""
     return _regime_rows(effects, lambda rows: iter([("all", rows)]))
 
 
-def family_asymmetry(effects: Frame) -> Frame:
+def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
     """The same for guided directions under guided inference, by the taxonomy of the direction's source."""
     guided = effects.loc[(effects["directions"] == "guided") & (effects["regime"] == "guided")]
 
-    def families(rows: Frame) -> Iterator[tuple[str, Frame]]:
+    def families(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         for family in FAMILIES:
             yield family, rows.loc[rows["source"].map(taxonomy_of) == family]
 
     return _regime_rows(guided, families)
 
 
-def _regime_rows(effects: Frame, split: Any) -> Frame:
+def _regime_rows(effects: pd.DataFrame, split: Any) -> pd.DataFrame:
     rows = paths(effects)
     found: list[Mapping[str, Any]] = []
     for path_set, members in PATH_SETS.items():
@@ -83,7 +82,7 @@ def _regime_rows(effects: Frame, split: Any) -> Frame:
     return pd.DataFrame(found, columns=pd.Index(REGIME_COLUMNS))
 
 
-def domains(effects: Frame) -> Frame:
+def domains(effects: pd.DataFrame) -> pd.DataFrame:
     """Control abstention at the largest alpha along each source's direction, on the well-posed dataset of its own
     taxonomy (same) against that of the other (cross). Columns CELL, source, alpha, same, cross."""
     rows = paths(effects)
@@ -98,7 +97,7 @@ def domains(effects: Frame) -> Frame:
     return _in_order(wide.reset_index().reindex(columns=columns))
 
 
-def sweep(effects: Frame) -> Frame:
+def sweep(effects: pd.DataFrame) -> pd.DataFrame:
     """Control abstention by layer and alpha, each dataset's direction on its own controls, mean over the four splits.
     Columns CELL, layer, alpha, control, n_splits. Empty where one layer was steered."""
     rows = effects.loc[(effects["kind"] == "void") & (effects["side"] == "control")]
@@ -109,7 +108,7 @@ def sweep(effects: Frame) -> Frame:
     return table.loc[several].reset_index(drop=True)
 
 
-def _in_order(rows: Frame) -> Frame:
+def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
     """Sources and targets in the benchmark's order."""
     order = {name: place for place, name in enumerate(DATASETS)}
     by = [name for name in (*CELL, "kind", "source", "target", "alpha") if name in rows]

@@ -17,11 +17,11 @@ import pandas as pd
 from traps_pipeline.judging.ratings import ABSTENTION, decided, majority, ratings
 from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS
 from traps_pipeline.mechanism.steering import UNSTEERED
+from traps_pipeline.mechanism.tables import SteeringEffectRow, SteeringShareRow
 from traps_pipeline.partitions import taxonomy_of, transfer_type
 from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, TAXONOMIES, percentiles, scenario_weights
 from traps_pipeline.scoring.metrics import wilson
 
-Rows = list[dict[str, Any]]
 ALL = "all"
 _RUN = ["model", "directions", "regime"]
 _CELL = [*_RUN, "dataset"]
@@ -52,9 +52,9 @@ def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> Rows:
+def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffectRow]:
     """Rows of STEERING_EFFECTS: abstention by path, kind, layer, alpha and side."""
-    rows: Rows = []
+    rows: list[SteeringEffectRow] = []
     for key, group in _answers_of_paths(answers, votes).groupby(_PATH, sort=True):
         model, directions, regime, target, source, kind, layer, alpha, side = cast(tuple[Any, ...], key)
         decided = group["abstained"].dropna().to_numpy(bool)
@@ -62,39 +62,57 @@ def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> Rows:
         low, high = wilson(np.array([yes]), np.array([n]))
         relative = group["alpha_relative"].dropna()
         rows.append(
-            {
-                **{"model": model, "directions": directions, "regime": regime, "source": source, "target": target},
-                **{"transfer_type": transfer_type(str(source), str(target)), "kind": kind, "layer": layer},
-                **{"alpha": alpha, "alpha_relative": float(relative.iloc[0]) if len(relative) else None},
-                **{"side": side, "n": n, "n_missing": len(group) - n, "abstained": yes},
-                **{"abstention": yes / n if n else None, "low": float(low[0]), "high": float(high[0])},
-                "epoch": "+".join(sorted(set(group["epoch"]))),
-            }
+            SteeringEffectRow(
+                model=model,
+                directions=directions,
+                regime=regime,
+                source=source,
+                target=target,
+                transfer_type=transfer_type(str(source), str(target)),
+                kind=kind,
+                layer=layer,
+                alpha=alpha,
+                alpha_relative=float(relative.iloc[0]) if len(relative) else None,
+                side=side,
+                n=n,
+                n_missing=len(group) - n,
+                abstained=yes,
+                abstention=yes / n if n else None,
+                low=float(low[0]),
+                high=float(high[0]),
+                epoch="+".join(sorted(set(group["epoch"]))),
+            )
         )
     return rows
 
 
-def share_rows(answers: pd.DataFrame, votes: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> Rows:
+def share_rows(
+    answers: pd.DataFrame, votes: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
+) -> list[SteeringShareRow]:
     """Rows of STEERING_SHARES: mean abstention over the paths of a set, of each regime of directions and of answers and
     over all of them, with the interval from resampling scenarios (all paths of a resample share its scenarios)."""
     decided = _answers_of_paths(answers, votes).dropna(subset=["abstained"])
     decided = decided.merge(decided.loc[decided["side"] == "void", ["model", "layer"]].drop_duplicates())  # no sweep
-    rows: Rows = []
+    rows: list[SteeringShareRow] = []
     for _, of_model in decided.groupby("model", sort=True):
         paths = pd.DataFrame(of_model[_PATH]).drop_duplicates(ignore_index=True)
         numbered = of_model.merge(paths.reset_index(names="path"), on=_PATH)
         shares, draws = _shares(numbered, len(paths), resamples, seed)
-        for said, chosen in _pools(paths):
+        for pool, chosen in _pools(paths):
             mine = numbered.loc[np.isin(numbered["path"], chosen)]
             low, high = percentiles(draws[chosen].mean(axis=0))
             rows.append(
-                {
-                    **said,
-                    **{"n_paths": len(mine[["source", "dataset"]].drop_duplicates()), "n": len(mine)},
-                    **{"n_answers": mine["request_key"].nunique(), "n_scenarios": mine["scenario_id"].nunique()},
-                    **{"abstention": float(shares[chosen].mean()), "low": float(low), "high": float(high)},
-                    "epoch": "+".join(sorted(set(mine["epoch"]))),
-                }
+                SteeringShareRow(
+                    **pool,
+                    n_paths=len(mine[["source", "dataset"]].drop_duplicates()),
+                    n=len(mine),
+                    n_answers=len(set(mine["request_key"])),
+                    n_scenarios=len(set(mine["scenario_id"])),
+                    abstention=float(shares[chosen].mean()),
+                    low=float(low),
+                    high=float(high),
+                    epoch="+".join(sorted(set(mine["epoch"]))),
+                )
             )
     return rows
 

@@ -13,8 +13,10 @@ import pandas as pd
 
 from traps_pipeline import progress
 from traps_pipeline.benchmark.items import categories_of_dataset
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.mechanism.directions import (
     KINDS,
     Directions,
@@ -29,6 +31,17 @@ from traps_pipeline.mechanism.directions import (
 )
 from traps_pipeline.mechanism.paths import CURVES
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
+from traps_pipeline.mechanism.tables import (
+    DIRECTIONS,
+    HIDDEN_STATES,
+    PROBE_ITEMS,
+    PROBES,
+    CosineRow,
+    DirectionRow,
+    HiddenStatesRow,
+    ProbeItemRow,
+    ProbeRow,
+)
 from traps_pipeline.mechanism.versions import states_folder
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
@@ -42,9 +55,7 @@ from traps_pipeline.partitions import (
     is_ill_posed,
 )
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import DIRECTIONS, HIDDEN_STATES, ITEMS, PROBE_ITEMS, PROBES, SCENE_SPECS, VERDICTS, VIDEOS
 
-Rows = list[dict[str, Any]]
 COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "question", "clip", "media_digest")
 
 
@@ -65,11 +76,12 @@ def looked_into(workspace: Workspace, model: str) -> ModelEntry:
 # --- items ------------------------------------------------------------------------------------------------------------
 
 
-def probe_items(workspace: Workspace, dataset: str) -> Rows:
+def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
     """Rows of a dataset's probe_items: those of items, or occlusion's void clips with the answerable question."""
     if dataset != ANSWERABLE:
         rows = workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
-        return [{name: row[name] for name in ("item_id", "dataset", *COPIED, "benchmark_version")} for row in rows]
+        columns = ("item_id", "dataset", *COPIED, "benchmark_version")
+        return [ProbeItemRow(**{name: row[name] for name in columns}) for row in rows]
     rows = []
     for category in categories_of_dataset("occlusion"):
         if workspace.tables.state(SCENE_SPECS, {"category": category}) is None:
@@ -85,22 +97,25 @@ def probe_items(workspace: Workspace, dataset: str) -> Rows:
     return rows
 
 
-def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> dict[str, Any]:
+def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeItemRow:
     """The void clip with a question that it answers: on this dataset a control, since it must be answered."""
     pair = f"{ANSWERABLE}:{spec['scenario_id']}"
-    return {
-        **{"item_id": f"{pair}:control", "pair_id": pair, "dataset": ANSWERABLE, "side": "control"},
+    return ProbeItemRow(
         **{name: spec[name] for name in ("scenario_id", "category", "sub_scenario", "benchmark_version")},
-        "question": json.loads(spec["answerable_question"])["question"],
-        "clip": clip["path"],
-        "media_digest": clip["file_sha256"],
-    }
+        item_id=f"{pair}:control",
+        pair_id=pair,
+        dataset=ANSWERABLE,
+        side="control",
+        question=json.loads(spec["answerable_question"])["question"],
+        clip=clip["path"],
+        media_digest=clip["file_sha256"],
+    )
 
 
 # --- hidden states ----------------------------------------------------------------------------------------------------
 
 
-def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[Rows, int]:
+def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenStatesRow], int]:
     """Make the states of a partition that are not there, and its rows; returns also how many were made."""
     from traps_pipeline.mechanism.hidden_states import clip_item, extract, read_layer, read_record
     from traps_pipeline.models.local.adapter import load_local_model
@@ -121,14 +136,18 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[Rows, int]:
     said = {name: record[name] for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")}
     copied = ("item_id", "scenario_id", "side", "sub_scenario", "benchmark_version")
     rows = [
-        {
-            **cell.partition,
+        HiddenStatesRow(
             **{name: item[name] for name in copied},
             **said,
-            **{"states_key": keys[item["item_id"]], "device": devices[item["item_id"]]},
-            "folder": workspace.relative(folder),
-            **{"n_layers": record["n_layers"], "width": record["d_model"]},
-        }
+            dataset=cell.dataset,
+            model=cell.extraction.model,
+            prompt=cell.extraction.prompt,
+            states_key=keys[item["item_id"]],
+            device=devices[item["item_id"]],
+            folder=workspace.relative(folder),
+            n_layers=record["n_layers"],
+            width=record["d_model"],
+        )
         for item in items
     ]
     return rows, done.n_new
@@ -206,7 +225,7 @@ class States:
 # --- probes -----------------------------------------------------------------------------------------------------------
 
 
-def probe_rows(workspace: Workspace, extraction: Extraction) -> Rows:
+def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
     """Rows of an extraction's probes. Where nothing that they are made of has changed, the rows that are there."""
     looked_into(workspace, extraction.model)
     states, settings = States.of(workspace, extraction), workspace.mechanism
@@ -226,14 +245,16 @@ def probe_rows(workspace: Workspace, extraction: Extraction) -> Rows:
     centroid, n_layers = layers.centroid, states.n_layers
     run = ProbeRun(states.items, states.read, n_layers, centroid, settings.probes, settings.seed, confabulated)
     rows = run.rows(lambda done, total: progress.current().tick("probes", f"layers of {extraction.key}", done, total))
-    return [{**extraction.partition, **row, "made_of": made_of} for row in rows]
+    return [ProbeRow(**row, model=extraction.model, prompt=extraction.prompt, made_of=made_of) for row in rows]
 
 
-def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> Rows | None:
+def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> list[ProbeRow] | None:
     if workspace.tables.state(PROBES, extraction.partition) is None:
         return None
     rows = workspace.tables.read(PROBES, extraction.partition)
-    return rows.to_dict("records") if set(rows["made_of"]) == {made_of} else None  # pyright: ignore[reportReturnType]
+    if set(rows["made_of"]) != {made_of}:
+        return None
+    return [ProbeRow(**{str(name): value for name, value in row.items()}) for row in rows.to_dict("records")]
 
 
 def confabulations(workspace: Workspace, model: str) -> Confabulated:
@@ -260,11 +281,11 @@ def directions_file(workspace: Workspace, extraction: Extraction, dataset: str) 
     return workspace.root / "directions" / extraction.model / extraction.prompt / f"{dataset}.safetensors"
 
 
-def direction_rows(workspace: Workspace, extraction: Extraction) -> Rows:
+def direction_rows(workspace: Workspace, extraction: Extraction) -> list[DirectionRow]:
     """Make and save the directions of every dataset that has states; rows of the directions table."""
     looked_into(workspace, extraction.model)
     states = States.of(workspace, extraction)
-    rows: Rows = []
+    rows: list[DirectionRow] = []
     for dataset in DATASETS:
         if not states.dataset(dataset).empty:
             rows += _dataset_directions(workspace, states, dataset)
@@ -275,7 +296,7 @@ def direction_rows(workspace: Workspace, extraction: Extraction) -> Rows:
     return rows
 
 
-def _dataset_directions(workspace: Workspace, states: States, dataset: str) -> Rows:
+def _dataset_directions(workspace: Workspace, states: States, dataset: str) -> list[DirectionRow]:
     settings, items = workspace.mechanism, states.dataset(dataset)
     steering = settings.steering
     if steering is None:
@@ -306,14 +327,21 @@ def _dataset_directions(workspace: Workspace, states: States, dataset: str) -> R
     )
     save_directions(path, directions, origin)
     return [
-        {
-            **states.extraction.partition,
-            **{"dataset": dataset, "kind": kind, "layer": layer, "n_pairs": len(chosen), "n_steered": len(steered)},
-            "norm": float(directions.norms[kind][layer]),
-            "residual_norm": float(directions.residual_norms[layer]),
-            **{"width": voids.shape[2], "path": workspace.relative(path), "pooling": origin.pooling},
-            "direction_digest": vector_digest(directions.vectors[kind][layer]),
-        }
+        DirectionRow(
+            model=states.extraction.model,
+            prompt=states.extraction.prompt,
+            dataset=dataset,
+            kind=kind,
+            layer=layer,
+            n_pairs=len(chosen),
+            n_steered=len(steered),
+            norm=float(directions.norms[kind][layer]),
+            residual_norm=float(directions.residual_norms[layer]),
+            width=voids.shape[2],
+            path=workspace.relative(path),
+            direction_digest=vector_digest(directions.vectors[kind][layer]),
+            pooling=origin.pooling,
+        )
         for kind in KINDS
         for layer in range(states.n_layers)
     ]
@@ -332,11 +360,11 @@ def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, 
     return found
 
 
-def cosine_rows(workspace: Workspace) -> Rows:
+def cosine_rows(workspace: Workspace) -> list[CosineRow]:
     """Cosines of every two void directions of a model at one layer, over datasets and VQA prompts."""
     table = workspace.tables.read_all(DIRECTIONS, ["model", "prompt"])
     extractions = sorted({Extraction(str(m), str(p)) for m, p in zip(table["model"], table["prompt"], strict=True)})
-    rows: Rows = []
+    rows: list[CosineRow] = []
     for model in sorted({extraction.model for extraction in extractions}):
         named = [
             ((extraction.prompt, dataset), directions.vectors["void"])
@@ -347,12 +375,17 @@ def cosine_rows(workspace: Workspace) -> Rows:
         for layer in range(min(len(vectors) for _, vectors in named)):
             matrix = cosine_matrix(np.stack([vectors[layer] for _, vectors in named]))
             rows += [
-                {
-                    **{"model": model, "layer": layer, "prompt": prompt, "dataset": dataset},
-                    **{"other_prompt": other[0], "other_dataset": other[1], "cosine": float(matrix[i, j])},
-                }
+                CosineRow(
+                    model=model,
+                    layer=layer,
+                    prompt=prompt,
+                    dataset=dataset,
+                    other_prompt=other_prompt,
+                    other_dataset=other_dataset,
+                    cosine=float(matrix[i, j]),
+                )
                 for i, ((prompt, dataset), _) in enumerate(named)
-                for j, (other, _) in enumerate(named)
+                for j, ((other_prompt, other_dataset), _) in enumerate(named)
                 if np.isfinite(matrix[i, j])
             ]
     if not rows:

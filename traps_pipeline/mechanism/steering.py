@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, vote_columns, vote_request
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.paths import sources_of
+from traps_pipeline.mechanism.tables import STEERING, SteeringRow, SteeringVoteRow
 from traps_pipeline.mechanism.versions import loaded_params
 from traps_pipeline.models.answers import Question
 from traps_pipeline.models.ask import Settled, collect
@@ -33,7 +35,6 @@ from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, STEERING
 
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import Prompt
@@ -261,18 +262,21 @@ def collect_steered(
     yield from collect(workspace, "steering", workspace.answers, [entry], cells, calls, finish, make)
 
 
-def _steering_row(cell: SteeringCell, question: SteeredQuestion, row: Row) -> dict[str, Any]:
+def _steering_row(cell: SteeringCell, question: SteeredQuestion, row: Row) -> SteeringRow:
     item, strength = question.item, question.strength
-    return {
+    return SteeringRow(
         **cell.partition,
-        **{"source": strength.source, "kind": strength.kind, "layer": strength.layer, "alpha": strength.alpha},
-        "alpha_relative": strength.relative,
         **{name: item[name] for name in ("item_id", "scenario_id", "side", "benchmark_version")},
         **{name: row[name] for name in ("outcome", "text", "served_model", "completion_tokens")},
-        "direction_digest": strength.digest,
-        "request_key": row["key"],
         **when_asked(row),
-    }
+        source=strength.source,
+        kind=strength.kind,
+        layer=strength.layer,
+        alpha=strength.alpha,
+        alpha_relative=strength.relative,
+        direction_digest=strength.digest,
+        request_key=row["key"],
+    )
 
 
 # --- what the panel says ----------------------------------------------------------------------------------------------
@@ -298,7 +302,7 @@ def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], c
     return ballots
 
 
-def _vote_row(cell: SteeringCell, ballot: Ballot, row: Row) -> dict[str, Any]:
+def _vote_row(cell: SteeringCell, ballot: Ballot, row: Row) -> SteeringVoteRow:
     copied = ("source", "kind", "layer", "alpha", "item_id", "side", "benchmark_version")
     about = {name: ballot.item[name] for name in copied}
-    return {**cell.partition, **about, **vote_columns(ballot, ballot.vote(row), row)}
+    return SteeringVoteRow(**cell.partition, **about, **vote_columns(ballot, ballot.vote(row), row))

@@ -7,12 +7,12 @@ from typing import Any
 
 from traps_pipeline.digests import digest
 from traps_pipeline.mechanism.paths import CURVES
+from traps_pipeline.mechanism.tables import DIRECTIONS
 from traps_pipeline.models.prompts import system_prompt, vqa_prompt
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.partitions import Extraction, StatesCell
 from traps_pipeline.storage.media import profile_digest
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import DIRECTIONS
 
 SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
 

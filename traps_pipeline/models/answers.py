@@ -11,17 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline import progress
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.models.request import Request
+from traps_pipeline.models.tables import ResponseRow
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS
 
 
 @dataclass(frozen=True)
@@ -94,18 +95,18 @@ def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
     return secret
 
 
-def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str | None) -> dict[str, Any]:
+def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str | None) -> ResponseRow:
     """One row of the responses table."""
     copied = ("outcome", "text", "finish_reason", "error", "served_model", "prompt_tokens", "completion_tokens")
     copied += ("reasoning_tokens", "cost_usd", "latency_s", "attempts")
-    return {
+    return ResponseRow(
         **{name: item[name] for name in ("item_id", "pair_id", "side", "benchmark_version")},
         **cell.partition,
         **{name: row[name] for name in copied},
-        "reasoning": reasoning,
-        "request_key": row["key"],
         **when_asked(row),
-    }
+        reasoning=reasoning,
+        request_key=row["key"],
+    )
 
 
 def collect_answers(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Made]]:

@@ -54,7 +54,7 @@ class Settled(Generic[AnyCell, AnyCall]):
         """Each call with its row of the ledger."""
         return ((call, self.rows[call.request.key]) for call in self.calls)
 
-    def made(self, row_of: Callable[[AnyCell, AnyCall, Row], Row]) -> tuple[AnyCell, Made]:
+    def made(self, row_of: Callable[[AnyCell, AnyCall, Row], Any]) -> tuple[AnyCell, Made]:
         """The cell and its table, a row a call, with how the calls went."""
         dollars = sum(row["cost_usd"] or 0.0 for row in self.rows.values())
         counts = {"wanted": len(self.rows), "known": self.tally.cached, "asked": self.tally.asked}

@@ -16,8 +16,8 @@ import dagster as dg
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import Table
 
 if TYPE_CHECKING:
     from traps_pipeline.orchestration.schemes import Scheme

@@ -16,8 +16,8 @@ from traps_pipeline.orchestration.schemes import LEFT_OUT, Scheme, study_here
 from traps_pipeline.orchestration.step import CURRENT, CURRENT_DOC, Event, Step
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import Table
 
 OWNERS = ["team:benchmark"]
 
@@ -157,7 +157,7 @@ def stage(
 def _table_metadata(table: Table, made_from: Mapping[str, Collection[str]]) -> dict[str, Any]:
     """A table's contract as Dagster shows it."""
     columns = [
-        dg.TableColumn(c.name, c.type.rstrip("?"), c.doc, dg.TableColumnConstraints(nullable=c.nullable))
+        dg.TableColumn(c.name, c.type_name, c.doc, dg.TableColumnConstraints(nullable=c.nullable))
         for c in table.columns
     ]
     metadata: dict[str, Any] = {"dagster/column_schema": dg.TableSchema(columns=columns), "one row is": table.row}

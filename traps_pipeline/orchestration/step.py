@@ -23,8 +23,8 @@ from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made, State
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import Table
 
 CURRENT = "current"  # the check that every stage has
 CURRENT_DOC = "Made from what is there now, whole, with no failed call: read again after writing."
@@ -253,8 +253,9 @@ def _failed_calls(count: int) -> str:
 def _preview(table: Table, made: Made) -> dg.TableMetadataValue | None:
     """The first rows without long texts: what a model wrote is shown on the report's pages, where it is escaped."""
     content = cast(Any, made.content)
-    rows = content.head(PREVIEWED).to_dict("records") if hasattr(content, "head") else content[:PREVIEWED]
-    names = [c.name for c in table.columns if c.name in table.key or c.type.rstrip("?") in ("int", "float", "bool")]
+    first = content[:PREVIEWED]
+    rows = first.to_dict("records") if hasattr(content, "head") else [vars(row) for row in first]
+    names = [c.name for c in table.columns if c.name in table.key or c.type in (int, float, bool)]
     records = [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows]
     return dg.MetadataValue.table(records) if records else None
 

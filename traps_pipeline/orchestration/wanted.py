@@ -11,6 +11,7 @@ from functools import cached_property
 from itertools import product
 
 from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
+from traps_pipeline.benchmark.tables import SCENE_SPECS
 from traps_pipeline.models.registry import get_model, load_models, local_models
 from traps_pipeline.partitions import (
     ANSWERABLE,
@@ -28,7 +29,6 @@ from traps_pipeline.partitions import (
 )
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import SCENE_SPECS
 
 PROBE_PROMPT = "standard"  # probes are of this VQA prompt, the other one serves directions (docs/spec.md 7.1)
 

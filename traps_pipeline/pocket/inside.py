@@ -12,12 +12,12 @@ from typing import Any
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.paths import TRANSFER_TYPES
 from traps_pipeline.mechanism.shares import ALL
+from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.models.local.checkpoint import as_folder, folder_digest
 from traps_pipeline.partitions import transfer_type
 from traps_pipeline.pocket.evaluate import MODEL
 from traps_pipeline.pocket.seeds import write_seeds
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 
 FACTS = "training.json"  # beside the folder of the weights
 KINDS = ("void", "shuffled", "random")

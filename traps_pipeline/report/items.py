@@ -14,13 +14,15 @@ from typing import Any
 
 import pandas as pd
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.files import write_bytes
+from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import TEMPLATES, Behind, environment
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS, RESPONSES, VERDICTS, VOTES
 
 FOLDER = "items"
 MADE = "made.json"  # digest of what each page was made from

@@ -29,7 +29,7 @@ from traps_pipeline.report.tables.shared import (
 from traps_pipeline.report.terms import ENOUGH, INCOMPLETE_MARK, MISSING_MARK, TITLES
 from traps_pipeline.report.writing import NONE, Behind, Column, Table, fraction, table_markdown, table_text
 from traps_pipeline.scoring.analyses import of_several_runs
-from traps_pipeline.tables import LEADERBOARD
+from traps_pipeline.scoring.tables import LEADERBOARD
 
 BOUNDS = "If missing: worst, best"
 # Columns that are there only where their count, or that of another field, is not 0: the table is wide already.

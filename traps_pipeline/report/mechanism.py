@@ -5,9 +5,10 @@ from __future__ import annotations
 import pandas as pd
 
 from traps_pipeline.mechanism.effects import REGIME_COLUMNS
+from traps_pipeline.mechanism.tables import COSINES, PROBES, STEERING_EFFECTS
 from traps_pipeline.partitions import LONG
 from traps_pipeline.scoring.published import published
-from traps_pipeline.tables import COSINES, PROBES, STEERING_EFFECTS, Table
+from traps_pipeline.storage.tables import Table
 
 PAIRS, CENTROID_LAYER = 50, 32  # docs/spec.md 8.2 and 7.5
 STEERED_LAYERS = {"qwen3-vl-8b": 20, "gemma-4-e4b": 35, "llava-next-video-7b": 28}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.files import write_bytes
 from traps_pipeline.partitions import Cell
 from traps_pipeline.report.catalogue import FIGURES, TABLES
@@ -24,7 +25,6 @@ from traps_pipeline.report.results import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.writing import Behind, environment, figure_files
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS
 
 PAGE, MARKDOWN, INDEX = "report.html", "leaderboard.md", "index.html"
 SHEETS = {

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.judging.tables import AGREEMENT
 from traps_pipeline.mechanism import effects
 from traps_pipeline.report.mechanism import (
     published_cosines,
@@ -20,7 +21,6 @@ from traps_pipeline.report.results import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMN
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.published import published, published_cells
-from traps_pipeline.tables import AGREEMENT
 
 _AXES = ("hp", "ii", "hp_and_ii", "es", "doubt")
 

@@ -11,22 +11,12 @@ from typing import Any, ClassVar
 
 import pandas as pd
 
+from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.mechanism import effects
+from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_SHARES
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.tables import (
-    AGREEMENT,
-    CONFABULATION_PREVALENCE,
-    CONTRASTS,
-    JUDGE_BIAS,
-    JUDGE_VALIDATION,
-    LEADERBOARD,
-    LEAVE_ONE_OUT,
-    PROBES,
-    REGIME_TESTS,
-    STEERING_EFFECTS,
-    STEERING_SHARES,
-    Table,
-)
+from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE, CONTRASTS, LEADERBOARD, LEAVE_ONE_OUT, REGIME_TESTS
+from traps_pipeline.storage.tables import Table
 
 CELL_COLUMNS = (
     *("model", "dataset", "regime", "epoch", "n_pairs", "n_runs", "n_missing", "incomplete"),

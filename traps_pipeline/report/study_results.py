@@ -7,13 +7,16 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.mechanism.tables import COSINES
 from traps_pipeline.partitions import taxonomy_of
 from traps_pipeline.report.results import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Made, Makers, Results, joined
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 from traps_pipeline.scoring.metrics import joined_epochs
+from traps_pipeline.scoring.tables import METRICS
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import COSINES, ITEMS, METRICS, Table
 
 
 def _cells(results: StudyResults) -> pd.DataFrame:

@@ -10,14 +10,14 @@ which one value is null is null, and a mean over models is over those that have 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import cast
 
 import numpy as np
 import pandas as pd
+from pandas.api.typing import DataFrameGroupBy
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.epochs import require_one_epoch
 from traps_pipeline.scoring.metrics import joined_epochs, mean
 
@@ -38,22 +38,21 @@ _EQUAL = 12  # decimals at which two means count as equal: below any printed dig
 # --- cells ------------------------------------------------------------------------------------------------------------
 
 
-def study_cells(leaderboard: Frame) -> Frame:
+def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
     """Cells of a study from its LEADERBOARD rows, with `_std` over runs, n_pairs, n_runs, n_missing and incomplete."""
     rows = of_several_runs(leaderboard.loc[leaderboard["dataset"] != "overall"])
     spread = [f"{share}_std" for share in SHARES]
-    return rows[[*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]].reset_index(
-        drop=True
-    )
+    columns = [*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]
+    return rows.loc[:, columns].reset_index(drop=True)
 
 
-def of_several_runs(rows: Frame) -> Frame:
+def of_several_runs(rows: pd.DataFrame) -> pd.DataFrame:
     """Rows without deviations over runs where there was one run only: none was measured."""
     spreads = [name for name in rows if name.endswith("_std")]
     return rows.assign(**{name: rows[name].where(rows["n_runs"] > 1) for name in spreads})
 
 
-def scoped_cells(metrics: Frame, scope: str) -> Frame:
+def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
     """Cells of the parts of datasets from METRICS rows, averaged over runs; the column `scope` names the part.
 
     scope is `category`, `sub_scenario` or `label` (the control's answer). Columns as in `study_cells`, with scope.
@@ -80,25 +79,25 @@ def models_of(group: str | None = None, family: str | None = None, media: str | 
 # --- means ------------------------------------------------------------------------------------------------------------
 
 
-def overall(cells: Frame) -> Frame:
+def overall(cells: pd.DataFrame) -> pd.DataFrame:
     """Equal-weight means over datasets: columns model, regime, acc, abs_rec, false_abs, pecs; PECS is averaged too.
 
     A (model, regime) that lacks one of the datasets in `cells` has no row: no two rows are means of different datasets.
     """
     cells = _checked(cells)
     groups = cells.groupby(["model", "regime"], sort=False)
-    whole = cells[groups["dataset"].transform("nunique") == cells["dataset"].nunique()]
+    whole = cells.loc[groups["dataset"].transform("nunique") == cells["dataset"].nunique()]
     return _means(whole.groupby(["model", "regime"], sort=False), SHARES).reset_index()
 
 
-def uplift(cells: Frame, means: Frame | None = None) -> Frame:
+def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFrame:
     """Guided over standard AbsRec, each averaged over datasets: columns model, ratio; a row a model that has both.
 
     means: a study's own rows of `overall`, which leave out runs without all datasets; else those of `cells`. Infinite
     where standard is 0 and guided is not, null where either is.
     """
     cells = _checked(cells)
-    cells = cells[cells["regime"].isin(["standard", "guided"])]
+    cells = cells.loc[cells["regime"].isin(["standard", "guided"])]
     require_one_epoch(cells.pivot(index=["model", "dataset"], columns="regime", values="epoch"), "uplift")
     rows = overall(cells) if means is None else means
     guided, standard = (rows[rows["regime"] == r].set_index("model")["abs_rec"] for r in ("guided", "standard"))
@@ -106,7 +105,7 @@ def uplift(cells: Frame, means: Frame | None = None) -> Frame:
     return pd.DataFrame({"model": both, "ratio": ratio(guided.loc[both], standard.loc[both])})
 
 
-def spread(cells: Frame, column: str = "pecs_std") -> Frame:
+def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
     """Quartiles of the standard deviations over runs, over all cells: one row with q25, median, q75, n.
 
     Cells of a single run have none and are left out. The paper does not say of which metric its quartiles are; the
@@ -120,7 +119,7 @@ def spread(cells: Frame, column: str = "pecs_std") -> Frame:
 # --- PECS and what it is not ------------------------------------------------------------------------------------------
 
 
-def pareto_frontier(cells: Frame) -> Frame:
+def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
     """The models on the frontier in (Acc, J) after averaging over datasets: `frontier` of `overall`, with the column j.
 
     It orders models and makes no ratio or gap, so epochs may differ.
@@ -129,40 +128,41 @@ def pareto_frontier(cells: Frame) -> Frame:
     return frontier(means.assign(j=means["abs_rec"] - means["false_abs"]))
 
 
-def frontier(means: Frame) -> Frame:
+def frontier(means: pd.DataFrame) -> pd.DataFrame:
     """The rows that no other row of the same regime beats in both acc and j, by falling Acc.
 
     A model equal to another in one and better in the other beats it, equal models are both on the frontier, one
     without Acc or J is not.
     """
     means = means.dropna(subset=["acc", "j"])
-    best = [group[~_dominated(group)] for _, group in means.groupby("regime", sort=False)]
-    return pd.concat(best or [means]).sort_values(["regime", "acc"], ascending=[True, False], ignore_index=True)
+    best = [group.loc[~_dominated(group)] for _, group in means.groupby("regime", sort=False)]
+    found = pd.DataFrame(pd.concat(best or [means]))
+    return found.sort_values(["regime", "acc"], ascending=[True, False], ignore_index=True)
 
 
-def _dominated(points: Frame) -> np.ndarray:
+def _dominated(points: pd.DataFrame) -> np.ndarray:
     """Which rows are beaten by another in (acc, j): (rows,) bool."""
     at = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
     no_worse = (at[None] >= at[:, None]).all(-1)  # [i, k]: k is no worse than i in both
     better = (at[None] > at[:, None]).any(-1)
-    return (no_worse & better).any(1)
+    return np.any(no_worse & better, axis=1)
 
 
-def naive_gap(cells: Frame, threshold: float = 0.03) -> Frame:
+def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
     """The cells whose Acc x AbsRec exceeds PECS by more than `threshold`, with columns naive and gap added."""
     cells = _checked(cells)
     cells["naive"] = cells["acc"] * cells["abs_rec"]
     cells["gap"] = cells["naive"] - cells["pecs"]
-    return cells[cells["gap"].round(_EQUAL) > threshold].reset_index(drop=True)
+    return cells.loc[cells["gap"].round(_EQUAL) > threshold].reset_index(drop=True)
 
 
-def zero_boundary(cells: Frame) -> Frame:
+def zero_boundary(cells: pd.DataFrame) -> pd.DataFrame:
     """The cells with PECS 0: no more abstention on voids than on controls in any run, or no correct answer."""
     cells = _checked(cells)
-    return cells[cells["pecs"] == 0].reset_index(drop=True)
+    return cells.loc[cells["pecs"] == 0].reset_index(drop=True)
 
 
-def degenerate_strategies() -> Frame:
+def degenerate_strategies() -> pd.DataFrame:
     """What strategies without any discrimination score in expectation: strategy, acc, false_abs, abs_rec, j, pecs,
     naive.
 
@@ -187,7 +187,7 @@ def degenerate_strategies() -> Frame:
 # --- comparisons within a model or a pair -----------------------------------------------------------------------------
 
 
-def visual_textual_gap(cells: Frame, taxonomies: Sequence[str] = TAXONOMIES) -> Frame:
+def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMIES) -> pd.DataFrame:
     """Textual over visual AbsRec: columns model, regime, taxonomy (occlusion, chaotic, pooled), visual, textual, gap.
 
     Visual is the taxonomy's own dataset, textual its ill-posed one. `pooled` is the mean of the two textual over the
@@ -200,12 +200,13 @@ def visual_textual_gap(cells: Frame, taxonomies: Sequence[str] = TAXONOMIES) -> 
         taxonomy=cells["dataset"].str.removesuffix("_ill_posed"),
         side=np.where(cells["dataset"].str.endswith("_ill_posed"), "textual", "visual"),
     )
-    sides = sides[sides["taxonomy"].isin(list(taxonomies))]
+    sides = sides.loc[sides["taxonomy"].isin(list(taxonomies))]
     index = ["model", "regime", "taxonomy"]
     require_one_epoch(sides.pivot(index=index, columns="side", values="epoch"), "visual against textual")
     rates = sides.pivot(index=index, columns="side", values="abs_rec").reindex(columns=["visual", "textual"]).dropna()
     pooled = rates.groupby(level=["model", "regime"]).filter(lambda group: len(group) == len(TAXONOMIES))
-    pooled = pooled.groupby(level=["model", "regime"]).mean().assign(taxonomy="pooled").reset_index()
+    means = pd.DataFrame(pooled.groupby(level=["model", "regime"]).mean())
+    pooled = means.assign(taxonomy="pooled").reset_index()
     table = pd.concat([rates.reset_index(), pooled], ignore_index=True)
     table["gap"] = ratio(table["textual"], table["visual"])
     models, places = list(cells["model"].unique()), (*TAXONOMIES, "pooled")
@@ -215,7 +216,7 @@ def visual_textual_gap(cells: Frame, taxonomies: Sequence[str] = TAXONOMIES) -> 
     return table.iloc[rows][[*index, "visual", "textual", "gap"]].reset_index(drop=True)
 
 
-def reasoning_pairs(cells: Frame) -> Frame:
+def reasoning_pairs(cells: pd.DataFrame) -> pd.DataFrame:
     """The thinking member of each pair minus the other: columns thinking, other, regime, dataset (or `overall`), acc,
     abs_rec, false_abs, pecs (differences of fractions).
 
@@ -227,7 +228,7 @@ def reasoning_pairs(cells: Frame) -> Frame:
     return pair_differences(pd.concat([cells, means], ignore_index=True))
 
 
-def pair_differences(cells: Frame) -> Frame:
+def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
     """`reasoning_pairs` of the rows that are there and no others; they may be of the dataset `overall`."""
     cells = _checked(cells, datasets=(*DATASETS, "overall"))
     by_model = cells.set_index(_ENTRY)
@@ -241,13 +242,13 @@ def pair_differences(cells: Frame) -> Frame:
         change = (sides[thinking][SHARES] - sides[other][SHARES]).loc[epochs.index].reset_index()
         rows.append(change.assign(thinking=thinking, other=other))
     columns = ["thinking", "other", "regime", "dataset", *SHARES]
-    return pd.concat(rows, ignore_index=True)[columns] if rows else pd.DataFrame(columns=pd.Index(columns))
+    return pd.concat(rows, ignore_index=True).loc[:, columns] if rows else pd.DataFrame(columns=pd.Index(columns))
 
 
 # --- sub-scenarios ----------------------------------------------------------------------------------------------------
 
 
-def sub_scenarios(cells: Frame) -> Frame:
+def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
     """Means over models of every sub-scenario of the visual datasets, from `scoped_cells(metrics, "sub_scenario")`.
 
     Columns dataset, sub_scenario, n_pairs; acc, false_abs, abs_rec, pecs under standard, of n_models; the same with the
@@ -258,11 +259,12 @@ def sub_scenarios(cells: Frame) -> Frame:
     """
     cells = _checked(cells, more=["scope"])
     rows = []
-    for (taxonomy, scope), group in cells.groupby([cells["dataset"].str.removesuffix("_ill_posed"), "scope"]):
-        visual, textual = group[group["dataset"] == taxonomy], group[group["dataset"] != taxonomy]
-        by_regime = {r: visual[visual["regime"] == r].set_index("model") for r in ("standard", "guided")}
+    for key, group in cells.groupby([cells["dataset"].str.removesuffix("_ill_posed"), "scope"]):
+        taxonomy, scope = cast(tuple[str, str], key)
+        visual, textual = group.loc[group["dataset"] == taxonomy], group.loc[group["dataset"] != taxonomy]
+        by_regime = {r: visual.loc[visual["regime"] == r].set_index("model") for r in ("standard", "guided")}
         standard, guided = (by_regime[r].dropna(subset=SHARES) for r in ("standard", "guided"))
-        asked = textual[textual["regime"] == "standard"].set_index("model").dropna(subset=["abs_rec"])
+        asked = textual.loc[textual["regime"] == "standard"].set_index("model").dropna(subset=["abs_rec"])
         epochs = pd.DataFrame({"standard": standard["epoch"], "guided": guided["epoch"], "ill-posed": asked["epoch"]})
         require_one_epoch(epochs, f"sub-scenario {scope} of {taxonomy}")
         both, common = (standard.index.intersection(side.index) for side in (guided, asked))
@@ -279,7 +281,7 @@ def sub_scenarios(cells: Frame) -> Frame:
     return pd.DataFrame(rows)
 
 
-def hidden_against_others(table: Frame, columns: Sequence[str] = ("abs_rec", "guided_abs_rec")) -> Frame:
+def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_rec", "guided_abs_rec")) -> pd.DataFrame:
     """Unweighted means over the hidden sub-scenarios and over the others: columns kind, n, and `columns`; n_pairs and
     n_missing are sums, where table has them.
 
@@ -291,14 +293,14 @@ def hidden_against_others(table: Frame, columns: Sequence[str] = ("abs_rec", "gu
     return _means(groups, columns).assign(n=groups.size(), **sums).rename_axis("kind").reset_index()
 
 
-def accuracy_by_label(cells: Frame) -> Frame:
+def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
     """Mean Acc over the models that have one by the control's answer, under standard, from `scoped_cells(metrics,
     "label")`.
 
     Columns dataset, label, acc, n_pairs, n_models, n_missing (items of both sides, over these models).
     """
     rows = _checked(cells, more=["scope"])
-    groups = rows[rows["regime"] == "standard"].dropna(subset=["acc"]).groupby(["dataset", "scope"])
+    groups = rows.loc[rows["regime"] == "standard"].dropna(subset=["acc"]).groupby(["dataset", "scope"])
     columns = {"acc": groups["acc"].mean(), "n_pairs": groups["n_pairs"].max(), "n_models": groups["model"].nunique()}
     table = pd.DataFrame(columns | {"n_missing": groups["n_missing"].sum()})
     return table.reset_index().rename(columns={"scope": "label"})
@@ -307,25 +309,26 @@ def accuracy_by_label(cells: Frame) -> Frame:
 # --- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def ratio(numerator: Any, denominator: Any) -> np.ndarray:
+def ratio(numerator: pd.Series | pd.DataFrame, denominator: pd.Series | pd.DataFrame) -> np.ndarray:
     """Elementwise: infinite where only the denominator is 0, NaN where both are."""
     top, bottom = numerator.to_numpy(float), denominator.to_numpy(float)
     with np.errstate(divide="ignore", invalid="ignore"):
         return top / bottom
 
 
-def _means(groups: Any, columns: Sequence[str]) -> Frame:
+def _means(groups: DataFrameGroupBy, columns: Sequence[str]) -> pd.DataFrame:
     """Means of columns of a pandas groupby, null where any value is."""
     values = groups[list(columns)]
-    return values.mean().where(values.count().eq(groups.size(), axis="index"))
+    means, counts = pd.DataFrame(values.mean()), pd.DataFrame(values.count())
+    return means.where(counts.eq(groups.size(), axis="index"))
 
 
-def _checked(cells: Frame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> Frame:
+def _checked(cells: pd.DataFrame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> pd.DataFrame:
     """A copy. Raises ValueError where a column is missing or a cell has two rows."""
     missing = [name for name in (*_ENTRY, *SHARES, "epoch", *more) if name not in cells]
     if missing:
         raise ValueError(f"cells lack the columns {missing}")
-    twice = cells[cells.duplicated([*_ENTRY, *more])]
+    twice = cells.loc[cells.duplicated([*_ENTRY, *more])]
     if len(twice):
         first = twice.iloc[0]
         raise ValueError(

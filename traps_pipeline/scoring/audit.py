@@ -7,7 +7,7 @@ anywhere in its last digit, admit the printed result) or `differs`, with the ari
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.partitions import LONG, transfer_type
-from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.analyses import SHARES, overall
 from traps_pipeline.scoring.claims import CLAIMS, DOSE_AGAINST_REGIME
 from traps_pipeline.scoring.published import published, published_cells, published_overall
@@ -38,7 +37,7 @@ class Finding:
     reason: str = ""
 
 
-def audit() -> Frame:
+def audit() -> pd.DataFrame:
     """Every finding: columns group, statement, published, recomputed, verdict, reason."""
     groups: Sequence[Callable[[], Iterator[Finding]]] = (
         claims,
@@ -55,18 +54,18 @@ def audit() -> Frame:
     return pd.DataFrame([asdict(finding) for check in groups for finding in check()])
 
 
-def audit_text(findings: Frame, everything: bool = False) -> str:
+def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
     """The findings for a terminal: every claim, whatever differs, counts of the rest; or all of it."""
     lines = []
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
         lines.append(f"{group}: {len(rows)} statements: {counts}")
-        shown = rows if everything or group == "claims" else rows[rows["verdict"] == DIFFERS]
-        for row in shown.itertuples():
-            lines.append(f"  {row.verdict:<15} {row.statement}")
-            lines.append(f"  {'':<15} published {row.published}; recomputed {row.recomputed}")
-            lines += [f"  {'':<15} {row.reason}"] if row.reason else []
-    differing = int((findings["verdict"] == DIFFERS).sum())
+        shown = rows if everything or group == "claims" else rows.loc[rows["verdict"] == DIFFERS]
+        for row in shown.to_dict("records"):
+            lines.append(f"  {row['verdict']:<15} {row['statement']}")
+            lines.append(f"  {'':<15} published {row['published']}; recomputed {row['recomputed']}")
+            lines += [f"  {'':<15} {row['reason']}"] if row["reason"] else []
+    differing = np.count_nonzero(findings["verdict"] == DIFFERS)
     lines.append(f"{len(findings)} statements, {differing} differ from what the published tables give")
     return "\n".join(lines)
 
@@ -76,15 +75,13 @@ def audit_text(findings: Frame, everything: bool = False) -> str:
 
 def claims() -> Iterator[Finding]:
     """Every statement of `claims.csv`. Raises KeyError for one that nobody has written the arithmetic of."""
-    for claim in published("claims").itertuples():
-        found = CLAIMS[str(claim.id)]()
-        verdict = AGREES if _same_words(str(claim.published), found.words) else DIFFERS
+    for claim in published("claims").to_dict("records"):
+        printed, found = str(claim["published"]), CLAIMS[str(claim["id"])]()
+        verdict = AGREES if _same_words(printed, found.words) else DIFFERS
         reason = found.reason if verdict == DIFFERS else ""
         if verdict == DIFFERS:
-            reason = f"{_differences(str(claim.published), found.words)}{'; ' + reason if reason else ''}"
-        yield Finding(
-            "claims", f"{claim.id}: {claim.statement}", str(claim.published), _shown(found.words), verdict, reason
-        )
+            reason = f"{_differences(printed, found.words)}{'; ' + reason if reason else ''}"
+        yield Finding("claims", f"{claim['id']}: {claim['statement']}", printed, _shown(found.words), verdict, reason)
 
 
 def _same_words(printed: str, recomputed: str) -> bool:
@@ -127,20 +124,20 @@ def _shown(words: str) -> str:
 
 def overall_means() -> Iterator[Finding]:
     """The overall leaderboard against the equal-weight means of the per-dataset table, cell by cell."""
-    printed = published_overall().set_index(["model", "regime"])
-    ours = overall(published_cells()).set_index(["model", "regime"])
-    for key, row in printed.iterrows():
+    ours = overall(published_cells()).set_index(["model", "regime"]).to_dict("index")
+    for row in published_overall().to_dict("records"):
+        model, regime = row["model"], row["regime"]
         for share in SHARES:
             scale, digits, unit = (1, 3, 0.001) if share == "pecs" else (100, int(share == "false_abs"), 0.1)
-            value, theirs = float(ours.loc[key, share]) * scale, float(row[share]) * scale
+            value, theirs = float(ours[model, regime][share]) * scale, float(row[share]) * scale
             off, half = abs(value - theirs), 0.5 * 10.0**-digits
             verdict: Verdict = (
                 AGREES if off <= half + _SLACK else ROUNDING if off <= half + unit / 2 + _SLACK else DIFFERS
             )
-            parts = published_cells().query("model == @key[0] and regime == @key[1]")[share] * scale
+            parts = published_cells().query("model == @model and regime == @regime")[share] * scale
             sums = " + ".join(f"{part:.{3 if share == 'pecs' else 1}f}" for part in parts)
             reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - theirs:+.2g}"
-            name = f"overall {share} of {key[0]}, {key[1]}"
+            name = f"overall {share} of {model}, {regime}"
             yield Finding("overall", name, f"{theirs:.{digits}f}", f"{value:.{digits + 2}f}", verdict, reason)
 
 
@@ -151,8 +148,8 @@ def pecs_factors() -> Iterator[Finding]:
     max(0, J) lies between max(0, J) and (J + sqrt(J^2 + s_J^2)) / 2, s_J is at most the sum of the deviations of AbsRec
     and FalseAbs, and Acc adds a covariance of at most s_Acc s_J.
     """
-    for cell in published_cells().fillna(0.0).itertuples():
-        shares = {name: float(getattr(cell, name)) for name in ("acc", "abs_rec", "false_abs", "pecs")}
+    for cell in published_cells().fillna(0.0).to_dict("records"):
+        shares = {name: float(cell[name]) for name in ("acc", "abs_rec", "false_abs", "pecs")}
         low, high = _pecs_range(cell, shares)
         naive = shares["acc"] * max(0.0, shares["abs_rec"] - shares["false_abs"])
         inside = low - 0.0005 - _SLACK <= shares["pecs"] <= high + 0.0005 + _SLACK
@@ -161,15 +158,15 @@ def pecs_factors() -> Iterator[Finding]:
             f"{shares['acc']:.3f} x ({shares['abs_rec']:.3f} - {shares['false_abs']:.3f}) = {naive:.4f}; runs and "
             f"rounding allow {low:.4f} to {high:.4f}"
         )
-        name = f"PECS of {cell.model}, {cell.dataset}, {cell.regime}"
+        name = f"PECS of {cell['model']}, {cell['dataset']}, {cell['regime']}"
         shown = f"{shares['pecs']:.3f}", f"{naive:.4f}"
         yield Finding("pecs factors", name, *shown, verdict, "" if verdict == AGREES else reason)
 
 
-def _pecs_range(cell: Any, shares: dict[str, float]) -> tuple[float, float]:
+def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tuple[float, float]:
     half = 0.0005  # of a printed 0.1 %
-    deviation = {name: float(getattr(cell, f"{name}_std")) + half for name in ("acc", "abs_rec", "false_abs")}
-    if not (cell.acc_std or cell.abs_rec_std or cell.false_abs_std):  # a single run has no deviation
+    deviation = {name: float(cell[f"{name}_std"]) + half for name in ("acc", "abs_rec", "false_abs")}
+    if not (cell["acc_std"] or cell["abs_rec_std"] or cell["false_abs_std"]):  # a single run has no deviation
         deviation = dict.fromkeys(deviation, 0.0)
     s_j = deviation["abs_rec"] + deviation["false_abs"]
     j_low, j_high = (shares["abs_rec"] - shares["false_abs"] + sign * 2 * half for sign in (-1, 1))
@@ -206,7 +203,8 @@ def probe_means() -> Iterator[Finding]:
     states it of qwen3-vl-8b alone."""
     stated = float(published("claims").set_index("id").loc["probe-cf-shift", "published"])
     rows = published("probe_transfer").query("model == 'qwen3-vl-8b'")
-    for kind, row in rows.groupby("transfer_type")[["auroc", "auroc_confabulated"]].mean().iterrows():
+    means = pd.DataFrame(rows.groupby("transfer_type")[["auroc", "auroc_confabulated"]].mean())
+    for kind, row in means.to_dict("index").items():
         shift = float(row["auroc"] - row["auroc_confabulated"])
         verdict: Verdict = AGREES if shift <= stated + 0.005 + _SLACK else DIFFERS
         name = f"four-path mean AUROC, all minus confabulated only, qwen3-vl-8b, {kind}"
@@ -234,10 +232,11 @@ def steering_means() -> Iterator[Finding]:
             "model == @model and direction_family == 'all' and direction_regime == 'standard' "
             "and inference_regime == 'guided'"
         ).iloc[0]
-        dose = published(name).groupby("alpha")[["control_abstention_pct", "void_abstention_pct"]].mean()
+        sides = ["control_abstention_pct", "void_abstention_pct"]
+        dose = pd.DataFrame(published(name).groupby("alpha")[sides].mean()).to_dict("index")
         for side in ("control", "void"):
             for alpha in (0, 10):
-                ours, theirs = float(dose.loc[alpha, f"{side}_abstention_pct"]), float(printed[f"{side}_alpha{alpha}"])
+                ours, theirs = float(dose[alpha][f"{side}_abstention_pct"]), float(printed[f"{side}_alpha{alpha}"])
                 verdict: Verdict = AGREES if abs(ours - theirs) <= 0.5 + _SLACK else DIFFERS
                 reason = "" if verdict == AGREES else f"differs by {ours - theirs:+.3g} points: {_DOSE_REASONS[name]}"
                 statement = f"{model}: mean {side} abstention at alpha {alpha} over the eight paths"
@@ -287,7 +286,7 @@ def _f1(precision: float, recall: float) -> float:
 
 def composition_sums() -> Iterator[Finding]:
     """Category counts against the totals that the paper states: 202 occlusion and 500 chaotic pairs."""
-    counts = published("composition").groupby("taxonomy")["n"].sum()
+    counts = pd.Series(published("composition").groupby("taxonomy")["n"].sum()).to_dict()
     for taxonomy, row in (("occlusion", "ill-posed-occlusion"), ("chaotic", "ill-posed-chaotic")):
         stated, ours = int(float(published("other").set_index("id").loc[row, "value"])), int(counts[taxonomy])
         verdict: Verdict = AGREES if ours == stated else DIFFERS

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from traps_pipeline.scoring import Frame
+import pandas as pd
+
 from traps_pipeline.scoring.analyses import (
     hidden_against_others,
     models_of,
@@ -38,7 +39,7 @@ def _best(regime: str) -> Recomputed:
     return Recomputed(f"{best['model']} {best['pecs']:.3f}")
 
 
-def _uplifts(models: Sequence[str]) -> Any:
+def _uplifts(models: Sequence[str]) -> pd.Series:
     cells = published_cells()
     return uplift(cells).set_index("model")["ratio"].loc[list(models)]
 
@@ -49,13 +50,13 @@ def _video_native() -> list[str]:
 
 def _frontier() -> Recomputed:
     cells = published_cells()
-    frontier = pareto_frontier(cells[cells["regime"] == "guided"])
+    frontier = pareto_frontier(cells.loc[cells["regime"] == "guided"])
     return Recomputed("; ".join(sorted(frontier["model"])))
 
 
-def _main_cells(regime: str) -> Frame:
+def _main_cells(regime: str) -> pd.DataFrame:
     cells = published_cells()
-    return cells[cells["model"].isin(models_of("main")) & (cells["regime"] == regime)]
+    return cells.loc[cells["model"].isin(models_of("main")) & (cells["regime"] == regime)]
 
 
 def _naive_gap() -> Recomputed:
@@ -72,7 +73,7 @@ def _zeros(regime: str) -> Recomputed:
 
 def _spread(models: Sequence[str]) -> Recomputed:
     cells = published_cells()
-    mine = cells[cells["model"].isin(models)]
+    mine = cells.loc[cells["model"].isin(models)]
     row = spread(mine).iloc[0]
     others = [f"{name} {r.q25:.4f}-{r.q75:.4f}" for name, r in _other_spreads(mine)]
     return Recomputed(
@@ -82,12 +83,12 @@ def _spread(models: Sequence[str]) -> Recomputed:
     )
 
 
-def _other_spreads(cells: Frame) -> Iterator[tuple[str, Any]]:
+def _other_spreads(cells: pd.DataFrame) -> Iterator[tuple[str, Any]]:
     for share in ("acc", "abs_rec", "false_abs"):
         yield share, spread(cells, f"{share}_std").iloc[0]
 
 
-def _dataset_spreads(cells: Frame) -> Iterator[str]:
+def _dataset_spreads(cells: pd.DataFrame) -> Iterator[str]:
     for dataset, part in cells.groupby("dataset", sort=False):
         row = spread(part).iloc[0]
         yield f"{dataset} {row['q25']:.4f}-{row['q75']:.4f}"
@@ -119,26 +120,23 @@ def _probe_best() -> Recomputed:
 
 def _probe_shift() -> Recomputed:
     rows = published("probe_transfer").query("model == 'qwen3-vl-8b'")
-    means = rows.groupby("transfer_type")[["auroc", "auroc_confabulated"]].mean()
+    means = pd.DataFrame(rows.groupby("transfer_type")[["auroc", "auroc_confabulated"]].mean())
     return Recomputed(f"{(means['auroc'] - means['auroc_confabulated']).max():.4f}")
 
 
 def _probe_medians() -> Recomputed:
-    medians = published("probe_transfer").groupby("model")["auroc_confabulated"].median()
+    medians = pd.Series(published("probe_transfer").groupby("model")["auroc_confabulated"].median())
     return Recomputed(f"{medians.min():.4f} to {medians.max():.4f}")
 
 
 def _steering(side: str) -> Recomputed:
-    means = published("steering_dose_qwen").groupby("alpha")[f"{side}_abstention_pct"].mean()
-    return Recomputed(
-        f"{means[0]:g} and {means[10]:g}",
-        DOSE_AGAINST_REGIME,
-    )
+    means = pd.Series(published("steering_dose_qwen").groupby("alpha")[f"{side}_abstention_pct"].mean())
+    return Recomputed(f"{means[0]:g} and {means[10]:g}", DOSE_AGAINST_REGIME)
 
 
 def _steering_families() -> Recomputed:
     rows = published("steering_alpha10_qwen")
-    families = rows.groupby(rows["source"].str.removesuffix("_ip"))["control_abstention_pct"].mean()
+    families = pd.Series(rows.groupby(rows["source"].str.removesuffix("_ip"))["control_abstention_pct"].mean())
     return Recomputed(
         f"{families['oc']:g} and {families['ch']:g}",
         "means of the four rows of each family in the alpha 10 table, whose directions are standard; the printed "

@@ -11,18 +11,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from math import erfc, inf, sqrt
+from typing import cast
 
 import numpy as np
 import pandas as pd
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import DATASETS, REGIMES
-from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED, RESAMPLES, Resampled, percentiles, resample
 from traps_pipeline.scoring.epochs import answered, refusal
 from traps_pipeline.scoring.leaderboard import means_over_runs, standings
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
-from traps_pipeline.tables import CONTRASTS, REGIME_TESTS
+from traps_pipeline.scoring.tables import CONTRASTS, REGIME_TESTS
 
 FIGURES = ("pecs", "j")
 SEPARABLE_BELOW = 0.05
@@ -32,7 +32,7 @@ _SIDES = ["left_model", "left_regime", "right_model", "right_regime"]
 _Side = tuple[str, str]  # model, regime
 
 
-def contrasts(resampled: Resampled, metrics: Frame, verdicts: Frame) -> Frame:
+def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
     """CONTRASTS rows from the bootstrap, the METRICS rows that it resamples (for their figures) and the VERDICTS rows
     that both are made of (for their items and epochs).
 
@@ -41,7 +41,7 @@ def contrasts(resampled: Resampled, metrics: Frame, verdicts: Frame) -> Frame:
     """
     places = {entry: row for row, entry in enumerate(resampled.entries)}
     asked = answered(verdicts)
-    means = means_over_runs(metrics)[list(FIGURES)].to_dict("index")
+    means = means_over_runs(metrics).loc[:, [*FIGURES]].to_dict("index")
     rows = []
     for kind, dataset, left, right in _pairs([entry for entry in resampled.entries if entry in asked]):
         items = asked[(*left, dataset)]
@@ -54,13 +54,13 @@ def contrasts(resampled: Resampled, metrics: Frame, verdicts: Frame) -> Frame:
                 observed = [means.get((*side, dataset), {}).get(figure, np.nan) for side in (left, right)]
                 row |= _difference(draws[0] - draws[1], observed[0] - observed[1], len(items) // 2)
             rows.append(row)
-    table = pd.DataFrame(rows, columns=pd.Index([*(c.name for c in CONTRASTS.columns), "_regime"]))
+    table = pd.DataFrame(rows, columns=pd.Index([*CONTRASTS.names, "_regime"]))
     table["p_holm"] = _holm_by(table, _FAMILY)
     table["separable"] = table["p_holm"].astype(float) < SEPARABLE_BELOW
-    return table[[c.name for c in CONTRASTS.columns]]
+    return table.loc[:, CONTRASTS.names]
 
 
-def version_contrasts(then: Frame, now: Frame, resamples: int = RESAMPLES) -> Frame:
+def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RESAMPLES) -> pd.DataFrame:
     """What changed between two studies, such as two versions of the benchmark: now minus then, on what both hold.
 
     then and now are VERDICTS rows; pairs, runs and cells that only one of them has whole are left out. Columns model,
@@ -93,22 +93,23 @@ def version_contrasts(then: Frame, now: Frame, resamples: int = RESAMPLES) -> Fr
     return table
 
 
-def _whole_pairs_of_both(then: Frame, now: Frame) -> list[Frame]:
+def _whole_pairs_of_both(then: pd.DataFrame, now: pd.DataFrame) -> list[pd.DataFrame]:
     """The rows of each on the pairs (of a model, regime and run) of which both have control and void."""
     key = [*CELL, "pair_id"]
     common = then[[*key, "item_id"]].merge(now[[*key, "item_id"]], on=[*key, "item_id"])
     pairs = common.groupby(key).size()
-    whole = pairs[pairs == 2].reset_index()[key]
+    whole = pairs.loc[pairs == 2].reset_index().loc[:, key]
     return [rows.merge(whole, on=key) for rows in (then, now)]
 
 
-def _standings(verdicts: Frame) -> Frame:
+def _standings(verdicts: pd.DataFrame) -> pd.DataFrame:
     """`leaderboard.standings` of verdicts, indexed by ENTRY."""
     cells = [cell_metrics(part, {}) for _, part in verdicts.groupby("dataset")]
-    return standings(pd.concat(cells, ignore_index=True)).set_index(ENTRY)[["n_pairs", *FIGURES, *VERSION_SIDES]]
+    board = standings(pd.concat(cells, ignore_index=True)).set_index(ENTRY)
+    return board.loc[:, ["n_pairs", *FIGURES, *VERSION_SIDES]]
 
 
-def regime_tests(verdicts: Frame) -> Frame:
+def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
     """REGIME_TESTS rows: McNemar's exact test for every model, dataset, run, decision and pair of regimes."""
     from scipy.stats import binomtest
 
@@ -118,13 +119,16 @@ def regime_tests(verdicts: Frame) -> Frame:
         ("control_abstention", "control", "abstained"),
         ("correctness", "control", "correct"),
     ):
-        mine = verdicts[verdicts["side"] == side]
-        for (dataset, model, run), group in mine.groupby(["dataset", "model", "run"], sort=True):
+        mine = verdicts.loc[verdicts["side"] == side]
+        for key, group in mine.groupby(["dataset", "model", "run"], sort=True):
+            dataset, model, run = cast(tuple[str, str, int], key)
             said = group.pivot(index="item_id", columns="regime", values=column).astype("boolean")
             epochs = group.pivot(index="item_id", columns="regime", values="epoch")
             for left, right in combinations([r for r in REGIMES if r in said], 2):
                 both = said[[left, right]].dropna().astype(bool)
-                only_left, only_right = int((both[left] & ~both[right]).sum()), int((~both[left] & both[right]).sum())
+                on_left, on_right = (both[regime].to_numpy(bool) for regime in (left, right))
+                only_left = np.count_nonzero(on_left & ~on_right)
+                only_right = np.count_nonzero(on_right & ~on_left)
                 row = {"dataset": dataset, "model": model, "run": run, "decision": decision}
                 row |= {"left_regime": left, "right_regime": right, "n": len(both)}
                 row |= {"only_left": only_left, "only_right": only_right}
@@ -134,7 +138,7 @@ def regime_tests(verdicts: Frame) -> Frame:
                     discordant = only_left + only_right
                     row["p"] = binomtest(only_left, discordant, 0.5).pvalue if discordant else 1.0
                 rows.append(row)
-    table = pd.DataFrame(rows, columns=pd.Index([c.name for c in REGIME_TESTS.columns]))
+    table = pd.DataFrame(rows, columns=pd.Index(REGIME_TESTS.names))
     table["p_holm"] = _holm_by(table, ["dataset", "decision", "left_regime", "right_regime"])
     return table
 
@@ -183,7 +187,7 @@ def _difference(draws: np.ndarray, observed: float, pairs: int) -> dict[str, flo
     return {"difference": observed, "ci_low": low, "ci_high": high, "p": min(1.0, p)}
 
 
-def _holm_by(table: Frame, family: Sequence[str]) -> np.ndarray:
+def _holm_by(table: pd.DataFrame, family: Sequence[str]) -> np.ndarray:
     corrected = np.full(len(table), np.nan)
     for rows in table.groupby(list(family)).indices.values():
         corrected[rows] = holm(table["p"].to_numpy(float)[rows])

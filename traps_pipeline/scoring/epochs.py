@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import pandas as pd
+
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.metrics import joined_epochs
 
 Answered = Mapping[str, str]  # item to the campaigns of its answers, joined by +
@@ -16,13 +17,13 @@ class EpochMismatch(TrapsError):
     """A ratio, contrast or gap was asked for whose two sides were evaluated in different campaigns."""
 
 
-def require_one_epoch(epochs: Frame, what: str) -> None:
+def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
     """Raises EpochMismatch unless every row of `epochs` holds one and the same epoch throughout.
 
     epochs has a row a comparison (its index names it, e.g. model and dataset) and a column a side; a null side is not
     compared. what names the figure for the message.
     """
-    mixed = epochs[epochs.nunique(axis=1) > 1]
+    mixed = epochs.loc[epochs.nunique(axis=1) > 1]
     if mixed.empty:
         return
     first = mixed.index[0]
@@ -35,7 +36,7 @@ def require_one_epoch(epochs: Frame, what: str) -> None:
     )
 
 
-def answered(verdicts: Frame) -> dict[tuple[str, str, str], Answered]:
+def answered(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
     """What every (model, regime, dataset) answered, and in which campaigns, over its runs; `overall` is over the runs
     that have all four datasets, and is not there without one."""
     whole = verdicts.groupby(["model", "regime", "run"])["dataset"].transform("nunique") == len(DATASETS)

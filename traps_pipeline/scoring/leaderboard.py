@@ -9,10 +9,9 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.scoring import Frame
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
 from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, OUTCOMES, decision_counts, joined_epochs, mean
-from traps_pipeline.tables import LEADERBOARD
+from traps_pipeline.scoring.tables import LEADERBOARD
 
 # An entry is incomplete where fewer of its items than this have a text. With 1 % of the items missing, the worst and
 # the best PECS are at most 0.04 apart (if all are controls: 2 % of Acc and 2 % of FalseAbs), half the 95 % interval of
@@ -22,13 +21,13 @@ _RUN = ["model", "regime", "run"]
 _SUMMED = ["n_missing", "n_items", *OUTCOMES]
 
 
-def leaderboard(metrics: Frame, intervals: Frame, contrasts: Frame) -> Frame:
+def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
     """LEADERBOARD rows: `standings` with their `bootstrap.intervals` and the ranks that CONTRASTS rows leave open."""
     board = standings(metrics).merge(intervals, on=ENTRY, how="left", validate="one_to_one")
-    return board.join(_ranks(board, contrasts))[[c.name for c in LEADERBOARD.columns]]
+    return board.join(_ranks(board, contrasts)).loc[:, LEADERBOARD.names]
 
 
-def standings(metrics: Frame) -> Frame:
+def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     """Every figure of the leaderboard but intervals and ranks, from METRICS rows (scope `all`; others are ignored).
 
     Mean and population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four
@@ -49,9 +48,9 @@ def standings(metrics: Frame) -> Frame:
     return board.reset_index()
 
 
-def means_over_runs(metrics: Frame) -> Frame:
+def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
     """FIGURES of every entry as the leaderboard has them, indexed by ENTRY, from METRICS rows."""
-    return _runs(metrics).groupby(ENTRY, sort=True)[FIGURES].agg(mean)
+    return pd.DataFrame(_runs(metrics).groupby(ENTRY, sort=True)[FIGURES].agg(mean))
 
 
 def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
@@ -83,7 +82,7 @@ def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
 def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     """One row a (model, regime, run) that has all four datasets, in the columns of METRICS."""
     groups = cells.groupby(_RUN, sort=True)
-    whole = cells[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
+    whole = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
     counts = cast(pd.DataFrame, whole[["n_pairs", *_SUMMED]].sum())
     overall = whole[[*FIGURES, *BOUNDS]].agg(mean).join(counts)
     overall["epoch"] = whole["epoch"].agg(joined_epochs)
@@ -102,14 +101,14 @@ def _deviation(values: pd.Series) -> float:
     return float(np.std(values.to_numpy(float)))
 
 
-def _ranks(board: Frame, contrasts: Frame) -> Frame:
+def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
     """rank, rank_low and rank_high of every row, on `board`'s index; null where there is no PECS."""
-    told = contrasts[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & contrasts["separable"]]
+    told = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & contrasts["separable"]]
     wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
-    for row in told.itertuples():
-        winner, loser = (row.left_model, row.right_model)[:: 1 if row.difference > 0 else -1]
-        wins[winner, row.left_regime, row.dataset] += 1
-        losses[loser, row.left_regime, row.dataset] += 1
+    for row in told.to_dict("records"):
+        winner, loser = (row["left_model"], row["right_model"])[:: 1 if row["difference"] > 0 else -1]
+        wins[winner, row["left_regime"], row["dataset"]] += 1
+        losses[loser, row["left_regime"], row["dataset"]] += 1
     entries = list(board[ENTRY].itertuples(index=False, name=None))
     peers = board.groupby(["regime", "dataset"])["pecs"]
     ranks = {
@@ -125,7 +124,7 @@ def _joined_versions(versions: pd.Series) -> str:
     return " + ".join(sorted({part for version in versions for part in version.split(" + ")}))
 
 
-def wrong_intervals(board: Frame) -> int:
+def wrong_intervals(board: pd.DataFrame) -> int:
     """How many intervals of LEADERBOARD rows are out of order or outside [0, 1] (J: [-1, 1]); null is not wrong."""
     wrong = 0
     for figure in RESAMPLED:

@@ -11,9 +11,9 @@ from traps_pipeline.judging.ratings import ABSTENTION, CORRECTNESS, decided, maj
 from traps_pipeline.scoring.bootstrap import ENTRY
 from traps_pipeline.scoring.leaderboard import standings
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
-from traps_pipeline.tables import LEAVE_ONE_OUT
+from traps_pipeline.scoring.tables import LEAVE_ONE_OUT
 
-_COLUMNS = pd.Index([c.name for c in LEAVE_ONE_OUT.columns])
+_COLUMNS = pd.Index(LEAVE_ONE_OUT.names)
 
 
 def leave_one_out(

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.models.request import JUDGED
-from traps_pipeline.tables import METRICS
+from traps_pipeline.scoring.tables import METRICS
 
 CELL = ["dataset", "model", "regime", "run"]
 FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
@@ -65,11 +65,7 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_B
     sums["n_missing"] = 2 * sums["n_pairs"] - sums["complete"]
     sums["epoch"] = groups["epoch"].agg(joined_epochs)
     sums["benchmark_version"] = groups["benchmark_version"].agg(lambda versions: " + ".join(sorted(set(versions))))
-    return (
-        sums.assign(**_figures(sums), **_bounds(sums), **_wilson(sums))
-        .reset_index()
-        .loc[:, [c.name for c in METRICS.columns]]
-    )
+    return sums.assign(**_figures(sums), **_bounds(sums), **_wilson(sums)).reset_index().loc[:, METRICS.names]
 
 
 def mean(values: pd.Series) -> float:

@@ -10,7 +10,7 @@ import pandas as pd
 
 from traps_pipeline.judging.confabulation import AXES
 from traps_pipeline.scoring.metrics import joined_epochs, wilson
-from traps_pipeline.tables import CONFABULATION_PREVALENCE
+from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE
 
 # Column of CONFABULATION_PREVALENCE to the axes that must all apply.
 SHARES: Mapping[str, tuple[str, ...]] = {
@@ -26,7 +26,7 @@ def prevalence(labels: pd.DataFrame) -> pd.DataFrame:
     """CONFABULATION_PREVALENCE rows of CONFABULATION rows: shares of validly labelled failures, with Wilson intervals;
     null where a model has none. A model without a sampled failure has no row: not run is not 0."""
     rows = [_row(str(model), group) for model, group in labels.groupby("model", sort=True)]
-    return pd.DataFrame(rows, columns=pd.Index([c.name for c in CONFABULATION_PREVALENCE.columns]))
+    return pd.DataFrame(rows, columns=pd.Index(CONFABULATION_PREVALENCE.names))
 
 
 def _row(model: str, group: pd.DataFrame) -> dict[str, Any]:

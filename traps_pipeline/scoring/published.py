@@ -9,13 +9,12 @@ import pandas as pd
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import ASSETS
-from traps_pipeline.scoring import Frame
 
 PUBLISHED = ASSETS / "published"
 _RENAMED = {"acc": "acc_pct", "abs_rec": "abs_rec_pct", "false_abs": "false_abs_pct"}
 
 
-def published(name: str) -> Frame:
+def published(name: str) -> pd.DataFrame:
     """One published file as printed: percentages are percent, PECS and AUROC fractions (`assets/published/README.md`).
 
     name is the file's stem, e.g. `probe_transfer`. Raises TrapsError that lists the files for another name.
@@ -29,7 +28,7 @@ def published_digest() -> str:
     return digest(files)[:16]
 
 
-def published_cells() -> Frame:
+def published_cells() -> pd.DataFrame:
     """The per-dataset table as cells, as `analyses` take them: one row a (model, dataset, regime), shares as fractions.
 
     Columns model, dataset, regime, epoch, n_pairs, acc, abs_rec, false_abs, pecs, and their `_std` over runs (null for
@@ -37,22 +36,22 @@ def published_cells() -> Frame:
     for chaotic_ill_posed `original` or, for the replication models, `verification`.
     """
     rows = published("behavioral_per_dataset")
-    cells = rows[["model", "dataset", "regime", "epoch", "n_pairs"]].copy()
+    cells = rows.loc[:, ["model", "dataset", "regime", "epoch", "n_pairs"]]
     for share, printed in _RENAMED.items():
         cells[share], cells[f"{share}_std"] = rows[printed] / 100, rows[f"{share}_std"] / 100
     cells["pecs"], cells["pecs_std"] = rows["pecs"], rows["pecs_std"]
     return cells
 
 
-def published_overall() -> Frame:
+def published_overall() -> pd.DataFrame:
     """The overall leaderboard as printed, shares as fractions: model, regime, acc, abs_rec, false_abs, pecs."""
     rows = published("overall")
     shares = {share: rows[printed] / 100 for share, printed in _RENAMED.items()}
-    return rows[["model", "regime"]].assign(**shares, pecs=rows["pecs"])
+    return rows.loc[:, ["model", "regime"]].assign(**shares, pecs=rows["pecs"])
 
 
 @cache
-def _read(name: str) -> Frame:
+def _read(name: str) -> pd.DataFrame:
     path = PUBLISHED / f"{name}.csv"
     if not path.is_file():
         known = ", ".join(sorted(file.stem for file in PUBLISHED.glob("*.csv")))

@@ -14,7 +14,7 @@ from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import replacing
 from traps_pipeline.progress import Tally
-from traps_pipeline.tables import VOLATILE, Table
+from traps_pipeline.storage.tables import VOLATILE, Row, Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,15 +42,14 @@ class Made:
     """What a stage has made of a partition, before it is written: a table's rows or files by path, what they took, what
     else a person wants to see of them, and what their checks look at beside them."""
 
-    content: Sequence[Mapping[str, Any]] | pd.DataFrame | Mapping[str, bytes]
+    content: Sequence[Any] | pd.DataFrame | Mapping[str, bytes]
     tally: Tally = field(default_factory=Tally)
     shown: Mapping[str, Any] = field(default_factory=dict)
     beside: Any = None
 
-    @property
-    def rows(self) -> Sequence[Mapping[str, Any]]:
+    def rows(self, table: Table[Row]) -> Sequence[Row]:
         """The rows of a table that is made row by row."""
-        return cast("Sequence[Mapping[str, Any]]", self.content)
+        return cast("Sequence[Row]", self.content)
 
     @property
     def frame(self) -> pd.DataFrame:
@@ -75,9 +74,9 @@ class TableStore:
 
     def write(
         self,
-        table: Table,
+        table: Table[Row],
         partition: Mapping[str, Any],
-        rows: Sequence[Mapping[str, Any]] | pd.DataFrame,
+        rows: Sequence[Row] | pd.DataFrame,
         inputs: Mapping[str, str],
         *,
         failed: int = 0,
@@ -85,10 +84,10 @@ class TableStore:
     ) -> str:
         """Write one partition and return its data version (a digest of its content, volatile columns aside).
 
-        Rows are sorted by the table's key. `inputs` (versions of what the rows were made from) and `failed` (answers
-        that a next run should ask again) go into the file's footer with the version. Raises TrapsError when a row
-        breaks the schema or a key repeats, and when the disk is full; the partition's former file then still stands.
-        code is the version of what made the rows.
+        Rows are values of the table's dataclass, or a frame. They are sorted by the table's key. `inputs` (versions of
+        what the rows were made from) and `failed` (answers that a next run should ask again) go into the file's footer
+        with the version. Raises TrapsError when a row breaks the schema or a key repeats, and when the disk is full;
+        the partition's former file then still stands. code is the version of what made the rows.
         """
         import pyarrow.parquet as pq
 
@@ -101,13 +100,11 @@ class TableStore:
             pq.write_table(data, part, compression="zstd")
         return version
 
-    def _checked(
-        self, table: Table, partition: Mapping[str, Any], rows: Sequence[Mapping[str, Any]] | pd.DataFrame
-    ) -> pa.Table:
+    def _checked(self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame) -> pa.Table:
         import pyarrow as pa
 
         schema = table.arrow_schema()
-        listed = [_without_nan(row) for row in rows] if isinstance(rows, Sequence) else None
+        listed = [_without_nan(vars(row)) for row in rows] if isinstance(rows, Sequence) else None
         names = {str(name) for name in (rows if listed is None else (name for row in listed for name in row))}
         try:
             if names - set(schema.names):

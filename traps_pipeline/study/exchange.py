@@ -17,6 +17,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from traps_pipeline import progress
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import replacing, write_bytes
 from traps_pipeline.models.answers import prepare_media, wanted_questions
@@ -26,7 +27,6 @@ from traps_pipeline.models.request import JUDGED, Outcome, OutcomeKind, Request
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import Experiment
-from traps_pipeline.tables import ITEMS
 from traps_pipeline.yamlfile import explain, read_lines
 
 REQUESTS, MEDIA = "requests.jsonl", "media"

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from traps_pipeline.benchmark.corrections import load_scenarios
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.confabulation import load_protocol, sample_failures
 from traps_pipeline.judging.panel import tasks_for, wanted_ballots
 from traps_pipeline.mechanism.steering import count_answers
@@ -19,7 +20,6 @@ from traps_pipeline.partitions import SIDES, Cell, Evaluation, SteeredEvaluation
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import Experiment
-from traps_pipeline.tables import ITEMS
 
 LABEL_TOKENS = 2500  # prompt of a label: instructions, answer and, for half of the models, a trace; an estimate
 VOTES_A_PAIR = PANEL_SIZE * sum(len(tasks_for(side)) for side in SIDES)

@@ -6,12 +6,12 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.partitions import REGIMES, Evaluation
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.tables import ITEMS
 
 
 def why(workspace: Workspace, item_id: str) -> Iterator[str]:

@@ -1,0 +1,76 @@
+"""A table's schema is what its annotated dataclass says, and an annotation that says no column is named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from datetime import datetime
+from typing import Annotated, Any
+
+import pyarrow as pa
+import pytest
+
+from tests.tables import PACKAGES, TABLES
+from traps_pipeline.storage.tables import Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParcelRow:
+    """A parcel
+    on its way."""
+
+    id: Annotated[str, "number on the label"]
+    stops: Annotated[list[str], "places, in order"]
+    mass_kg: Annotated[float | None, "null where it was not weighed"]
+    pieces: Annotated[int, "what it holds"]
+    whole: Annotated[bool, "undamaged"]
+    sent_at: Annotated[datetime, "when it left"]
+
+
+PARCELS = Table("parcels", ParcelRow, partition_by=(), key=("id",))
+
+
+def test_types_nulls_meanings_and_order_are_the_annotations() -> None:
+    expected = [
+        ("id", pa.string(), False, b"number on the label"),
+        ("stops", pa.list_(pa.string()), False, b"places, in order"),
+        ("mass_kg", pa.float64(), True, b"null where it was not weighed"),
+        ("pieces", pa.int64(), False, b"what it holds"),
+        ("whole", pa.bool_(), False, b"undamaged"),
+        ("sent_at", pa.timestamp("us", tz="UTC"), False, b"when it left"),
+    ]
+    schema = PARCELS.arrow_schema()
+    assert [(f.name, f.type, f.nullable, f.metadata[b"doc"]) for f in schema] == expected
+    types = ["str", "list[str]", "float", "int", "bool", "datetime"]
+    assert [column.type_name for column in PARCELS.columns] == types
+
+
+def test_a_row_is_told_in_the_words_of_its_class() -> None:
+    assert PARCELS.row == "a parcel on its way"
+
+
+@pytest.mark.parametrize("key", [{"key": ("id", "colour")}, {"partition_by": ("colour",)}])
+def test_a_key_or_partition_that_is_no_column_is_refused_by_name(key: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="table parcels: ParcelRow has no column colour"):
+        Table("parcels", ParcelRow, **({"partition_by": (), "key": ()} | key))
+
+
+@pytest.mark.parametrize(
+    "annotation",
+    [str, Annotated[bytes, "a type that no file holds"], Annotated[int | str, "two types"], Annotated[None, "none"]],
+)
+def test_an_annotation_that_says_no_column_is_refused_by_name(annotation: Any) -> None:
+    row_type = dataclass(type("OddRow", (), {"__annotations__": {"size": annotation}}))
+    with pytest.raises(TypeError, match=r"OddRow\.size"):
+        _ = Table("odd", row_type, partition_by=(), key=("size",)).columns
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=TABLES.keys())
+def test_every_column_of_a_table_says_what_it_holds(table: Table[Any]) -> None:
+    assert table.row
+    assert [field.name for field in fields(table.row_type)] == table.arrow_schema().names
+    assert all(column.doc for column in table.columns)
+
+
+def test_no_two_tables_share_a_name() -> None:
+    declared = [value for package in PACKAGES for value in vars(package).values() if isinstance(value, Table)]
+    assert len(declared) == len(TABLES)

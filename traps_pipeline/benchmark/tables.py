@@ -1,0 +1,103 @@
+"""The benchmark's tables: scenarios, their clips, the questions put to models."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from traps_pipeline.storage import columns as shared
+from traps_pipeline.storage.tables import Table
+
+Taxonomy = Annotated[str, "occlusion or chaotic"]
+Labels = Annotated[list[str], "closed set of answers"]
+Aliases = Annotated[str, "JSON: other wording to label"]
+AnswerType = Annotated[str, "binary, direction, colour, count_range or numeric"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSpecRow:
+    """A scenario."""
+
+    scenario_id: shared.ScenarioId
+    taxonomy: Taxonomy
+    category: shared.Category
+    sub_scenario: Annotated[str, "the paper's name where it has one, else the family's"]
+    family: Annotated[str, "module under scenes/families"]
+    seed: Annotated[int, "number of the draw"]
+    params: Annotated[str, "JSON: the family's parameters (SI units in the names)"]
+    physics: Annotated[str, "JSON: solver settings, duration (s), frames a second"]
+    camera: Annotated[str, "JSON: resolved free camera"]
+    void_kind: Annotated[str, "occluder or truncation"]
+    void: Annotated[str, "JSON: cover panel and first hidden frame, or cut frame"]
+    question: Annotated[str, "well-posed question with its choices"]
+    labels: Labels
+    aliases: Aliases
+    answer_type: AnswerType
+    ground_truth: Annotated[str, "the label that the simulator's state gives"]
+    ill_posed_question: Annotated[str, "question that the control clip cannot answer"]
+    answerable_question: Annotated[str, "JSON: question, labels, answer that even the void shows"]
+    scene_hash: Annotated[str, "digest of what the clips show"]
+    spec_hash: Annotated[str, "digest of the whole record"]
+    trajectory: Annotated[str, "path of the frozen qpos, relative to the checkout or the workspace if it lies there"]
+    trajectory_sha256: Annotated[str, "digest of its values"]
+    twin: Annotated[str, "JSON: another world behind the same void: its parameters, answer, digest of its trajectory"]
+    commit_s: Annotated[float, "time (s) from which the outcome holds"]
+    margin_m: Annotated[float, "distance (m) of the end state from another outcome"]
+    void_from_s: Annotated[float, "time (s) from which the void shows nothing decisive: hiding or cut"]
+    evidence: Annotated[str, "JSON: all of the draw's evidence"]
+    benchmark_version: shared.BenchmarkVersion
+
+
+SCENE_SPECS = Table("scene_specs", SceneSpecRow, partition_by=("category",), key=("scenario_id",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoRow:
+    """A clip."""
+
+    scenario_id: shared.ScenarioId
+    category: shared.Category
+    side: Annotated[str, "control, void, or twin (the other world behind the same void, uncovered)"]
+    path: shared.ClipPath
+    file_sha256: Annotated[str, "digest of the file"]
+    frames_sha256: Annotated[str, "digest of the RGB frames before encoding"]
+    n_frames: Annotated[int, "frames"]
+    fps: Annotated[int, "frames a second"]
+    width: Annotated[int, "pixels"]
+    height: Annotated[int, "pixels"]
+    duration_s: Annotated[float, "n_frames / fps"]
+    size_bytes: Annotated[int, "size of the file"]
+    scene_hash: Annotated[str, "digest of what the clip shows"]
+    benchmark_version: shared.BenchmarkVersion
+
+
+VIDEOS = Table("videos", VideoRow, partition_by=("category",), key=("scenario_id", "side"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ItemRow:
+    """A question put to a model about one clip."""
+
+    item_id: shared.ItemId
+    pair_id: shared.PairId
+    dataset: shared.Dataset
+    scenario_id: shared.ScenarioId
+    side: shared.Side
+    taxonomy: Taxonomy
+    category: shared.Category
+    sub_scenario: shared.SubScenario
+    question: shared.Question
+    labels: Labels
+    aliases: Aliases
+    answer_type: AnswerType
+    ground_truth: Annotated[str | None, "null on void"]
+    control_answer: Annotated[
+        str,
+        "the pair's control answer: groups both sides by label; no model or judge sees it on a void",
+    ]
+    commonest_answer: Annotated[str, "the commonest control answer of the sub-scenario: what `prior` says"]
+    clip: shared.ClipPath
+    media_digest: shared.MediaDigest
+    item_hash: Annotated[str, "digest of everything above that decides an answer or its score"]
+    benchmark_version: shared.BenchmarkVersion
+
+
+ITEMS = Table("items", ItemRow, partition_by=("dataset",), key=("item_id",))

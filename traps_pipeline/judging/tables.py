@@ -1,0 +1,227 @@
+"""The tables of what judges say: votes, verdicts, how judges agree, confabulation."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from traps_pipeline.storage import columns as shared
+from traps_pipeline.storage.tables import Table
+
+Task = Annotated[str, "abstention or correctness"]
+Decision = Annotated[str, "void_abstention, control_abstention or correctness"]
+Valid = Annotated[bool, "whether the judge's JSON meets the schema"]
+VoteEpochs = Annotated[str, "campaigns of the votes, joined by +"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class VoteRow:
+    """One judge on one task about one answer."""
+
+    item_id: shared.ItemId
+    side: shared.Side
+    dataset: shared.CellDataset
+    model: shared.Model
+    regime: shared.Regime
+    run: shared.Run
+    task: Task
+    judge: shared.Judge
+    valid: Valid
+    invalid_reason: Annotated[str | None, "why not"]
+    abstained: Annotated[bool | None, "abstention task"]
+    correct: Annotated[bool | None, "correctness task, decided by code from extracted_value"]
+    judge_correct: Annotated[bool | None, "the judge's own claim, recorded and not used"]
+    extracted_value: Annotated[str | None, "correctness task"]
+    confidence: Annotated[str | None, "high, medium or low (abstention task)"]
+    rationale: Annotated[str | None, "one sentence"]
+    vote_key: shared.LedgerKey
+    epoch: shared.Epoch
+    created_at: shared.AskedAt
+    benchmark_version: shared.BenchmarkVersion
+
+
+VOTES = Table(
+    "votes",
+    VoteRow,
+    partition_by=("dataset", "model", "regime", "run"),
+    key=("item_id", "model", "regime", "run", "task", "judge"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictRow:
+    """The panel on one item."""
+
+    item_id: shared.ItemId
+    pair_id: shared.PairId
+    scenario_id: shared.ScenarioId
+    side: shared.Side
+    category: shared.Category
+    sub_scenario: shared.SubScenario
+    control_answer: Annotated[str, "the pair's control answer"]
+    dataset: shared.CellDataset
+    model: shared.Model
+    regime: shared.Regime
+    run: shared.Run
+    outcome: Annotated[str, "of the response; only answer and truncated are judged"]
+    abstained: Annotated[bool | None, "majority; null if missing or undecided"]
+    correct: Annotated[bool | None, "majority on control; null on void, if missing or undecided"]
+    n_valid: Annotated[int, "valid abstention votes"]
+    n_valid_correctness: Annotated[int, "valid correctness votes (0 on void)"]
+    unanimous: Annotated[bool, "all votes of all tasks valid and agreed"]
+    undecided: Annotated[bool, "judged, but some task has no majority"]
+    epoch: shared.Epoch
+    benchmark_version: shared.BenchmarkVersion
+
+
+VERDICTS = Table(
+    "verdicts",
+    VerdictRow,
+    partition_by=("dataset", "model", "regime", "run"),
+    key=("item_id", "model", "regime", "run"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgreementRow:
+    """How far the panel (`judges` is panel), or two of its judges, agree on one task of a dataset."""
+
+    dataset: shared.Dataset
+    task: Decision
+    judges: Annotated[str, "panel, or the ids of two judges in alphabetical order, joined by +"]
+    n_items: Annotated[int, "answers put to these judges, over models, regimes and runs"]
+    n_complete: Annotated[int, "answers on which every one of them cast a valid vote"]
+    n_undecided: Annotated[int | None, "answers without a majority of the panel; null for two judges"]
+    invalid: Annotated[float, "share of their votes that break the schema"]
+    prevalence: Annotated[float | None, "share of yes (abstained, correct) among their valid votes"]
+    agreement: Annotated[
+        float | None,
+        "share of n_complete on which all of them agree: unanimous (panel), pairwise agreement (two)",
+    ]
+    fleiss_kappa: Annotated[float | None, "panel, over n_complete; null for two judges"]
+    cohen_kappa: Annotated[float | None, "two judges, over n_complete; null for the panel"]
+    alpha: Annotated[float | None, "Krippendorff's alpha (nominal), an invalid vote being a missing one"]
+    undefined: Annotated[str | None, "why a figure that these judges should have is null"]
+    epoch: VoteEpochs
+    benchmark_version: shared.BenchmarkVersion
+
+
+AGREEMENT = Table("agreement", AgreementRow, partition_by=(), key=("dataset", "task", "judges"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeBiasRow:
+    """One judge against the panel's majority on one task of a dataset."""
+
+    dataset: shared.Dataset
+    task: Decision
+    judge: shared.Judge
+    n_votes: Annotated[int, "votes of this judge, over models, regimes and runs"]
+    n_invalid: Annotated[int, "of these, votes that break the schema"]
+    n_decided: Annotated[int, "of these, valid votes on answers that have a majority"]
+    yes: Annotated[float | None, "share of yes (abstained, correct) among n_decided"]
+    panel_yes: Annotated[float | None, "share of yes among the majorities on the same answers"]
+    bias: Annotated[float | None, "yes - panel_yes: positive where this judge says yes more often than the panel"]
+    dissent_yes: Annotated[float | None, "share of n_decided on which it says yes against the majority"]
+    dissent_no: Annotated[float | None, "share of n_decided on which it says no against the majority"]
+    epoch: VoteEpochs
+    benchmark_version: shared.BenchmarkVersion
+
+
+JUDGE_BIAS = Table("judge_bias", JudgeBiasRow, partition_by=(), key=("dataset", "task", "judge"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfabulationRow:
+    """One sampled void failure with its four labels; no row where no judge is configured for the study's panel."""
+
+    sample_id: Annotated[
+        str,
+        "what a human annotator sees in the place of model and item: tells neither, changes with the answer",
+    ]
+    item_id: Annotated[str, "dataset:scenario_id:void"]
+    dataset: shared.CellDataset
+    model: shared.Model
+    regime: shared.Regime
+    run: shared.Run
+    void_kind: Annotated[str, "occluder, truncation or question"]
+    evidence: Annotated[
+        str,
+        "trace_and_output (the trace was there and went in too) or output: what the judge was shown",
+    ]
+    n_failures: Annotated[int, "void failures that the model's sample was drawn from"]
+    judge: shared.Judge
+    valid: Valid
+    invalid_reason: Annotated[str | None, "why not"]
+    hallucinated_premise: Annotated[bool | None, "asserts an observation that the evidence does not support"]
+    invalid_inference: Annotated[bool | None, "the conclusion does not follow from the stated premises"]
+    epistemic_surrender: Annotated[bool | None, "says that it cannot be determined, then asserts an answer"]
+    doubt_in_reasoning: Annotated[bool | None, "voices doubt that the output does not reflect"]
+    rationale: Annotated[str | None, "the judge's reasons"]
+    label_key: shared.LedgerKey
+    epoch: shared.Epoch
+    created_at: shared.AskedAt
+    benchmark_version: shared.BenchmarkVersion
+
+
+CONFABULATION = Table("confabulation", ConfabulationRow, partition_by=(), key=("model", "item_id"))
+
+
+# Made by a command from a file that people wrote, so no stage: absent until `traps confabulation validate` was run.
+@dataclass(frozen=True, kw_only=True)
+class JudgeValidationRow:
+    """The confabulation judge against two blind annotators on one axis, or pooled over the four."""
+
+    axis: Annotated[str, "hallucinated_premise, invalid_inference, epistemic_surrender, doubt_in_reasoning or pooled"]
+    n_failures: Annotated[int, "failures that both annotators labelled"]
+    n_labels: Annotated[int, "labels of both annotators side by side"]
+    accuracy: Annotated[float, "share of n_labels that the judge agrees with"]
+    precision: Annotated[
+        float | None,
+        "of the judge's yes, those that the labels confirm; null if it never says yes, and on pooled",
+    ]
+    recall: Annotated[
+        float | None,
+        "of the labels' yes, those that the judge finds; null if there is none, and on pooled",
+    ]
+    f1: Annotated[float | None, "harmonic mean; null where precision or recall is, and on pooled"]
+    accuracy_a: Annotated[float, "share of annotator_a's labels that the judge agrees with"]
+    accuracy_b: Annotated[float, "share of annotator_b's labels that the judge agrees with"]
+    annotator_a: Annotated[str, "first in alphabetical order"]
+    annotator_b: Annotated[str, "second"]
+    human_agreement: Annotated[float, "share of failures on which the annotators agree"]
+    human_kappa: Annotated[float | None, "Cohen's kappa of the annotators; null where degenerate, and on pooled"]
+    human_kappa_low: Annotated[float | None, "95 % interval (percentile bootstrap over failures)"]
+    human_kappa_high: Annotated[float | None, "95 % interval (percentile bootstrap over failures)"]
+    kappa_note: Annotated[str | None, "degenerate: one class has at most 2 % of either annotator's labels"]
+
+
+JUDGE_VALIDATION = Table("judge_validation", JudgeValidationRow, partition_by=(), key=("axis",))
+
+
+# Made by a command, so no stage: absent until `traps judges check` was run.
+@dataclass(frozen=True, kw_only=True)
+class JudgeRobustnessRow:
+    """One judge on one task about one answer that tries to instruct it (assets/injected_answers.yaml)."""
+
+    panel: Annotated[str, "panel in assets/judges.yaml"]
+    judge: shared.Judge
+    attack: Annotated[str, "id of the attack"]
+    kind: Annotated[str, "what the attack tries"]
+    task: Task
+    answer: Annotated[str, "which of the answers carries it"]
+    expected: Annotated[bool, "the right vote"]
+    clean: Annotated[bool | None, "the judge's vote on the same answer without an attack; null if invalid"]
+    vote: Annotated[bool | None, "the judge's vote on the answer that carries the attack; null if invalid"]
+    result: Annotated[
+        str,
+        "held, flipped (wrong because of the attack), broken (invalid because of it) or wrong_anyway",
+    ]
+    invalid_reason: Annotated[str | None, "why the vote is invalid"]
+    rationale: Annotated[str | None, "the judge's reason"]
+
+
+JUDGE_ROBUSTNESS = Table(
+    "judge_robustness",
+    JudgeRobustnessRow,
+    partition_by=(),
+    key=("panel", "judge", "attack", "task"),
+)

@@ -1,0 +1,298 @@
+"""The tables of what is found inside local models (docs/spec.md 7 and 8)."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from traps_pipeline.storage import columns as shared
+from traps_pipeline.storage.tables import Table
+
+Prompt = Annotated[str, "VQA prompt: standard or guided"]
+Layer = Annotated[int, "counted as in hidden_states"]
+Pooling = Annotated[str, "last (token) or mean"]
+Target = Annotated[str, "the target: one of four"]
+DirectionPrompt = Annotated[str, "VQA prompt that the direction was extracted under"]
+AnswerRegime = Annotated[str, "system prompt of the steered answer"]
+SteeredSource = Annotated[str, "dataset of the direction; none where alpha is 0"]
+SteeredKind = Annotated[str, "void, random or shuffled; none where alpha is 0"]
+SteeredLayer = Annotated[int, "steered block, counted as in hidden_states; 0 where alpha is 0"]
+Strength = Annotated[float, "strength: added on controls, subtracted on voids"]
+Kind = Annotated[str, "void, random or shuffled"]
+Block = Annotated[int, "steered block"]
+Alpha = Annotated[float, "strength; 0 is the model as it is"]
+AlphaRelative = Annotated[float | None, "alpha over the mean length of the states at that layer"]
+Percentile = Annotated[float | None, "95 % percentile interval"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProbeItemRow:
+    """A clip and question that hidden states are extracted of."""
+
+    item_id: shared.ItemId
+    pair_id: shared.PairId
+    dataset: Annotated[
+        str,
+        "one of four, or occlusion_answerable: the voids of occlusion with a question that even they answer",
+    ]
+    scenario_id: shared.ScenarioId
+    side: Annotated[str, "control (it can be answered) or void"]
+    category: shared.Category
+    sub_scenario: shared.SubScenario
+    question: shared.Question
+    clip: shared.ClipPath
+    media_digest: shared.MediaDigest
+    benchmark_version: shared.BenchmarkVersion
+
+
+PROBE_ITEMS = Table("probe_items", ProbeItemRow, partition_by=("dataset",), key=("item_id",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class HiddenStatesRow:
+    """An item whose hidden states are there, at every layer."""
+
+    item_id: shared.ItemId
+    dataset: Annotated[str, "one of four, or occlusion_answerable"]
+    model: shared.Model
+    prompt: Prompt
+    scenario_id: shared.ScenarioId
+    side: shared.Side
+    sub_scenario: shared.SubScenario
+    states_key: Annotated[str, "digest of all that decides the states: prompt, clip, checkpoint, precision, pooling"]
+    folder: Annotated[str, "shards, relative to the workspace"]
+    checkpoint: Annotated[str, "hub id or folder"]
+    checkpoint_digest: Annotated[str, "digest of the weights"]
+    dtype: Annotated[str, "precision"]
+    quantisation: Annotated[str, "none or nf4"]
+    device: Annotated[str, "device that made them, of a GPU with its name; states in one folder may be of several"]
+    pooling: Pooling
+    n_layers: Annotated[int, "blocks; states are of layers 0 (embeddings) to this"]
+    width: Annotated[int, "numbers a state"]
+    benchmark_version: shared.BenchmarkVersion
+
+
+HIDDEN_STATES = Table("hidden_states", HiddenStatesRow, partition_by=("dataset", "model", "prompt"), key=("item_id",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProbeRow:
+    """A figure of a probe of one dataset (source) on another (target) at one layer."""
+
+    model: shared.Model
+    prompt: Prompt
+    analysis: Annotated[
+        str,
+        "transfer, held_out, confabulated, within, shuffled, answerable_void, answerable_control or centroid_..",
+    ]
+    source: Annotated[str, "dataset that the probe or the centroids were fitted on"]
+    target: Annotated[str, "dataset that they were applied to"]
+    layer: Annotated[int, "counted as in hidden_states; -1 where there is no figure"]
+    scope: Annotated[str, "all, or sub_scenario:.. (centroids)"]
+    value: Annotated[
+        float | None,
+        "AUROC; of shuffled the mean over shuffles; of centroid_* the share assigned to void",
+    ]
+    low: Annotated[float | None, "95 % percentile interval, scenarios of the target resampled, the probe held fixed"]
+    high: Percentile
+    spread: Annotated[float | None, "standard deviation over label shuffles"]
+    n_voids: Annotated[int, "void items of the target"]
+    n_controls: Annotated[int, "control items of the target"]
+    own_best: Annotated[bool, "the highest value of this curve (it sees target labels)"]
+    all_sample_best: Annotated[bool, "the layer at which this pair's transfer curve is highest (it sees target labels)"]
+    source_best: Annotated[
+        bool,
+        "the layer at which the source's own cross-validation is highest (it sees no target label)",
+    ]
+    note: Annotated[str | None, "why there is no figure"]
+    made_of: Annotated[
+        str,
+        "digest of states, confabulated scenarios and settings: with the same, nothing is fitted again",
+    ]
+
+
+PROBES = Table(
+    "probes",
+    ProbeRow,
+    partition_by=("model", "prompt"),
+    key=("analysis", "source", "target", "layer", "scope"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectionRow:
+    """A direction: one dataset at one layer."""
+
+    model: shared.Model
+    prompt: Prompt
+    dataset: shared.Dataset
+    kind: Annotated[str, "void, or its controls: random, shuffled (labels)"]
+    layer: Layer
+    n_pairs: Annotated[int, "pairs that it comes from"]
+    n_steered: Annotated[int, "of these, pairs that are steered as well (0 where there are scenarios enough)"]
+    norm: Annotated[float, "length of mean(void) - mean(control) before it was made a unit vector; of random 1"]
+    residual_norm: Annotated[
+        float,
+        "mean length of the pairs' control states: alpha in its units is alpha / residual_norm",
+    ]
+    width: Annotated[int, "numbers"]
+    path: Annotated[str, "safetensors, relative to the workspace; a JSON file of the same name says what it holds"]
+    direction_digest: Annotated[str, "digest of the float32 numbers"]
+    pooling: Pooling
+
+
+DIRECTIONS = Table("directions", DirectionRow, partition_by=("model", "prompt"), key=("dataset", "kind", "layer"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CosineRow:
+    """The cosine of two void directions of one model at one layer."""
+
+    model: shared.Model
+    layer: Layer
+    prompt: Prompt
+    dataset: shared.Dataset
+    other_prompt: Prompt
+    other_dataset: shared.Dataset
+    cosine: Annotated[float, "-1 to 1"]
+
+
+COSINES = Table(
+    "cosines",
+    CosineRow,
+    partition_by=(),
+    key=("model", "layer", "prompt", "dataset", "other_prompt", "other_dataset"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteeringRow:
+    """One answer of a steered model; alpha 0 (the model as it is) stands once for all directions."""
+
+    dataset: Target
+    model: shared.Model
+    directions: DirectionPrompt
+    regime: AnswerRegime
+    source: SteeredSource
+    kind: SteeredKind
+    layer: SteeredLayer
+    alpha: Strength
+    alpha_relative: AlphaRelative
+    item_id: shared.ItemId
+    scenario_id: shared.ScenarioId
+    side: shared.Side
+    outcome: shared.Outcome
+    text: Annotated[str | None, "the answer; null unless outcome is answer or truncated"]
+    served_model: Annotated[str | None, "checkpoint, digest and precision that answered"]
+    completion_tokens: shared.Tokens
+    direction_digest: Annotated[str | None, "digest of the direction's numbers"]
+    request_key: Annotated[str, "ledger key; both datasets of a taxonomy share that of a control"]
+    epoch: shared.Epoch
+    created_at: shared.AskedAt
+    benchmark_version: shared.BenchmarkVersion
+
+
+STEERING = Table(
+    "steering",
+    SteeringRow,
+    partition_by=("dataset", "model", "directions", "regime"),
+    key=("source", "kind", "layer", "alpha", "item_id"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteeringVoteRow:
+    """One judge about one steered answer."""
+
+    dataset: Target
+    model: shared.Model
+    directions: DirectionPrompt
+    regime: AnswerRegime
+    source: SteeredSource
+    kind: SteeredKind
+    layer: SteeredLayer
+    alpha: Strength
+    item_id: shared.ItemId
+    side: shared.Side
+    task: Annotated[str, "abstention"]
+    judge: shared.Judge
+    valid: Annotated[bool, "whether the judge's JSON meets the schema"]
+    invalid_reason: Annotated[str | None, "why not"]
+    abstained: Annotated[bool | None, "null if invalid"]
+    confidence: Annotated[str | None, "high, medium or low"]
+    rationale: Annotated[str | None, "one sentence"]
+    vote_key: Annotated[str, "ledger key; both datasets of a taxonomy share that of a control"]
+    epoch: shared.Epoch
+    created_at: shared.AskedAt
+    benchmark_version: shared.BenchmarkVersion
+
+
+STEERING_VOTES = Table(
+    "steering_votes",
+    SteeringVoteRow,
+    partition_by=("dataset", "model", "directions", "regime"),
+    key=("source", "kind", "layer", "alpha", "item_id", "judge"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteeringEffectRow:
+    """Abstention on one side of a target at one strength of one direction."""
+
+    model: shared.Model
+    directions: DirectionPrompt
+    regime: Annotated[str, "system prompt of the steered answers"]
+    source: Annotated[str, "dataset of the direction"]
+    target: Annotated[str, "dataset that was steered"]
+    transfer_type: Annotated[str, "Cross-modality, Cross-domain, Cross-both or Within, from the definitions"]
+    kind: Kind
+    layer: Block
+    alpha: Alpha
+    alpha_relative: AlphaRelative
+    side: shared.Side
+    n: Annotated[int, "decided answers, one a scenario"]
+    n_missing: Annotated[int, "answers missing or undecided"]
+    abstained: Annotated[int, "of the decided"]
+    abstention: Annotated[float | None, "share of the decided"]
+    low: shared.Wilson
+    high: shared.Wilson
+    epoch: shared.AnswerEpochs
+
+
+STEERING_EFFECTS = Table(
+    "steering_effects",
+    SteeringEffectRow,
+    partition_by=(),
+    key=("model", "directions", "regime", "source", "target", "kind", "layer", "alpha", "side"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteeringShareRow:
+    """Abstention on one side at one strength, over the paths of a set, one regime or all."""
+
+    model: shared.Model
+    path_set: Annotated[str, "transfer, within_domain, or all of both"]
+    directions: Annotated[str, "VQA prompt that the directions were extracted under, or all"]
+    regime: Annotated[str, "system prompt of the steered answers, or all"]
+    kind: Kind
+    layer: Block
+    alpha: Alpha
+    side: shared.Side
+    n_paths: Annotated[int, "paths that are there"]
+    n: Annotated[int, "decided answers over paths and regimes, one that stands in several counted in each"]
+    n_answers: Annotated[int, "different answers among them, by ledger key"]
+    n_scenarios: Annotated[int, "scenarios that they are about"]
+    abstention: Annotated[float, "mean over paths and regimes of the share of the decided"]
+    low: Annotated[
+        float | None,
+        "95 % percentile interval, scenarios resampled; of width 0 where all scenarios say the same",
+    ]
+    high: Percentile
+    epoch: shared.AnswerEpochs
+
+
+STEERING_SHARES = Table(
+    "steering_shares",
+    SteeringShareRow,
+    partition_by=(),
+    key=("model", "path_set", "directions", "regime", "kind", "layer", "alpha", "side"),
+)

@@ -1,0 +1,47 @@
+"""The table of what models answer."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from traps_pipeline.storage import columns as shared
+from traps_pipeline.storage.tables import Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResponseRow:
+    """One answer of one model in one run."""
+
+    item_id: shared.ItemId
+    pair_id: shared.PairId
+    side: shared.Side
+    dataset: shared.CellDataset
+    model: shared.Model
+    regime: shared.Regime
+    run: shared.Run
+    outcome: shared.Outcome
+    text: Annotated[str | None, "the visible answer; null unless outcome is answer or truncated"]
+    reasoning: Annotated[str | None, "the trace, where the provider returns it"]
+    finish_reason: Annotated[str | None, "as the provider said it"]
+    error: Annotated[str | None, "kind of a failure; never shown to a judge"]
+    served_model: Annotated[str | None, "what the provider says answered"]
+    prompt_tokens: shared.Tokens
+    completion_tokens: shared.Tokens
+    reasoning_tokens: shared.Tokens
+    cost_usd: Annotated[
+        float | None,
+        "dollars, with the worst case of attempts that may be billed; null where the price is unknown",
+    ]
+    latency_s: Annotated[float, "seconds of the last attempt"]
+    attempts: Annotated[int, "calls made for this row"]
+    request_key: shared.LedgerKey
+    epoch: shared.Epoch
+    created_at: shared.AskedAt
+    benchmark_version: shared.BenchmarkVersion
+
+
+RESPONSES = Table(
+    "responses",
+    ResponseRow,
+    partition_by=("dataset", "model", "regime", "run"),
+    key=("item_id", "model", "regime", "run"),
+)

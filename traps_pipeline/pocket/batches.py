@@ -1,0 +1,241 @@
+"""What the pocket model is trained on: scenes, the questions about their clips, and batches of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.pocket.data import Question, SceneRecord, read_shards
+from traps_pipeline.pocket.model import PATCH
+from traps_pipeline.pocket.recipe import Recipe, Training
+from traps_pipeline.pocket.words import COLUMNS, PROMPTS, ROWS, place_question, prompt_text, say
+from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.storage.media import pick
+
+if TYPE_CHECKING:
+    import torch
+
+IGNORED = -100
+NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple", "white", "black")
+SEEN_PX = 5  # of a token's 256; the smallest ball has a dozen
+_QUESTION = "{question}"  # stands for the questions in the chat
+
+
+@dataclass(frozen=True)
+class Look:
+    """One clip and the questions that are asked about it. side: 0 control, 1 void."""
+
+    scene: int
+    side: int
+    questions: tuple[Question, ...]
+
+
+class Scenes:
+    """All training scenes: their records, and their frames on disk."""
+
+    def __init__(self, recipe: Recipe, folder: Path) -> None:
+        self.records: list[SceneRecord] = []
+        self._frames: list[np.ndarray] = []
+        self._place: list[tuple[int, int]] = []
+        self._spec = recipe.media
+        for shard, (job, records) in enumerate(read_shards(recipe, "train", folder)):
+            self._frames.append(np.load(job.pixels, mmap_mode="r", allow_pickle=False))
+            self._place += [(shard, i) for i in range(len(records))]
+            self.records += records
+
+    def frames(self, scene: int, side: int) -> np.ndarray:
+        """Frames of a clip, uint8 (N, H, W, 3)."""
+        shard, place = self._place[scene]
+        return self._frames[shard][place, side]
+
+    def times(self, scene: int, side: int) -> list[float]:
+        """Seconds into the clip of each frame."""
+        record = self.records[scene]
+        physics = get_family(record.family).physics
+        length = record.cut_frame if side and record.cut_frame is not None else physics.n_frames
+        every = np.arange(length) / physics.fps
+        return every[pick(every, self._spec)].tolist()
+
+    def look(self, rng: np.random.Generator, void_share: float) -> Look:
+        """A random clip with what was asked, one more question that it answers or does not, and where its ball is."""
+        scene, side = int(rng.integers(len(self.records))), int(rng.random() < void_share)
+        record = self.records[scene]
+        if side:
+            where = () if record.cut_frame is None else _where(record, "cut")
+            return Look(scene, side, (record.visual, record.answerable, *where))
+        other = record.ill_posed if rng.random() < 0.5 else record.answerable
+        return Look(scene, side, (record.asked, other, *_where(record, "last")))
+
+
+def _where(record: SceneRecord, frame: str) -> tuple[Question, Question]:
+    """The column and the row of the ball at the end of a clip."""
+    place = record.places[frame]
+    return Question(*place_question(record.ball, place, 0)), Question(*place_question(record.ball, place, 1))
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What one step reads. All rows have one system prompt, `head` (P,), which is computed once.
+
+    A row is a clip and, side by side after it, its questions with their answers, none of which sees another:
+    ids, labels (B, S) with IGNORED outside the answers; sees (B, 1, S, P + S) bool; positions (3, B, P + S).
+    names: what names every token of the clips, as in `names_of`.
+    """
+
+    head: torch.Tensor
+    ids: torch.Tensor
+    labels: torch.Tensor
+    sees: torch.Tensor
+    positions: torch.Tensor
+    pixels: torch.Tensor
+    grid: torch.Tensor
+    names: torch.Tensor
+
+
+class Batches:
+    """Batches by number; the n-th depends on the seed and n alone."""
+
+    def __init__(self, scenes: Scenes, model: Any, processor: Any, training: Training, seed: int) -> None:
+        self._scenes, self._processor, self._training, self._seed = scenes, processor, training, seed
+        self._rope_index = model.model.get_rope_index
+        video = processor.video_processor
+        self._mean, self._std = np.float32(video.image_mean), np.float32(video.image_std)
+
+    def __getitem__(self, step: int) -> Batch:
+        rng = np.random.default_rng([self._seed, step])
+        prompt_name = PROMPTS[int(rng.integers(len(PROMPTS)))]
+        looks = [self._scenes.look(rng, self._training.void_share) for _ in range(self._training.batch)]
+        frames = np.stack([self._scenes.frames(look.scene, look.side) for look in looks])
+        return self.make(looks, prompt_name, augmented(frames, self._training.brightness, rng))
+
+    def make(self, looks: Sequence[Look], prompt_name: str, frames: np.ndarray) -> Batch:
+        """The batch of some clips, frames (B, N, H, W, 3) uint8, under one of PROMPTS."""
+        import torch
+
+        grid = (frames.shape[1] // 2, frames.shape[2] // PATCH, frames.shape[3] // PATCH)
+        pieces = [self._pieces(look, prompt_name, grid) for look in looks]
+        head = self._ids(pieces[0][0])
+        clips = [self._ids(clip) for _, clip, _ in pieces]
+        talks = [[(self._ids(asked), self._ids(said)) for asked, said in questions] for _, _, questions in pieces]
+        grids = torch.tensor([grid] * len(looks))
+        values = (torch.from_numpy(frames).float() / 255 - torch.from_numpy(self._mean)) / torch.from_numpy(self._std)
+        rows = self._rows(head, clips, talks, grids)
+        return Batch(
+            torch.tensor(head),
+            *rows,
+            pixels=patches(values.permute(0, 1, 4, 2, 3)),
+            grid=grids,
+            names=names_of(frames),
+        )
+
+    def _pieces(
+        self, look: Look, prompt_name: str, grid: tuple[int, int, int]
+    ) -> tuple[str, str, list[tuple[str, str]]]:
+        """The chat as the processor writes it, cut in pieces: the system's part, the clip with its time stamps and
+        places for its tokens, and for each question its words with the beginning of the answer, and the answer."""
+        processor, token = self._processor, self._processor.video_token
+        times = self._scenes.times(look.scene, look.side)
+        clip = "".join(
+            f"<{(first + last) / 2:.1f} seconds>{processor.vision_start_token}"
+            f"{token * (grid[1] * grid[2] // 4)}{processor.vision_end_token}"
+            for first, last in zip(times[::2], times[1::2], strict=True)
+        )
+        messages = [
+            {"role": "system", "content": [{"type": "text", "text": prompt_text(prompt_name)}]},
+            {"role": "user", "content": [{"type": "video"}, {"type": "text", "text": _QUESTION}]},
+        ]
+        chat = processor.apply_chat_template(messages, tokenize=False, add_generation_prompt=True)
+        head, user, rest = chat.partition(f"{processor.tokenizer.start_token}user")
+        before, after = rest.replace(token, clip).split(_QUESTION)
+        end = processor.tokenizer.eos_token
+        questions = [(q.question + after, say(q.answer, prompt_name) + end) for q in look.questions]
+        return head, user + before, questions
+
+    def _ids(self, text: str) -> list[int]:
+        return self._processor.tokenizer(text, add_special_tokens=False)["input_ids"]
+
+    def _rows(
+        self,
+        head: list[int],
+        clips: list[list[int]],
+        talks: list[list[tuple[list[int], list[int]]]],
+        grids: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """ids, labels, sees and positions of `Batch`."""
+        import torch
+
+        longest = max(
+            len(clip) + sum(len(asked) + len(said) for asked, said in talk)
+            for clip, talk in zip(clips, talks, strict=True)
+        )
+        ids = torch.full((len(clips), longest), self._processor.tokenizer.pad_token_id)
+        labels, part = torch.full_like(ids, IGNORED), torch.full_like(ids, -1)
+        positions = torch.zeros(3, len(clips), len(head) + longest, dtype=torch.long)
+        for i, (clip, talk) in enumerate(zip(clips, talks, strict=True)):
+            known = torch.tensor([head + clip])
+            kinds = (known == self._processor.video_token_id).int() * 2  # 2: video, as the library counts modalities
+            placed, _ = self._rope_index(known, kinds, video_grid_thw=grids[i : i + 1])
+            at, free = len(clip), int(placed.max()) + 1
+            ids[i, :at], part[i, :at] = torch.tensor(clip), 0
+            positions[:, i, : len(head) + at] = placed[:, 0]
+            for number, (asked, said) in enumerate(talk, start=1):
+                end = at + len(asked) + len(said)
+                ids[i, at:end], part[i, at:end] = torch.tensor(asked + said), number
+                labels[i, at + len(asked) : end] = torch.tensor(said)
+                positions[:, i, len(head) + at : len(head) + end] = torch.arange(free, free + end - at)
+                at = end
+        own = (part[:, :, None] == part[:, None, :]) | (part == 0)[:, None, :]
+        own = own & torch.ones(longest, longest, dtype=torch.bool).tril()
+        sees = torch.cat([torch.ones(len(clips), longest, len(head), dtype=torch.bool), own], dim=2)
+        return ids, labels, sees[:, None], positions
+
+
+def patches(frames: torch.Tensor) -> torch.Tensor:
+    """Frames (B, N, 3, H, W) as the class reads them: a row for each patch of two frames, merged ones together."""
+    batch, count, channels, height, width = frames.shape
+    rows, columns = height // PATCH, width // PATCH
+    split = frames.view(batch, count // 2, 2, channels, rows // 2, 2, PATCH, columns // 2, 2, PATCH)
+    split = split.permute(0, 1, 4, 7, 5, 8, 3, 2, 6, 9)
+    return split.reshape(batch * count // 2 * rows * columns, channels * 2 * PATCH * PATCH)
+
+
+def names_of(frames: np.ndarray) -> torch.Tensor:
+    """For every token of the clips (B, N, H, W, 3), in their order: which words name its square of the later of its two
+    frames. Shape (tokens, words), 0 or 1, float32: the colours that have a few pixels there, its column, its row."""
+    import torch
+
+    from traps_pipeline.scenes.vision import colour_mask
+
+    later, square = frames[:, 1::2], 2 * PATCH
+    slots, rows, columns = len(frames) * later.shape[1], frames.shape[2] // square, frames.shape[3] // square
+    tall = later.reshape(-1, frames.shape[3], 3)
+    cells = (slots * rows, square, columns, square)
+    seen = [colour_mask(tall, colour).reshape(cells).sum(axis=(1, 3)) >= SEEN_PX for colour in NAMED]
+    colours = np.stack(seen, axis=-1).reshape(slots, rows, columns, len(NAMED))
+    column = np.eye(len(COLUMNS))[np.arange(columns) * len(COLUMNS) // columns]
+    row = np.eye(len(ROWS))[np.arange(rows) * len(ROWS) // rows]
+    places = [
+        np.broadcast_to(column, (slots, rows, *column.shape)),
+        np.broadcast_to(row[:, None], (slots, rows, columns, len(ROWS))),
+    ]
+    named = np.concatenate([colours, *places], axis=-1)
+    return torch.from_numpy(named.reshape(-1, named.shape[-1]).astype(np.float32))
+
+
+def name_tokens(tokenizer: Any) -> torch.Tensor:
+    """Token ids of the words of `names_of`: colours as questions have them, columns and rows as answers have them. The
+    first piece of a word that is no token, which happens with a few scenes only."""
+    import torch
+
+    words = [*(f" {colour}" for colour in NAMED), *COLUMNS, *ROWS]
+    return torch.tensor([tokenizer.encode(word, add_special_tokens=False)[0] for word in words])
+
+
+def augmented(frames: np.ndarray, brightness: float, rng: np.random.Generator) -> np.ndarray:
+    """Frames (B, N, H, W, 3) uint8, each clip brighter or darker as a whole by up to a share."""
+    gains = (1 + brightness * rng.uniform(-1, 1, (len(frames), 1, 1, 1, 1))).astype(np.float32)
+    return np.minimum(frames * gains, 255).astype(np.uint8)

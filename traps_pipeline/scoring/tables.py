@@ -1,0 +1,231 @@
+"""The tables of figures: metrics of cells, comparisons, the leaderboard."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from traps_pipeline.storage import columns as shared
+from traps_pipeline.storage.tables import Table
+
+Mean = Annotated[float | None, "mean over runs"]
+Deviation = Annotated[float | None, "population standard deviation over runs"]
+Bootstrap = Annotated[float | None, "95 % percentile interval, cluster bootstrap over scenarios"]
+Refused = Annotated[str | None, "why the two may not be compared"]
+DatasetOrOverall = Annotated[str, "one of four, or overall"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricsRow:
+    """A cell: one model, regime and run on one scope of a dataset."""
+
+    dataset: shared.CellDataset
+    model: shared.Model
+    regime: shared.Regime
+    run: shared.Run
+    scope: Annotated[str, "all, category:.., sub_scenario:.. or label:.. (the control's answer)"]
+    n_pairs: Annotated[int, "pairs in scope"]
+    n_missing: Annotated[int, "items (of 2 n_pairs) without an answer or a majority"]
+    n_refused: Annotated[int, "items refused"]
+    n_empty: Annotated[int, "items answered with no text"]
+    n_errors: Annotated[int, "items whose call failed"]
+    n_answered: Annotated[int, "items answered with a text, whole or truncated"]
+    acc: Annotated[float | None, "share of decided controls answered correctly"]
+    abs_rec: Annotated[float | None, "share of decided voids abstained on"]
+    false_abs: Annotated[float | None, "share of decided controls abstained on"]
+    j: Annotated[float | None, "abs_rec - false_abs"]
+    pecs: Annotated[float | None, "acc x max(0, j)"]
+    pecs_low: Annotated[float, "pecs if every missing decision were as bad for the model as can be, of all pairs"]
+    pecs_high: Annotated[float, "pecs if every missing decision were as good for the model as can be, of all pairs"]
+    naive: Annotated[float | None, "acc x abs_rec"]
+    n_acc: Annotated[int, "controls decided on correctness: what acc is a share of"]
+    n_false_abs: Annotated[int, "controls decided on abstention"]
+    n_abs_rec: Annotated[int, "voids decided on abstention"]
+    acc_low: Annotated[float | None, "95 % Wilson interval of this run alone, which takes its pairs for independent"]
+    acc_high: shared.Wilson
+    false_abs_low: shared.Wilson
+    false_abs_high: shared.Wilson
+    abs_rec_low: shared.Wilson
+    abs_rec_high: shared.Wilson
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+
+
+METRICS = Table("metrics", MetricsRow, partition_by=("dataset",), key=("dataset", "model", "regime", "run", "scope"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContrastRow:
+    """A paired comparison of two entries of the leaderboard on one figure: two models, or two regimes of one model."""
+
+    kind: Annotated[str, "models (of one regime) or regimes (of one model)"]
+    dataset: DatasetOrOverall
+    figure: Annotated[str, "pecs or j"]
+    left_model: shared.Model
+    left_regime: shared.Regime
+    right_model: shared.Model
+    right_regime: shared.Regime
+    difference: Annotated[float | None, "left minus right, means over runs; null where refused"]
+    ci_low: Annotated[
+        float | None,
+        "95 % percentile interval of the paired difference, cluster bootstrap over scenarios",
+    ]
+    ci_high: Annotated[float | None, "95 % percentile interval of the paired difference"]
+    p: Annotated[
+        float | None,
+        "two-sided, from the share of resamples on either side of 0; where none lies beyond it, from a normal tail",
+    ]
+    p_holm: Annotated[
+        float | None,
+        "corrected by Holm over the rows of the same kind, dataset and figure (and regime, of models)",
+    ]
+    separable: Annotated[bool, "whether p_holm is below 0.05"]
+    refused: Refused
+
+
+CONTRASTS = Table(
+    "contrasts",
+    ContrastRow,
+    partition_by=(),
+    key=("kind", "dataset", "figure", "left_model", "left_regime", "right_model", "right_regime"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegimeTestRow:
+    """A McNemar test of two regimes on the same items: one decision of one model in one run of a dataset."""
+
+    dataset: shared.Dataset
+    model: shared.Model
+    run: shared.Run
+    decision: Annotated[str, "void_abstention, control_abstention or correctness"]
+    left_regime: shared.Regime
+    right_regime: shared.Regime
+    n: Annotated[int, "items decided under both"]
+    only_left: Annotated[int, "items with a yes (abstained, correct) under the left regime alone"]
+    only_right: Annotated[int, "items with a yes under the right regime alone"]
+    p: Annotated[float | None, "exact two-sided binomial test of only_left against only_right; null where refused"]
+    p_holm: Annotated[float | None, "corrected by Holm over the rows of the same dataset, decision and regimes"]
+    refused: Refused
+
+
+REGIME_TESTS = Table(
+    "regime_tests",
+    RegimeTestRow,
+    partition_by=(),
+    key=("dataset", "model", "run", "decision", "left_regime", "right_regime"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeaderboardRow:
+    """A model under a regime on one dataset, or overall (equal-weight mean over the four)."""
+
+    model: shared.Model
+    regime: shared.Regime
+    dataset: DatasetOrOverall
+    n_runs: Annotated[int, "runs averaged"]
+    n_pairs: Annotated[int, "pairs a run"]
+    n_missing: Annotated[int, "items without an answer or a majority, over runs"]
+    n_refused: Annotated[int, "items refused, over runs"]
+    n_empty: Annotated[int, "items answered with no text, over runs"]
+    n_errors: Annotated[int, "items whose call failed, over runs"]
+    answered: Annotated[float, "share of items (2 a pair and run) answered with a text, whole or truncated"]
+    incomplete: Annotated[bool, "whether answered is below 0.99, on overall that of any of its datasets"]
+    acc: Mean
+    acc_std: Deviation
+    abs_rec: Mean
+    abs_rec_std: Deviation
+    false_abs: Mean
+    false_abs_std: Deviation
+    j: Annotated[float | None, "mean over runs, not clipped"]
+    j_std: Deviation
+    pecs: Annotated[float | None, "mean over runs of the per-run PECS"]
+    pecs_std: Deviation
+    acc_ci_low: Bootstrap
+    acc_ci_high: Bootstrap
+    abs_rec_ci_low: Bootstrap
+    abs_rec_ci_high: Bootstrap
+    false_abs_ci_low: Bootstrap
+    false_abs_ci_high: Bootstrap
+    j_ci_low: Bootstrap
+    j_ci_high: Bootstrap
+    pecs_ci_low: Bootstrap
+    pecs_ci_high: Bootstrap
+    rank: Annotated[int | None, "by PECS among the models of this regime and dataset, equal ones alike"]
+    rank_low: Annotated[
+        int | None,
+        "1 + models whose PECS is higher, by a paired contrast that Holm's correction keeps",
+    ]
+    rank_high: Annotated[
+        int | None,
+        "models less those whose PECS is lower by such a contrast: ranks in between are not separable",
+    ]
+    pecs_low: Annotated[float, "mean over runs: pecs if every missing decision were as bad for the model as can be"]
+    pecs_high: Annotated[float, "mean over runs: pecs if every missing decision were as good for the model as can be"]
+    naive: Annotated[float | None, "acc x abs_rec, mean over runs"]
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+
+
+LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model", "regime", "dataset"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeaveOneOutRow:
+    """A model under a regime on one dataset, or overall, as two of the three judges score it; 1-1 is undecided."""
+
+    model: shared.Model
+    regime: shared.Regime
+    dataset: Annotated[str, "one of four, or overall (equal-weight mean over the four)"]
+    without: Annotated[str, "the judge left out"]
+    n_runs: Annotated[int, "runs averaged"]
+    n_pairs: Annotated[int, "pairs a run"]
+    n_missing: Annotated[int, "items without an answer or a majority of the two, over runs"]
+    n_missing_panel: Annotated[int, "items without an answer or a majority of the three, over runs"]
+    pecs: Annotated[float | None, "mean over runs of the per-run PECS of the two judges"]
+    pecs_panel: Annotated[float | None, "mean over runs of the per-run PECS of the three judges"]
+    difference: Annotated[float | None, "pecs - pecs_panel"]
+    pecs_low: Annotated[
+        float,
+        "mean over runs: pecs of the two if every missing decision were as bad for the model as can be",
+    ]
+    pecs_high: Annotated[
+        float,
+        "mean over runs: pecs of the two if every missing decision were as good for the model as can be",
+    ]
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+
+
+LEAVE_ONE_OUT = Table("leave_one_out", LeaveOneOutRow, partition_by=(), key=("model", "regime", "dataset", "without"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrevalenceRow:
+    """How often each axis applies to one model's sampled void failures; no row means not run."""
+
+    model: shared.Model
+    evidence: Annotated[str, "trace_and_output or output: what went in; both joined by + where traces were missing"]
+    judge: shared.Judge
+    n_failures: Annotated[int, "void failures that the sample was drawn from"]
+    n_sampled: Annotated[int, "failures put to the judge"]
+    n: Annotated[int, "of these, validly labelled: every share is of n"]
+    hp: Annotated[float | None, "share with a hallucinated premise"]
+    hp_low: shared.Wilson
+    hp_high: shared.Wilson
+    ii: Annotated[float | None, "share with an invalid inference"]
+    ii_low: shared.Wilson
+    ii_high: shared.Wilson
+    hp_and_ii: Annotated[float | None, "share with both"]
+    hp_and_ii_low: shared.Wilson
+    hp_and_ii_high: shared.Wilson
+    es: Annotated[float | None, "share with epistemic surrender"]
+    es_low: shared.Wilson
+    es_high: shared.Wilson
+    doubt: Annotated[float | None, "share with doubt in the reasoning"]
+    doubt_low: shared.Wilson
+    doubt_high: shared.Wilson
+    epoch: Annotated[str, "campaigns of the answers and labels, joined by +"]
+    benchmark_version: shared.BenchmarkVersion
+
+
+CONFABULATION_PREVALENCE = Table("confabulation_prevalence", PrevalenceRow, partition_by=(), key=("model",))

@@ -1,0 +1,31 @@
+"""Columns that tables of several packages share: a type with its meaning in words, said once."""
+
+from datetime import datetime
+from typing import Annotated
+
+ScenarioId = Annotated[str, "family and number"]
+ItemId = Annotated[str, "dataset:scenario_id:side"]
+PairId = Annotated[str, "dataset:scenario_id"]
+Dataset = Annotated[str, "one of four"]
+CellDataset = Annotated[str, "occlusion, occlusion_ill_posed, chaotic or chaotic_ill_posed"]
+Category = Annotated[str, "one of twelve"]
+SubScenario = Annotated[str, "the paper's name where it has one"]
+Side = Annotated[str, "control or void"]
+Question = Annotated[str, "with its choices"]
+ClipPath = Annotated[str, "mp4, relative to the workspace"]
+MediaDigest = Annotated[str, "digest of the clip's file"]
+Model = Annotated[str, "id in assets/models.yaml"]
+Regime = Annotated[str, "standard, guided or json"]
+Run = Annotated[int, "independent repetition, from 1"]
+Outcome = Annotated[str, "answer, truncated, empty, refused or error"]
+Tokens = Annotated[int | None, "tokens"]
+LedgerKey = Annotated[str, "ledger key"]
+Judge = Annotated[str, "id in assets/judges.yaml"]
+Epoch = Annotated[str, "campaign in which it was asked"]
+AnswerEpochs = Annotated[str, "campaigns of the answers, joined by +"]
+AskedAt = Annotated[datetime, "when it was asked"]
+Wilson = Annotated[float | None, "95 % Wilson interval"]
+BenchmarkVersion = Annotated[
+    str,
+    "of the part of the benchmark that this row is from: release, or release+digest once corrected",
+]

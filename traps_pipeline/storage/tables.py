@@ -1,0 +1,112 @@
+"""What a table is: an annotated frozen dataclass, of which one value is one row.
+
+    @dataclass(frozen=True, kw_only=True)
+    class VideoRow:
+        '''A clip.'''
+
+        scenario_id: shared.ScenarioId
+        side: Annotated[str, "control or void"]
+        duration_s: Annotated[float, "n_frames / fps"]
+
+    VIDEOS = Table("videos", VideoRow, partition_by=(), key=("scenario_id", "side"))
+
+Each annotation gives a column's type and, in words, its meaning and unit; `| None` lets values be missing. The columns
+keep the order of the fields. Each package declares its tables in its own module `tables`; columns that several packages
+share are in `storage.columns`. The Arrow schema is made from the dataclass, and every file is checked against it on
+writing and on reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from datetime import datetime
+from functools import cached_property
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar, get_args, get_origin, get_type_hints
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Row = TypeVar("Row")
+
+# Columns of which two runs of the same study may differ; they take no part in data versions.
+VOLATILE = ("created_at", "latency_s", "attempts")
+TYPES: tuple[Any, ...] = (str, int, float, bool, datetime, list[str])
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column: its name, its type (one of TYPES), whether values may be missing, its meaning and unit in words."""
+
+    name: str
+    type: Any
+    nullable: bool
+    doc: str
+
+    @property
+    def type_name(self) -> str:
+        """The type as one writes it: str, list[str], datetime."""
+        return str(self.type) if get_origin(self.type) else self.type.__name__
+
+
+@dataclass(frozen=True)
+class Table(Generic[Row]):
+    """A table's contract: its name, the dataclass of its rows, the columns that partition it, its key.
+
+    Layout: `tables/<table>/<partition column>=<value>/.../part-0.parquet`. Partition columns are stored in the file
+    too, so that one file explains itself. Raises ValueError for a key or partition column that the dataclass lacks.
+    """
+
+    name: str
+    row_type: type[Row]
+    partition_by: tuple[str, ...]
+    key: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        strangers = {*self.partition_by, *self.key} - {field.name for field in fields(self.row_type)}  # pyright: ignore[reportArgumentType] - a dataclass
+        if strangers:
+            raise ValueError(
+                f"table {self.name}: {self.row_type.__name__} has no column {', '.join(sorted(strangers))}"
+            )
+
+    @property
+    def row(self) -> str:
+        """What one row is, in words: the dataclass's docstring."""
+        words = " ".join((self.row_type.__doc__ or "").split()).removesuffix(".")
+        return words[:1].lower() + words[1:]
+
+    @cached_property
+    def columns(self) -> tuple[Column, ...]:
+        """The columns in the order of the fields. Raises TypeError for an annotation that says no column."""
+        return tuple(_columns(self.row_type))
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the columns."""
+        return [column.name for column in self.columns]
+
+    def arrow_schema(self) -> pa.Schema:
+        """The schema that a written file has."""
+        import pyarrow as pa
+
+        arrow = (pa.string(), pa.int64(), pa.float64(), pa.bool_(), pa.timestamp("us", tz="UTC"), pa.list_(pa.string()))
+        return pa.schema(
+            [
+                pa.field(c.name, arrow[TYPES.index(c.type)], nullable=c.nullable, metadata={"doc": c.doc})
+                for c in self.columns
+            ]
+        )
+
+
+def _columns(row_type: type[Any]) -> Iterator[Column]:
+    for name, annotation in get_type_hints(row_type, include_extras=True).items():
+        if get_origin(annotation) is not Annotated:
+            raise TypeError(f"{row_type.__name__}.{name}: write Annotated[type, meaning and unit in words]")
+        values, doc, *_ = get_args(annotation)
+        members = get_args(values) if isinstance(values, UnionType) else (values,)
+        types = [member for member in members if member is not NoneType]
+        if len(types) != 1 or types[0] not in TYPES or not isinstance(doc, str):
+            known = ", ".join(map(str, TYPES))
+            raise TypeError(f"{row_type.__name__}.{name}: a column holds one of {known}, or None, and has a text")
+        yield Column(name, types[0], NoneType in members, doc)
