@@ -147,7 +147,7 @@ def test_a_hidden_element_that_follows_what_is_seen_is_refused_before_anything_i
         "plank_post",
         seen=("seen_m: float = between(0.30, 0.40)", f"seen_m: float = {drawn}"),
         names=("import apart,", "import drawn_by, apart,"),
-        kit=("import Physics, Scene", "import Physics, Scene, uniform"),
+        kit=("import Motion, Physics, Scene", "import Motion, Physics, Scene, uniform"),
     )
     message = (
         r"families/plank_post\.py: the hidden element .* `post_in_way` goes with `seen_m`; draw it from nothing but"
