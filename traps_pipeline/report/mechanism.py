@@ -101,4 +101,4 @@ def _steered(rows: pd.DataFrame) -> list[int]:
 
 
 def _as(table: Table, parts: list[pd.DataFrame]) -> pd.DataFrame:
-    return pd.concat(parts, ignore_index=True).reindex(columns=pd.Index([c.name for c in table.columns]))
+    return pd.concat(parts, ignore_index=True).reindex(columns=pd.Index(table.names))

@@ -88,7 +88,7 @@ def _labels(results: Results) -> pd.DataFrame:
 def _agreement(results: Results) -> pd.DataFrame:
     rows = published("judge_agreement")
     table = rows[["dataset", "task", "fleiss_kappa"]].assign(judges="panel", agreement=rows["unanimous_pct"] / 100)
-    return table.reindex(columns=pd.Index([c.name for c in AGREEMENT.columns])).assign(epoch="not stated")
+    return table.reindex(columns=pd.Index(AGREEMENT.names)).assign(epoch="not stated")
 
 
 def _confabulation(results: Results) -> pd.DataFrame:

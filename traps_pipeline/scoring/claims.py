@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import pandas as pd
 
@@ -83,7 +82,7 @@ def _spread(models: Sequence[str]) -> Recomputed:
     )
 
 
-def _other_spreads(cells: pd.DataFrame) -> Iterator[tuple[str, Any]]:
+def _other_spreads(cells: pd.DataFrame) -> Iterator[tuple[str, pd.Series]]:
     for share in ("acc", "abs_rec", "false_abs"):
         yield share, spread(cells, f"{share}_std").iloc[0]
 
