@@ -120,15 +120,15 @@ def test_the_cap_holds_and_the_next_run_goes_on(unasked: Checkout, provider: Pro
     provider.configure(latency_s=0.05)
     register(unasked, provider, entry("image-model", "images").replace("limits: {", "limits: {concurrency: 200, "))
     path = experiment(unasked, ["image-model"])
-    first = ask(unasked, path, "--budget-usd", "1.0")
+    first = ask(unasked, path, "--budget-usd", "0.4")  # all answers cost about $0.70
     assert first.code == 4, first.err
     assert "the budget of the study is reached" in first.err
     spent = sum(row["cost_usd"] for row in settled(unasked))
-    assert 0 < spent <= 1.0
+    assert 0 < spent <= 0.4
     assert provider.stats()["answered_in_full"] == len(settled(unasked))
     again = ask(unasked, path)  # spend survives restarts
     assert again.code == 4
-    assert sum(row["cost_usd"] for row in settled(unasked)) <= 1.0
+    assert sum(row["cost_usd"] for row in settled(unasked)) <= 0.4
     more = ask(unasked, path, "--budget-usd", "100")
     assert more.code == 0, more.err
     assert provider.stats()["answered_in_full"] == len(settled(unasked)) == 2 * ITEMS
@@ -159,8 +159,9 @@ def test_a_model_that_only_fails_is_stopped_and_the_others_go_on(unasked: Checko
     assert finished.code == 1
     assert "locked-out is stopped: 20 refusals in a row (http_401)" in finished.err
     assert SECRET not in finished.out + finished.err
-    assert len(responses(unasked)) == 2 * ITEMS
-    assert {row["model"] for row in responses(unasked)} == {"image-model"}
+    answered = [row for row in responses(unasked) if row["outcome"] != "error"]
+    assert len(answered) == 2 * ITEMS
+    assert {row["model"] for row in answered} == {"image-model"}
     # 20 in a row, those in flight then, and no more; in no later batch either.
     assert provider.stats()["by_status"]["401"] < 20 + 24
     assert finished.err.count("locked-out is stopped") == 1
