@@ -329,12 +329,15 @@ def figure_style() -> Iterator[None]:
         yield
 
 
-def new_figure(width: float, height: float, dpi: float | None = None) -> Figure:
-    """An empty figure (inches) with a canvas of its own and constrained layout; draw inside `figure_style`."""
+def new_figure(
+    width: float, height: float, dpi: float | None = None, layout: Literal["constrained", "none"] = "constrained"
+) -> Figure:
+    """An empty figure (inches) with a canvas of its own; draw inside `figure_style`. layout: "none" leaves all where
+    it is placed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+    figure = Figure(figsize=(width, height), dpi=dpi, layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
@@ -355,10 +358,10 @@ def not_run_figure(what: str, why: str, width: float = COLUMN_IN) -> Figure:
 
 
 def freeze_layout(figure: Figure) -> None:
-    """Run the layout engine once and switch it off: it would move things again, differently, on every save."""
+    """Run the layout engine once and take it away: it would move things again, differently, on every save."""
     with figure_style():
-        figure.canvas.draw()
-    figure.set_layout_engine("none")
+        figure.draw_without_rendering()
+        figure.set_layout_engine(None)  # "none" would leave a placeholder, for which each save draws everything twice
 
 
 def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
