@@ -1,15 +1,14 @@
-"""Dagster's own SQLite history, in Dagster's own files, at a third less cost an event.
+"""Dagster's own SQLite history, in Dagster's own files, at a fraction of the cost of an event.
 
-Dagster makes a new SQLAlchemy engine for every event, so that each statement is compiled anew. Here an engine is kept
-for each file, and a commit does not wait for the disk: a power cut may take the last events, never the history, and
-what counts (versions, inputs) stands in the tables' footers. `dagster.yaml` names this class; a study may name another
-storage.
+For each event Dagster makes a SQLAlchemy engine, which compiles its statements anew, and opens and closes the file,
+which writes SQLite's log back to it. Here engine and connection of a file are kept, and a commit does not wait for the
+disk: a power cut may take the last events, never the history; what counts (versions, inputs) stands in the tables'
+footers. `dagster.yaml` names this class; a study may name another storage in its own.
 """
 
 import contextlib
 from collections.abc import Iterator
-from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 import sqlalchemy as db
 from dagster._core.storage.event_log.sqlite.sqlite_event_log import SqliteEventLogStorage
@@ -18,33 +17,52 @@ from dagster._core.storage.sqlite import SQLITE_BUSY_TIMEOUT_SECONDS
 from dagster._core.storage.sqlite_storage import DagsterSqliteStorage
 from sqlalchemy.event import listen
 
+FILES = 32  # kept open at most: each run has a file of its own, and a server sees many
 
-@lru_cache(maxsize=64)  # a file a run: a server sees many
-def _engine(address: str) -> db.Engine:
-    """The engine of a file, which opens it for each use: no connection outlives a fork or holds a deleted file."""
-    engine = db.create_engine(
-        address, poolclass=db.pool.NullPool, connect_args={"timeout": SQLITE_BUSY_TIMEOUT_SECONDS}
-    )
-    listen(engine, "connect", lambda connection, _: connection.execute("PRAGMA synchronous=NORMAL"))
-    return engine
+
+class _Engines(dict[str, db.Engine]):
+    """The engine of each file."""
+
+    def __missing__(self, address: str) -> db.Engine:
+        if len(self) >= FILES:
+            self.pop(next(iter(self))).dispose()
+        engine = db.create_engine(address, connect_args={"timeout": SQLITE_BUSY_TIMEOUT_SECONDS})
+        listen(engine, "connect", lambda connection, _: connection.execute("PRAGMA synchronous=NORMAL"))
+        self[address] = engine
+        return engine
+
+    def dispose(self) -> None:
+        """Close all files."""
+        while self:
+            self.popitem()[1].dispose()
 
 
 class _Events(SqliteEventLogStorage):
+    def __init__(self, base_dir: str) -> None:
+        self.engines = _Engines()
+        super().__init__(base_dir)
+
     @contextlib.contextmanager
     def _connect(self, shard: str) -> Iterator[db.Connection]:
         with self._db_lock:
-            engine = _engine(self.conn_string_for_shard(shard))
+            engine = self.engines[self.conn_string_for_shard(shard)]
             if shard not in self._initialized_dbs:
                 self._initdb(engine)
                 self._initialized_dbs.add(shard)
             with engine.begin() as connection:
                 yield connection
 
+    def dispose(self) -> None:
+        super().dispose()
+        self.engines.dispose()
+
 
 class _Runs(SqliteRunStorage):
+    engines: _Engines
+
     @contextlib.contextmanager
     def connect(self) -> Iterator[db.Connection]:
-        with _engine(self._conn_string).begin() as connection:
+        with self.engines[self._conn_string].begin() as connection:
             yield connection
 
 
@@ -53,8 +71,10 @@ class SqliteHistory(DagsterSqliteStorage):
 
     def __init__(self, base_dir: str, inst_data: Any = None) -> None:
         super().__init__(base_dir, inst_data)
-        self._event_log_storage = _Events(self._event_log_storage._base_dir)
-        self._run_storage = _Runs(self._run_storage._conn_string)
+        theirs = cast(SqliteEventLogStorage, self._event_log_storage), cast(SqliteRunStorage, self._run_storage)
+        self._event_log_storage = _Events(theirs[0]._base_dir)
+        self._run_storage = _Runs(theirs[1]._conn_string)
+        self._run_storage.engines = self._event_log_storage.engines
 
     @classmethod
     def from_config_value(cls, inst_data: Any, config_value: Any) -> "SqliteHistory":
