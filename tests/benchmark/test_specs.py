@@ -51,6 +51,7 @@ def test_another_colour_brings_the_words_for_it(workspace: Workspace) -> None:
     assert old not in spec.question
 
 
+@pytest.mark.slow  # resolves a scene
 def test_words_corrected_later_find_the_scene_that_was_simulated(workspace: Workspace) -> None:
     azimuth = load_released()["hidden_race-0001"].params["azimuth_deg"] + 2.0
     scene = {"scenario_id": "hidden_race-0001", "params": {"azimuth_deg": azimuth}}
@@ -63,6 +64,7 @@ def test_words_corrected_later_find_the_scene_that_was_simulated(workspace: Work
     assert {path: path.stat().st_mtime_ns for path in workspace.trajectories.iterdir()} == simulated
 
 
+@pytest.mark.slow  # resolves a scene
 def test_an_answer_that_the_simulation_contradicts_is_refused(workspace: Workspace) -> None:
     released = load_released()["domino_chain-0001"]
     wrong = next(label for label in released.labels if label != released.ground_truth)

@@ -71,7 +71,7 @@ def test_a_corrected_question_asks_its_three_items_again(study: Checkout) -> Non
     before = len(study.ledger_rows("answers")), len(study.ledger_rows("votes"))
     question = "Is the hindmost domino lying down when the clip ends, yes or no?"
     study.correct("domino_chain-0001", question=question)
-    run = study.traps("run", EXPERIMENT)
+    run = study.score(EXPERIMENT)
     assert run.code == 0, run.err
     # Asked: control and void of `occlusion`, control of `occlusion_ill_posed`. Votes: three judges on abstention for
     # each, and on correctness for the two controls.
@@ -199,7 +199,7 @@ def test_an_added_scenario_joins_and_a_copy_is_told_by_every_run_until_it_is_gon
     shutil.copytree(demo.workspace / "clips", study.workspace / "clips")
     whole = whole_benchmark(study, tmp_path)
     for _ in range(2):  # the second run finds everything fresh, and still says so
-        run = whole.score(tmp_path / "whole.yaml")
+        run = whole.traps("run", tmp_path / "whole.yaml", "--until", "responses")
         assert run.code == 1
         assert "check clips_distinct of videos/hidden does not pass" in run.err
     assert len(Workspace.open(whole.workspace).tables.read_all(RESPONSES)) == 2 * (8 + 6 + 1)
@@ -208,7 +208,7 @@ def test_an_added_scenario_joins_and_a_copy_is_told_by_every_run_until_it_is_gon
     latest = whole.run(sys.executable, "-W", "ignore", "-c", LATEST, "videos", "clips_distinct")
     assert latest.out.split() == ["FAILED", "hidden"], latest.err
     study.correct("hidden_race-9001", params={"azimuth_deg": params["azimuth_deg"] + 3.0})
-    run = whole.score(tmp_path / "whole.yaml")
+    run = whole.traps("run", tmp_path / "whole.yaml", "--until", "responses")
     assert run.code == 0, run.err
     assert run.counts()["frames"] == 150
 

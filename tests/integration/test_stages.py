@@ -20,7 +20,7 @@ from traps_pipeline.storage.workspace import Workspace
 pytestmark = pytest.mark.slow
 CELL = "occlusion|oracle__standard__run1"
 RANGE = "occlusion|oracle__standard__run1...occlusion_ill_posed|oracle__json__run1"
-# Versions of all that is there, by partition, as the footers say; and the stages that share no partitions.
+# Versions of all that is there, by partition, as the footers say; and the tables without partitions.
 VERSIONS = """
 import json
 import traps_pipeline.definitions
@@ -31,7 +31,7 @@ w = Workspace.open()
 found, stages = Lineage(w), Lineage(w).graph.stages
 print(json.dumps({
     "versions": {f"{s.name}/{k}": found.version(s.name, k) for s in stages for k in s.wanted(Wanted(w))},
-    "whole": [s.name for s in stages if s.scheme is None],
+    "whole": [s.name for s in stages if s.scheme is None and s.table is not None],
 }))
 """
 

@@ -281,7 +281,7 @@ def test_a_table_or_figure_is_stale_when_what_it_reads_changed_and_only_then():
     assert {*PRINTED} <= {stage.name for stage in graph.stages}
     assert graph.parents("figure_pecs_landscape", None) == {"leaderboard": [None]}
     assert "chaotic" in graph.parents("table_chaotic_sub_scenarios", None)["metrics"]
-    assert graph.parents("published_table_overall", None) == {"published": [None]}
+    assert graph.parents("published_tables", None) == {"published": [None]}
     assert graph.parents("report_page", None).keys() >= {*OF_STUDY, *OF_PAPER, "verdicts", "leaderboard"}
 
 
@@ -294,7 +294,7 @@ def test_names_of_tables_and_figures_are_unique():
 def test_a_workspace_keeps_every_table_file_and_a_figures_picture(partial):
     files = workspace_files(OF_STUDY["table_overall"], partial)
     assert sorted(files) == [f"tables/overall.{kind}" for kind in ("csv", "md", "parquet", "tex")]
-    files = workspace_files(OF_PAPER["published_figure_doubt_conversion"], PAPER)
+    files = workspace_files(next(r for r in OF_PAPER["published_figures"] if r.name == "doubt_conversion"), PAPER)
     assert list(files) == ["figures/published/doubt_conversion.png"]
     assert imread(io.BytesIO(files["figures/published/doubt_conversion.png"])).shape[1] == 990  # 3.3 in, 300 dpi
 

@@ -110,6 +110,7 @@ def test_a_scenario_of_every_chaotic_family_is_certified(stored: Stored):
         assert verdict.measured["accepted"] == evidence["accepted"]
 
 
+@pytest.mark.slow  # simulates 128 futures
 def test_a_later_cut_leaves_the_outcome_less_open_than_is_certified():
     plinko = load("plinko")
     twin = load_trajectory(

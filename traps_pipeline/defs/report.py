@@ -153,18 +153,28 @@ _KEPT: dict[str, tuple[Any, Results]] = {}
 
 
 def _printed(name: str, report: Report) -> dg.AssetsDefinition:
-    of_paper, table = name in OF_PAPER, isinstance(report, TableReport)
+    table = isinstance(report, TableReport)
     return _report(
         name,
-        lambda workspace: workspace_files(report, _results(workspace, of_paper=of_paper)),
-        f"{report.doc} From the paper's published numbers." if of_paper else report.doc,
-        deps=["published"] if of_paper else report.reads,
-        group="published" if of_paper else "tables" if table else "figures",
+        lambda workspace: workspace_files(report, _results(workspace, of_paper=False)),
+        report.doc,
+        deps=report.reads,
+        group="tables" if table else "figures",
         kinds=["csv" if table else "png"],
     )
 
 
-printed = [_printed(name, report) for name, report in {**OF_STUDY, **OF_PAPER}.items()]
+def _printed_of_paper(name: str, reports: Sequence[Report]) -> dg.AssetsDefinition:
+    def files(workspace: Workspace) -> Files:
+        results = _results(workspace, of_paper=True)
+        return {path: data for report in reports for path, data in workspace_files(report, results).items()}
+
+    doc = f"From the paper's published numbers: {', '.join(report.name for report in reports)}."
+    return _report(name, files, doc, deps=["published"], group="published")
+
+
+printed = [_printed(name, report) for name, report in OF_STUDY.items()]
+printed_of_paper = [_printed_of_paper(name, reports) for name, reports in OF_PAPER.items()]
 report_page = _report(
     "report_page",
     _page,

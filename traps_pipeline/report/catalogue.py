@@ -129,12 +129,15 @@ FIGURES: tuple[FigureReport, ...] = (
     FigureReport("cosines", "Cosines of void directions", mechanism.cosine_heatmaps, ("cosines",)),
 )
 
-# Assets by name: of a study, and of the paper's numbers, which change with `assets/published` alone.
+# Assets by name: of a study, one a table or figure; of the paper's numbers, which change together, one a kind.
 OF_STUDY: Mapping[str, Report] = {
     **{f"table_{report.name}": report for report in TABLES},
     **{f"figure_{report.name}": report for report in FIGURES},
 }
-OF_PAPER: Mapping[str, Report] = {f"published_{n}": report for n, report in OF_STUDY.items() if report.published}
+OF_PAPER: Mapping[str, Sequence[Report]] = {
+    "published_tables": [report for report in TABLES if report.published],
+    "published_figures": [report for report in FIGURES if report.published],
+}
 PRINTED: Sequence[str] = (*OF_STUDY, *OF_PAPER)
 
 
