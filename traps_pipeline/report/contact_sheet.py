@@ -71,7 +71,7 @@ def pairs_figure(
         heights = [layout.block * _ratio(control) + layout.header + FOOTER_IN for control, _, _ in blocks]
         rows = [max(heights[k : k + columns]) for k in range(0, len(heights), columns)]
         width, height = columns * (layout.block + layout.gap), sum(rows) + 0.1
-        figure = new_figure(width, height, layout.dpi, layout="none")
+        figure = new_figure(width, height, layout.dpi, layout=None)
         for k, (pair, block) in enumerate(zip(pairs, blocks, strict=True)):
             row, column = divmod(k, columns)
             left = column * (layout.block + layout.gap) + 0.8 * layout.gap

@@ -330,10 +330,10 @@ def figure_style() -> Iterator[None]:
 
 
 def new_figure(
-    width: float, height: float, dpi: float | None = None, layout: Literal["constrained", "none"] = "constrained"
+    width: float, height: float, dpi: float | None = None, layout: Literal["constrained"] | None = "constrained"
 ) -> Figure:
-    """An empty figure (inches) with a canvas of its own; draw inside `figure_style`. layout: "none" leaves all where
-    it is placed."""
+    """An empty figure (inches) with a canvas of its own; draw inside `figure_style`. layout: None leaves all where it
+    is placed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
