@@ -25,6 +25,11 @@ CATEGORIES = OCCLUSION_CATEGORIES + CHAOTIC_CATEGORIES
 DATASETS = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
 SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
 LONG = {short: dataset for dataset, short in SHORT.items()}
+# Datasets of their own beside the pairs: each takes one shortcut away (docs/arms.md). No part of PECS; asked on request.
+ANSWERABLE_ARMS = ("decoy", "removed", "late_panel", "length_matched", "predictable_cut", "twin_control")
+VOID_ARMS = ("frame_out", "held_void")
+PAIRED_ARMS = ("choices_swapped",)  # has controls and voids
+ARMS = (*ANSWERABLE_ARMS, *VOID_ARMS, *PAIRED_ARMS)
 REGIMES = ("standard", "guided", "json")
 ANSWERABLE = "occlusion_answerable"  # of the mechanistic stages alone: occlusion's voids, with a question they answer
 PROBED_DATASETS = (*DATASETS, ANSWERABLE)
@@ -111,8 +116,8 @@ class Cell:
     def parse(key: str) -> Cell:
         """Inverse of `key`. Raises ValueError."""
         dataset, _, evaluation = key.partition("|")
-        if dataset not in DATASETS:
-            raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {DATASETS}")
+        if dataset not in (*DATASETS, *ARMS):
+            raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {(*DATASETS, *ARMS)}")
         return Cell(dataset, Evaluation.parse(evaluation))
 
 
