@@ -233,7 +233,7 @@ def test_a_table_that_was_deleted_is_made_again_from_the_ledger(study: Checkout)
 
 
 def test_the_code_location_validates_and_imports_nothing_heavy(study: Checkout) -> None:
-    heavy = ("torch", "transformers", "litellm", "mujoco", "matplotlib", "cv2", "sklearn", "av")
+    heavy = ("torch", "transformers", "litellm", "mujoco", "matplotlib", "cv2", "sklearn", "av", "pandas")
     code = f"import traps_pipeline.definitions, sys; print([m for m in {heavy} if m in sys.modules])"
     finished = study.run(sys.executable, "-c", code)
     assert finished.out.strip() == "[]", finished.err

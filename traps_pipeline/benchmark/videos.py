@@ -73,5 +73,5 @@ def _rows(workspace: Workspace, spec: dict[str, Any], job: Job, version: str) ->
 
 def missing_clips(workspace: Workspace, category: str) -> Sequence[str]:
     """Clips of the category's table that are gone or have another size: reasons for `traps status`."""
-    table = workspace.tables.read(VIDEOS, {"category": category}, ["path"])
-    return [path for path in table["path"] if not rendered(workspace.resolve(path))]
+    table = workspace.tables.read_arrow(VIDEOS, ["path"], category=category)
+    return [path for path in table["path"].to_pylist() if not rendered(workspace.resolve(path))]

@@ -7,12 +7,13 @@ target, kind, layer, alpha, side, abstention (a fraction).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.mechanism.paths import FAMILIES, PATH_SETS
 from traps_pipeline.partitions import DATASETS, is_ill_posed, taxonomy_of, transfer_type
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CELL = ["model", "directions", "regime"]
 REGIME_COLUMNS = (
@@ -30,6 +31,8 @@ def on_both_sides(effects: pd.DataFrame) -> pd.DataFrame:
 def paths(effects: pd.DataFrame) -> pd.DataFrame:
     """One row a path and strength at the steered layer: abstention of control and void side by side, where effects have
     intervals `control_low` and so on, transfer_type."""
+    import pandas as pd
+
     keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
     rows, columns = on_both_sides(effects), keys.copy()
     parts: list[pd.DataFrame] = []
@@ -61,6 +64,8 @@ def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def _regime_rows(effects: pd.DataFrame, split: Any) -> pd.DataFrame:
+    import pandas as pd
+
     rows = paths(effects)
     found: list[Mapping[str, Any]] = []
     for path_set, members in PATH_SETS.items():
@@ -85,6 +90,8 @@ def _regime_rows(effects: pd.DataFrame, split: Any) -> pd.DataFrame:
 def domains(effects: pd.DataFrame) -> pd.DataFrame:
     """Control abstention at the largest alpha along each source's direction, on the well-posed dataset of its own
     taxonomy (same) against that of the other (cross). Columns CELL, source, alpha, same, cross."""
+    import pandas as pd
+
     rows = paths(effects)
     well_posed = [name for name in DATASETS if not is_ill_posed(name)]
     rows = rows.loc[(rows["kind"] == "void") & rows["target"].isin(well_posed)]

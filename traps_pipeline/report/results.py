@@ -7,9 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
-from typing import Any, ClassVar
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.mechanism import effects
@@ -17,6 +15,9 @@ from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_S
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE, CONTRASTS, LEADERBOARD, LEAVE_ONE_OUT, REGIME_TESTS
 from traps_pipeline.storage.tables import Table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CELL_COLUMNS = (
     *("model", "dataset", "regime", "epoch", "n_pairs", "n_runs", "n_missing", "incomplete"),
@@ -33,7 +34,7 @@ SUB_COLUMNS = (
 )
 
 
-Makers = Mapping[str, Callable[[Any], pd.DataFrame]]  # by the name of a frame; each gets the results
+Makers = Mapping[str, Callable[[Any], "pd.DataFrame"]]  # by the name of a frame; each gets the results
 
 
 class Made:
@@ -115,6 +116,8 @@ class Results:
 
     def rows(self, table: Table) -> pd.DataFrame:
         """All rows of a table of a study; without rows here."""
+        import pandas as pd
+
         return pd.DataFrame(columns=pd.Index([column.name for column in table.columns]))
 
     def refusal(self, dataset: str, left: tuple[str, str], right: tuple[str, str]) -> str | None:
@@ -143,4 +146,6 @@ def datasets_of(cells: pd.DataFrame) -> list[str]:
 
 def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
     """One below the other; a frame without rows or columns where there are none."""
+    import pandas as pd
+
     return pd.concat([pd.DataFrame(), *parts], ignore_index=True)

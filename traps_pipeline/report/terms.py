@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from traps_pipeline.scoring.leaderboard import INCOMPLETE_BELOW
+from traps_pipeline.scoring.tables import INCOMPLETE_BELOW
 
 TITLES = {
     "overall": "Overall",

@@ -17,13 +17,12 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import pandas as pd
-
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.terminal import plain, text_table
 
 if TYPE_CHECKING:
     import jinja2
+    import pandas as pd
     from matplotlib.figure import Figure
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -62,6 +61,8 @@ Trace = Callable[[Mapping[str, Any], str], Behind | None]  # row and field -> th
 
 def fraction(value: float | None, digits: int = 3) -> str:
     """A figure as printed, with a true minus sign; a dash for null."""
+    import pandas as pd
+
     if value is None or pd.isna(value):
         return NONE
     if value in (float("inf"), float("-inf")):
@@ -72,6 +73,8 @@ def fraction(value: float | None, digits: int = 3) -> str:
 
 def percent(value: float | None, digits: int = 1) -> str:
     """A share (0 to 1) in percent, without the sign."""
+    import pandas as pd
+
     return NONE if value is None or pd.isna(value) else fraction(100 * value, digits)
 
 
@@ -110,6 +113,8 @@ class Column:
 
     def parts(self, row: Mapping[str, Any]) -> tuple[str, str, str]:
         """The text or number of a cell, its spread and its mark, as printed; empty where there is none of them."""
+        import pandas as pd
+
         value = row.get(self.field)
         if self.unit in ("text", "range"):
             return "" if value is None or value is pd.NA or value != value else plain(value), "", ""
@@ -177,6 +182,8 @@ class Table:
     @property
     def data(self) -> pd.DataFrame:
         """The numbers behind what is printed: fields of the columns and their spreads, then what else the rows hold."""
+        import pandas as pd
+
         printed = [field for column in self.columns for field in (column.field, column.spread) if field]
         fields = dict.fromkeys([*printed, *map(str, self.rows.columns)])
         return self.rows.reindex(columns=pd.Index(list(fields)))
@@ -235,6 +242,8 @@ def _hung(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def table_latex(table: Table) -> str:
     """A floating `table` environment with booktabs rules (`\\usepackage{booktabs}`); notes stand in the caption."""
+    import pandas as pd
+
     parts = [table.title, *([table.lead] if table.lead else []), *table.remarks]
     caption = latex(". ".join(part.rstrip(".") for part in parts) + ".")
     cells = [[latex(table.absence)]] if table.absence else [[latex(cell) for cell in row] for row in table.cells]

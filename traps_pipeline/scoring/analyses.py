@@ -10,16 +10,18 @@ which one value is null is null, and a mean over models is over those that have 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-import pandas as pd
-from pandas.api.typing import DataFrameGroupBy
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.epochs import require_one_epoch
 from traps_pipeline.scoring.metrics import joined_epochs, mean
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from pandas.api.typing import DataFrameGroupBy
 
 SHARES = ["acc", "abs_rec", "false_abs", "pecs"]
 TAXONOMIES = ("occlusion", "chaotic")
@@ -96,6 +98,8 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
     means: a study's own rows of `overall`, which leave out runs without all datasets; else those of `cells`. Infinite
     where standard is 0 and guided is not, null where either is.
     """
+    import pandas as pd
+
     cells = _checked(cells)
     cells = cells.loc[cells["regime"].isin(["standard", "guided"])]
     require_one_epoch(cells.pivot(index=["model", "dataset"], columns="regime", values="epoch"), "uplift")
@@ -111,6 +115,8 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
     Cells of a single run have none and are left out. The paper does not say of which metric its quartiles are; the
     default takes PECS.
     """
+    import pandas as pd
+
     values = cells[column].dropna().to_numpy(float)
     q25, median, q75 = np.quantile(values, [0.25, 0.5, 0.75]) if len(values) else (np.nan,) * 3
     return pd.DataFrame({"q25": [q25], "median": [median], "q75": [q75], "n": [len(values)]})
@@ -134,6 +140,8 @@ def frontier(means: pd.DataFrame) -> pd.DataFrame:
     A model equal to another in one and better in the other beats it, equal models are both on the frontier, one
     without Acc or J is not.
     """
+    import pandas as pd
+
     means = means.dropna(subset=["acc", "j"])
     best = [group.loc[~_dominated(group)] for _, group in means.groupby("regime", sort=False)]
     found = pd.DataFrame(pd.concat(best or [means]))
@@ -168,6 +176,8 @@ def degenerate_strategies() -> pd.DataFrame:
 
     acc is null where the strategy does not fix it; PECS is 0 all the same, since J is not above 0.
     """
+    import pandas as pd
+
     some = 0.2  # any share will do: it is the same on either side
     rows = [
         ("always-abstain", 0.0, 1.0, 1.0),
@@ -195,6 +205,8 @@ def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMI
     null where both are 0. Raises EpochMismatch where the two datasets of a taxonomy are of different epochs: as with
     the paper's own chaotic datasets, whose gaps it prints from an earlier epoch (`visual_vs_textual.csv`).
     """
+    import pandas as pd
+
     cells = _checked(cells)
     sides = cells.assign(
         taxonomy=cells["dataset"].str.removesuffix("_ill_posed"),
@@ -222,6 +234,8 @@ def reasoning_pairs(cells: pd.DataFrame) -> pd.DataFrame:
 
     `overall` is the mean over the datasets of `cells`, where both members have all of them.
     """
+    import pandas as pd
+
     cells = _checked(cells)
     epochs = cells.groupby(["model", "regime"])["epoch"].agg(joined_epochs).reset_index()
     means = overall(cells).merge(epochs, on=["model", "regime"]).assign(dataset="overall")
@@ -230,6 +244,8 @@ def reasoning_pairs(cells: pd.DataFrame) -> pd.DataFrame:
 
 def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
     """`reasoning_pairs` of the rows that are there and no others; they may be of the dataset `overall`."""
+    import pandas as pd
+
     cells = _checked(cells, datasets=(*DATASETS, "overall"))
     by_model = cells.set_index(_ENTRY)
     rows = []
@@ -257,6 +273,8 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
     missing over the cells that enter. A model of which a figure is null is in none of the means that it belongs
     to; null where a regime or dataset was not run.
     """
+    import pandas as pd
+
     cells = _checked(cells, more=["scope"])
     rows = []
     for key, group in cells.groupby([cells["dataset"].str.removesuffix("_ill_posed"), "scope"]):
@@ -299,6 +317,8 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
 
     Columns dataset, label, acc, n_pairs, n_models, n_missing (items of both sides, over these models).
     """
+    import pandas as pd
+
     rows = _checked(cells, more=["scope"])
     groups = rows.loc[rows["regime"] == "standard"].dropna(subset=["acc"]).groupby(["dataset", "scope"])
     columns = {"acc": groups["acc"].mean(), "n_pairs": groups["n_pairs"].max(), "n_models": groups["model"].nunique()}
@@ -318,6 +338,8 @@ def ratio(numerator: pd.Series | pd.DataFrame, denominator: pd.Series | pd.DataF
 
 def _means(groups: DataFrameGroupBy, columns: Sequence[str]) -> pd.DataFrame:
     """Means of columns of a pandas groupby, null where any value is."""
+    import pandas as pd
+
     values = groups[list(columns)]
     means, counts = pd.DataFrame(values.mean()), pd.DataFrame(values.count())
     return means.where(counts.eq(groups.size(), axis="index"))

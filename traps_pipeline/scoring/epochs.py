@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-
-import pandas as pd
+from typing import TYPE_CHECKING
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.metrics import joined_epochs
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Answered = Mapping[str, str]  # item to the campaigns of its answers, joined by +
 

@@ -11,12 +11,8 @@ import pandas as pd
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
 from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, OUTCOMES, decision_counts, joined_epochs, mean
-from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.scoring.tables import INCOMPLETE_BELOW, LEADERBOARD
 
-# An entry is incomplete where fewer of its items than this have a text. With 1 % of the items missing, the worst and
-# the best PECS are at most 0.04 apart (if all are controls: 2 % of Acc and 2 % of FalseAbs), half the 95 % interval of
-# a middling model on 500 pairs (0.08); beyond that, which answers were lost may matter as much as which were sampled.
-INCOMPLETE_BELOW = 0.99
 _RUN = ["model", "regime", "run"]
 _SUMMED = ["n_missing", "n_items", *OUTCOMES]
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-import pandas as pd
 
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.scoring.tables import METRICS
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CELL = ["dataset", "model", "regime", "run"]
 FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
@@ -26,6 +28,8 @@ def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
 
     A null decision counts in no denominator: shares are over decided items.
     """
+    import pandas as pd
+
     control = verdicts["side"].eq("control")
     abstained, correct = (verdicts[name].astype("boolean") for name in ("abstained", "correct"))
     decided = abstained.notna()
@@ -60,7 +64,7 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_B
     if len(datasets) > 1:
         raise ValueError(f"verdicts of several datasets {datasets}: score one dataset at a time")
     groups = _scoped(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
-    sums = cast(pd.DataFrame, groups[[*COUNTS, "complete", *OUTCOMES]].sum())
+    sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *OUTCOMES]].sum())
     sums["n_pairs"] = groups["pair_id"].nunique()
     sums["n_missing"] = 2 * sums["n_pairs"] - sums["complete"]
     sums["epoch"] = groups["epoch"].agg(joined_epochs)
@@ -80,6 +84,8 @@ def joined_epochs(epochs: Iterable[str]) -> str:
 
 def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, str]) -> pd.DataFrame:
     """Every verdict with its counts, once for each scope that it belongs to: ((1 + len(scoped_by)) x items) rows."""
+    import pandas as pd
+
     counts = decision_counts(verdicts)
     on_control = verdicts["side"].eq("control")
     complete = np.where(on_control, counts["correct_of"] & counts["false_abs_of"], counts["abs_rec_of"])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
-
-import pandas as pd
+from typing import TYPE_CHECKING
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import ASSETS
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 PUBLISHED = ASSETS / "published"
 _RENAMED = {"acc": "acc_pct", "abs_rec": "abs_rec_pct", "false_abs": "false_abs_pct"}
@@ -52,6 +54,8 @@ def published_overall() -> pd.DataFrame:
 
 @cache
 def _read(name: str) -> pd.DataFrame:
+    import pandas as pd
+
     path = PUBLISHED / f"{name}.csv"
     if not path.is_file():
         known = ", ".join(sorted(file.stem for file in PUBLISHED.glob("*.csv")))

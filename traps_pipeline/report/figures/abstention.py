@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from traps_pipeline.partitions import taxonomy_of
 from traps_pipeline.report.figures.looks import families, family_colour, family_of, looks
@@ -24,6 +23,7 @@ from traps_pipeline.report.writing import (
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -170,6 +170,8 @@ def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
 
     AbsRec is that of `results.rates` (standard), whose epoch must be that of the doubt labels (docs/spec.md 9.2).
     """
+    import pandas as pd
+
     labels = results.confabulation.set_index("model") if len(results.confabulation) else pd.DataFrame()
     rates = results.rates.loc[results.rates["taxonomy"] != "pooled"]
     rows, refused = [], []

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.report.results import Results
@@ -13,6 +12,7 @@ from traps_pipeline.report.writing import COLOURS, PAGE_IN, SOFT, figure_style, 
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage

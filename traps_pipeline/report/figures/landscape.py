@@ -6,7 +6,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from traps_pipeline.report.figures.labels import LINES, Label, merged_labels, place_labels, short
 from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, looks
@@ -24,6 +23,7 @@ from traps_pipeline.report.writing import (
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 

@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.report.writing import COLOURS, GRID, MARKERS, SOFT
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
 
 OWN, REFERENCE = "own", "reference"

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.paths import PATH_SETS, TRANSFER_TYPES, path_name
@@ -16,6 +15,7 @@ from traps_pipeline.report.tables.mechanism import NOT_LOOKED, best_layers
 from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D

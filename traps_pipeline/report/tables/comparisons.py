@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.partitions import DATASETS, REGIMES
@@ -38,6 +37,9 @@ from traps_pipeline.report.terms import SIDE_OF
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 NAIVE_THRESHOLD = 0.03
 
@@ -163,6 +165,8 @@ def frontier(results: Results) -> list[Table]:
 
 def reasoning(results: Results) -> list[Table]:
     """The thinking member of each pair minus the other, by dataset and overall."""
+    import pandas as pd
+
     cells = entries(results)
     rows, refused = [analyses.pair_differences(cells.iloc[:0])], []
     for pair in analyses.REASONING_PAIRS:

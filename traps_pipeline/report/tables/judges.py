@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
@@ -21,6 +19,9 @@ from traps_pipeline.report.tables.shared import (
     titled,
 )
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def agreement(results: Results) -> list[Table]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-
-import pandas as pd
+from typing import TYPE_CHECKING
 
 from traps_pipeline.partitions import DATASETS, REGIMES
 from traps_pipeline.report.results import Results
@@ -32,6 +31,9 @@ from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.published import published_overall
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def overall(results: Results) -> list[Table]:
@@ -81,6 +83,8 @@ def replication_per_dataset(results: Results) -> list[Table]:
 
 
 def _by_dataset(results: Results, name: str, title: str, replication: bool) -> Table:
+    import pandas as pd
+
     cells = marked(results.cells)
     cells = cells.loc[cells["model"].isin(analyses.models_of(group="replication")) == replication]
     index = ["model", "regime"]

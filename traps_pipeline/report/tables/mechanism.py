@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.paths import TRANSFER_PAIRS, path_name
@@ -14,6 +13,9 @@ from traps_pipeline.partitions import SHORT, transfer_type
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import MODEL, epochs, said
 from traps_pipeline.report.writing import Column, Table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 PATH, TYPE = Column("path", "Path"), Column("transfer_type", "Transfer")
 DIRECTIONS, INFERENCE = Column("directions", "Directions"), Column("regime", "Inference")
@@ -36,6 +38,8 @@ def probes(results: Results) -> list[Table]:
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
     """One row a model and ordered pair: the paper's best layer, the source's own choice, and Cf->Cf at both layers."""
+    import pandas as pd
+
     made: list[dict[str, Any]] = []
     for model, of in rows.groupby("model", sort=False):
         for source, target in TRANSFER_PAIRS:
@@ -149,6 +153,8 @@ def _catch(results: Results) -> Table:
 
 
 def _answerable(results: Results) -> Table:
+    import pandas as pd
+
     rows = results.probes
     rows = rows.loc[rows["analysis"].isin(["answerable_void", "answerable_control"]) & rows["source_best"]]
     wide = rows.pivot_table(index=["model", "source", "layer"], columns="analysis", values="value", observed=True)
@@ -172,6 +178,8 @@ def _answerable(results: Results) -> Table:
 
 def cosines(results: Results) -> list[Table]:
     """Cosines of the four void directions at the steered layer, and of standard against guided ones."""
+    import pandas as pd
+
     rows = results.cosines
     rows = rows.assign(name=_short(rows["dataset"]), other=_short(rows["other_dataset"]))
     same = rows.loc[rows["prompt"] == rows["other_prompt"]]

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import pandas as pd
-
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import Entry, ModelEntry, load_models
 from traps_pipeline.report.results import Results
@@ -96,6 +94,8 @@ def _entries(results: Results) -> Iterable[ModelEntry]:
 
 def composition(results: Results) -> list[Table]:
     """Pairs by category."""
+    import pandas as pd
+
     rows = results.composition
     if len(rows):
         total = {"taxonomy": "all", "category": "", "void": "", **rows[["n", "n_ill_posed"]].sum().to_dict()}

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
 from traps_pipeline.report.writing import Behind, Column, Table, fraction
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MODEL, REGIME = Column("model", "Model", look="head"), Column("regime", "Regime", look="tag")
 DATASET = Column("title", "Dataset")
@@ -67,6 +69,8 @@ def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
     """Rows that compare entries, `marked` and with COUNTED. sides: the columns of rows that hold model, regime and
     dataset of either side; entries: cells, and those of the dataset `overall`."""
+    import pandas as pd
+
     known = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
     keys = [[tuple(row[name] for name in side) for side in sides] for row in rows.to_dict("records")]
     counts = [together([known[key] for key in of_row if key in known]) for of_row in keys]
@@ -75,6 +79,8 @@ def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[
 
 def entries(results: Results) -> pd.DataFrame:
     """The cells, and below them the overall rows as those of a dataset `overall`."""
+    import pandas as pd
+
     return pd.concat([results.cells, results.overall.assign(dataset="overall")], ignore_index=True)
 
 
@@ -136,12 +142,16 @@ def interval(row: Mapping[str, Any]) -> str:
 
 def ranks(row: Mapping[str, Any]) -> str:
     """The ranks that contrasts leave open, as printed."""
+    import pandas as pd
+
     low, high = row["rank_low"], row["rank_high"]
     return "" if pd.isna(low) else f"{low:.0f}" if low == high else f"{low:.0f}–{high:.0f}"
 
 
 def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
     """Rows as a frame; one with these columns where there are none."""
+    import pandas as pd
+
     return pd.DataFrame(list(rows)) if rows else pd.DataFrame(columns=pd.Index(list(columns)))
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.partitions import taxonomy_of
 from traps_pipeline.report.results import Results
@@ -23,6 +21,9 @@ from traps_pipeline.report.tables.shared import (
 from traps_pipeline.report.terms import SIDE_OF
 from traps_pipeline.report.writing import Behind, Column, Table, Trace
 from traps_pipeline.scoring import analyses
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def occlusion_sub_scenarios(results: Results) -> list[Table]:
