@@ -25,11 +25,15 @@ CATEGORIES = OCCLUSION_CATEGORIES + CHAOTIC_CATEGORIES
 DATASETS = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
 SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
 LONG = {short: dataset for dataset, short in SHORT.items()}
-# Datasets of their own beside the pairs: each takes one shortcut away (docs/arms.md). No part of PECS; asked on request.
+# Datasets beside the pairs, each of which takes one shortcut away (docs/arms.md). No part of PECS; asked on request.
 ANSWERABLE_ARMS = ("decoy", "removed", "late_panel", "length_matched", "predictable_cut", "twin_control")
 VOID_ARMS = ("frame_out", "held_void")
 PAIRED_ARMS = ("choices_swapped",)  # has controls and voids
 ARMS = (*ANSWERABLE_ARMS, *VOID_ARMS, *PAIRED_ARMS)
+_ONE_TAXONOMY = {
+    **dict.fromkeys(("decoy", "removed", "late_panel", "frame_out"), "occlusion"),
+    **dict.fromkeys(("length_matched", "predictable_cut", "held_void"), "chaotic"),
+}
 REGIMES = ("standard", "guided", "json")
 ANSWERABLE = "occlusion_answerable"  # of the mechanistic stages alone: occlusion's voids, with a question they answer
 PROBED_DATASETS = (*DATASETS, ANSWERABLE)
@@ -59,10 +63,30 @@ def transfer_type(source: str, target: str) -> str:
     )
 
 
+def taxonomy_of_category(category: str) -> str:
+    """`occlusion` or `chaotic`."""
+    return "occlusion" if category in OCCLUSION_CATEGORIES else "chaotic"
+
+
 def datasets_of_category(category: str) -> tuple[str, str]:
     """The two datasets (visual, ill-posed) that a category's scenarios belong to."""
-    taxonomy = "occlusion" if category in OCCLUSION_CATEGORIES else "chaotic"
+    taxonomy = taxonomy_of_category(category)
     return taxonomy, f"{taxonomy}_ill_posed"
+
+
+def arms_of(taxonomy: str) -> tuple[str, ...]:
+    """The arms that scenarios of a taxonomy may have."""
+    return tuple(arm for arm in ARMS if _ONE_TAXONOMY.get(arm, taxonomy) == taxonomy)
+
+
+def datasets_and_arms_of(category: str) -> tuple[str, ...]:
+    """Everything that a category's scenarios are asked in."""
+    return (*datasets_of_category(category), *arms_of(taxonomy_of_category(category)))
+
+
+def sides_of(dataset: str) -> tuple[str, ...]:
+    """The sides that a dataset or an arm asks of each scenario."""
+    return {**dict.fromkeys(ANSWERABLE_ARMS, ("control",)), **dict.fromkeys(VOID_ARMS, ("void",))}.get(dataset, SIDES)
 
 
 def check_slug(model_id: str) -> str:

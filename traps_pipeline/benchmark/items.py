@@ -8,11 +8,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from traps_pipeline.benchmark.specs import released_in_study
+from traps_pipeline.benchmark.tables import ARMS as ARMS_TABLE
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import CATEGORIES, SIDES, datasets_of_category, is_ill_posed
+from traps_pipeline.partitions import ARMS, CATEGORIES, SIDES, datasets_and_arms_of, is_ill_posed
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
@@ -22,7 +23,7 @@ Record = Mapping[str, Any]
 
 def categories_of_dataset(dataset: str) -> list[str]:
     """The categories whose scenarios make a dataset."""
-    return [category for category in CATEGORIES if dataset in datasets_of_category(category)]
+    return [category for category in CATEGORIES if dataset in datasets_and_arms_of(category)]
 
 
 def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
@@ -37,13 +38,44 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
             clips[row["scenario_id"], row["side"]] = row
     if not specs:
         raise TrapsError(f"items {dataset}: no scene_specs yet; materialize scene_specs and videos first")
-    _check_clips(workspace, dataset, specs, clips)
+    if dataset not in ARMS:
+        _check_clips(workspace, dataset, specs, clips)
     released = [s for c in categories_of_dataset(dataset) for s in released_in_study(workspace, c).values()]
     version = version_of(
         (item_content(dataset, spec_record(spec)) for spec in released), (item_content(dataset, row) for row in specs)
     )
     commonest = commonest_answers(specs)
+    if dataset in ARMS:
+        return _of_arm(workspace, dataset, {spec["scenario_id"]: spec for spec in specs}, commonest, version)
     return [_item(dataset, spec, side, clips, commonest, version) for spec in specs for side in SIDES]
+
+
+def _of_arm(
+    workspace: Workspace, arm: str, specs: Mapping[str, Record], commonest: Mapping[str, str], version: str
+) -> list[ItemRow]:
+    """Items of an arm: of each scenario that admits it, what the arms table asks."""
+    rows = []
+    for category in categories_of_dataset(arm):
+        if workspace.tables.state(ARMS_TABLE, {"category": category}) is not None:
+            table = workspace.tables.read(ARMS_TABLE, {"category": category})
+            rows += table.astype(object).where(table.notna(), None).to_dict("records")
+    rows = [row for row in rows if row["arm"] == arm and row["refused"] is None]
+    if not rows:
+        raise TrapsError(f"items {arm}: no scenario of this study admits it; take more scenarios or leave the arm out")
+    return [_arm_item(specs[row["scenario_id"]], row, commonest, version) for row in rows]
+
+
+def _arm_item(spec: Record, row: Record, commonest: Mapping[str, str], version: str) -> ItemRow:
+    decisive: dict[str, Any] = _decisive(
+        spec,
+        dataset=row["arm"],
+        side=row["side"],
+        question=row["question"],
+        ground_truth=row["ground_truth"],
+        control_answer=row["ground_truth"] or spec["ground_truth"],
+        media_digest=row["media_digest"],
+    )
+    return _row(decisive, spec, commonest, row["clip"], version)
 
 
 def commonest_answers(specs: Sequence[Record]) -> dict[str, str]:
@@ -81,7 +113,30 @@ def _item(
 ) -> ItemRow:
     unanswerable = side == "void" and is_ill_posed(dataset)
     clip = clips[spec["scenario_id"], "control" if is_ill_posed(dataset) else side]
-    decisive: dict[str, Any] = {
+    decisive = _decisive(
+        spec,
+        dataset=dataset,
+        side=side,
+        question=spec["ill_posed_question"] if unanswerable else spec["question"],
+        ground_truth=spec["ground_truth"] if side == "control" else None,
+        control_answer=spec["ground_truth"],
+        media_digest=clip["file_sha256"],
+    )
+    return _row(decisive, spec, commonest, clip["path"], version)
+
+
+def _decisive(
+    spec: Record,
+    *,
+    dataset: str,
+    side: str,
+    question: str,
+    ground_truth: str | None,
+    control_answer: str,
+    media_digest: str,
+) -> dict[str, Any]:
+    """All of an item that decides its answer or its score."""
+    return {
         "item_id": f"{dataset}:{spec['scenario_id']}:{side}",
         "pair_id": f"{dataset}:{spec['scenario_id']}",
         "dataset": dataset,
@@ -90,18 +145,21 @@ def _item(
         "taxonomy": spec["taxonomy"],
         "category": spec["category"],
         "sub_scenario": spec["sub_scenario"],
-        "question": spec["ill_posed_question"] if unanswerable else spec["question"],
+        "question": question,
         "labels": list(spec["labels"]),
         "aliases": spec["aliases"],
         "answer_type": spec["answer_type"],
-        "ground_truth": spec["ground_truth"] if side == "control" else None,
-        "control_answer": spec["ground_truth"],
-        "media_digest": clip["file_sha256"],
+        "ground_truth": ground_truth,
+        "control_answer": control_answer,
+        "media_digest": media_digest,
     }
+
+
+def _row(decisive: dict[str, Any], spec: Record, commonest: Mapping[str, str], clip: str, version: str) -> ItemRow:
     return ItemRow(
         **decisive,
         item_hash=digest(decisive | {"aliases": json.loads(spec["aliases"])}),
         commonest_answer=commonest[spec["sub_scenario"]],
-        clip=clip["path"],
+        clip=clip,
         benchmark_version=version,
     )

@@ -73,6 +73,29 @@ VIDEOS = Table("videos", VideoRow, partition_by=("category",), key=("scenario_id
 
 
 @dataclass(frozen=True, kw_only=True)
+class ArmRow:
+    """What a scenario gives for an arm: a clip and a question beside the pair, or why it has none."""
+
+    scenario_id: shared.ScenarioId
+    category: shared.Category
+    arm: Annotated[str, "name of the arm, which is its dataset"]
+    side: Annotated[str, "control: must be answered; void: must be abstained on"]
+    question: shared.Question
+    ground_truth: Annotated[str | None, "null on void"]
+    refused: Annotated[str | None, "why the scenario does not admit the arm; null where it does"]
+    evidence: Annotated[str, "JSON: the numbers behind the arm's certificate"]
+    clip: Annotated[str | None, "path of the mp4, relative to the workspace; the pair's own where words alone differ"]
+    media_digest: Annotated[str | None, "digest of the clip's file"]
+    n_frames: Annotated[int | None, "frames"]
+    duration_s: Annotated[float | None, "seconds"]
+    scene_hash: Annotated[str, "digest of what the pair shows"]
+    benchmark_version: shared.BenchmarkVersion
+
+
+ARMS = Table("arms", ArmRow, partition_by=("category",), key=("scenario_id", "arm", "side"))
+
+
+@dataclass(frozen=True, kw_only=True)
 class ItemRow:
     """A question put to a model about one clip."""
 

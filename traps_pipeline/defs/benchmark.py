@@ -7,12 +7,12 @@ import dagster as dg
 
 from traps_pipeline.benchmark.composition import problems
 from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, unsettled
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
+from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET, to_keys
-from traps_pipeline.orchestration.stage import source, stage
-from traps_pipeline.partitions import datasets_of_category
+from traps_pipeline.orchestration.stage import key_of, shown, source, stage
+from traps_pipeline.partitions import arms_of, datasets_and_arms_of, sides_of, taxonomy_of_category
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -34,7 +34,8 @@ corrections = source(
     kinds=["json"],
     scheme=CATEGORY,
 )
-category_to_datasets = to_keys(CATEGORY, DATASET, datasets_of_category)
+category_to_datasets = to_keys(CATEGORY, DATASET, datasets_and_arms_of)
+category_to_arms = to_keys(CATEGORY, DATASET, lambda category: arms_of(taxonomy_of_category(category)))
 
 
 def _make_specs(workspace: Workspace, category: str) -> Made:
@@ -130,6 +131,36 @@ videos = stage(
 )
 
 
+def _make_arms(workspace: Workspace, category: str) -> Made:
+    """Arms of a category's scenarios that the study asks for: clips and questions that take a shortcut away."""
+    from traps_pipeline.benchmark.arms import build_arms
+
+    rows, drawn = build_arms(workspace, category)
+    admitted = sum(row.refused is None for row in rows)
+    return Made(
+        rows, Tally(frames=drawn), {"frames rendered": drawn, "admitted": admitted, "refused": len(rows) - admitted}
+    )
+
+
+def _unmade_arms(workspace: Workspace, category: str) -> list[str]:
+    from traps_pipeline.benchmark.arms import unmade
+
+    return unmade(workspace, category)
+
+
+arms = stage(
+    ARMS,
+    _make_arms,
+    group="arms",
+    deps=[scene_specs, videos],
+    scheme=CATEGORY,
+    kinds=["parquet", "mp4"],
+    wants=lambda wanted, key: bool({*wanted.arms} & {*arms_of(taxonomy_of_category(str(key)))}),
+    lost=lambda workspace, key: _unmade_arms(workspace, str(key)),
+    columns={name: [f"scene_specs.{name}"] for name in ("scenario_id", "scene_hash")},
+)
+
+
 def _make_items(workspace: Workspace, dataset: str) -> Made:
     """Questions put to models, two a pair: the control and the void that differs from it by one change."""
     from traps_pipeline.benchmark.items import build_items
@@ -142,14 +173,17 @@ def _odd_pairs(workspace: Workspace, key: str | None, made: Made) -> dict[str, l
     sides: dict[str, list[str]] = {}
     for row in made.rows(ITEMS):
         sides.setdefault(row.pair_id, []).append(row.side)
-    return {pair: found for pair, found in sides.items() if sorted(found) != ["control", "void"]}
+    return {pair: found for pair, found in sides.items() if tuple(sorted(found)) != sides_of(str(key))}
 
 
 items = stage(
     ITEMS,
     _make_items,
     group=GROUP,
-    deps=[dg.AssetDep(above, partition_mapping=category_to_datasets) for above in (scene_specs, videos)],
+    deps=[
+        *(dg.AssetDep(above, partition_mapping=category_to_datasets) for above in (scene_specs, videos)),
+        *([dg.AssetDep(key_of("arms"), partition_mapping=category_to_arms)] if shown("arms") else []),
+    ],
     scheme=DATASET,
     columns={
         **{n: [f"scene_specs.{n}"] for n in ("scenario_id", "category", "sub_scenario", "labels", "answer_type")},
@@ -157,7 +191,11 @@ items = stage(
         "clip": ["videos.path"],
     },
     checks=[
-        Check("two_items_a_pair", "Every pair has one control and one void item.", _odd_pairs),
+        Check(
+            "two_items_a_pair",
+            "Every pair has one control and one void item, an arm the sides that it asks.",
+            _odd_pairs,
+        ),
         Check(
             "clips_present",
             "Every clip is there with its digest (checked while building; a damaged one fails the step).",

@@ -46,7 +46,9 @@ def _multi(**dimensions: dg.PartitionsDefinition) -> dg.MultiPartitionsDefinitio
 
 
 # Groups of assets that the study has no use for: Dagster does not show them, and nothing is made of them.
-LEFT_OUT = frozenset() if _HERE.looks_inside else frozenset({"mechanism"})
+LEFT_OUT = frozenset(
+    group for group, used in (("mechanism", _HERE.looks_inside), ("arms", bool(_HERE.arms))) if not used
+)
 
 CATEGORY = Scheme(_static(_HERE.categories), lambda key: {"category": key}, lambda wanted: wanted.categories)
 DATASET = Scheme(_static(_HERE.datasets), lambda key: {"dataset": key}, lambda wanted: wanted.datasets)

@@ -15,6 +15,7 @@ from traps_pipeline.benchmark.tables import SCENE_SPECS
 from traps_pipeline.models.registry import get_model, load_models, local_models
 from traps_pipeline.partitions import (
     ANSWERABLE,
+    ARMS,
     CATEGORIES,
     DATASETS,
     PROBED_DATASETS,
@@ -25,7 +26,7 @@ from traps_pipeline.partitions import (
     Extraction,
     StatesCell,
     SteeringCell,
-    datasets_of_category,
+    datasets_and_arms_of,
 )
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
@@ -43,7 +44,9 @@ class Wanted:
     def __init__(self, workspace: Workspace | None, experiment: str | None = None) -> None:
         self._workspace = workspace
         if workspace is None:
-            every = Asked(datasets=DATASETS, models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True)
+            every = Asked(
+                datasets=(*DATASETS, *ARMS), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
+            )
             self._asked: Sequence[Asked] = [every]
         else:
             self._asked = [e for name, e in workspace.study.experiments.items() if experiment in (None, name)]
@@ -65,10 +68,15 @@ class Wanted:
         """Datasets that have scenarios and are asked for."""
         return self._datasets(self._asked)
 
+    @cached_property
+    def arms(self) -> list[str]:
+        """Arms among them."""
+        return [dataset for dataset in self.datasets if dataset in ARMS]
+
     def _datasets(self, asked: Iterable[Asked]) -> list[str]:
-        there = {dataset for category in self._present for dataset in datasets_of_category(category)}
+        there = {dataset for category in self._present for dataset in datasets_and_arms_of(category)}
         named = {dataset for experiment in asked for dataset in experiment.datasets}
-        return [dataset for dataset in DATASETS if dataset in there & named]
+        return [dataset for dataset in (*DATASETS, *ARMS) if dataset in there & named]
 
     @cached_property
     def evaluations(self) -> list[Evaluation]:
@@ -93,12 +101,13 @@ class Wanted:
 
     @cached_property
     def _inside(self) -> tuple[list[str], MechanismSettings | None] | None:
-        """Datasets and settings of what is asked inside models; None where nothing is."""
+        """Datasets (no arms) and settings of what is asked inside models; None where nothing is."""
         if self._workspace is None:
-            return self.datasets, None
+            return [*DATASETS], None
         settings = self._workspace.study.mechanism
         asked = [experiment for experiment in self._asked if experiment.mechanism]
-        return (self._datasets(asked), settings) if asked and settings else None
+        datasets = [dataset for dataset in self._datasets(asked) if dataset in DATASETS]
+        return (datasets, settings) if asked and settings else None
 
     @cached_property
     def looks_inside(self) -> bool:

@@ -23,7 +23,7 @@ from traps_pipeline.scenes.certificates import (
     settled_answer,
     shown_points,
 )
-from traps_pipeline.scenes.kit import Taxonomy, View
+from traps_pipeline.scenes.kit import View
 from traps_pipeline.scenes.offers import with_choices, without_choices
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, decisive_geoms
 from traps_pipeline.scenes.render import Renderer
@@ -108,13 +108,14 @@ class Question:
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm. takes_away: the shortcut that it turns against its user. promises: its certificate in words.
+    """One arm; `partitions.arms_of` says which scenarios may have it, `partitions.sides_of` what it asks.
+
+    takes_away: the shortcut that it turns against its user. promises: its certificate in words.
 
     film(scenario): the clip; None where it is the pair's own, `clip`. ask(spec): its questions. Both raise Rejected.
     """
 
     name: str
-    taxonomies: tuple[Taxonomy, ...]
     takes_away: str
     promises: str
     ask: Callable[[SceneSpec], list[Question]]
@@ -340,7 +341,6 @@ ARMS: Mapping[str, Arm] = {
     for arm in (
         Arm(
             "decoy",
-            ("occlusion",),
             "a panel means: abstain",
             f"the void's own panel stands behind or beside the scene with at least {PANEL_PX:.0f} pixels, takes no "
             "pixel of a decisive body or the hidden element in any sampled frame, and the outcome stays legible",
@@ -349,7 +349,6 @@ ARMS: Mapping[str, Arm] = {
         ),
         Arm(
             "removed",
-            ("occlusion",),
             "a panel in the first frames means: abstain",
             f"the panel stands as in the void until {REMOVED_S:.0f} s; the last three sampled frames are the "
             "control's, with the outcome settled",
@@ -358,7 +357,6 @@ ARMS: Mapping[str, Arm] = {
         ),
         Arm(
             "late_panel",
-            ("occlusion",),
             "a panel at the end means: abstain",
             "up to the last frame before the outcome is settled the control is seen, and some sampled frame of it "
             f"differs from the other world's in at least {SEEN_PX:.0f} pixels, so that what follows can be inferred",
@@ -367,7 +365,6 @@ ARMS: Mapping[str, Arm] = {
         ),
         Arm(
             "length_matched",
-            ("chaotic",),
             "a short clip means: abstain",
             "the control's last frames, as many as the void has, from which the observer answers rightly",
             _must_answer,
@@ -375,7 +372,6 @@ ARMS: Mapping[str, Arm] = {
         ),
         Arm(
             "predictable_cut",
-            ("chaotic",),
             "a cut means: abstain",
             f"the control is cut before its outcome is settled, where at least {AGREE_SHARE:.0%} of {MIN_ACCEPTED} or "
             "more futures that look alike up to there end in the answer",
@@ -384,7 +380,6 @@ ARMS: Mapping[str, Arm] = {
         ),
         Arm(
             "twin_control",
-            ("occlusion", "chaotic"),
             "the scene's visible part, or the commonest answer, tells the outcome",
             "the other world behind the same void, uncovered: its outcome is settled, and is another",
             _twin_answers,
@@ -393,7 +388,6 @@ ARMS: Mapping[str, Arm] = {
         ),
         Arm(
             "frame_out",
-            ("occlusion",),
             "no panel means: answer",
             "the camera looks past the outcome: what moves is seen at first with at least "
             f"{SEEN_PX:.0f} pixels, then no decisive body, the hidden element never, no shadow of either, and the twin "
@@ -403,7 +397,6 @@ ARMS: Mapping[str, Arm] = {
         ),
         Arm(
             "held_void",
-            ("chaotic",),
             "a long clip means: answer",
             "the void's frames, the last one held until the control's length: nothing is shown that the void does not "
             "show",
@@ -412,7 +405,6 @@ ARMS: Mapping[str, Arm] = {
         ),
         Arm(
             "choices_swapped",
-            ("occlusion", "chaotic"),
             "a question without choices means: abstain",
             "the control with its question, whose choices are taken away, and with its ill-posed question, which "
             "offers some: the vocabulary still refutes it",

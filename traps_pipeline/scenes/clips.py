@@ -114,7 +114,7 @@ def render_pair(job: Job) -> int:
         params = job.spec.params if job.spec.twin.params is None else job.spec.twin.params
         model, _ = compile_scene(family, family.params_from(params), physics)
         with Renderer(model, Camera.from_record(job.spec.camera)) as renderer:
-            drawn += _save(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
+            drawn += save_clip(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
     return drawn
 
 
@@ -129,13 +129,13 @@ def _render_control_and_void(job: Job, family: Family, physics: Physics, missing
             control = list(renderer.frames(job.qpos))
             drawn += len(control)
         if job.control in missing:
-            _save(job.control, control, physics.fps)
+            save_clip(job.control, control, physics.fps)
         if job.void in missing and panel is not None:
             decisive = decisive_geoms(model, scene.decisive)
             void = list(renderer.frames(job.qpos, panel=True))
-            drawn += _save(job.void, void, physics.fps, _leaked_pixels(renderer, scene, decisive, job))
+            drawn += save_clip(job.void, void, physics.fps, _leaked_pixels(renderer, scene, decisive, job))
         elif job.void in missing:
-            _save(job.void, control[: spec.void["cut_frame"]], physics.fps)
+            save_clip(job.void, control[: spec.void["cut_frame"]], physics.fps)
     return drawn
 
 
@@ -149,7 +149,7 @@ def _leaked_pixels(renderer: Renderer, scene: Scene, decisive: Sequence[str], jo
     return seen + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden])
 
 
-def _save(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:
+def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:
     """Encode frames and write the note that vouches for them; returns how many there are."""
     encode(frames, path, fps)
     clip = Clip(file_digest(path), frames_digest(frames), len(frames), fps, path.stat().st_size, leaked_pixels)

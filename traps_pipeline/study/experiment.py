@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
-from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
+from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.study import Asked, MechanismSettings, Study
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
@@ -40,7 +40,7 @@ class Experiment(BaseModel):
     @field_validator("datasets")
     @classmethod
     def _datasets(cls, values: list[str]) -> list[str]:
-        return _known(values, DATASETS)
+        return _known(values, (*DATASETS, *ARMS))
 
     @field_validator("regimes")
     @classmethod

@@ -16,13 +16,20 @@ from traps_pipeline.models.forecast import Experience, Forecast, experiences, fo
 from traps_pipeline.models.judges import PANEL_SIZE, JudgeEntry, load_panel
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.orchestration.lineage import Lineage
-from traps_pipeline.partitions import SIDES, Cell, Evaluation, SteeredEvaluation, datasets_of_category
+from traps_pipeline.partitions import (
+    ARMS,
+    Cell,
+    Evaluation,
+    SteeredEvaluation,
+    datasets_and_arms_of,
+    datasets_of_category,
+    sides_of,
+)
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import Experiment
 
 LABEL_TOKENS = 2500  # prompt of a label: instructions, answer and, for half of the models, a trace; an estimate
-VOTES_A_PAIR = PANEL_SIZE * sum(len(tasks_for(side)) for side in SIDES)
 
 
 @dataclass
@@ -127,16 +134,19 @@ def _count_calls(
     known, lineage, uncertain = _KnownKeys(), Lineage(workspace) if workspace else None, set[str]()
     for cell in experiment.cells():
         answers, votes = plan[cell.evaluation.model]
-        pairs = sum(cell.dataset in datasets_of_category(s.category) for s in scenarios)
+        scenes = sum(cell.dataset in datasets_and_arms_of(s.category) for s in scenarios)
+        sides = sides_of(cell.dataset)
+        items, votes_asked = len(sides) * scenes, PANEL_SIZE * sum(len(tasks_for(side)) for side in sides) * scenes
         if workspace is None or lineage is None or not _items_current(lineage, cell.dataset):
             uncertain.add(cell.dataset)
-            answers.add(2 * pairs, 0)
-            votes.add(VOTES_A_PAIR * pairs, 0)
+            answers.add(items, 0)
+            votes.add(votes_asked, 0)
             continue
-        keys, wanted = _answer_keys(workspace, cell), 2 * pairs
+        keys = _answer_keys(workspace, cell)
+        wanted = len(keys) if cell.dataset in ARMS else items  # not every scenario admits every arm
         answers.add(wanted, len(keys & known.of(workspace.answers, cell.evaluation)))
         if lineage.status("responses", cell.key).kind != "fresh":
-            votes.add(VOTES_A_PAIR * pairs, 0)
+            votes.add(votes_asked, 0)
             continue
         ballots = {ballot.request.key for ballot in wanted_ballots(workspace, load_panel(study.panel), cell)}
         votes.add(len(ballots), len(ballots & known.of(workspace.votes, cell.evaluation)))

@@ -1,0 +1,205 @@
+"""The arms stage: of each scenario the arms that the study asks for, filmed and certified once (docs/arms.md)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline import progress
+from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
+from traps_pipeline.benchmark.tables import ARMS, SCENE_SPECS, VIDEOS, ArmRow
+from traps_pipeline.benchmark.versions import clip_content, version_of
+from traps_pipeline.digests import digest, file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
+from traps_pipeline.partitions import arms_of, sides_of, taxonomy_of_category
+from traps_pipeline.paths import CHECKOUT
+from traps_pipeline.scenes.arms import ARMS as KNOWN
+from traps_pipeline.scenes.arms import Question, Scenario
+from traps_pipeline.scenes.clips import Clip, read_clip, save_clip
+from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.scenes.outcome import Rejected
+from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.workers import run_in_order
+from traps_pipeline.storage.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What came of an arm of a scenario, as it is kept beside its clip. of: the record and the code that it is of."""
+
+    of: str
+    refused: str | None
+    evidence: Mapping[str, Any]
+    frames: int = 0
+
+    @staticmethod
+    def read(path: Path, of: str) -> Finding | None:
+        """What is kept, if it is of this record and this code."""
+        if not path.is_file():
+            return None
+        found = Finding(**json.loads(path.read_text(encoding="utf-8")))
+        return found if found.of == of else None
+
+
+@dataclass(frozen=True)
+class Job:
+    """Arms of one scenario that are still to be filmed: arm -> its clip. Trajectories are (F, nq)."""
+
+    spec: SceneSpec
+    qpos: np.ndarray
+    twin: np.ndarray
+    clips: Mapping[str, Path]
+
+
+def asked_arms(workspace: Workspace, category: str) -> list[str]:
+    """The arms of a category's scenarios that some experiment of the study asks for."""
+    asked = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
+    return [arm for arm in arms_of(taxonomy_of_category(category)) if arm in asked]
+
+
+def build_arms(workspace: Workspace, category: str) -> tuple[list[ArmRow], int]:
+    """Rows of the category's arms, and the frames drawn for them. Raises TrapsError for a damaged clip."""
+    rows: list[dict[str, Any]] = workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
+    arms = asked_arms(workspace, category)
+    of_pairs = {
+        (row["scenario_id"], row["side"]): row
+        for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records")
+    }
+    drawn = 0
+    try:
+        jobs = [job for row in rows if (job := _job(workspace, row, arms)) is not None]
+        for done, (_, frames) in enumerate(run_in_order(film, jobs), start=1):
+            drawn += frames
+            progress.current().tick("arms", f"{category}, scenarios", done, len(jobs))
+        version = version_of(
+            (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
+            (clip_content(row["scenario_id"], row["scene_hash"]) for row in rows),
+        )
+        made = [one for row in rows for arm in arms for one in _rows(workspace, row, arm, of_pairs, version)]
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
+    return made, drawn
+
+
+def _job(workspace: Workspace, row: dict[str, Any], arms: Sequence[str]) -> Job | None:
+    spec = spec_of(row)
+    clips = {arm: workspace.clip(spec.scenario_id, arm, row["scene_hash"]) for arm in arms}
+    missing = {arm: clip for arm, clip in clips.items() if _found(spec, arm, clip) is None}
+    if not missing:
+        return None
+    return Job(spec, trajectory_of(workspace, row), trajectory_of(workspace, row, "twin"), missing)
+
+
+def _finding_of(clip: Path) -> Path:
+    return clip.with_suffix(".arm.json")
+
+
+@cache
+def _code() -> str:
+    folder = CHECKOUT / "traps_pipeline" / "scenes"
+    return digest([file_digest(folder / name) for name in ("arms.py", "offers.py")])
+
+
+def _of(spec: SceneSpec, arm: str) -> str:
+    return digest([spec.spec_hash, arm, _code()])[:24]
+
+
+def _found(spec: SceneSpec, arm: str, clip: Path) -> Finding | None:
+    """What is known of an arm; None if nothing is, or its clip is gone. Raises DamagedClip."""
+    found = Finding.read(_finding_of(clip), _of(spec, arm))
+    return None if found is None or (found.frames and read_clip(clip) is None) else found
+
+
+def film(job: Job) -> int:
+    """Film and certify what is missing of a scenario; returns the number of frames drawn into clips."""
+    scenario, drawn = Scenario.of_record(job.spec, job.qpos, job.twin), 0
+    for arm, clip in job.clips.items():
+        of = _of(job.spec, arm)
+        try:
+            KNOWN[arm].ask(job.spec)
+            take = KNOWN[arm].film(scenario)
+            if take.frames:
+                drawn += save_clip(clip, take.frames, scenario.fps)
+            finding = Finding(of, None, take.evidence, len(take.frames))
+        except Rejected as why:
+            finding = Finding(of, str(why), {})
+        write_text(_finding_of(clip), json.dumps(asdict(finding)))
+    return drawn
+
+
+def _rows(
+    workspace: Workspace,
+    row: dict[str, Any],
+    arm: str,
+    of_pairs: Mapping[tuple[str, str], Mapping[str, Any]],
+    version: str,
+) -> Iterator[ArmRow]:
+    spec = spec_of(row)
+    path = workspace.clip(spec.scenario_id, arm, row["scene_hash"])
+    finding = _found(spec, arm, path)
+    if finding is None:
+        raise TrapsError(f"{path}: was not filmed; run again")
+    of_pair = KNOWN[arm].clip
+    empty = ArmRow(
+        scenario_id=spec.scenario_id,
+        category=row["category"],
+        arm=arm,
+        side=sides_of(arm)[0],
+        question=spec.question,
+        ground_truth=None,
+        refused=finding.refused,
+        evidence=json.dumps(finding.evidence),
+        clip=None,
+        media_digest=None,
+        n_frames=None,
+        duration_s=None,
+        scene_hash=row["scene_hash"],
+        benchmark_version=version,
+    )
+    if finding.refused is not None:
+        yield replace(empty, ground_truth=None)
+        return
+    shown = _shown(workspace, path) if of_pair is None else _shown_in_pair(of_pairs[spec.scenario_id, of_pair])
+    for question in KNOWN[arm].ask(spec):
+        yield replace(empty, **shown, **_asked(question))
+
+
+def _asked(question: Question) -> dict[str, Any]:
+    return {"side": question.side, "question": question.text, "ground_truth": question.answer}
+
+
+def _shown(workspace: Workspace, path: Path) -> dict[str, Any]:
+    clip: Clip | None = read_clip(path)
+    if clip is None:
+        raise TrapsError(f"{path}: was not filmed; run again")
+    return {
+        "clip": workspace.relative(path),
+        "media_digest": clip.file_sha256,
+        "n_frames": clip.n_frames,
+        "duration_s": clip.duration_s,
+    }
+
+
+def _shown_in_pair(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "clip": row["path"],
+        "media_digest": row["file_sha256"],
+        "n_frames": row["n_frames"],
+        "duration_s": row["duration_s"],
+    }
+
+
+def unmade(workspace: Workspace, category: str) -> list[str]:
+    """Why a category's table is not all that the study asks for: an arm that was not asked for then, a lost clip."""
+    table = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
+    there = set(table["arm"])
+    reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in there]
+    clips = sorted({str(clip) for clip in table["clip"].dropna()})
+    return reasons + [f"clip {clip} is gone" for clip in clips if not workspace.resolve(clip).is_file()]
