@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tests.scenes.released import Released, load
+from tests.scenes.released import SAMPLED, Released, load
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.digests import canonical_json
 from traps_pipeline.scenes.certificates import legible_groups
@@ -202,28 +202,20 @@ def records_of(name: str) -> list[str]:
 
 
 def observed(name: str) -> dict[str, str | None]:
-    """What a family's observer says of encoded and decoded clips of its first record, whole and cut short."""
+    """What a family's observer says of its first record's sampled frames, encoded and decoded, whole and cut short."""
     case = load(records_of(name)[0])
     observe, question, physics = case.family.observe, case.spec.question, case.physics
     assert observe is not None
     stored = case.spec.twin.params
     twin, _ = compile_scene(case.family, case.params if stored is None else case.family.params_from(stored), physics)
-    control, _ = compile_scene(case.family, case.params, physics)
-    with Renderer(control, case.camera) as renderer:
-        clips = {"control": list(renderer.frames(case.qpos))}
     with Renderer(twin, case.camera) as renderer:
-        clips["twin"] = list(renderer.frames(case.twin))
-    if case.panel is None:
-        clips["void"] = clips["control"][: case.spec.void["cut_frame"]]
-    else:
-        covered, _ = compile_scene(case.family, case.params, physics, case.panel)
-        with Renderer(covered, case.camera) as renderer:
-            clips["void"] = list(renderer.frames(case.qpos, panel=True))
+        other = list(renderer.frames(case.twin[SAMPLED]))
+    clips = {"control": case.control_frames, "twin": other, "void": case.void_frames()}
     said: dict[str, str | None] = {}
     with tempfile.TemporaryDirectory() as folder:
         for clip, frames in clips.items():
             path = Path(folder) / f"{clip}.mp4"
-            encode(frames, path, physics.fps)
+            encode([*frames], path, physics.fps // SAMPLED.step)
             sampled = decode_sampled(path)
             said[clip] = observe(sampled, question)
             if clip == "control":
