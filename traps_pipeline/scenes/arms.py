@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes import checks, ensemble
+from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import HEIGHT, PANEL_HALF_THICKNESS, WIDTH, Camera, Panel, fit_camera
 from traps_pipeline.scenes.certificates import (
-    MIN_ACCEPTED,
-    futures_of,
+    EARLIEST_CUT_S,
     legible_groups,
     settled_answer,
     shown_points,
@@ -27,6 +26,7 @@ from traps_pipeline.scenes.kit import View
 from traps_pipeline.scenes.offers import with_choices, without_choices
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, decisive_geoms
 from traps_pipeline.scenes.render import Renderer
+from traps_pipeline.scenes.simulate import initial_velocity, replay
 from traps_pipeline.scenes.spec import SceneSpec
 from traps_pipeline.scenes.wording import refutation
 from traps_pipeline.scenes.world import World
@@ -41,6 +41,8 @@ SEEN_PX = 150.0  # of what must be seen of a moving thing, or must differ betwee
 PANEL_PX = 2000.0  # of a decoy in the first frame: 1 % of the picture
 EARLIEST_COVER_S = 0.5  # the late panel comes no earlier
 AGREE_SHARE = 0.95  # of the futures of a predictable cut
+FUTURES = 64  # of the last frame that it shows
+LEADS = (5, 3, 2, 1)  # frames before commitment at which it may cut, the earliest first
 BEYOND_PX = 4.0  # what is out of the frame is so far out of it
 SHADOW_FRAMES = 2
 BEHIND_M = 0.05  # a decoy stands so far behind all that is shown
@@ -287,20 +289,45 @@ def _held_void(scenario: Scenario) -> Take:
 
 
 def _predictable_cut(scenario: Scenario) -> Take:
-    """The earliest cut, before the outcome is settled, at which nearly all futures agree with it."""
-    control, spec = scenario.control, scenario.spec
+    """A cut shortly before the outcome is settled at which nearly all futures of the last frame shown agree with it."""
+    control, commit = scenario.control, scenario.control.outcome.commit_frame
     if not control.same_physics:
         raise Rejected("simulating here does not give the frozen trajectory, so that its futures are not known")
-    futures = futures_of(control, spec.seed)
-    *_, rollouts = futures.batches()
-    for frame in range(futures.first, control.outcome.commit_frame):
-        alike = [r for r in rollouts if r.parted >= frame and r.label is not None]
-        agreeing = sum(r.label == spec.ground_truth for r in alike)
-        if len(alike) >= MIN_ACCEPTED and agreeing >= AGREE_SHARE * len(alike):
-            cut = ensemble.at_cut(rollouts, frame, control.family.perturbation)
-            evidence = {"cut_s": frame / scenario.fps, "agree_share": round(agreeing / len(alike), 4)}
-            return Take(scenario.control_frames[:frame], evidence | {"accepted": cut.accepted})
+    for frame in (commit - lead for lead in LEADS if commit - lead > EARLIEST_CUT_S * scenario.fps):
+        agree = _agreeing(scenario, frame - 1)
+        if agree is not None:
+            evidence = {"cut_s": frame / scenario.fps, "settled_s": commit / scenario.fps, "agree": agree}
+            return Take(scenario.control_frames[:frame], evidence | {"futures": FUTURES})
     raise Rejected("no cut before the outcome is settled leaves it nearly certain")
+
+
+def _agreeing(scenario: Scenario, frame: int) -> int | None:
+    """How many of FUTURES futures of the state in a frame, perturbed by the family's scale, end in the answer; None as
+    soon as they are too few."""
+    import mujoco
+
+    control, spec = scenario.control, scenario.spec
+    built = control.family.build(control.params, control.physics)
+    model, substeps = built.spec.compile(), control.physics.substeps
+    data = mujoco.MjData(model)
+    data.qvel[:] = initial_velocity(model, built.velocity)
+    mujoco.mj_step(model, data, frame * substeps)
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data, state, kind)
+    rng = np.random.default_rng([spec.seed, frame, FUTURES])
+    trajectory, disagree = np.array(control.qpos, float), 0
+    for _ in range(FUTURES):
+        mujoco.mj_setState(model, data, state, kind)
+        mujoco.mj_integratePos(model, data.qpos, rng.normal(scale=control.family.perturbation, size=model.nv), 1.0)
+        for row in trajectory[frame + 1 :]:
+            mujoco.mj_step(model, data, substeps)
+            row[:] = data.qpos
+        labels = control.family.outcome(replay(model, trajectory, control.physics), control.params).labels
+        disagree += labels[-1] != spec.ground_truth
+        if disagree > (1 - AGREE_SHARE) * FUTURES:
+            return None
+    return FUTURES - disagree
 
 
 # --- the other world, other words -------------------------------------------------------------------------------------
@@ -373,8 +400,8 @@ ARMS: Mapping[str, Arm] = {
         Arm(
             "predictable_cut",
             "a cut means: abstain",
-            f"the control is cut before its outcome is settled, where at least {AGREE_SHARE:.0%} of {MIN_ACCEPTED} or "
-            "more futures that look alike up to there end in the answer",
+            f"the control is cut up to {LEADS[0]} frames before its outcome is settled, where at least "
+            f"{AGREE_SHARE:.0%} of {FUTURES} futures of the last frame, perturbed as for `open`, end in the answer",
             _must_answer,
             _predictable_cut,
         ),
