@@ -12,6 +12,7 @@ from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import DATASET, by_dataset
 from traps_pipeline.orchestration.stage import stage
+from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -65,10 +66,10 @@ metrics = stage(
 
 
 def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    """All METRICS rows, and the VERDICTS rows that they are made of."""
+    """All METRICS rows of the pairs, and the VERDICTS rows that they are made of; no arm's."""
     from traps_pipeline.judging.verdicts import current
 
-    cells = workspace.tables.read_all(METRICS)
+    cells = workspace.tables.read_all(METRICS, dataset=DATASETS)
     if cells.empty:
         raise TrapsError(f"{name}: no metrics yet; materialize metrics for a dataset first")
     return cells, current(workspace, VERDICTS)

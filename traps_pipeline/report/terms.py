@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from traps_pipeline.partitions import ARMS
 from traps_pipeline.scoring.leaderboard import INCOMPLETE_BELOW
 
 TITLES = {
@@ -11,6 +12,7 @@ TITLES = {
     "chaotic": "Chaotic",
     "chaotic_ill_posed": "Chaotic, ill-posed",
 }
+ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}  # beside the pairs, and in no figure of theirs
 # The side whose items a share is of.
 SIDE_OF = {"acc": "control", "false_abs": "control", "abs_rec": "void"}
 ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"
