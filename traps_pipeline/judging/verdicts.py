@@ -37,7 +37,7 @@ def current(
     """The rows of a table on items that are still in the benchmark: cells that nobody has evaluated since a correction
     may hold others. What is counted is counted over these.
 
-    dataset: those that are meant; the four of the pairs unless arms are named, so that no arm enters a figure by chance.
+    dataset: which are meant; the four of the pairs unless arms are named, so that no arm enters a figure by chance.
     """
     rows = workspace.tables.read_all(table, columns, dataset=dataset)
     there = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]

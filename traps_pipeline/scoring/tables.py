@@ -23,7 +23,7 @@ class MetricsRow:
     run: shared.Run
     scope: Annotated[str, "all, category:.., sub_scenario:.. or label:.. (the control's answer)"]
     n_pairs: Annotated[int, "pairs in scope"]
-    n_missing: Annotated[int, "items (of 2 n_pairs) without an answer or a majority"]
+    n_missing: Annotated[int, "items (of 2 n_pairs, of n_pairs in an arm of one side) without an answer or a majority"]
     n_refused: Annotated[int, "items refused"]
     n_empty: Annotated[int, "items answered with no text"]
     n_errors: Annotated[int, "items whose call failed"]
