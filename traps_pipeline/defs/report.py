@@ -181,6 +181,6 @@ report_page = _report(
     _page,
     "The report: leaderboard, figures and tables beside the paper's, every number linked to its items (HTML that opens "
     "from disk); the leaderboard as Markdown.",
-    deps=["items", "responses", "votes", "verdicts", "leaderboard", "contact_sheet", "shortcuts", *PRINTED],
+    deps=["items", "responses", "votes", "verdicts", "leaderboard", "robust", "contact_sheet", "shortcuts", *PRINTED],
     kinds=["html"],
 )

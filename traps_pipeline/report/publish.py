@@ -41,8 +41,8 @@ def report_files(study: StudyResults, cells: Sequence[Cell], pictures: Pictures)
     address = addresses(cells)
     landscape = FIGURES[0]
     first = {landscape.title: pictures[landscape.path(study)]} if landscape.path(study) in pictures else {}
-    page = report_html(study.board, first, _chapters(study, address, pictures), address)
-    return {PAGE: page.encode(), MARKDOWN: leaderboard_markdown(study.board).encode()}
+    page = report_html(study.board, first, _chapters(study, address, pictures), address, robust=study.robust)
+    return {PAGE: page.encode(), MARKDOWN: leaderboard_markdown(study.board, study.robust).encode()}
 
 
 def _chapters(

@@ -13,6 +13,12 @@ TITLES = {
     "chaotic_ill_posed": "Chaotic, ill-posed",
 }
 ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}  # beside the pairs, and in no figure of theirs
+# What the columns of a leaderboard with arms mean (docs/scoring.md, "PECS-R and the gap").
+ROBUST_TERMS = {
+    "PECS-R": "PECS over the pairs and the arms, which take shortcuts away; kinds of items have equal weight. Entries "
+    "over different arms are not compared",
+    "gap": "PECS of the runs behind PECS-R, minus PECS-R: what shortcuts may have earned",
+}
 # The side whose items a share is of.
 SIDE_OF = {"acc": "control", "false_abs": "control", "abs_rec": "void"}
 ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"
