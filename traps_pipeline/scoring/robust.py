@@ -97,7 +97,7 @@ def _row(items: pd.DataFrame, arms: Sequence[str], drawn: Drawn) -> dict[str, An
     told = by_run[..., 0]  # (runs, FIGURES)
     row: dict[str, Any] = {
         "n_runs": len(runs),
-        "n_items": int(items.groupby("run")["item_id"].nunique().max()),
+        "n_items": max(rows["item_id"].nunique() for _, rows in items.groupby("run")),
         "n_missing": _missing(items),
         "epoch": joined_epochs(items["epoch"]),
         "benchmark_version": " + ".join(sorted(set(items["benchmark_version"]))),
@@ -138,8 +138,8 @@ def _twins(items: pd.DataFrame) -> tuple[float, int]:
     controls = items.loc[(items["side"] == "control") & items["correct_of"].eq(1)].set_index("scenario_id")
     own = controls.loc[controls["dataset"].isin(VISUAL), "correct"]
     twin = controls.loc[controls["dataset"] == TWIN, "correct"]
-    both = pd.concat([own, twin], axis=1, join="inner").to_numpy(float).all(axis=1)
-    return (float(both.mean()) if len(both) else float("nan")), len(both)
+    worlds = pd.concat([own, twin], axis=1, join="inner").to_numpy(float)
+    return (float(worlds.min(axis=1).mean()) if len(worlds) else float("nan")), len(worlds)
 
 
 def _missing(items: pd.DataFrame) -> int:
