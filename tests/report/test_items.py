@@ -94,6 +94,17 @@ def test_a_page_is_made_anew_only_where_its_tables_changed(workspace, tmp_path):
     assert sorted(file.name for file in tmp_path.glob("*.html")) == [page_name(CELL), "index.html"]
 
 
+def test_cells_of_arms_have_pages_behind_those_of_the_pairs(workspace, tmp_path):
+    arm = Cell("held_void", CELL.evaluation)
+    for cell in (arm, CELL):
+        write_cell(workspace, cell)
+    assert write_item_pages(workspace, tmp_path, None) == [CELL, arm]
+    assert "Arm: held void" in (tmp_path / page_name(arm)).read_text()
+    index = (tmp_path / "index.html").read_text()
+    assert index.index("<th>Chaotic</th>") < index.index("<th>Arm: held void</th>")
+    assert page_name(arm) in index
+
+
 def test_a_number_leads_to_the_one_run_behind_it_else_to_the_index():
     twice = Cell("occlusion", Evaluation("oracle", "guided", 1)), Cell("occlusion", Evaluation("oracle", "guided", 2))
     address = addresses([CELL, *twice])

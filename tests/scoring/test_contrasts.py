@@ -19,10 +19,11 @@ from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
+    figures_of,
     intervals,
     percentiles,
     resample,
-    resampled_figures,
+    resampled_sums,
     scenario_weights,
 )
 from traps_pipeline.scoring.contrasts import contrasts, holm, regime_tests, version_contrasts
@@ -247,7 +248,7 @@ def coverage(acc, false_abs, abs_rec):
     true_j = abs_rec - false_abs
     covered = []
     for first in range(0, studies * runs, 300):
-        drawn = resampled_figures(weights, counts[:, first : first + 300])[
+        drawn = figures_of(resampled_sums(weights, counts[:, first : first + 300]))[
             :, [RESAMPLED.index("j"), RESAMPLED.index("pecs")]
         ]
         bounds = percentiles(drawn.reshape(-1, runs, 2, resamples).mean(axis=1))

@@ -176,6 +176,10 @@ def test_partitions_are_read_together_and_by_column(store: TableStore) -> None:
     assert len(store.read_all(RESPONSES)) == 6
     assert len(store.read_all(RESPONSES, dataset="chaotic", run=2)) == 2
     assert list(store.read_all(RESPONSES, ["item_id"], run=1)["item_id"]) == ["chaotic:0", "occlusion:0"]
+    assert list(store.read_all(RESPONSES, ["item_id"], run=1, dataset=("occlusion", "decoy"))["item_id"]) == [
+        "occlusion:0"
+    ]
+    assert len(store.read_all(RESPONSES, dataset=[])) == 0
 
 
 def test_a_misspelt_partition_column_is_refused(store: TableStore) -> None:

@@ -120,9 +120,9 @@ def _check_participant(name: str) -> None:
 
 def _print_results(workspace: Workspace) -> None:
     from traps_pipeline.report.leaderboard import leaderboard_text
-    from traps_pipeline.scoring.tables import LEADERBOARD
+    from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
 
-    print(leaderboard_text(workspace.tables.read(LEADERBOARD, {})))
+    print(leaderboard_text(workspace.tables.read(LEADERBOARD, {}), workspace.tables.read_all(ROBUST)))
     pictures = ("figures/pecs_landscape.png", "contact_sheet.png", "shortcuts.png")
     for name in ("report.html", "leaderboard.md", "gallery.html", *pictures):
         print(workspace.reports / name)

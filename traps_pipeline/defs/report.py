@@ -11,6 +11,7 @@ from traps_pipeline.defs.shown import thumbnail
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.graph import Need
 from traps_pipeline.orchestration.stage import key_of, shown, source, stage
+from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report.catalogue import OF_PAPER, OF_STUDY, PRINTED, Report, TableReport, workspace_files
 from traps_pipeline.report.results import Results
 from traps_pipeline.scoring.published import published_digest
@@ -60,7 +61,7 @@ def _sheet(workspace: Workspace) -> Files:
     from traps_pipeline.report.contact_sheet import PAGE, contact_sheet, pairs_figure, six_pairs
     from traps_pipeline.report.writing import figure_bytes
 
-    rows = workspace.tables.read_all(ITEMS)
+    rows = workspace.tables.read_all(ITEMS, dataset=DATASETS)
     if rows.empty:
         raise TrapsError("contact_sheet: no items yet; materialize items first")
     six = pairs_figure(six_pairs(rows), workspace.root, None, layout=PAGE)
@@ -84,7 +85,7 @@ def _shortcuts(workspace: Workspace) -> Files:
     from traps_pipeline.report.writing import figure_bytes
     from traps_pipeline.scenes.encode import DamagedClip
 
-    rows = workspace.tables.read_all(ITEMS)
+    rows = workspace.tables.read_all(ITEMS, dataset=DATASETS)
     if rows.empty:
         raise TrapsError("shortcuts: no items yet; materialize items first")
     try:
@@ -180,6 +181,6 @@ report_page = _report(
     _page,
     "The report: leaderboard, figures and tables beside the paper's, every number linked to its items (HTML that opens "
     "from disk); the leaderboard as Markdown.",
-    deps=["items", "responses", "votes", "verdicts", "leaderboard", "contact_sheet", "shortcuts", *PRINTED],
+    deps=["items", "responses", "votes", "verdicts", "leaderboard", "robust", "contact_sheet", "shortcuts", *PRINTED],
     kinds=["html"],
 )

@@ -12,7 +12,8 @@ from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import DATASET, by_dataset
 from traps_pipeline.orchestration.stage import stage
-from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS
+from traps_pipeline.partitions import ARMS, DATASETS
+from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -65,10 +66,10 @@ metrics = stage(
 
 
 def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    """All METRICS rows, and the VERDICTS rows that they are made of."""
+    """All METRICS rows of the pairs, and the VERDICTS rows that they are made of; no arm's."""
     from traps_pipeline.judging.verdicts import current
 
-    cells = workspace.tables.read_all(METRICS)
+    cells = workspace.tables.read_all(METRICS, dataset=DATASETS)
     if cells.empty:
         raise TrapsError(f"{name}: no metrics yet; materialize metrics for a dataset first")
     return cells, current(workspace, VERDICTS)
@@ -115,6 +116,26 @@ def _wrong_intervals(workspace: Workspace, key: str | None, made: Made) -> str:
     return f"{wrong} intervals are wrong" if wrong else ""
 
 
+def _make_robust(workspace: Workspace, _: None) -> Made:
+    """PECS-R of every model under every regime that was asked all four datasets and an arm, the gap to PECS, and paired
+    twin accuracy; empty where no arm was run."""
+    from traps_pipeline.judging.verdicts import current
+    from traps_pipeline.scoring.robust import robust as without_shortcuts
+
+    judged = current(workspace, VERDICTS, dataset=(*DATASETS, *ARMS))
+    if judged.empty:
+        raise TrapsError("robust: no verdicts yet; materialize verdicts for a cell first")
+    table = without_shortcuts(judged)
+    return Made(table, shown={"PECS-R": rows_shown(table)})
+
+
+def _wrong_robust(workspace: Workspace, key: str | None, made: Made) -> str:
+    from traps_pipeline.scoring.robust import wrong_rows
+
+    wrong = wrong_rows(made.frame)
+    return f"{wrong} rows are wrong" if wrong else ""
+
+
 _OF_SOME: dict[str, Need] = {"metrics": "some", "verdicts": "some"}
 contrasts = stage(CONTRASTS, _make_contrasts, group=GROUP, deps=[metrics, verdicts], needs=_OF_SOME)
 regime_tests = stage(REGIME_TESTS, _make_regime_tests, group=GROUP, deps=[metrics, verdicts], needs=_OF_SOME)
@@ -130,6 +151,21 @@ leaderboard = stage(
             "intervals_ordered",
             "Every interval is ordered and lies in [0, 1], that of J in [-1, 1].",
             _wrong_intervals,
+        )
+    ],
+)
+robust = stage(
+    ROBUST,
+    _make_robust,
+    group=GROUP,
+    deps=[metrics, verdicts],
+    needs=_OF_SOME,
+    columns={"acc_r": ["verdicts.correct"], "abs_rec_r": ["verdicts.abstained"], "false_abs_r": ["verdicts.abstained"]},
+    checks=[
+        Check(
+            "robust_rows_hold",
+            "PECS-R and its shares lie in [0, 1], intervals are ordered, the gap is PECS - PECS-R.",
+            _wrong_robust,
         )
     ],
 )

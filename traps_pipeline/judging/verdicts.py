@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,7 +23,7 @@ from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.judges import PANEL_SIZE
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import Cell
+from traps_pipeline.partitions import DATASETS, Cell
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -32,10 +31,15 @@ ITEM_COLUMNS = ["item_id", "scenario_id", "category", "sub_scenario", "control_a
 RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "epoch"]
 
 
-def current(workspace: Workspace, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pd.DataFrame:
-    """The rows of a table (partition columns as in `equal`) on items that are still in the benchmark: cells that nobody
-    has evaluated since a correction may hold others. What is counted is counted over these."""
-    rows = workspace.tables.read_all(table, columns, **equal)
+def current(
+    workspace: Workspace, table: Table, columns: Sequence[str] | None = None, dataset: str | Sequence[str] = DATASETS
+) -> pd.DataFrame:
+    """The rows of a table on items that are still in the benchmark: cells that nobody has evaluated since a correction
+    may hold others. What is counted is counted over these.
+
+    dataset: which are meant; the four of the pairs unless arms are named, so that no arm enters a figure by chance.
+    """
+    rows = workspace.tables.read_all(table, columns, dataset=dataset)
     there = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
     return rows.loc[rows["item_id"].isin(there)].reset_index(drop=True)
 

@@ -49,7 +49,7 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
         media=clip,
         sent=sent,
         media_digest=sent.sha256 if sent else item["media_digest"],
-        secret=_secret(entry, item) if entry.backend == "reference" else {},
+        secret=_secret(entry, item),
     )
 
 
@@ -86,7 +86,12 @@ def _items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
     """What reference strategies may read: side, labels, on a control its ground truth; the sub-scenario's commonest
-    answer goes to `prior` alone, so that a corrected answer which changes it re-asks no other model."""
+    answer goes to `prior` and to the rules alone, so that a corrected answer which changes it re-asks no other model.
+    A rule reads nothing else, and every other model nothing at all."""
+    if entry.backend == "rule":
+        return {"commonest_answer": item["commonest_answer"]}
+    if entry.backend != "reference":
+        return {}
     secret: dict[str, Any] = {"side": item["side"], "labels": list(item["labels"])}
     if item["side"] == "control":
         secret["ground_truth"] = item["ground_truth"]

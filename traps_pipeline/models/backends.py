@@ -21,6 +21,10 @@ def make_backend(entry: Entry) -> Backend:
             from traps_pipeline.models.observer import ObserverBackend
 
             return ObserverBackend()
+        case "rule":
+            from traps_pipeline.models.shortcut_rules import RuleBackend
+
+            return RuleBackend()
         case "api":
             from traps_pipeline.models.api import ApiBackend
 
@@ -29,4 +33,4 @@ def make_backend(entry: Entry) -> Backend:
             from traps_pipeline.models.local.backend import LocalBackend
 
             return LocalBackend(entry)
-    raise TrapsError(f"{entry.id}: unknown backend {entry.backend!r}; known: reference, observer, api, local")
+    raise TrapsError(f"{entry.id}: unknown backend {entry.backend!r}; known: reference, observer, rule, api, local")

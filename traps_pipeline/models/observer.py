@@ -11,8 +11,8 @@ from traps_pipeline.models.request import Outcome, Request
 
 
 @lru_cache(maxsize=100_000)
-def _seen(media_digest: str, clip: Path, question: str) -> str | None:
-    """One look at a clip serves all regimes and runs."""
+def seen(media_digest: str, clip: Path, question: str) -> str | None:
+    """What the observer says of a clip; one look at a clip serves all regimes and runs."""
     from traps_pipeline.scenes.observe import observe
 
     return observe(clip, question)
@@ -24,6 +24,6 @@ class ObserverBackend:
     async def ask(self, request: Request) -> Outcome:
         """One attempt; see `Backend`."""
         assert request.media is not None, "the observer is asked about clips"
-        answer = await asyncio.to_thread(_seen, request.media_digest, request.media, request.user)
+        answer = await asyncio.to_thread(seen, request.media_digest, request.media, request.user)
         text = phrase(answer, str(request.about["regime"]))
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)

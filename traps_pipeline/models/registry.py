@@ -175,7 +175,7 @@ class Entry(BaseModel):
 class ModelEntry(Entry):
     """One model configuration."""
 
-    backend: Literal["reference", "observer", "api", "local"]  # pyright: ignore[reportIncompatibleVariableOverride]
+    backend: Literal["reference", "observer", "rule", "api", "local"]  # pyright: ignore[reportIncompatibleVariableOverride]
     media: MediaSpec | None = None
     runs: int = Field(default=3, ge=1, le=9)
     json_schema: bool = Field(default=True, description="structured output in the JSON regime; of backend api")
@@ -195,10 +195,13 @@ class ModelEntry(Entry):
     @model_validator(mode="after")
     def _backend_has_what_it_needs(self) -> ModelEntry:
         from traps_pipeline.models.reference import STRATEGIES
+        from traps_pipeline.models.shortcut_rules import RULES
 
         if self.backend == "reference" and self.params.get("strategy") not in STRATEGIES:
             known = ", ".join(STRATEGIES)
             raise ValueError(f"params.strategy is {self.params.get('strategy')!r}; known strategies: {known}")
+        if self.backend == "rule" and self.params.get("rule") not in RULES:
+            raise ValueError(f"params.rule is {self.params.get('rule')!r}; known rules: {', '.join(RULES)}")
         if (self.backend in (NETWORK, LOCAL)) != (self.media is not None):
             raise ValueError(f"media: backend {self.backend} {'needs it' if self.media is None else 'has none'}")
         if self.media is not None:

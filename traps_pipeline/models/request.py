@@ -26,7 +26,8 @@ class Request:
 
     participant: model or judge. endpoint: kind of backend. params: exactly what is sent. about: which item, model,
     regime, run (and task) it is for: repeated questions are calls of their own. secret: what only a reference model
-    sees (side, ground truth). media is the clip, media_digest what stands for it in the key.
+    sees (side, ground truth) or a rule (the commonest answer). media is the clip, media_digest what stands for it in
+    the key.
     """
 
     participant: str

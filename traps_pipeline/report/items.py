@@ -19,14 +19,15 @@ from traps_pipeline.files import write_bytes
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
-from traps_pipeline.report.terms import TITLES
+from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, Cell, Evaluation
+from traps_pipeline.report.terms import ARM_TITLES, TITLES
 from traps_pipeline.report.writing import TEMPLATES, Behind, environment
 from traps_pipeline.storage.workspace import Workspace
 
 FOLDER = "items"
 MADE = "made.json"  # digest of what each page was made from
 _PER_CELL = (RESPONSES, VOTES, VERDICTS)
+_DATASETS, _TITLES = (*DATASETS, *ARMS), TITLES | ARM_TITLES  # an arm's items have pages as those of the pairs have
 
 
 def cells_with_items(workspace: Workspace) -> list[Cell]:
@@ -41,7 +42,7 @@ def cells_with_items(workspace: Workspace) -> list[Cell]:
 
 def _place(cell: Cell) -> tuple[Any, ...]:
     e = cell.evaluation
-    return e.model, REGIMES.index(e.regime), DATASETS.index(cell.dataset), e.run
+    return e.model, REGIMES.index(e.regime), _DATASETS.index(cell.dataset), e.run
 
 
 def page_name(cell: Cell) -> str:
@@ -111,7 +112,7 @@ def item_page(workspace: Workspace, cell: Cell, clips: str | None) -> str:
     return (
         environment()
         .get_template("items.html.j2")
-        .render(cell=cell, title=TITLES[cell.dataset], sides=sides, clips=clips, judged=JUDGED)
+        .render(cell=cell, title=_TITLES[cell.dataset], sides=sides, clips=clips, judged=JUDGED)
     )
 
 
@@ -151,9 +152,9 @@ def index_page(cells: Sequence[Cell]) -> str:
         e = cell.evaluation
         by_dataset = models.setdefault(e.model, {}).setdefault(e.regime, {})
         by_dataset.setdefault(cell.dataset, []).append((e.run, page_name(cell)))
-    datasets = [name for name in DATASETS if any(cell.dataset == name for cell in cells)]
+    datasets = [name for name in _DATASETS if any(cell.dataset == name for cell in cells)]
     return (
         environment()
         .get_template("items_index.html.j2")
-        .render(models=models, datasets=datasets, titles=TITLES, anchor=_anchor)
+        .render(models=models, datasets=datasets, titles=_TITLES, anchor=_anchor)
     )

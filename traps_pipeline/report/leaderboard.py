@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
+from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, SHORT
 from traps_pipeline.report.tables.shared import (
     EPOCH,
     MISSING,
@@ -26,8 +26,8 @@ from traps_pipeline.report.tables.shared import (
     interval,
     meanings,
 )
-from traps_pipeline.report.terms import ENOUGH, INCOMPLETE_MARK, MISSING_MARK, TITLES
-from traps_pipeline.report.writing import NONE, Behind, Column, Table, fraction, table_markdown, table_text
+from traps_pipeline.report.terms import ENOUGH, INCOMPLETE_MARK, MISSING_MARK, ROBUST_TERMS, TITLES
+from traps_pipeline.report.writing import NONE, NOT_RUN, Behind, Column, Table, fraction, table_markdown, table_text
 from traps_pipeline.scoring.analyses import of_several_runs
 from traps_pipeline.scoring.tables import LEADERBOARD
 
@@ -38,6 +38,8 @@ OPTIONAL = {
     Column("n_empty", "Empty", "count"): "n_empty",
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
+Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # model and regime to their ROBUST row
+ROBUST_COLUMNS = (Column("pecs_r", "PECS-R", "range", group=True), Column("gap", "gap", "range"))
 LEGEND = {
     "Acc": "share of control items answered correctly",
     "AbsRec": "abstention recall: share of void items, which cannot be answered, that the model abstains on",
@@ -55,24 +57,26 @@ LEGEND = {
     "Empty": "items over all runs answered with no text; among the missing",
     BOUNDS: "PECS of all items if every missing decision were as bad for the model as can be (a control wrong and "
     "abstained on, a void not abstained on) and as good as can be; computed per run, then averaged",
+    **ROBUST_TERMS,
     "Epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
 }
 
 
-def leaderboard_text(board: pd.DataFrame) -> str:
-    """LEADERBOARD rows as a table for standard output, best first."""
-    return table_text(leaderboards(board, brief=True)[0])
+def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> str:
+    """LEADERBOARD rows, with what ROBUST rows say of them, as a table for standard output, best first."""
+    return table_text(leaderboards(board, robust, brief=True)[0])
 
 
-def leaderboard_markdown(board: pd.DataFrame) -> str:
-    """LEADERBOARD rows as a Markdown table with its legend, best first."""
-    terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board).items()]
-    return "\n".join([table_markdown(leaderboards(board, brief=True)[0]), *terms]) + "\n"
+def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> str:
+    """LEADERBOARD rows, with what ROBUST rows say of them, as a Markdown table with its legend, best first."""
+    terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
+    return "\n".join([table_markdown(leaderboards(board, robust, brief=True)[0]), *terms]) + "\n"
 
 
-def leaderboards(board: pd.DataFrame, *, brief: bool = False) -> list[Table]:
-    """Tables of LEADERBOARD rows: first the one that entries are ranked by, then one of each other dataset.
+def leaderboards(board: pd.DataFrame, robust: pd.DataFrame | None = None, *, brief: bool = False) -> list[Table]:
+    """Tables of LEADERBOARD rows: first the one that entries are ranked by, then one of each other dataset. The overall
+    one has the figures of ROBUST rows, where there are any.
 
     The first is `overall`; on a board where no model has all four datasets it is the first dataset that is there. An
     entry without a row there stands last. brief: without deviations, runs and epochs.
@@ -80,14 +84,17 @@ def leaderboards(board: pd.DataFrame, *, brief: bool = False) -> list[Table]:
     there = set(board["dataset"])
     ranked = next((name for name in TITLES if name in there), "overall")
     others = [name for name in DATASETS if name in there and name != ranked]
-    own = [_leaderboard(board.loc[board["dataset"] == name], name, [], brief) for name in others]
-    return [_leaderboard(board, ranked, others, brief), *own]
+    own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief) for name in others]
+    rows = [] if robust is None or ranked != "overall" else robust.to_dict("records")
+    beside = {(row["model"], row["regime"]): row for row in rows}
+    return [_leaderboard(board, ranked, others, beside, brief), *own]
 
 
-def legend(board: pd.DataFrame) -> dict[str, str]:
+def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
     """LEGEND without the mark and the columns that nothing on the board calls for."""
     needed = {column.heading: field for column, field in OPTIONAL.items()} | {INCOMPLETE_MARK: "incomplete"}
     absent = {term for term, field in needed.items() if not (board.loc[:, field] > 0).any()}
+    absent |= {*ROBUST_TERMS} if robust is None or robust.empty else set()
     return {term: meaning for term, meaning in LEGEND.items() if term not in absent}
 
 
@@ -105,18 +112,20 @@ def _distinct(values: Iterable[Any], separator: str) -> list[str]:
     return sorted({part for value in values for part in str(value).split(separator) if part})
 
 
-def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], brief: bool) -> Table:
+def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], beside: Robust, brief: bool) -> Table:
     rows = _entries(board, dataset, others)
     columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, J]
     for name in others:
         heading = f"PECS {SHORT[name] if brief else TITLES[name]}"
         columns.append(Column(name, heading, "fraction", mark=f"{name}_mark", group=name == others[0]))
+    if beside:
+        rows, columns = _with_robust(rows, beside), [*columns, *ROBUST_COLUMNS]
     columns += [replace(N, mark="n_mark", group=True), RUNS, replace(MISSING, mark="missing_mark")]
     columns += [column for column, field in OPTIONAL.items() if (rows.loc[:, field] > 0).any()]
     columns += [
         column for column in (EPOCH, Column("benchmark_version", "Version")) if rows.loc[:, column.field].nunique() > 1
     ]
-    notes = meanings([*rows["n_mark"], *rows["missing_mark"]])
+    notes = [*meanings([*rows["n_mark"], *rows["missing_mark"]]), *_said_of_arms(beside)]
     if brief:
         columns = [replace(c, spread="") for c in columns if c.field not in ("n_runs", "epoch", "benchmark_version")]
     else:
@@ -128,7 +137,36 @@ def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], brief
     )  # fmt: skip
 
 
+def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
+    """The rows with PECS-R and gap as printed: PECS-R with the number of its arms where these are not all."""
+    found = [beside.get((row["model"], row["regime"])) for row in rows.to_dict("records")]
+    return rows.assign(
+        pecs_r=[fraction(row["pecs_r"]) + _of_arms(row) if row else NOT_RUN for row in found],
+        gap=[fraction(row["gap"]) if row else NOT_RUN for row in found],
+    )
+
+
+def _of_arms(row: Mapping[str, Any]) -> str:
+    return f" ({len(row['arms'])} of {len(ARMS)} arms)" if len(row["arms"]) < len(ARMS) else ""
+
+
+def _said_of_arms(beside: Robust) -> list[str]:
+    """Over which arms each PECS-R is, and why there is no gap."""
+    entries: dict[tuple[str, ...], list[str]] = {}
+    for (model, regime), row in beside.items():
+        entries.setdefault(tuple(row["arms"]), []).append(f"{model} {regime}")
+    notes = [
+        f"PECS-R{' of ' + ', '.join(names) if len(entries) > 1 else ''} is over {len(arms)} of {len(ARMS)} arms: "
+        + ", ".join(arms)
+        for arms, names in entries.items()
+    ]
+    refused = dict.fromkeys(row["refused"] for row in beside.values() if row["refused"])
+    return [*notes, *(f"no gap: {why}" for why in refused)]
+
+
 def _trace(row: Mapping[str, Any], field: str) -> Behind | None:
+    if row.get(field) == NOT_RUN:
+        return None
     return cell_trace({**row, "dataset": field} if field in DATASETS else row, field)
 
 

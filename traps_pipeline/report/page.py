@@ -39,11 +39,12 @@ def report_html(
     chapters: Sequence[tuple[str, Sequence[Card]]] = (),
     address: Callable[[Behind], str] | None = None,
     title: str = "TRAPSBench report",
+    robust: pd.DataFrame | None = None,
 ) -> str:
     """One page: the leaderboard, figures (title -> PNG bytes, inlined), legend, a table a dataset, then the chapters.
 
-    With `address`, every number is a link to the items behind it. The page opens from disk and asks the network for
-    nothing; its content policy forbids it.
+    robust: ROBUST rows, whose figures stand on the leaderboard. With `address`, every number is a link to the items
+    behind it. The page opens from disk and asks the network for nothing; its content policy forbids it.
     """
     return (
         environment()
@@ -51,11 +52,11 @@ def report_html(
         .render(
             title=title,
             provenance=provenance(board),
-            boards=[(table.title, table_html(table, address)) for table in leaderboards(board)],
+            boards=[(table.title, table_html(table, address)) for table in leaderboards(board, robust)],
             figures={name: base64.b64encode(png).decode() for name, png in (figures or {}).items()},
             chapters=chapters,
             all_items=address(Behind()) if address else "",
-            legend=legend(board),
+            legend=legend(board, robust),
         )
     )
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.files import write_bytes
-from traps_pipeline.partitions import Cell
+from traps_pipeline.partitions import DATASETS, Cell
 from traps_pipeline.report.catalogue import FIGURES, TABLES
 from traps_pipeline.report.contact_sheet import PAGE as SIX_PAIRS
 from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
@@ -41,8 +41,8 @@ def report_files(study: StudyResults, cells: Sequence[Cell], pictures: Pictures)
     address = addresses(cells)
     landscape = FIGURES[0]
     first = {landscape.title: pictures[landscape.path(study)]} if landscape.path(study) in pictures else {}
-    page = report_html(study.board, first, _chapters(study, address, pictures), address)
-    return {PAGE: page.encode(), MARKDOWN: leaderboard_markdown(study.board).encode()}
+    page = report_html(study.board, first, _chapters(study, address, pictures), address, robust=study.robust)
+    return {PAGE: page.encode(), MARKDOWN: leaderboard_markdown(study.board, study.robust).encode()}
 
 
 def _chapters(
@@ -103,7 +103,7 @@ def _sheets(workspace: Workspace) -> Iterator[tuple[str, bytes]]:
     for path in sorted(workspace.reports.glob("*.*")):
         if path.stem in ("shortcuts", "contact_sheet") and not path.name.endswith(".state.json"):
             yield path.name, path.read_bytes()
-    pairs = six_pairs(workspace.tables.read_all(ITEMS))
+    pairs = six_pairs(workspace.tables.read_all(ITEMS, dataset=DATASETS))
     if len(pairs) and all(workspace.resolve(clip).is_file() for clip in pairs["clip"]):
         files = figure_files("six_pairs", pairs_figure(pairs, workspace.root, None, layout=SIX_PAIRS))
         yield from ((f"figures/{name}", content) for name, content in files.items())

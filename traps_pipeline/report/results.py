@@ -13,7 +13,14 @@ from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATIO
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_SHARES
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE, CONTRASTS, LEADERBOARD, LEAVE_ONE_OUT, REGIME_TESTS
+from traps_pipeline.scoring.tables import (
+    CONFABULATION_PREVALENCE,
+    CONTRASTS,
+    LEADERBOARD,
+    LEAVE_ONE_OUT,
+    REGIME_TESTS,
+    ROBUST,
+)
 from traps_pipeline.storage.tables import Table
 
 if TYPE_CHECKING:
@@ -87,6 +94,7 @@ class Results:
     agreement = Made(table=AGREEMENT)
     bias = Made(table=JUDGE_BIAS)
     leave_one_out = Made(table=LEAVE_ONE_OUT)
+    robust = Made(table=ROBUST)
     contrasts = Made(table=CONTRASTS)
     regime_tests = Made(table=REGIME_TESTS)
     confabulation = Made(table=CONFABULATION_PREVALENCE)

@@ -9,7 +9,7 @@ import pandas as pd
 
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.mechanism.tables import COSINES
-from traps_pipeline.partitions import taxonomy_of
+from traps_pipeline.partitions import DATASETS, taxonomy_of
 from traps_pipeline.report.results import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Made, Makers, Results, joined
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
@@ -59,7 +59,7 @@ def _scoped(results: StudyResults, scope: str) -> pd.DataFrame:
 
 
 def _sub_scenarios(results: StudyResults) -> pd.DataFrame:
-    items = joined([results.tables.read_all(ITEMS, ["sub_scenario", "answer_type"])])
+    items = joined([results.tables.read_all(ITEMS, ["sub_scenario", "answer_type"], dataset=DATASETS)])
     types = items.drop_duplicates("sub_scenario").set_index("sub_scenario").loc[:, "answer_type"]
     found = []
     for _, cells in results.sub_cells.groupby("scope", sort=True):
@@ -72,7 +72,7 @@ def _sub_scenarios(results: StudyResults) -> pd.DataFrame:
 
 
 def _composition(results: StudyResults) -> pd.DataFrame:
-    items = results.tables.read_all(ITEMS, ["dataset", "taxonomy", "category", "pair_id"])
+    items = results.tables.read_all(ITEMS, ["dataset", "taxonomy", "category", "pair_id"], dataset=DATASETS)
     pairs = items.drop_duplicates("pair_id").assign(kind=lambda f: np.where(_ill_posed(f), "n_ill_posed", "n"))
     counts = pairs.pivot_table(index=["taxonomy", "category"], columns="kind", values="pair_id", aggfunc="count")
     table = joined([counts.reindex(columns=["n", "n_ill_posed"]).reset_index()])
@@ -102,8 +102,9 @@ class StudyResults(Results):
 
     source = "this study"
     is_study = True
-    metrics = Made(table=METRICS)
+    metrics = Made("METRICS rows of the pairs: an arm enters no table or figure.")
     makers: ClassVar[Makers] = {
+        "metrics": lambda results: results.tables.read_all(METRICS, dataset=DATASETS),
         "cells": _cells,
         "overall": _overall,
         "rates": _rates,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from traps_pipeline.partitions import ARMS
 from traps_pipeline.scoring.tables import INCOMPLETE_BELOW
 
 TITLES = {
@@ -10,6 +11,13 @@ TITLES = {
     "occlusion_ill_posed": "Occlusion, ill-posed",
     "chaotic": "Chaotic",
     "chaotic_ill_posed": "Chaotic, ill-posed",
+}
+ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}  # beside the pairs, and in no figure of theirs
+# What the columns of a leaderboard with arms mean (docs/scoring.md, "PECS-R and the gap").
+ROBUST_TERMS = {
+    "PECS-R": "PECS over the pairs and the arms, which take shortcuts away; kinds of items have equal weight. Entries "
+    "over different arms are not compared",
+    "gap": "PECS of the runs behind PECS-R, minus PECS-R: what shortcuts may have earned",
 }
 # The side whose items a share is of.
 SIDE_OF = {"acc": "control", "false_abs": "control", "abs_rec": "void"}

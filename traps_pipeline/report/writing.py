@@ -35,7 +35,8 @@ FIGURE_KINDS = ("pdf", "svg", "png")
 COLUMN_IN, PAGE_IN = 3.3, 6.8  # widths of a figure of one column, and of two
 # Okabe and Ito's palette without its yellow, which is too light for a hollow marker, and with its black as grey.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#4D4D4D")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "p", ">", "h")  # 7 colours x 11 shapes: 77 models stay distinct
+# 7 colours x 13 shapes: 91 models stay distinct.
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "p", ">", "h", "*", "d")
 INK, SOFT, GRID = "#1b1f27", "#667085", "#d0d5dd"
 
 # A range is two numbers that are text already: it stands and links as a number does.

@@ -69,6 +69,20 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([p[0] for p in pairs]), np.array([p[1] for p in pairs])
 
 
+def count_frames(path: Path) -> int:
+    """How many frames a clip says that it has; nothing is decoded. Raises DamagedClip."""
+    import av
+    from av.error import FFmpegError
+
+    try:
+        with av.open(str(path)) as container:
+            return container.streams.video[0].frames
+    except (FFmpegError, OSError, IndexError) as error:
+        raise DamagedClip(
+            f"{path}: cannot be decoded ({error}); delete the file and materialize videos again"
+        ) from error
+
+
 def decode_first(path: Path) -> np.ndarray:
     """The first frame (H, W, 3) uint8 RGB alone. Raises DamagedClip."""
     import av

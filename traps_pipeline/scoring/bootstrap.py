@@ -54,12 +54,12 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
         [verdicts[["model", "regime", "dataset", "run", "scenario_id"]], decision_counts(verdicts)], axis=1
     )
     items["taxonomy"] = items["dataset"].map(taxonomy_of)
-    scenarios = {t: pd.Index(sorted(items.loc[items["taxonomy"] == t, "scenario_id"].unique())) for t in TAXONOMIES}
-    weights = {t: scenario_weights(len(ids), resamples, [seed, k]) for k, (t, ids) in enumerate(scenarios.items())}
+    drawn = draw_scenarios(items, resamples, seed)
     entries, values = [], []
     for key, group in items.groupby(["model", "regime"], sort=True):
         model, regime = cast(tuple[str, str], key)
-        for dataset, mean in _means_over_runs(_run_draws(group, scenarios, weights), resamples).items():
+        draws = {cell: figures_of(sums) for cell, sums in run_sums(group, drawn).items()}
+        for dataset, mean in _means_over_runs(draws, resamples).items():
             entries.append((model, regime, dataset))
             values.append(mean)
     shape = (len(entries), len(RESAMPLED), resamples)
@@ -98,33 +98,52 @@ def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> n
     return rng.multinomial(scenarios, np.full(scenarios, 1 / scenarios), size=resamples).astype(np.float32)
 
 
-def resampled_figures(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """RESAMPLED figures of every cell and resample: (cells, RESAMPLED, resamples); NaN where a denominator is 0.
+Drawn = Mapping[str, tuple[pd.Index, np.ndarray]]  # of each taxonomy: its scenarios, and how often each is drawn
+
+
+def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Drawn:
+    """Scenarios of items (columns scenario_id, taxonomy) with their weights (`scenario_weights`)."""
+    drawn = {}
+    for k, taxonomy in enumerate(TAXONOMIES):
+        ids = pd.Index(sorted(items.loc[items["taxonomy"] == taxonomy, "scenario_id"].unique()))
+        drawn[taxonomy] = ids, scenario_weights(len(ids), resamples, [seed, k])
+    return drawn
+
+
+def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Sums of COUNTS of every cell and resample: (cells, 6, resamples).
 
     weights is (resamples, scenarios), counts is (scenarios, cells, 6) in the order of COUNTS. Sums of counts stay far
     below 2^24, so float32 products are exact.
     """
     scenarios, cells, _ = counts.shape
     products = counts.astype(np.float32).reshape(scenarios, -1).T @ weights.T
-    sums = products.reshape(cells, len(COUNTS), -1).astype(np.float64)
+    return products.reshape(cells, len(COUNTS), -1).astype(np.float64)
+
+
+def figures_of(sums: np.ndarray) -> np.ndarray:
+    """RESAMPLED figures of sums of COUNTS: (.., 6, resamples) -> (.., RESAMPLED, resamples); NaN where a denominator
+    is 0."""
     with np.errstate(invalid="ignore"):
-        acc, false_abs, abs_rec = np.moveaxis(sums[:, 0::2] / sums[:, 1::2], 1, 0)
+        acc, false_abs, abs_rec = np.moveaxis(sums[..., 0::2, :] / sums[..., 1::2, :], -2, 0)
     j = abs_rec - false_abs
-    return np.stack([acc, abs_rec, false_abs, j, pecs_of(acc, j)], axis=1)
+    return np.stack([acc, abs_rec, false_abs, j, pecs_of(acc, j)], axis=-2)
 
 
-def _run_draws(
-    group: pd.DataFrame, scenarios: Mapping[str, pd.Index], weights: Mapping[str, np.ndarray]
-) -> dict[tuple[str, int], np.ndarray]:
-    """(dataset, run) -> (RESAMPLED, resamples), for one model and regime."""
-    draws = {}
+def run_sums(group: pd.DataFrame, drawn: Drawn) -> dict[tuple[str, int], np.ndarray]:
+    """(dataset, run) -> sums of COUNTS (6, resamples), for the items of one model and regime; a dataset may have items
+    of both taxonomies."""
+    found: dict[tuple[str, int], np.ndarray] = {}
     for taxonomy, items in group.groupby("taxonomy", sort=True):
+        scenarios, weights = drawn[str(taxonomy)]
         cells = items.groupby(["dataset", "run"], sort=True)
-        counts = np.zeros((len(scenarios[str(taxonomy)]), cells.ngroups, len(COUNTS)))
-        places = scenarios[str(taxonomy)].get_indexer(pd.Index(items["scenario_id"])), cells.ngroup().to_numpy()
+        counts = np.zeros((len(scenarios), cells.ngroups, len(COUNTS)))
+        places = scenarios.get_indexer(pd.Index(items["scenario_id"])), cells.ngroup().to_numpy()
         np.add.at(counts, places, items[COUNTS].to_numpy())
-        draws.update(zip(cells.size().index, resampled_figures(weights[str(taxonomy)], counts), strict=True))
-    return cast(dict[tuple[str, int], np.ndarray], draws)
+        for cell, sums in zip(cells.size().index, resampled_sums(weights, counts), strict=True):
+            key = cast(tuple[str, int], cell)
+            found[key] = found[key] + sums if key in found else sums
+    return found
 
 
 def _means_over_runs(draws: Mapping[tuple[str, int], np.ndarray], resamples: int) -> dict[str, np.ndarray]:

@@ -54,8 +54,8 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_B
 
     One row a cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x` (the control's answer, both sides of
     the pair); `scoped_by` (prefix to column) may name fewer. Figures are fractions; one whose denominator is 0 is null,
-    and so is what depends on it. `n_missing` counts items, of 2 n_pairs, without a needed decision: abstained and
-    correct on a control, abstained on a void.
+    and so is what depends on it. `n_missing` counts items, of 2 n_pairs (of n_pairs where the dataset is an arm of one
+    side), without a needed decision: abstained and correct on a control, abstained on a void.
     BOUNDS say what the missing decisions could do to PECS; they are never null. Every share has its n and its Wilson
     interval.
     Raises ValueError when the verdicts are of several datasets, whose versions may differ (docs/spec.md 5.1).
@@ -66,7 +66,7 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_B
     groups = _scoped(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
     sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *OUTCOMES]].sum())
     sums["n_pairs"] = groups["pair_id"].nunique()
-    sums["n_missing"] = 2 * sums["n_pairs"] - sums["complete"]
+    sums["n_missing"] = verdicts["side"].nunique() * sums["n_pairs"] - sums["complete"]
     sums["epoch"] = groups["epoch"].agg(joined_epochs)
     sums["benchmark_version"] = groups["benchmark_version"].agg(lambda versions: " + ".join(sorted(set(versions))))
     return sums.assign(**_figures(sums), **_bounds(sums), **_wilson(sums)).reset_index().loc[:, METRICS.names]

@@ -28,7 +28,7 @@ class MetricsRow:
     run: shared.Run
     scope: Annotated[str, "all, category:.., sub_scenario:.. or label:.. (the control's answer)"]
     n_pairs: Annotated[int, "pairs in scope"]
-    n_missing: Annotated[int, "items (of 2 n_pairs) without an answer or a majority"]
+    n_missing: Annotated[int, "items (of 2 n_pairs, of n_pairs in an arm of one side) without an answer or a majority"]
     n_refused: Annotated[int, "items refused"]
     n_empty: Annotated[int, "items answered with no text"]
     n_errors: Annotated[int, "items whose call failed"]
@@ -172,6 +172,46 @@ class LeaderboardRow:
 
 
 LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model", "regime", "dataset"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustRow:
+    """A model under a regime once shortcuts are taken away: over the four datasets and the arms that it was asked."""
+
+    model: shared.Model
+    regime: shared.Regime
+    arms: Annotated[list[str], "arms behind the figures, of partitions.ARMS; entries over others are not compared"]
+    n_runs: Annotated[int, "runs averaged: those that have all four datasets and these arms"]
+    n_items: Annotated[int, "items a run, of the four datasets and the arms"]
+    n_missing: Annotated[int, "items without an answer or a majority, over runs"]
+    acc_r: Annotated[float | None, "mean over runs of Acc over answerable kinds, with equal weights"]
+    acc_r_std: Deviation
+    abs_rec_r: Annotated[float | None, "mean over runs of AbsRec over void kinds, with equal weights"]
+    abs_rec_r_std: Deviation
+    false_abs_r: Annotated[float | None, "mean over runs of FalseAbs over answerable kinds, with equal weights"]
+    false_abs_r_std: Deviation
+    pecs: Annotated[float | None, "mean over these runs of the overall PECS"]
+    pecs_std: Deviation
+    pecs_r: Annotated[float | None, "mean over runs of acc_r x max(0, abs_rec_r - false_abs_r), per run"]
+    pecs_r_std: Deviation
+    pecs_r_ci_low: Bootstrap
+    pecs_r_ci_high: Bootstrap
+    gap: Annotated[float | None, "pecs - pecs_r; null where refused"]
+    gap_std: Deviation
+    gap_ci_low: Bootstrap
+    gap_ci_high: Bootstrap
+    twin_accuracy: Annotated[
+        float | None,
+        "share of scenarios of whose control and twin control both are answered correctly; null without that arm",
+    ]
+    twin_accuracy_std: Deviation
+    n_twins: Annotated[int, "scenarios of which both are decided, in the run that has most"]
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+    refused: Annotated[str | None, "why pairs and arms make no gap"]
+
+
+ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
 
 
 @dataclass(frozen=True, kw_only=True)

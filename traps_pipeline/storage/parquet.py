@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -180,7 +181,8 @@ class TableStore:
         return self._load(table, self.path(table, partition), columns).to_pandas()
 
     def read_all(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pd.DataFrame:
-        """All partitions whose partition columns equal the given values; an empty frame if there are none."""
+        """All partitions whose partition columns equal the given values (of several given, any of them); an empty frame
+        if there are none."""
         return self.read_arrow(table, columns, **equal).to_pandas()
 
     def read_arrow(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pa.Table:
@@ -190,9 +192,11 @@ class TableStore:
         strangers = sorted(set(equal) - set(table.partition_by))
         if strangers:
             raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not by {strangers}")
-        parts = ["*" if c not in equal else str(equal[c]) for c in table.partition_by]
-        pattern = "/".join([*(f"{c}={v}" for c, v in zip(table.partition_by, parts, strict=True)), "part-0.parquet"])
-        pieces = [self._load(table, path, columns) for path in sorted((self.root / table.name).glob(pattern))]
+        values = {c: v if isinstance(v, tuple | list) else [v] for c, v in equal.items()}
+        parts = product(*([f"{c}={value}" for value in values.get(c, "*")] for c in table.partition_by))
+        patterns = ["/".join([*part, "part-0.parquet"]) for part in parts]
+        paths = {path for pattern in patterns for path in (self.root / table.name).glob(pattern)}
+        pieces = [self._load(table, path, columns) for path in sorted(paths)]
         pieces = [piece.replace_schema_metadata(None) for piece in pieces]
         return pa.concat_tables(pieces) if pieces else _wanted(table, columns).empty_table()
 

@@ -37,7 +37,7 @@ def family_colour(family: str) -> str:
 
 
 def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Colour and marker of each model: its family's colour, and within a colour no two markers alike (up to 11)."""
+    """Colour and marker of each model: its family's colour, and within a colour no two markers alike (up to 13)."""
     known = dict.fromkeys([*load_models(), *sorted(set(models))])
     colours = {model: family_colour(family_of(model)) for model in known}
     alike = {colour: [m for m in known if colours[m] == colour] for colour in COLOURS}

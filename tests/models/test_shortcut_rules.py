@@ -1,0 +1,120 @@
+"""The rules abstain by their cue and by nothing else, and see neither record nor side."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.scenes.released import load
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.models.answers import _secret
+from traps_pipeline.models.backends import make_backend
+from traps_pipeline.models.reference import ABSTENTION
+from traps_pipeline.models.registry import get_model, load_models
+from traps_pipeline.models.request import Request
+from traps_pipeline.models.shortcut_rules import CUES, RULES, names_no_choices
+from traps_pipeline.scenes.encode import count_frames, encode
+from traps_pipeline.scenes.kit import COLOURS
+from traps_pipeline.scenes.outcome import compile_scene
+from traps_pipeline.scenes.render import Renderer
+
+FLOOR, NAVY = (200, 200, 188), tuple(round(255 * part) for part in COLOURS["navy"])
+CHOICES, OPEN = "Is the ball in the tray, yes or no?", "What did the ball cost?"
+
+
+def clip(folder: Path, name: str, frames: int = 50, patch: int = 0, from_frame: int = 0) -> Path:
+    """A clip of an empty floor, with a square of navy of that side from a frame on."""
+    shown = np.full((frames, 360, 480, 3), FLOOR, np.uint8)
+    shown[from_frame:, 100 : 100 + patch, 100 : 100 + patch] = NAVY
+    encode(list(shown), folder / name, 10)
+    return folder / name
+
+
+def said(rule: str, media: Path, question: str, **secret: Any) -> str:
+    """The text that a rule gives; the observer sees nothing on an empty floor."""
+    entry = get_model(f"{rule}-rule")
+    about = {"item_id": "i", "model": entry.id, "regime": "standard", "run": 1}
+    given = secret or {"commonest_answer": "no"}
+    request = Request(entry.id, "rule", entry.params, "", question, about, media=media, media_digest=str(media))
+    request = Request(**{**vars(request), "secret": given})
+    return str(asyncio.run(make_backend(entry).ask(request)).text)
+
+
+def abstains(rule: str, media: Path, question: str) -> bool:
+    text = said(rule, media, question)
+    assert (ABSTENTION in text) != ("The answer is: no." in text)
+    return ABSTENTION in text
+
+
+@pytest.mark.parametrize(
+    ("what", "question", "abstaining"),
+    [
+        ({}, CHOICES, set()),
+        ({"patch": 60}, CHOICES, {"panel", "any"}),
+        ({"frames": 49}, CHOICES, {"length", "any"}),
+        ({}, OPEN, {"wording", "any"}),
+        ({"patch": 60, "frames": 20}, OPEN, {*RULES}),
+        ({"patch": 20}, CHOICES, set()),  # 400 pixels of dark blue are a shade and no panel
+        ({"patch": 60, "from_frame": 30}, CHOICES, set()),  # the first frame alone is looked at
+    ],
+)
+def test_a_rule_abstains_by_its_own_cue_and_by_no_other(
+    tmp_path: Path, what: dict[str, int], question: str, abstaining: set[str]
+) -> None:
+    media = clip(tmp_path, "clip.mp4", **what)
+    assert {rule for rule in RULES if abstains(rule, media, question)} == abstaining
+
+
+def test_without_its_cue_a_rule_says_what_the_observer_sees_and_else_the_commonest_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    media = clip(tmp_path, "clip.mp4")
+    assert said("any", media, CHOICES, commonest_answer="maybe").endswith("The answer is: maybe.")
+    monkeypatch.setattr("traps_pipeline.models.shortcut_rules.seen", lambda digest, clip, question: "yes")
+    assert said("any", media, CHOICES, commonest_answer="maybe").endswith("The answer is: yes.")
+
+
+def test_a_rule_is_told_the_commonest_answer_and_nothing_of_the_item_besides() -> None:
+    item = {"side": "void", "labels": ["yes"], "ground_truth": "yes", "commonest_answer": "no"}
+    for rule in RULES:
+        assert _secret(get_model(f"{rule}-rule"), item) == {"commonest_answer": "no"}
+    assert _secret(get_model("observer"), item) == {}
+
+
+def test_the_rules_stand_behind_the_observer_in_the_registry() -> None:
+    known = [*load_models()]
+    at = known.index("observer") + 1
+    assert known[at : at + 4] == ["panel-rule", "length-rule", "wording-rule", "any-rule"]
+
+
+def test_the_number_of_frames_is_read_without_decoding(tmp_path: Path) -> None:
+    assert count_frames(clip(tmp_path, "clip.mp4", frames=17)) == 17
+
+
+def test_every_released_question_names_its_choices_and_nine_in_ten_ill_posed_ones_do_not() -> None:
+    specs = load_released().values()
+    assert not any(names_no_choices(spec.question) for spec in specs)
+    caught = [spec.taxonomy for spec in specs if names_no_choices(spec.ill_posed_question)]
+    # "Is the ramp hollow or solid?", "Is the bell to the left or to the right of the die?" name some all the same.
+    assert (caught.count("occlusion"), caught.count("chaotic")) == (193, 436)  # of 202 and 500
+
+
+def test_every_released_chaotic_void_is_shorter_than_a_control() -> None:
+    cuts = [spec.void["cut_frame"] for spec in load_released().values() if spec.void_kind == "truncation"]
+    assert len(cuts) == 500
+    assert max(cuts) < 50
+
+
+@pytest.mark.parametrize("scenario_id", ["stack-0001", "transfer-0001", "topple-0001"])  # dark blue specks, no panel
+def test_the_panel_is_seen_in_an_occlusion_void_and_not_in_its_control(tmp_path: Path, scenario_id: str) -> None:
+    case = load(scenario_id)
+    model, _ = compile_scene(case.family, case.params, case.physics, case.panel)
+    with Renderer(model, case.camera) as renderer:
+        for side, panel in (("control", False), ("void", True)):
+            media = tmp_path / f"{scenario_id}-{side}.mp4"
+            encode(list(renderer.frames(case.qpos[:1], panel=panel)), media, 10)
+            assert CUES["panel"](str(media), media, case.spec.question) == panel

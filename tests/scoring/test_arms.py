@@ -1,0 +1,104 @@
+"""Arms stand beside the pairs: no figure of the pairs knows of them, and they have figures of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.report.test_items import row
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.defs import judging, scoring
+from traps_pipeline.judging.ratings import VOTE_COLUMNS
+from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.judging.verdicts import current
+from traps_pipeline.partitions import ANSWERABLE_ARMS, ARMS, DATASETS, VOID_ARMS
+from traps_pipeline.report.study_results import StudyResults
+from traps_pipeline.scoring import bootstrap
+from traps_pipeline.scoring.metrics import cell_metrics, wrong_figures
+from traps_pipeline.scoring.tables import CONTRASTS, METRICS
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
+
+Rows = Callable[..., pd.DataFrame]
+MODELS = {"oracle": (True, False, True), "prior": (True, True, False)}
+JUDGES = ("rule-1", "rule-2", "rule-3")
+
+
+def of_arm(rows: Rows, arm: str, pairs: list[tuple[bool, bool, bool]], **cell: object) -> pd.DataFrame:
+    """VERDICTS rows of an arm: of the sides that it has."""
+    both = rows(pairs, dataset=arm, **cell)
+    sides = ["control"] * (arm not in VOID_ARMS) + ["void"] * (arm not in ANSWERABLE_ARMS)
+    return both.loc[both["side"].isin(sides)].reset_index(drop=True)
+
+
+def write(workspace: Workspace, verdicts: pd.DataFrame) -> None:
+    """Items, votes, verdicts and metrics of these VERDICTS rows, as their stages would leave them."""
+    tables = workspace.tables
+    for dataset, part in verdicts.groupby("dataset"):
+        named = part.drop_duplicates("item_id")[["item_id", "pair_id", "side"]].to_dict("records")
+        tables.write(ITEMS, {"dataset": dataset}, [row(ITEMS, dataset=dataset, **item) for item in named], {})
+        for cell, mine in part.groupby(["dataset", "model", "regime", "run"]):
+            where = dict(zip(("dataset", "model", "regime", "run"), cell, strict=True))
+            tables.write(VERDICTS, where, mine.reset_index(drop=True), {})
+            cast = [
+                row(VOTES, item_id=item, side=side, task="abstention", judge=judge, valid=True,
+                    abstained=bool(said) != (judge == JUDGES[0] and dataset in ARMS), **where)
+                for item, side, said in mine[["item_id", "side", "abstained"]].itertuples(index=False)
+                for judge in JUDGES
+            ]  # fmt: skip
+            tables.write(VOTES, where, cast, {})
+        tables.write(
+            METRICS, {"dataset": dataset}, cell_metrics(current(workspace, VERDICTS, dataset=str(dataset))), {}
+        )
+
+
+def figures(workspace: Workspace) -> Mapping[str, pd.DataFrame]:
+    """Every table of figures over the pairs, and every frame that tables and figures of the report are made from."""
+    made: dict[str, Made] = {"contrasts": scoring._make_contrasts(workspace, None)}
+    workspace.tables.write(CONTRASTS, {}, made["contrasts"].frame, {})
+    made["regime_tests"] = scoring._make_regime_tests(workspace, None)
+    made["leaderboard"] = scoring._make_leaderboard(workspace, None)
+    votes = judging._votes(workspace, "agreement")
+    study = StudyResults(workspace)
+    frames = {name: getattr(study, name) for name in ("metrics", "sub_cells", "sub_scenarios", "labels", "composition")}
+    return {name: one.frame for name, one in made.items()} | frames | {"votes": votes.loc[:, VOTE_COLUMNS]}
+
+
+def test_rows_of_arms_beside_the_pairs_change_no_figure(
+    rows: Rows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bootstrap.resample, "__defaults__", (50, bootstrap.SEED))
+    monkeypatch.setattr(judging, "_panel", lambda workspace: [*JUDGES])
+    asked = [(model, regime) for model in MODELS for regime in ("standard", "guided")]
+    cells = [{"model": model, "regime": regime} for model, regime in asked]
+    pairs = [rows([MODELS[c["model"]], (True, False, True)], dataset=d, **c) for c in cells for d in DATASETS]
+    # All is wrong in the arms: whoever reads them shows it.
+    arms = [of_arm(rows, arm, [(False, True, False)] * 3, **c) for c in cells for arm in ARMS]
+    study = Study(scenarios=["plinko-0001"])
+    alone, beside = (Workspace.create(tmp_path / name, study) for name in ("alone", "beside"))
+    write(alone, pd.concat(pairs, ignore_index=True))
+    write(beside, pd.concat([*pairs, *arms], ignore_index=True))
+    expected, found = figures(alone), figures(beside)
+    assert len(expected["leaderboard"]) == 4 * 5
+    for name, frame in expected.items():
+        pd.testing.assert_frame_equal(found[name], frame, obj=name)
+
+
+@pytest.mark.parametrize(
+    ("arm", "acc", "false_abs", "abs_rec", "missing"),
+    [("decoy", 0.5, 0.5, np.nan, 1), ("held_void", np.nan, np.nan, 1.0, 1), ("choices_swapped", 0.5, 0.5, 1.0, 2)],
+)
+def test_an_arm_has_the_figures_of_the_sides_that_it_has(
+    rows: Rows, arm: str, acc: float, false_abs: float, abs_rec: float, missing: int
+) -> None:
+    cells = cell_metrics(of_arm(rows, arm, [(True, False, True), (False, True, True), (None, None, None)]))
+    one = cells.loc[cells["scope"] == "all"].iloc[0]
+    np.testing.assert_equal([one.acc, one.false_abs, one.abs_rec], [acc, false_abs, abs_rec])
+    assert (one.n_pairs, one.n_missing) == (3, missing)
+    assert np.isnan(one.pecs) == (arm != "choices_swapped")
+    assert wrong_figures(cells) == 0

@@ -1,0 +1,68 @@
+"""Rules that abstain by one cue and understand nothing of the void: the line that a model must beat.
+
+A cue looks at the clip or at the question alone, never at the record. Where its cue is absent a rule says what the
+observer sees, and where that sees nothing the commonest answer of the sub-scenario: it abstains by its cue alone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from pathlib import Path
+
+from traps_pipeline.models.observer import seen
+from traps_pipeline.models.reference import phrase
+from traps_pipeline.models.request import Outcome, Request
+
+# Pixels of navy in one piece. Panels of released voids have 18,000 and more; shade in a control never had above 100.
+PANEL_PX = 1000
+WHOLE_FRAMES = 50  # of a control (docs/spec.md 2.5)
+
+
+@lru_cache(maxsize=100_000)
+def _panel(media_digest: str, clip: Path) -> bool:
+    from traps_pipeline.scenes.encode import decode_first
+    from traps_pipeline.scenes.vision import largest
+
+    return largest(decode_first(clip), "navy", PANEL_PX) is not None
+
+
+@lru_cache(maxsize=100_000)
+def _cut(media_digest: str, clip: Path) -> bool:
+    from traps_pipeline.scenes.encode import count_frames
+
+    return count_frames(clip) < WHOLE_FRAMES
+
+
+def names_no_choices(question: str) -> bool:
+    """Whether a question puts nothing up for choice: it has no `or`."""
+    return re.search(r"\bor\b", question) is None
+
+
+Cue = Callable[[str, Path, str], bool]  # digest of the clip, clip, question -> whether the rule abstains
+CUES: Mapping[str, Cue] = {
+    "panel": lambda digest, clip, question: _panel(digest, clip),
+    "length": lambda digest, clip, question: _cut(digest, clip),
+    "wording": lambda digest, clip, question: names_no_choices(question),
+}
+RULES: Mapping[str, tuple[str, ...]] = {**{name: (name,) for name in CUES}, "any": tuple(CUES)}  # the cues of each
+
+
+class RuleBackend:
+    """Plays the rule that `params.rule` names."""
+
+    async def ask(self, request: Request) -> Outcome:
+        """One attempt; see `Backend`."""
+        assert request.media is not None, "a rule is asked about clips"
+        answer = await asyncio.to_thread(_answer, request, request.media)
+        text = phrase(answer, str(request.about["regime"]))
+        return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)
+
+
+def _answer(request: Request, clip: Path) -> str | None:
+    question = request.user
+    if any(CUES[cue](request.media_digest, clip, question) for cue in RULES[str(request.params["rule"])]):
+        return None
+    return seen(request.media_digest, clip, question) or str(request.secret["commonest_answer"])

@@ -1,0 +1,170 @@
+"""PECS-R: PECS once shortcuts are taken away, and the gap between the two (docs/scoring.md, "PECS-R and the gap").
+
+A kind is a set of items that are answerable, or void, in one way. The controls of the four datasets are one kind, and
+their voids another; each arm adds one, or, where it has both sides, one of either. Kinds have equal weight, so that no
+cue that holds in the many pairs alone carries a model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.partitions import (
+    ANSWERABLE_ARMS,
+    ARMS,
+    DATASETS,
+    PAIRED_ARMS,
+    VOID_ARMS,
+    datasets_of_category,
+    is_ill_posed,
+)
+from traps_pipeline.scoring.bootstrap import (
+    RESAMPLED,
+    RESAMPLES,
+    SEED,
+    Drawn,
+    draw_scenarios,
+    figures_of,
+    percentiles,
+    run_sums,
+)
+from traps_pipeline.scoring.metrics import decision_counts, joined_epochs, pecs_of
+from traps_pipeline.scoring.tables import ROBUST
+
+TWIN = "twin_control"
+VISUAL = tuple(dataset for dataset in DATASETS if not is_ill_posed(dataset))
+WITH_CONTROLS, WITH_VOIDS = (*ANSWERABLE_ARMS, *PAIRED_ARMS), (*VOID_ARMS, *PAIRED_ARMS)
+FIGURES = ("acc_r", "abs_rec_r", "false_abs_r", "pecs", "pecs_r", "gap")
+INTERVALS = ("pecs_r", "gap")
+_ITEM = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "benchmark_version"]
+
+
+def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
+    """ROBUST rows of the VERDICTS rows of pairs and arms: one a model and regime with a run that has all four datasets
+    and an arm.
+
+    Figures are computed per run, then averaged; one that is null in a run is null. Runs may have different arms: an
+    entry rests on the runs that have most, which then all have the same (`arms`).
+    """
+    items = pd.concat([verdicts[_ITEM], decision_counts(verdicts)], axis=1)
+    items["taxonomy"] = [datasets_of_category(category)[0] for category in verdicts["category"]]
+    entries = {}
+    for key, group in items.groupby(["model", "regime"], sort=True):
+        runs, arms = _runs_and_arms(group)
+        if runs:
+            chosen = group["run"].isin(runs) & group["dataset"].isin([*DATASETS, *arms])
+            entries[key] = arms, group.loc[chosen]
+    if not entries:
+        return pd.DataFrame(columns=pd.Index(ROBUST.names))
+    # A scenario is drawn with its items in all datasets and arms. The first of the draws takes each scenario once: the
+    # figures themselves.
+    drawn = {
+        taxonomy: (ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights]))
+        for taxonomy, (ids, weights) in draw_scenarios(items, resamples, seed).items()
+    }
+    rows = [
+        {"model": model, "regime": regime, "arms": list(arms), **_row(group, arms, drawn)}
+        for (model, regime), (arms, group) in cast(Mapping[tuple[str, str], Any], entries).items()
+    ]
+    return pd.DataFrame(rows, columns=pd.Index(ROBUST.names))
+
+
+def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
+    """The runs of a model and regime that its entry rests on, and the arms that each of them has. Of several sets of
+    arms that are as large, the one that most runs have counts, then the first in the order of ARMS."""
+    sets: dict[tuple[str, ...], list[int]] = {}
+    for run, rows in group.groupby("run", sort=True):
+        there = {*rows["dataset"]}
+        arms = tuple(arm for arm in ARMS if arm in there)
+        if arms and there.issuperset(DATASETS):
+            sets.setdefault(arms, []).append(cast(int, run))
+    if not sets:
+        return [], ()
+    best = min(sets, key=lambda arms: (-len(arms), -len(sets[arms]), [ARMS.index(arm) for arm in arms]))
+    return sets[best], best
+
+
+def _row(items: pd.DataFrame, arms: Sequence[str], drawn: Drawn) -> dict[str, Any]:
+    """What ROBUST says of an entry's items, but for its model, regime and arms."""
+    figures = {cell: figures_of(sums) for cell, sums in run_sums(items, drawn).items()}
+    runs = sorted({run for _, run in figures})
+    by_run = np.stack([run_figures({d: figures[d, run] for d in (*DATASETS, *arms)}, arms) for run in runs])
+    twins = [_twins(items.loc[items["run"] == run]) for run in runs] if TWIN in arms else []
+    told = by_run[..., 0]  # (runs, FIGURES)
+    row: dict[str, Any] = {
+        "n_runs": len(runs),
+        "n_items": max(rows["item_id"].nunique() for _, rows in items.groupby("run")),
+        "n_missing": _missing(items),
+        "epoch": joined_epochs(items["epoch"]),
+        "benchmark_version": " + ".join(sorted(set(items["benchmark_version"]))),
+        "refused": _refusal(items),
+        "n_twins": max((n for _, n in twins), default=0),
+    }
+    row |= dict(zip(FIGURES, told.mean(axis=0), strict=True))
+    row |= {f"{name}_std": value for name, value in zip(FIGURES, told.std(axis=0), strict=True)}
+    shares = [share for share, _ in twins]
+    row |= {"twin_accuracy": None, "twin_accuracy_std": None}
+    if shares:
+        row |= {"twin_accuracy": np.mean(shares), "twin_accuracy_std": np.std(shares)}
+    bounds = percentiles(by_run.mean(axis=0)[:, 1:])
+    for name in INTERVALS:
+        row |= dict(zip((f"{name}_ci_low", f"{name}_ci_high"), bounds[FIGURES.index(name)], strict=True))
+    if row["refused"]:
+        row |= {name: None for name in row if name.startswith("gap")}
+    return row
+
+
+def run_figures(cells: Mapping[str, np.ndarray], arms: Sequence[str]) -> np.ndarray:
+    """FIGURES of one run, (FIGURES, draws), from the RESAMPLED figures (RESAMPLED, draws) of its datasets and arms."""
+
+    def mean_over_kinds(figure: str, of: Sequence[str]) -> np.ndarray:
+        at = RESAMPLED.index(figure)
+        return np.mean([pairs[at], *(cells[arm][at] for arm in arms if arm in of)], axis=0)
+
+    pairs = np.mean([cells[dataset] for dataset in DATASETS], axis=0)
+    acc, false_abs = (mean_over_kinds(figure, WITH_CONTROLS) for figure in ("acc", "false_abs"))
+    abs_rec, pecs = mean_over_kinds("abs_rec", WITH_VOIDS), pairs[RESAMPLED.index("pecs")]
+    pecs_r = pecs_of(acc, abs_rec - false_abs)
+    return np.stack([acc, abs_rec, false_abs, pecs, pecs_r, pecs - pecs_r])
+
+
+def _twins(items: pd.DataFrame) -> tuple[float, int]:
+    """Of one run: the share of scenarios of whose control and twin both are answered correctly, and of how many it is:
+    those of which both are decided. NaN of none."""
+    controls = items.loc[(items["side"] == "control") & items["correct_of"].eq(1)].set_index("scenario_id")
+    own = controls.loc[controls["dataset"].isin(VISUAL), "correct"]
+    twin = controls.loc[controls["dataset"] == TWIN, "correct"]
+    worlds = pd.concat([own, twin], axis=1, join="inner").to_numpy(float)
+    return (float(worlds.min(axis=1).mean()) if len(worlds) else float("nan")), len(worlds)
+
+
+def _missing(items: pd.DataFrame) -> int:
+    """Items, over runs, without a decision that their side needs."""
+    control = items["side"] == "control"
+    decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
+    return int(len(items) - decided.sum())
+
+
+def _refusal(items: pd.DataFrame) -> str | None:
+    """Why pairs and arms make no gap: they were answered in different campaigns (docs/spec.md 9.2)."""
+    of_arms = items["dataset"].isin(ARMS)
+    pairs, arms = (joined_epochs(items.loc[chosen, "epoch"]) for chosen in (~of_arms, of_arms))
+    if pairs == arms and "+" not in pairs:
+        return None
+    return f"pairs of epoch {pairs}, arms of epoch {arms}; figures of different epochs are never put in one gap"
+
+
+def wrong_rows(table: pd.DataFrame) -> int:
+    """How many ROBUST rows break their definition: a PECS-R or share outside [0, 1], an interval out of order, a gap
+    that is not PECS - PECS-R. Null is not wrong."""
+    shares = table[["acc_r", "abs_rec_r", "false_abs_r", "pecs_r", "twin_accuracy"]].to_numpy(float)
+    wrong = ((shares < 0) | (shares > 1)).any(axis=1)
+    for name in INTERVALS:
+        low, high = (table[f"{name}_ci_{end}"].to_numpy(float) for end in ("low", "high"))
+        wrong |= (low > high) | (low < (0 if name == "pecs_r" else -1)) | (high > 1)
+    pecs, pecs_r, gap = (table[name].to_numpy(float) for name in ("pecs", "pecs_r", "gap"))
+    return int((wrong | (np.abs(gap - (pecs - pecs_r)) > 1e-12)).sum())
