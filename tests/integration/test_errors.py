@@ -121,7 +121,7 @@ def test_a_workspace_keeps_its_benchmark(study: Checkout, tmp_path: Path) -> Non
 
 def test_unknown_names_are_answered_with_the_known_ones(study: Checkout, tmp_path: Path) -> None:
     assert_refused(
-        study.traps("plan", "nonesuch"), "no experiment 'nonesuch'", "known: benchmark, demo, mechanism, paper"
+        study.traps("plan", "nonesuch"), "no experiment 'nonesuch'", "known: arms, benchmark, demo, mechanism, paper"
     )
     experiment = tmp_path / "typo.yaml"
     experiment.write_text("name: typo\nmodels: [orakel]\n")

@@ -60,7 +60,7 @@ def test_a_block_shares_its_partitions_and_blocks_are_few() -> None:
         assert len({id(stage.scheme) for stage in block}) == 1
     without = [name for name in STAGES if GRAPH[name].spec.group_name != "mechanism"]
     named = [[stage.name for stage in block] for block in GRAPH.blocks(without)]
-    assert named[:4] == [["scene_specs", "videos"], ["items"], ["responses", "votes", "verdicts"], ["metrics"]]
+    assert named[:4] == [["scene_specs", "videos", "arms"], ["items"], ["responses", "votes", "verdicts"], ["metrics"]]
     assert len(named) == 5  # what has no partitions is one run
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.partitions import arms_of, sides_of
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import HEIGHT, PANEL_HALF_THICKNESS, WIDTH, Camera, Panel, fit_camera
 from traps_pipeline.scenes.certificates import (
@@ -441,3 +442,14 @@ ARMS: Mapping[str, Arm] = {
         ),
     )
 }
+
+
+def table() -> str:
+    """The arms as the Markdown table of `docs/arms.md`."""
+    lines = ["| arm | of | asks | takes away | certificate |", "| --- | --- | --- | --- | --- |"]
+    for arm in ARMS.values():
+        of = [taxonomy for taxonomy in ("occlusion", "chaotic") if arm.name in arms_of(taxonomy)]
+        asks = {"control": "must be answered", "void": "must be abstained on"}
+        asked = ", ".join(asks[side] for side in sides_of(arm.name))
+        lines.append(f"| `{arm.name}` | {', '.join(of)} | {asked} | {arm.takes_away} | {arm.promises} |")
+    return "\n".join(lines)

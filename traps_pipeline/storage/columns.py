@@ -6,7 +6,7 @@ from typing import Annotated
 ScenarioId = Annotated[str, "family and number"]
 ItemId = Annotated[str, "dataset:scenario_id:side"]
 PairId = Annotated[str, "dataset:scenario_id"]
-Dataset = Annotated[str, "one of four"]
+Dataset = Annotated[str, "one of four, or an arm"]
 CellDataset = Annotated[str, "occlusion, occlusion_ill_posed, chaotic or chaotic_ill_posed"]
 Category = Annotated[str, "one of twelve"]
 SubScenario = Annotated[str, "the paper's name where it has one"]
