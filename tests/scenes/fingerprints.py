@@ -201,16 +201,15 @@ def records_of(name: str) -> list[str]:
     return sorted(id_ for id_, spec in load_released().items() if spec.family == name)
 
 
-def observed(name: str) -> dict[str, str | None]:
-    """What a family's observer says of its first record's sampled frames, encoded and decoded, whole and cut short."""
-    case = load(records_of(name)[0])
+def observed(case: Released) -> dict[str, str | None]:
+    """What a family's observer says of a record's sampled frames, encoded and decoded, whole and cut short."""
     observe, question, physics = case.family.observe, case.spec.question, case.physics
     assert observe is not None
     stored = case.spec.twin.params
     twin, _ = compile_scene(case.family, case.params if stored is None else case.family.params_from(stored), physics)
     with Renderer(twin, case.camera) as renderer:
         other = list(renderer.frames(case.twin[SAMPLED]))
-    clips = {"control": case.control_frames, "twin": other, "void": case.void_frames()}
+    clips = {"control": case.control_frames, "twin": other, "void": case.void}
     said: dict[str, str | None] = {}
     with tempfile.TemporaryDirectory() as folder:
         for clip, frames in clips.items():
@@ -236,7 +235,7 @@ def freeze(names: Sequence[str]) -> None:
     known = frozen()["families"] if FROZEN.is_file() else {}
     for name in names:
         records = {scenario_id: of_record(scenario_id) for scenario_id in records_of(name)}
-        known[name] = of_family(name) | {"records": records, "observed": observed(name)}
+        known[name] = of_family(name) | {"records": records, "observed": observed(load(records_of(name)[0]))}
         print(f"{name}: {len(records)} records, {DRAWS} draws", flush=True)
         text = json.dumps({"versions": versions(), "families": known}, indent=1, sort_keys=True)
         FROZEN.parent.mkdir(exist_ok=True)

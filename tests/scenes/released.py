@@ -59,6 +59,11 @@ class Released:
         with Renderer(model, self.camera) as renderer:
             return np.stack(list(renderer.frames(self.qpos[SAMPLED])))
 
+    @cached_property
+    def void(self) -> np.ndarray:
+        """`void_frames` with the panel's own colour."""
+        return self.void_frames()
+
     def void_frames(self, panel_rgb: tuple[float, float, float] | None = None) -> np.ndarray:
         """The void as it is sampled; its panel in another colour if one is given."""
         if self.panel is None:

@@ -53,10 +53,11 @@ def run(arguments: argparse.Namespace) -> int:
         outcome = walk(instance, every_asset, workspace, stages, experiment=experiment.name)
     problems = [*dict.fromkeys([*outcome.problems, *failed_checks(workspace, experiment.name)])]
     total = progress.totals
-    asked, voted, drawn = (total.get(stage, Tally()) for stage in ("responses", "votes", "videos"))
+    asked, voted = (total.get(stage, Tally()) for stage in ("responses", "votes"))
+    frames = sum(tally.frames for tally in total.values())
     print(
         f"\n{asked.asked} answers asked ({asked.cached} from the ledger), {voted.asked} votes asked "
-        f"({voted.cached} from the ledger), {drawn.frames} frames rendered, {clock(outcome.seconds)} min"
+        f"({voted.cached} from the ledger), {frames} frames rendered, {clock(outcome.seconds)} min"
     )
     if experiment.mechanism is not None:
         states, steered, judged = (
