@@ -7,6 +7,7 @@ footers. `dagster.yaml` names this class; a study may name another storage in it
 """
 
 import contextlib
+import threading
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -21,15 +22,22 @@ FILES = 32  # kept open at most: each run has a file of its own, and a server se
 
 
 class _Engines(dict[str, db.Engine]):
-    """The engine of each file."""
+    """The engine of each file. Threads of a web server ask for it at once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._lock = threading.Lock()
 
     def __missing__(self, address: str) -> db.Engine:
-        if len(self) >= FILES:
-            self.pop(next(iter(self))).dispose()
-        engine = db.create_engine(address, connect_args={"timeout": SQLITE_BUSY_TIMEOUT_SECONDS})
-        listen(engine, "connect", lambda connection, _: connection.execute("PRAGMA synchronous=NORMAL"))
-        self[address] = engine
-        return engine
+        with self._lock:
+            if address in self:  # another thread was first
+                return self[address]
+            if len(self) >= FILES:
+                self.pop(next(iter(self))).dispose()
+            engine = db.create_engine(address, connect_args={"timeout": SQLITE_BUSY_TIMEOUT_SECONDS})
+            listen(engine, "connect", lambda connection, _: connection.execute("PRAGMA synchronous=NORMAL"))
+            self[address] = engine
+            return engine
 
     def dispose(self) -> None:
         """Close all files."""
