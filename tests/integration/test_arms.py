@@ -8,6 +8,7 @@ import pytest
 
 from tests.conftest import Checkout
 from traps_pipeline.benchmark.tables import ARMS, ITEMS
+from traps_pipeline.report.leaderboard import leaderboard_text
 from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
 from traps_pipeline.storage.workspace import Workspace
 
@@ -45,5 +46,7 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     assert board.loc["any-rule", "pecs"] == 1.0  # it understands nothing of a void
     assert robust.loc["any-rule", "pecs_r"] < 0.25
     assert robust.loc["any-rule", "gap"] == pytest.approx(1.0 - robust.loc["any-rule", "pecs_r"])
+    board_text = leaderboard_text(tables.read(LEADERBOARD, {}), tables.read_all(ROBUST))
+    assert "(4 of 9 arms)" in board_text and "nan" not in board_text and "no gap" not in board_text
     again = other.traps("run", path, "--until", "leaderboard,robust")
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}

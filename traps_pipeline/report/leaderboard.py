@@ -85,7 +85,9 @@ def leaderboards(board: pd.DataFrame, robust: pd.DataFrame | None = None, *, bri
     ranked = next((name for name in TITLES if name in there), "overall")
     others = [name for name in DATASETS if name in there and name != ranked]
     own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief) for name in others]
-    rows = [] if robust is None or ranked != "overall" else robust.to_dict("records")
+    rows = []
+    if robust is not None and ranked == "overall":  # a null text is NaN once it was in a file
+        rows = robust.astype(object).where(robust.notna(), None).to_dict("records")
     beside = {(row["model"], row["regime"]): row for row in rows}
     return [_leaderboard(board, ranked, others, beside, brief), *own]
 
