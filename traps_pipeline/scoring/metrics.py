@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from traps_pipeline.models.request import JUDGED
+from traps_pipeline.partitions import sides_of
 from traps_pipeline.scoring.tables import METRICS
 
 if TYPE_CHECKING:
@@ -66,7 +67,8 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_B
     groups = _scoped(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
     sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *OUTCOMES]].sum())
     sums["n_pairs"] = groups["pair_id"].nunique()
-    sums["n_missing"] = verdicts["side"].nunique() * sums["n_pairs"] - sums["complete"]
+    sides = sides_of(datasets[0]) if datasets else ()
+    sums["n_missing"] = len(sides) * sums["n_pairs"] - sums["complete"]
     sums["epoch"] = groups["epoch"].agg(joined_epochs)
     sums["benchmark_version"] = groups["benchmark_version"].agg(lambda versions: " + ".join(sorted(set(versions))))
     return sums.assign(**_figures(sums), **_bounds(sums), **_wilson(sums)).reset_index().loc[:, METRICS.names]
