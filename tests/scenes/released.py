@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -83,10 +84,10 @@ def load(scenario_id: str, folder: Path = RELEASED) -> Released:
     return Released(spec, qpos, load_trajectory(path, spec.twin.trajectory_sha256, "twin"))
 
 
-def first_of_each(void_kind: str) -> list[str]:
-    """The first released scenario of every family of a kind."""
+def first_of_each(void_kind: str, of: Callable[[Family], str] = lambda family: family.name) -> list[str]:
+    """The first released scenario of every family of a kind, or of every other thing `of` a family."""
     firsts: dict[str, str] = {}
     for scenario_id, spec in load_released().items():
         if spec.void_kind == void_kind:
-            firsts.setdefault(spec.family, scenario_id)
+            firsts.setdefault(of(get_family(spec.family)), scenario_id)
     return sorted(firsts.values())

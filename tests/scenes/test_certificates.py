@@ -1,4 +1,4 @@
-"""The certificates judge numbers; one scenario of every occlusion family is certified on its sampled frames; whatever
+"""The certificates judge numbers; one scenario of every occlusion category is certified; whatever
 is altered is found out."""
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from traps_pipeline.scenes.simulate import replay
 from traps_pipeline.scenes.spec import SceneSpec, trajectory_digest
 
 
+# `traps certify` looks at all 702; what is particular to a family, its world and readings, test_fingerprints.py holds.
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario_id", first_of_each("occluder"))
-def test_a_scenario_of_every_occlusion_family_is_certified(scenario_id: str) -> None:
+@pytest.mark.parametrize("scenario_id", first_of_each("occluder", of=lambda family: family.category))
+def test_a_scenario_of_every_occlusion_category_is_certified(scenario_id: str) -> None:
     case = load(scenario_id)
-    verdict = certify(case.spec, case.qpos, case.twin, frame_step=2)
+    verdict = certify(case.spec, case.qpos, case.twin, frame_step=5)
     assert verdict.failures == {}
     assert verdict.measured["twin_px"] == verdict.measured["ablation_px"] == 0
     assert verdict.measured["least_visible_px"] >= 150

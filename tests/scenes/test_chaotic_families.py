@@ -101,7 +101,7 @@ def test_a_scenario_of_every_chaotic_family_is_certified(stored: Stored):
     twin = load_trajectory(
         RELEASED / "trajectories" / f"{stored.spec.scenario_id}.npz", stored.spec.twin.trajectory_sha256, "twin"
     )
-    verdict = certify(stored.spec, stored.qpos, twin, frame_step=2)
+    verdict = certify(stored.spec, stored.qpos, twin, frame_step=5)
     assert verdict.failures == {}
     assert verdict.measured["twin_deviation_px"] <= 0.5
     evidence = stored.spec.evidence
@@ -110,15 +110,11 @@ def test_a_scenario_of_every_chaotic_family_is_certified(stored: Stored):
         assert verdict.measured["accepted"] == evidence["accepted"]
 
 
-@pytest.mark.slow  # simulates 128 futures
-def test_a_later_cut_leaves_the_outcome_less_open_than_is_certified():
+def test_a_cut_after_commitment_is_named():  # one before it, but too late, test_certify_command.py alters
     plinko = load("plinko")
     twin = load_trajectory(
         RELEASED / "trajectories" / f"{plinko.spec.scenario_id}.npz", plinko.spec.twin.trajectory_sha256, "twin"
     )
-    late = plinko.spec.model_copy(update={"void": {"cut_frame": plinko.outcome.commit_frame}})
-    verdict = certify(late, plinko.qpos, twin, frame_step=10)
-    assert {"open", "twin"} & set(verdict.failures)
     beyond = plinko.spec.model_copy(update={"void": {"cut_frame": plinko.outcome.commit_frame + 1}})
     assert "after commitment" in certify(beyond, plinko.qpos, twin, frame_step=10).failures["cut"]
 

@@ -17,7 +17,7 @@ from traps_pipeline.scenes.simulate import swept_points
 from traps_pipeline.scenes.vision import blobs, colour_mask
 from traps_pipeline.scenes.wording import asked
 
-MAGENTA, OLIVE = (0.75, 0.10, 0.50), (0.42, 0.42, 0.10)
+OTHER_PANEL = (0.75, 0.10, 0.50), (0.42, 0.42, 0.10)  # magenta and olive, in turn: the panel is navy
 PATCH = 56  # pixels of a panel that hides nothing
 ALL = [*first_of_each("occluder"), *first_of_each("truncation")]
 
@@ -38,7 +38,7 @@ def test_the_observer_answers_the_control_and_abstains_on_every_void_as_frozen(s
         padded = np.concatenate([void, np.repeat(void[-1:], len(case.control_frames) - len(void), axis=0)])
         assert observe(padded, question) is None
     else:  # the colour of the panel tells it nothing
-        assert [observe(case.void_frames(rgb), question) for rgb in (MAGENTA, OLIVE)] == [None, None]
+        assert observe(case.void_frames(OTHER_PANEL[ALL.index(scenario_id) % 2]), question) is None
     assert fingerprints.observed(case) == fingerprints.frozen()["families"][case.family.name]["observed"]
 
 
