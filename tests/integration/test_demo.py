@@ -16,8 +16,8 @@ from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 NOT_RUN = ("confabulation", "confabulation_prevalence", "judge_validation", "judge_robustness")  # empty, never zeros
-INSIDE = ("probe_items", "hidden_states", "probes", "directions", "cosines", "steering", "steering_votes")
-INSIDE += ("steering_effects", "steering_shares")
+MECHANISM = ("probe_items", "hidden_states", "probes", "directions", "cosines", "steering", "steering_votes")
+MECHANISM += ("steering_effects", "steering_shares")
 ON_REQUEST = ("arms", "robust")  # an experiment names arms
 DEGENERATE = ("always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle")
 
@@ -83,7 +83,7 @@ def test_clips_are_five_second_masters_and_chaotic_voids_are_prefixes(workspace:
 def test_every_table_knows_its_benchmark_version(workspace: Workspace) -> None:
     for table in TABLES.values():
         rows = workspace.tables.read_all(table)
-        assert rows.empty == (table.name in {*NOT_RUN, *INSIDE, *ON_REQUEST}), table.name
+        assert rows.empty == (table.name in {*NOT_RUN, *MECHANISM, *ON_REQUEST}), table.name
         assert set(rows.get("benchmark_version", ())) <= {"0.1.0"}, table.name
 
 

@@ -103,7 +103,7 @@ def test_a_second_extraction_computes_nothing_and_a_corrected_item_alone_is_extr
 
 
 def test_states_stand_in_the_order_of_their_table(study: Workspace) -> None:
-    states = stages.States.of(study, STANDARD)
+    states = stages.StoredStates.of(study, STANDARD)
     ill_posed = states.dataset("chaotic_ill_posed")
     controls = [states.read(d, 3)[(states.dataset(d)["side"] == "control").to_numpy()] for d in DATASETS[2:]]
     assert np.allclose(*controls, atol=1e-5)  # the same clip and question
@@ -117,7 +117,7 @@ def test_two_items_with_the_same_clip_and_question_have_the_same_states(own: Wor
     twin |= {name: first[name] for name in ("clip", "media_digest", "question")}
     own.tables.write(ITEMS, {"dataset": "chaotic"}, [ItemRow(**item) for item in items], {})
     extract_all(own)
-    states = stages.States.of(own, STANDARD)
+    states = stages.StoredStates.of(own, STANDARD)
     at = dict(zip(states.dataset("chaotic")["item_id"], states.read("chaotic", 3), strict=True))
     assert (at[first["item_id"]] == at[twin["item_id"]]).all()
     assert (at[first["item_id"]] != at["chaotic:plinko-2:void"]).any()
@@ -136,12 +136,12 @@ def test_states_that_are_gone_are_told(own: Workspace) -> None:
 def test_lost_states_are_stale_and_made_again_as_they_were(own: Workspace, lost: str) -> None:
     cell = StatesCell("chaotic", STANDARD)
     assert states_of(own, cell) == ()
-    before = stages.States.of(own, STANDARD).read("chaotic", 3)
+    before = stages.StoredStates.of(own, STANDARD).read("chaotic", 3)
     (own.root / "states" / "tiny" / "standard" / "chaotic" / lost).unlink()
     assert "its states are gone" in states_of(own, cell)
     stages.extract_states(own, cell)
     assert states_of(own, cell) == ()
-    assert (stages.States.of(own, STANDARD).read("chaotic", 3) == before).all()
+    assert (stages.StoredStates.of(own, STANDARD).read("chaotic", 3) == before).all()
 
 
 def states_of(workspace: Workspace, cell: StatesCell) -> tuple[str, ...]:
@@ -154,7 +154,7 @@ def test_a_damaged_index_of_states_is_written_again(own: Workspace) -> None:
     cell = StatesCell("chaotic", STANDARD)
     (own.root / "states" / "tiny" / "standard" / "chaotic" / "ids.parquet").write_bytes(b"torn")
     with pytest.raises(TrapsError, match="the next `traps run` writes it again"):
-        stages.States.of(own, STANDARD).read("chaotic", 3)
+        stages.StoredStates.of(own, STANDARD).read("chaotic", 3)
     assert "its states are gone" in states_of(own, cell)
     assert stages.extract_states(own, cell)[1] == 0
     assert states_of(own, cell) == ()
@@ -184,7 +184,10 @@ def test_directions_are_what_the_states_say(study: Workspace) -> None:
     assert len(table) == 4 * 3 * 5
     row = table.query("dataset == 'occlusion' and kind == 'void' and layer == 2").iloc[0]
     said = json.loads(study.resolve(row["path"]).with_suffix(".json").read_text())
-    states, items = stages.States.of(study, STANDARD), stages.States.of(study, STANDARD).dataset("occlusion")
+    states, items = (
+        stages.StoredStates.of(study, STANDARD),
+        stages.StoredStates.of(study, STANDARD).dataset("occlusion"),
+    )
     chosen, at = items["scenario_id"].isin(said["scenarios"]).to_numpy(), states.read("occlusion", 2).astype(float)
     void = (items["side"] == "void").to_numpy()
     difference = at[chosen & void].mean(axis=0) - at[chosen & ~void].mean(axis=0)
@@ -223,9 +226,9 @@ def test_probes_take_confabulated_items_from_the_verdicts_and_are_fitted_once(
 
 def test_a_model_that_is_not_local_or_not_asked_for_is_told(study: Workspace, entry: ModelEntry) -> None:
     with pytest.raises(TrapsError, match="oracle: is asked through backend reference, and only local models"):
-        stages.looked_into(study, "oracle")
+        stages.examined_model(study, "oracle")
     with pytest.raises(TrapsError, match=r"mechanism\.models does not name qwen3-vl-8b"):
-        stages.looked_into(study, "qwen3-vl-8b")
+        stages.examined_model(study, "qwen3-vl-8b")
     with pytest.raises(TrapsError, match="asks nothing inside models; run an experiment with a `mechanism:` section"):
         _ = study.allow(mechanism=None).mechanism
     study.save_study()

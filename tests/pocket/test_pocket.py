@@ -19,7 +19,7 @@ from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHAR
 from traps_pipeline.models.local.checkpoint import folder_digest
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pocket import inside
-from traps_pipeline.pocket.commands import CARD, EVALUATION, FACTS, INSIDE, INSIDE_MARKS, MARKS, WEIGHTS
+from traps_pipeline.pocket.commands import CARD, EVALUATION, FACTS, MARKS, MECHANISM_FIGURES, MECHANISM_MARKS, WEIGHTS
 from traps_pipeline.pocket.data import (
     STREAM,
     SceneRecord,
@@ -252,7 +252,7 @@ def in_card(marks: tuple[str, str]) -> str:
 def test_the_card_shows_the_shipped_counts() -> None:
     cells = read_cells(EVALUATION)
     assert in_card(MARKS) == markdown(cells)
-    assert in_card(INSIDE_MARKS) == inside.markdown(inside.read_figures(INSIDE))
+    assert in_card(MECHANISM_MARKS) == inside.markdown(inside.read_figures(MECHANISM_FIGURES))
     recipe = load_recipe()
     assert {(cell.family, cell.regime) for cell in cells} == {
         (family, regime) for family in recipe.scenes for regime in ("standard", "guided", "json")
@@ -287,7 +287,7 @@ def test_the_card_command_needs_its_counts(tmp_path: Path, capsys: pytest.Captur
 # --- what was found inside, over seeds --------------------------------------------------------------------------------
 
 
-def looked_into(root: Path, seed: int, area: float, share: float) -> Workspace:
+def examined_study(root: Path, seed: int, area: float, share: float) -> Workspace:
     """A finished workspace of one seed: its weights with their facts, and the tables that the card reads."""
     weights = root / f"seed{seed}" / WEIGHTS
     weights.mkdir(parents=True)
@@ -317,7 +317,7 @@ def looked_into(root: Path, seed: int, area: float, share: float) -> Workspace:
 def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Path) -> None:
     table = tmp_path / "mechanism.csv"
     for seed, area, share in ((1, 1.0, 0.5), (2, 0.8, 0.25)):
-        made = looked_into(tmp_path, seed, area, share)
+        made = examined_study(tmp_path, seed, area, share)
         inside.write_figures(table, inside.figures_of(made))
         inside.write_figures(table, inside.figures_of(made))  # the same seed again takes its own place
     found = inside.read_figures(table)
@@ -329,7 +329,7 @@ def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Pa
 
 
 def test_figures_of_weights_that_lie_there_no_more_are_refused(tmp_path: Path) -> None:
-    workspace = looked_into(tmp_path, 3, 1.0, 0.5)
+    workspace = examined_study(tmp_path, 3, 1.0, 0.5)
     (tmp_path / "seed3" / FACTS).unlink()
     with pytest.raises(TrapsError, match="does not say which seed"):
         inside.figures_of(workspace)

@@ -11,7 +11,7 @@ import pandas as pd
 from traps_pipeline.report.writing import (
     Behind,
     Column,
-    Table,
+    PrintedTable,
     figure_files,
     latex,
     not_run_figure,
@@ -43,7 +43,7 @@ def table(**other):
             "epoch": ["e1", "e1"],
         }
     )
-    return Table("results", "Results & more", rows, COLUMNS, ["epoch e1"], **other)
+    return PrintedTable("results", "Results & more", rows, COLUMNS, ["epoch e1"], **other)
 
 
 def latex_cells(text):
@@ -71,7 +71,7 @@ def test_a_dash_and_a_spread_are_explained_where_they_occur():
         "± population standard deviation over runs",
         "– not run, or undefined for want of decided items",
     ]
-    whole = Table("t", "T", pd.DataFrame({"n": [1]}), [Column("n", "n", "count")])
+    whole = PrintedTable("t", "T", pd.DataFrame({"n": [1]}), [Column("n", "n", "count")])
     assert whole.remarks == []
 
 
@@ -117,7 +117,7 @@ def test_parquet_and_csv_hold_the_numbers_behind_what_is_printed():
 
 
 def test_a_table_without_rows_says_not_run_and_why_everywhere():
-    empty = Table("t", "T", pd.DataFrame(columns=["model", "acc"]), COLUMNS[:2], why="nobody was asked")
+    empty = PrintedTable("t", "T", pd.DataFrame(columns=["model", "acc"]), COLUMNS[:2], why="nobody was asked")
     files = table_files(empty)
     for text in (files["t.md"].decode(), files["t.tex"].decode(), table_html(empty)):
         assert "not run: nobody was asked" in text

@@ -68,9 +68,9 @@ def _hits(items: pd.DataFrame, features: np.ndarray, model: Pipeline) -> np.ndar
     from sklearn.model_selection import GroupKFold, cross_val_predict
 
     void = (items["side"] == "void").to_numpy()
-    told = cross_val_predict(model, features, void, groups=items["scenario_id"], cv=GroupKFold(FOLDS))
+    predicted = cross_val_predict(model, features, void, groups=items["scenario_id"], cv=GroupKFold(FOLDS))
     _, pair = np.unique(items["pair_id"].to_numpy(str), return_inverse=True)
-    return np.bincount(pair, weights=told == void) / np.bincount(pair)
+    return np.bincount(pair, weights=predicted == void) / np.bincount(pair)
 
 
 def _thumbnail(clip: Path) -> np.ndarray:

@@ -217,12 +217,12 @@ cosines = stage(COSINES, _make_cosines, group=GROUP, deps=[directions], needs={"
 
 def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
     """Answers of a model that is steered along every path into a dataset; what the ledger holds is not asked."""
-    from traps_pipeline.mechanism.stages import looked_into, saved_directions
+    from traps_pipeline.mechanism.stages import examined_model, saved_directions
     from traps_pipeline.mechanism.steering import collect_steered
 
     for key in keys:
         cell = SteeringCell.parse(key)
-        entry = looked_into(workspace, cell.evaluation.model)
+        entry = examined_model(workspace, cell.evaluation.model)
         along = {cell.directions: saved_directions(workspace, Extraction(entry.id, cell.directions))}
         for done, made in collect_steered(workspace, entry, [cell], along):
             yield done.key, made

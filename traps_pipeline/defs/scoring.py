@@ -83,8 +83,8 @@ def _make_contrasts(workspace: Workspace, _: None) -> Made:
     cells, judged = _scored(workspace, "contrasts")
     table = paired(resample(judged), cells, judged)
     separable, refused = table["separable"].to_numpy(bool), len(table.loc[table["refused"].notna()])
-    told = table.loc[separable & (table["dataset"] == "overall")]
-    shown = {"contrasts": rows_shown(told), "separable": int(separable.sum()), "refused": refused}
+    separable_overall = table.loc[separable & (table["dataset"] == "overall")]
+    shown = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": refused}
     return Made(table, shown=shown)
 
 

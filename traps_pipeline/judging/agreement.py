@@ -165,9 +165,9 @@ def _why_undefined(whole: np.ndarray) -> str | None:
 
 def _bias(votes: np.ndarray, verdict: np.ndarray) -> dict[str, Any]:
     counted = (votes != INVALID) & (verdict != INVALID)
-    said, panel = votes[counted] == YES, verdict[counted] == YES
+    voted_yes, panel = votes[counted] == YES, verdict[counted] == YES
     n = int(counted.sum())
-    yes, panel_yes = _share(said.sum(), n), _share(panel.sum(), n)
+    yes, panel_yes = _share(voted_yes.sum(), n), _share(panel.sum(), n)
     return {
         "n_votes": len(votes),
         "n_invalid": int((votes == INVALID).sum()),
@@ -175,8 +175,8 @@ def _bias(votes: np.ndarray, verdict: np.ndarray) -> dict[str, Any]:
         "yes": yes,
         "panel_yes": panel_yes,
         "bias": yes - panel_yes,
-        "dissent_yes": _share((said & (verdict[counted] == NO)).sum(), n),
-        "dissent_no": _share((~said & panel).sum(), n),
+        "dissent_yes": _share((voted_yes & (verdict[counted] == NO)).sum(), n),
+        "dissent_no": _share((~voted_yes & panel).sum(), n),
     }
 
 

@@ -57,8 +57,8 @@ def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Se
     places = rows, pd.Index(seats).get_indexer(pd.Index(votes["judge"]))
     values[places], asked[places] = _decisions(votes), True
     answers = votes.loc[first, [*answer, "epoch", "benchmark_version"]].reset_index(drop=True)
-    told = votes.loc[first, ["task", "side"]]
-    answers["task"] = np.where(told["task"] == "correctness", "correctness", told["side"] + "_abstention")
+    first_votes = votes.loc[first, ["task", "side"]]
+    answers["task"] = np.where(first_votes["task"] == "correctness", "correctness", first_votes["side"] + "_abstention")
     whole = asked.all(axis=1)
     return Ratings(answers.loc[whole].reset_index(drop=True), values[whole], seats, answer)
 

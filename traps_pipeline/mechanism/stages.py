@@ -59,7 +59,7 @@ from traps_pipeline.storage.workspace import Workspace
 COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "question", "clip", "media_digest")
 
 
-def looked_into(workspace: Workspace, model: str) -> ModelEntry:
+def examined_model(workspace: Workspace, model: str) -> ModelEntry:
     """The entry of a model that the study looks into. Raises TrapsError for one that is not local or not asked for."""
     entry, settings = get_model(model), workspace.mechanism
     if entry.backend != LOCAL:
@@ -120,7 +120,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     from traps_pipeline.mechanism.hidden_states import clip_item, extract, read_layer, read_record
     from traps_pipeline.models.local.adapter import load_local_model
 
-    entry, settings = looked_into(workspace, cell.extraction.model), workspace.mechanism
+    entry, settings = examined_model(workspace, cell.extraction.model), workspace.mechanism
     assert entry.media is not None, "local entries have media"
     items = workspace.tables.read(PROBE_ITEMS, {"dataset": cell.dataset}).to_dict("records")
     model, system = load_local_model(entry, inside=True), vqa_prompt(cell.extraction.prompt)
@@ -177,7 +177,7 @@ def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
 
 
 @dataclass
-class States:
+class StoredStates:
     """The hidden states of one extraction: an id table, and a reader of one layer of one dataset in its order."""
 
     workspace: Workspace
@@ -185,12 +185,12 @@ class States:
     items: pd.DataFrame
 
     @staticmethod
-    def of(workspace: Workspace, extraction: Extraction) -> States:
+    def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
         """Raises TrapsError when nothing was extracted."""
         items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
-        return States(workspace, extraction, items.reset_index(drop=True))
+        return StoredStates(workspace, extraction, items.reset_index(drop=True))
 
     @property
     def n_layers(self) -> int:
@@ -227,8 +227,8 @@ class States:
 
 def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
     """Rows of an extraction's probes. Where nothing that they are made of has changed, the rows that are there."""
-    looked_into(workspace, extraction.model)
-    states, settings = States.of(workspace, extraction), workspace.mechanism
+    examined_model(workspace, extraction.model)
+    states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     confabulated = confabulations(workspace, extraction.model)
     layers = settings.models[extraction.model]
     made_of = digest(
@@ -283,8 +283,8 @@ def directions_file(workspace: Workspace, extraction: Extraction, dataset: str) 
 
 def direction_rows(workspace: Workspace, extraction: Extraction) -> list[DirectionRow]:
     """Make and save the directions of every dataset that has states; rows of the directions table."""
-    looked_into(workspace, extraction.model)
-    states = States.of(workspace, extraction)
+    examined_model(workspace, extraction.model)
+    states = StoredStates.of(workspace, extraction)
     rows: list[DirectionRow] = []
     for dataset in DATASETS:
         if not states.dataset(dataset).empty:
@@ -296,7 +296,7 @@ def direction_rows(workspace: Workspace, extraction: Extraction) -> list[Directi
     return rows
 
 
-def _dataset_directions(workspace: Workspace, states: States, dataset: str) -> list[DirectionRow]:
+def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str) -> list[DirectionRow]:
     settings, items = workspace.mechanism, states.dataset(dataset)
     steering = settings.steering
     if steering is None:

@@ -103,7 +103,7 @@ def outdated(workspace: Workspace, lineage: Lineage, *, costs: bool) -> dict[Nod
     return found
 
 
-def _tell(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, told: set[str]) -> None:
+def _tell(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, reported: set[str]) -> None:
     """Report what Dagster does not see by itself: altered tables, and unpartitioned ones that are not current."""
     for stage in the_graph().stages:
         for key in stage.wanted(Wanted(workspace)):
@@ -111,8 +111,8 @@ def _tell(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, 
             if stage.scheme is None:
                 wrong = [*lineage.status(stage.name, key).outdated]
             text = f"{name_of((stage.name, key))}: {'; '.join(wrong)}"
-            if wrong and text not in told:
-                told.add(text)
+            if wrong and text not in reported:
+                reported.add(text)
                 instance.report_runless_asset_event(
                     dg.AssetCheckEvaluation(
                         asset_key=stage.spec.key,
@@ -125,7 +125,7 @@ def _tell(instance: dg.DagsterInstance, workspace: Workspace, lineage: Lineage, 
 
 
 def _sensor(name: str, job: dg.JobDefinition, doc: str, *, costs: bool) -> dg.SensorDefinition:
-    told: set[str] = set()
+    reported: set[str] = set()
 
     @dg.sensor(
         name=name,
@@ -139,7 +139,7 @@ def _sensor(name: str, job: dg.JobDefinition, doc: str, *, costs: bool) -> dg.Se
         opened = workspace.open()
         lineage = Lineage(opened)
         History(context.instance, the_graph()).observe(lineage)
-        _tell(context.instance, opened, lineage, told)
+        _tell(context.instance, opened, lineage, reported)
         if context.instance.get_runs_count(dg.RunsFilter(statuses=UNFINISHED)):
             return dg.SkipReason("runs are under way")
         found = outdated(opened, lineage, costs=costs)

@@ -35,7 +35,7 @@ _QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
 
 
 @dataclass
-class Outcome:
+class WalkResult:
     """What a walk did: problems in sentences, among them checks that do not pass; whether a budget ended it."""
 
     problems: list[str] = field(default_factory=list)
@@ -97,13 +97,13 @@ def walk(
     *,
     experiment: str | None = None,
     existing: bool = False,
-) -> Outcome:
+) -> WalkResult:
     """Make what is missing or stale of these stages, block by block, in runs of the job of all assets.
 
     experiment: only what that one of the study's wants; existing: only what is there already and outdated.
     KeyboardInterrupt passes through.
     """
-    outcome, began, graph = Outcome(), time.monotonic(), the_graph()
+    outcome, began, graph = WalkResult(), time.monotonic(), the_graph()
     history, wanted = History(instance, graph), Wanted(workspace, experiment)
     tags = {MAKE_TAG: OUTDATED if existing else STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})
     with remembering_stops():
@@ -226,7 +226,7 @@ def _chain(event: dg.DagsterEvent) -> list[Any]:
 def _reason(event: dg.DagsterEvent) -> str:
     """The error of a failed step: our own sentences where there are some, else the innermost exception."""
     chain = _chain(event)
-    told = [error for error in chain if error.cls_name in _SENTENCES]
-    if not told:
+    readable = [error for error in chain if error.cls_name in _SENTENCES]
+    if not readable:
         return chain[-1].message.strip() if chain else "the step failed"
-    return re.sub(rf"^\S*\b{told[0].cls_name}: ", "", told[0].message.strip())
+    return re.sub(rf"^\S*\b{readable[0].cls_name}: ", "", readable[0].message.strip())

@@ -19,12 +19,12 @@ from traps_pipeline.pocket.recipe import POCKET, Recipe, Split
 from traps_pipeline.storage.workspace import Workspace
 
 EVALUATION = POCKET / "evaluation.csv"
-INSIDE = POCKET / "mechanism.csv"
+MECHANISM_FIGURES = POCKET / "mechanism.csv"
 CARD = POCKET / "README.md"
 THREADS = 1  # sums then come in one order on any number of cores; layers this small gain little by a second one
 WEIGHTS = "weights"  # in the folder of a seed: what `checkpoint:` names
 MARKS = "<!-- evaluation: written by `traps pocket card` -->", "<!-- end of evaluation -->"
-INSIDE_MARKS = "<!-- inside: written by `traps pocket card` -->", "<!-- end of inside -->"
+MECHANISM_MARKS = "<!-- inside: written by `traps pocket card` -->", "<!-- end of inside -->"
 
 
 Report = Callable[[str], None]  # is told, in a line, how far the work is
@@ -95,10 +95,10 @@ def write_card(counts: Path, workspaces: Sequence[Path]) -> list[str]:
     returns the tables in Markdown. Raises TrapsError where the card has no place for them."""
     figures = [figure for folder in workspaces for figure in inside.figures_of(Workspace.open(folder))]
     if figures:
-        inside.write_figures(INSIDE, figures)
+        inside.write_figures(MECHANISM_FIGURES, figures)
     tables = {
         MARKS: evaluation.markdown(evaluation.read_cells(counts)),
-        INSIDE_MARKS: inside.markdown(inside.read_figures(INSIDE)),
+        MECHANISM_MARKS: inside.markdown(inside.read_figures(MECHANISM_FIGURES)),
     }
     text = CARD.read_text(encoding="utf-8")
     for (begin, end), table in tables.items():

@@ -45,7 +45,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Cell:
+class AnswerCounts:
     """Counts of one training seed, family, regime and kind of question. prior: controls that have the commonest answer
     of the family's held-out scenes, as the reference model `prior` would answer; 0 but for controls."""
 
@@ -92,7 +92,7 @@ def evaluate(
     seed: int,
     regimes: Sequence[str] = REGIMES,
     report: Callable[[str], None] = lambda _: None,
-) -> list[Cell]:
+) -> list[AnswerCounts]:
     """Ask everything under every regime; returns the counts by family, regime and kind."""
     from traps_pipeline.models.local.adapter import load_local_model
 
@@ -117,7 +117,7 @@ def evaluate(
                 correct[cell] += one.truth is not None and _right(one, said)
                 prior[cell] += one.kind == "control" and one.truth == commonest[one.scene.family]
         report(f"seed {seed}: {start + len(some)} of {len(asked)} questions under {len(regimes)} regimes")
-    return [Cell(seed, *cell, n[cell], correct[cell], abstained[cell], prior[cell]) for cell in n]
+    return [AnswerCounts(seed, *cell, n[cell], correct[cell], abstained[cell], prior[cell]) for cell in n]
 
 
 def _answers(model: LocalModel, prompts: Sequence[Prompt], max_new_tokens: int) -> list[str]:
@@ -149,27 +149,29 @@ COLUMNS = (
     *("family", "regime", "Acc", "lowest 95 % bound", "prior", "FalseAbs"),
     *("AbsRec visual", "AbsRec ill-posed", "Acc answerable"),
 )
-FIELDS = tuple(Cell.__dataclass_fields__)
+FIELDS = tuple(AnswerCounts.__dataclass_fields__)
 
 
-def write_cells(path: Path, cells: Sequence[Cell]) -> None:
+def write_cells(path: Path, cells: Sequence[AnswerCounts]) -> None:
     """Write counts as CSV, in the place of those of the same seeds."""
     write_seeds(path, cells, read_cells)
 
 
-def read_cells(path: Path) -> list[Cell]:
+def read_cells(path: Path) -> list[AnswerCounts]:
     """The counts of a CSV of `write_cells`. Raises TrapsError."""
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             return [
-                Cell(int(row["seed"]), row["family"], row["regime"], row["kind"], *(int(row[k]) for k in FIELDS[4:]))
+                AnswerCounts(
+                    int(row["seed"]), row["family"], row["regime"], row["kind"], *(int(row[k]) for k in FIELDS[4:])
+                )
                 for row in csv.DictReader(stream)
             ]
     except (OSError, KeyError, ValueError) as error:
         raise TrapsError(f"{path}: no table of `traps pocket evaluate` ({error}); run it again") from error
 
 
-def markdown(cells: Sequence[Cell]) -> str:
+def markdown(cells: Sequence[AnswerCounts]) -> str:
     """The model card's table: percent, a row a family and regime, the mean over training seeds."""
     seeds = sorted({cell.seed for cell in cells})
     lines = [

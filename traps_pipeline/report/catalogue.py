@@ -14,7 +14,7 @@ from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables import comparisons, judges, leaderboards, setup, sub_scenarios
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
 from traps_pipeline.report.tables.shared import printed
-from traps_pipeline.report.writing import Table, figure_bytes, figure_files, table_files
+from traps_pipeline.report.writing import PrintedTable, figure_bytes, figure_files, table_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,7 +28,7 @@ class TableReport:
     paper prints something of the kind."""
 
     name: str
-    make: Callable[[Results], list[Table]]
+    make: Callable[[Results], list[PrintedTable]]
     reads: tuple[str, ...]
     published: bool = True
     title: str = ""  # of several tables together; else the first one's
@@ -38,7 +38,7 @@ class TableReport:
         """What it shows."""
         return _first_paragraph(self.make)
 
-    def tables(self, results: Results) -> list[Table]:
+    def tables(self, results: Results) -> list[PrintedTable]:
         """The tables, without columns that the paper prints nowhere."""
         return [replace(t, columns=printed(results, t.rows, t.columns)) for t in self.make(results)]
 

@@ -42,7 +42,7 @@ SCREEN, PAGE = Layout(), Layout(block=2.98, header=0.5, gap=0.4, dpi=300, size=6
 
 
 @dataclass(frozen=True)
-class Clip:
+class SampledClip:
     """Frames (MOMENTS, H, W, 3) uint8 at the control's times; those from `known` on lie behind the clip's end (s)."""
 
     frames: np.ndarray
@@ -109,7 +109,7 @@ def chosen_pairs(items: pd.DataFrame, per_family: int | None) -> list[pd.DataFra
     return [by_pair[pair_id].set_index("side") for pair_id in ids]
 
 
-def _moments(pair: pd.DataFrame, root: Path) -> tuple[Clip, Clip, np.ndarray]:
+def _moments(pair: pd.DataFrame, root: Path) -> tuple[SampledClip, SampledClip, np.ndarray]:
     """Control, void and the times (MOMENTS,) in seconds, from the control's first frame to its last."""
     control, at = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
@@ -117,21 +117,23 @@ def _moments(pair: pd.DataFrame, root: Path) -> tuple[Clip, Clip, np.ndarray]:
     return _sampled(control, at, times), _sampled(void, void_at, times), times
 
 
-def _sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> Clip:
+def _sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
     """The frames nearest to the times; a clip ends one frame after its last frame begins."""
     step = float(at[1] - at[0]) if len(at) > 1 else 0.0
     end = float(at[-1]) + step
     nearest = np.abs(at[:, None] - times).argmin(axis=0)
-    return Clip(frames[nearest], int((times < end - step / 4).sum()), end)
+    return SampledClip(frames[nearest], int((times < end - step / 4).sum()), end)
 
 
-def _ratio(clip: Clip) -> float:
+def _ratio(clip: SampledClip) -> float:
     """Height over width of a pair's block of frames."""
     _, height, width, _ = clip.frames.shape
     return (2 * height + GAP) / (MOMENTS * width + (MOMENTS - 1) * GAP)
 
 
-def _draw_pair(axes: Axes, pair: pd.DataFrame, control: Clip, void: Clip, times: np.ndarray, layout: Layout) -> None:
+def _draw_pair(
+    axes: Axes, pair: pd.DataFrame, control: SampledClip, void: SampledClip, times: np.ndarray, layout: Layout
+) -> None:
     from matplotlib.patches import Rectangle
 
     _, height, width, _ = control.frames.shape

@@ -34,7 +34,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Entry:
+class ShownScenario:
     """A scenario on the page."""
 
     scenario_id: str
@@ -52,7 +52,7 @@ def gallery_files(specs: pd.DataFrame, videos: pd.DataFrame, root: Path, title: 
     """
     clips = {(row["scenario_id"], row["side"]): str(row["path"]) for row in videos.to_dict("records")}
     files: dict[str, bytes] = {}
-    sections: defaultdict[str, list[Entry]] = defaultdict(list)
+    sections: defaultdict[str, list[ShownScenario]] = defaultdict(list)
     for spec in specs.sort_values("scenario_id").to_dict("records"):
         if all((spec["scenario_id"], side) in clips for side in SIDES):
             for side in SIDES:
@@ -75,7 +75,7 @@ def _last_frame(clip: Path) -> bytes:
     return jpeg.tobytes()
 
 
-def _entry(spec: Mapping[str, Any], clips: Mapping[tuple[str, str], str]) -> Entry:
+def _entry(spec: Mapping[str, Any], clips: Mapping[tuple[str, str], str]) -> ShownScenario:
     scenario_id, evidence, twin = spec["scenario_id"], json.loads(spec["evidence"]), json.loads(spec["twin"])
     captions = {
         "control": f"control: {spec['ground_truth']}",
@@ -87,7 +87,7 @@ def _entry(spec: Mapping[str, Any], clips: Mapping[tuple[str, str], str]) -> Ent
     )
     labels = ", ".join(spec["labels"])
     certificate = dict(_certificate(evidence))
-    return Entry(scenario_id, spec["question"], labels, spec["ill_posed_question"], pictures, certificate)
+    return ShownScenario(scenario_id, spec["question"], labels, spec["ill_posed_question"], pictures, certificate)
 
 
 def _what_is_done(spec: Mapping[str, Any]) -> str:
@@ -114,6 +114,6 @@ def _certificate(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             yield name, words.format(evidence[name])
 
 
-def _render(title: str, sections: Mapping[str, list[Entry]]) -> str:
+def _render(title: str, sections: Mapping[str, list[ShownScenario]]) -> str:
     count = sum(len(entries) for entries in sections.values())
     return environment().get_template("gallery.html.j2").render(title=title, sections=sections, count=count)

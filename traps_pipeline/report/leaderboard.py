@@ -27,7 +27,16 @@ from traps_pipeline.report.tables.shared import (
     meanings,
 )
 from traps_pipeline.report.terms import ENOUGH, INCOMPLETE_MARK, MISSING_MARK, ROBUST_TERMS, TITLES
-from traps_pipeline.report.writing import NONE, NOT_RUN, Behind, Column, Table, fraction, table_markdown, table_text
+from traps_pipeline.report.writing import (
+    NONE,
+    NOT_RUN,
+    Behind,
+    Column,
+    PrintedTable,
+    fraction,
+    table_markdown,
+    table_text,
+)
 from traps_pipeline.scoring.analyses import of_several_runs
 from traps_pipeline.scoring.tables import LEADERBOARD
 
@@ -74,7 +83,7 @@ def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None
     return "\n".join([table_markdown(leaderboards(board, robust, brief=True)[0]), *terms]) + "\n"
 
 
-def leaderboards(board: pd.DataFrame, robust: pd.DataFrame | None = None, *, brief: bool = False) -> list[Table]:
+def leaderboards(board: pd.DataFrame, robust: pd.DataFrame | None = None, *, brief: bool = False) -> list[PrintedTable]:
     """Tables of LEADERBOARD rows: first the one that entries are ranked by, then one of each other dataset. The overall
     one has the figures of ROBUST rows, where there are any.
 
@@ -114,7 +123,7 @@ def _distinct(values: Iterable[Any], separator: str) -> list[str]:
     return sorted({part for value in values for part in str(value).split(separator) if part})
 
 
-def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], beside: Robust, brief: bool) -> Table:
+def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], beside: Robust, brief: bool) -> PrintedTable:
     rows = _entries(board, dataset, others)
     columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, J]
     for name in others:
@@ -132,7 +141,7 @@ def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], besid
         columns = [replace(c, spread="") for c in columns if c.field not in ("n_runs", "epoch", "benchmark_version")]
     else:
         notes = ["ranked by PECS", *notes]
-    return Table(
+    return PrintedTable(
         f"leaderboard_{dataset}", TITLES[dataset], rows, columns, notes, "this study has no leaderboard yet", _trace,
         dash="not all four datasets evaluated, or nothing decided" if dataset == "overall" else "nothing decided",
         lead=provenance(board),

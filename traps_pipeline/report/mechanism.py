@@ -22,10 +22,12 @@ def published_probes() -> pd.DataFrame:
     rows = _long(published("probe_transfer")).rename(columns={"best_layer": "layer"})
     transfer = rows.assign(analysis="transfer", value=rows["auroc"], own_best=True, all_sample_best=True)
     confabulated = rows.assign(analysis="confabulated", value=rows["auroc_confabulated"], all_sample_best=True)
-    told = published("other")
-    told["value"] = pd.to_numeric(told["value"], errors="coerce")
-    shuffled = told.loc[told["id"].str.startswith("shuffle-")].assign(analysis="shuffled")
-    catch = told.loc[told["id"].str.startswith("catch-")].assign(analysis="centroid_void", layer=CENTROID_LAYER)
+    other_figures = published("other")
+    other_figures["value"] = pd.to_numeric(other_figures["value"], errors="coerce")
+    shuffled = other_figures.loc[other_figures["id"].str.startswith("shuffle-")].assign(analysis="shuffled")
+    catch = other_figures.loc[other_figures["id"].str.startswith("catch-")].assign(
+        analysis="centroid_void", layer=CENTROID_LAYER
+    )
     catch = catch.assign(scope="sub_scenario:" + catch["id"].str.removeprefix("catch-"), value=catch["value"] / 100)
     table = _as(PROBES, [transfer, confabulated, shuffled, catch])
     return table.assign(**{flag: table[flag].eq(True) for flag in _FLAGS})
@@ -34,10 +36,10 @@ def published_probes() -> pd.DataFrame:
 def published_cosines() -> pd.DataFrame:
     """COSINES rows: qwen3-vl-8b's matrix, and the few of the other two that the text has."""
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
-    told = published("other")
-    told = told.loc[told["id"].str.match("cos-(gemma|llava)-")].reset_index(drop=True)
-    pairs = told["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
-    few = told.assign(source=pairs[0], other=pairs[1], cosine=told["value"].astype(float))
+    other_figures = published("other")
+    other_figures = other_figures.loc[other_figures["id"].str.match("cos-(gemma|llava)-")].reset_index(drop=True)
+    pairs = other_figures["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
+    few = other_figures.assign(source=pairs[0], other=pairs[1], cosine=other_figures["value"].astype(float))
     mirrored = few.rename(columns={"source": "other", "other": "source"})
     both = pd.concat([matrix, few, mirrored], ignore_index=True)
     both = _long(both).rename(columns={"source": "dataset", "other": "other_dataset"})
@@ -73,8 +75,8 @@ def published_regimes() -> pd.DataFrame:
 
 def published_domains(recomputed: pd.DataFrame) -> pd.DataFrame:
     """Rows of `effects.domains`, with the two same-domain figures of qwen3-vl-8b that the text has, marked."""
-    told = published("other").set_index("id")["value"]
-    same = {LONG[short]: float(str(told[f"same-{short}"]).split(" / ")[0]) / 100 for short in ("ch", "oc")}
+    other_figures = published("other").set_index("id")["value"]
+    same = {LONG[short]: float(str(other_figures[f"same-{short}"]).split(" / ")[0]) / 100 for short in ("ch", "oc")}
     mine = (recomputed["model"] == "qwen3-vl-8b") & recomputed["source"].isin([*same])
     values = [same.get(source, float("nan")) for source in recomputed["source"]]
     return recomputed.assign(same=recomputed["same"].mask(mine, values), mark=mine.map(lambda m: "*" if m else ""))
@@ -82,11 +84,11 @@ def published_domains(recomputed: pd.DataFrame) -> pd.DataFrame:
 
 def published_layers() -> pd.DataFrame:
     """Rows of `effects.sweep`: gemma-4-e4b at three layers, alpha 0 and 10, regimes not stated."""
-    told = published("other")
-    told = told.loc[told["id"].str.fullmatch(r"depth-gemma-\d+")]
+    other_figures = published("other")
+    other_figures = other_figures.loc[other_figures["id"].str.fullmatch(r"depth-gemma-\d+")]
     rows = [
         {"model": model, "layer": int(name.rsplit("-", 1)[1]), "alpha": alpha, "control": float(share) / 100}
-        for name, model, value in zip(told["id"], told["model"], told["value"], strict=True)
+        for name, model, value in zip(other_figures["id"], other_figures["model"], other_figures["value"], strict=True)
         for alpha, share in zip((0.0, 10.0), str(value).split(" to "), strict=True)
     ]
     return pd.DataFrame(rows).assign(directions=NOT_STATED, regime=NOT_STATED, n_splits=4)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from traps_pipeline.report.leaderboard import leaderboards, legend, provenance
-from traps_pipeline.report.writing import Behind, Table, environment, table_html
+from traps_pipeline.report.writing import Behind, PrintedTable, environment, table_html
 
 WIDE_PX = 1300  # a picture of more pixels across is a page's width
 
@@ -68,6 +68,6 @@ def picture_block(source: str, png: bytes, full: bool = False) -> Block:
     return Block(source, base64.b64encode(png).decode(), size=size)
 
 
-def table_block(source: str, tables: Sequence[Table], address: Callable[[Behind], str] | None) -> Block:
+def table_block(source: str, tables: Sequence[PrintedTable], address: Callable[[Behind], str] | None) -> Block:
     """Tables as a card's block."""
     return Block(source, tables=[(table.title, table_html(table, address)) for table in tables])

@@ -1,8 +1,8 @@
 """How every table and every figure is written: one way for each, the same bytes on every build.
 
-A `Table` is a frame of numbers with the columns that are printed; it becomes Parquet and CSV (numbers as they are),
-LaTeX, Markdown, text for a terminal and an HTML fragment (numbers as printed). Its texts are untrusted: each medium
-escapes them. A figure becomes PDF, SVG and PNG.
+A `PrintedTable` is a frame of numbers with the columns that are printed; it becomes Parquet and CSV (numbers as they
+are), LaTeX, Markdown, text for a terminal and an HTML fragment (numbers as printed). Its texts are untrusted: each
+medium escapes them. A figure becomes PDF, SVG and PNG.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Table:
+class PrintedTable:
     """A table for people: a frame, what of it is printed, and what a reader must know (epoch, n, what is missing).
 
     A table without rows says that it was not run, and `why`; or `none`, where it was run and is rightly empty. `trace`
@@ -190,7 +190,7 @@ class Table:
         return self.rows.reindex(columns=pd.Index(list(fields)))
 
 
-def table_files(table: Table) -> dict[str, bytes]:
+def table_files(table: PrintedTable) -> dict[str, bytes]:
     """The table as `name.parquet`, `name.csv` (shares as fractions), `name.tex` (booktabs) and `name.md`."""
     files = {
         "parquet": _parquet(table),
@@ -201,7 +201,7 @@ def table_files(table: Table) -> dict[str, bytes]:
     return {f"{table.name}.{kind}": files[kind] for kind in TABLE_KINDS}
 
 
-def table_markdown(table: Table) -> str:
+def table_markdown(table: PrintedTable) -> str:
     """Title, table, notes; texts escaped."""
     title = f"**{markdown(table.title)}.** {markdown(table.lead)}" if table.lead else f"**{markdown(table.title)}**"
     lines = [title, ""]
@@ -216,7 +216,7 @@ def table_markdown(table: Table) -> str:
     return "\n".join([*lines, *([""] if notes else []), *(f"- {note}" for note in notes)]) + "\n"
 
 
-def table_text(table: Table) -> str:
+def table_text(table: PrintedTable) -> str:
     """Title, table and notes for standard output, as `terminal.text_table` prints there."""
     lines = [plain(f"{table.title}. {table.lead}" if table.lead else table.title), ""]
     if table.absence:
@@ -241,7 +241,7 @@ def _hung(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:
     return [f"{number:>{max(map(len, numbers))}} {mark:1}" for number, mark in zip(numbers, marks, strict=True)]
 
 
-def table_latex(table: Table) -> str:
+def table_latex(table: PrintedTable) -> str:
     """A floating `table` environment with booktabs rules (`\\usepackage{booktabs}`); notes stand in the caption."""
     import pandas as pd
 
@@ -262,7 +262,7 @@ def table_latex(table: Table) -> str:
     return str(text)
 
 
-def table_html(table: Table, address: Callable[[Behind], str] | None = None) -> str:
+def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = None) -> str:
     """An HTML fragment: the table in a scrolling box, notes below; escaped. With `address`, every number that has items
     behind it is a link to them."""
 
@@ -310,7 +310,7 @@ def latex(text: object) -> str:
     return plain(text).translate(_LATEX)
 
 
-def _parquet(table: Table) -> bytes:
+def _parquet(table: PrintedTable) -> bytes:
     """Every text column as text, so that the file's schema does not depend on what happens to be missing."""
     import pyarrow as pa
     import pyarrow.parquet as pq

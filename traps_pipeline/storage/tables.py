@@ -36,7 +36,7 @@ TYPES: tuple[Any, ...] = (str, int, float, bool, datetime, list[str])
 
 
 @dataclass(frozen=True)
-class Column:
+class StoredColumn:
     """One column: its name, its type (one of TYPES), whether values may be missing, its meaning and unit in words."""
 
     name: str
@@ -77,7 +77,7 @@ class Table(Generic[Row]):
         return words[:1].lower() + words[1:]
 
     @cached_property
-    def columns(self) -> tuple[Column, ...]:
+    def columns(self) -> tuple[StoredColumn, ...]:
         """The columns in the order of the fields. Raises TypeError for an annotation that says no column."""
         return tuple(_columns(self.row_type))
 
@@ -99,7 +99,7 @@ class Table(Generic[Row]):
         )
 
 
-def _columns(row_type: type[Any]) -> Iterator[Column]:
+def _columns(row_type: type[Any]) -> Iterator[StoredColumn]:
     for name, annotation in get_type_hints(row_type, include_extras=True).items():
         if get_origin(annotation) is not Annotated:
             raise TypeError(f"{row_type.__name__}.{name}: write Annotated[type, meaning and unit in words]")
@@ -109,4 +109,4 @@ def _columns(row_type: type[Any]) -> Iterator[Column]:
         if len(types) != 1 or types[0] not in TYPES or not isinstance(doc, str):
             known = ", ".join(map(str, TYPES))
             raise TypeError(f"{row_type.__name__}.{name}: a column holds one of {known}, or None, and has a text")
-        yield Column(name, types[0], NoneType in members, doc)
+        yield StoredColumn(name, types[0], NoneType in members, doc)

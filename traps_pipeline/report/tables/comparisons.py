@@ -29,12 +29,12 @@ from traps_pipeline.report.tables.shared import (
     marks,
     no_overall,
     ordered,
-    said,
+    rightly_empty,
     titled,
     together,
 )
 from traps_pipeline.report.terms import SIDE_OF
-from traps_pipeline.report.writing import Behind, Column, Table, Trace
+from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 NAIVE_THRESHOLD = 0.03
 
 
-def visual_textual(results: Results) -> list[Table]:
+def visual_textual(results: Results) -> list[PrintedTable]:
     """AbsRec under standard on visual and on ill-posed voids, and their ratio, by taxonomy and pooled."""
     rates = marked(results.rates)
     rows = rates.drop_duplicates("model", keep="last").loc[
@@ -71,7 +71,9 @@ def visual_textual(results: Results) -> list[Table]:
         *results.refused.get("rates", []),
     ]
     return [
-        Table("visual_textual", "Visual against textual voids", rows, columns, notes, results.why("rates"), _rate_trace)
+        PrintedTable(
+            "visual_textual", "Visual against textual voids", rows, columns, notes, results.why("rates"), _rate_trace
+        )
     ]
 
 
@@ -83,7 +85,7 @@ def _rate_trace(row: Mapping[str, Any], field: str) -> Behind:
     return Behind(dataset, row["model"], "standard", "void")
 
 
-def uplift(results: Results) -> list[Table]:
+def uplift(results: Results) -> list[PrintedTable]:
     """Guided over standard: AbsRec (equal weight over datasets) and their ratio, PECS of both."""
     rows, refused, both = [], [], ("standard", "guided")
     for model, means in marked(results.overall).groupby("model", sort=False):
@@ -115,7 +117,7 @@ def uplift(results: Results) -> list[Table]:
     notes = [epochs(results.cells), "equal-weight means over the four datasets; ∞ where only standard is 0"]
     notes += [*marks(table), *refused]
     why = "no model has standard and guided on all four datasets"
-    return [Table("guided_uplift", "Guided against standard", table, columns, notes, why, _regime_trace)]
+    return [PrintedTable("guided_uplift", "Guided against standard", table, columns, notes, why, _regime_trace)]
 
 
 def _regime_trace(row: Mapping[str, Any], field: str) -> Behind:
@@ -123,7 +125,7 @@ def _regime_trace(row: Mapping[str, Any], field: str) -> Behind:
     return Behind("", row["model"], regime if regime in REGIMES else "", SIDE_OF.get(figure, ""))
 
 
-def naive(results: Results) -> list[Table]:
+def naive(results: Results) -> list[PrintedTable]:
     """Cells under guided by how far Acc x AbsRec, which forgives false abstention, exceeds PECS."""
     cells = results.cells.loc[results.cells["regime"] == "guided"]
     rows = marked(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
@@ -139,10 +141,14 @@ def naive(results: Results) -> list[Table]:
         epochs(cells),
         *marks(rows),
     ]
-    return [Table("pecs_naive", "PECS against Acc × AbsRec", rows, columns, notes, "no cell under guided", cell_trace)]
+    return [
+        PrintedTable(
+            "pecs_naive", "PECS against Acc × AbsRec", rows, columns, notes, "no cell under guided", cell_trace
+        )
+    ]
 
 
-def zero_boundary(results: Results) -> list[Table]:
+def zero_boundary(results: Results) -> list[PrintedTable]:
     """Cells whose PECS is 0: where a model does not tell void from control at all."""
     rows = ordered(titled(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
     columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
@@ -151,19 +157,19 @@ def zero_boundary(results: Results) -> list[Table]:
     notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in asked.items()), epochs(rows)]
     notes += marks(rows)
     why = "no cell has PECS 0" if len(results.cells) else results.why("cells")
-    table = Table("zero_boundary", "Cells with PECS 0", rows, columns, notes, why, cell_trace)
-    return [said(table, bool(len(results.cells)))]
+    table = PrintedTable("zero_boundary", "Cells with PECS 0", rows, columns, notes, why, cell_trace)
+    return [rightly_empty(table, bool(len(results.cells)))]
 
 
-def frontier(results: Results) -> list[Table]:
+def frontier(results: Results) -> list[PrintedTable]:
     """The Pareto frontier in (Acc, J) under each regime, after averaging over datasets."""
     rows = ordered(marked(analyses.frontier(results.overall)), ["regime"])
     columns = [REGIME, MODEL, SHARES[0], J, PECS, *COUNTS]
     notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *marks(rows)]
-    return [Table("frontier", "Pareto frontier", rows, columns, notes, no_overall(results, False), cell_trace)]
+    return [PrintedTable("frontier", "Pareto frontier", rows, columns, notes, no_overall(results, False), cell_trace)]
 
 
-def reasoning(results: Results) -> list[Table]:
+def reasoning(results: Results) -> list[PrintedTable]:
     """The thinking member of each pair minus the other, by dataset and overall."""
     import pandas as pd
 
@@ -194,10 +200,10 @@ def reasoning(results: Results) -> list[Table]:
         row["dataset"] if row["dataset"] in DATASETS else "", row["thinking"], row["regime"], SIDE_OF.get(field, "")
     )
     why = "no reasoning pair was evaluated whole"
-    return [Table("reasoning_pairs", "Reasoning pairs", table, columns, notes, why, trace)]
+    return [PrintedTable("reasoning_pairs", "Reasoning pairs", table, columns, notes, why, trace)]
 
 
-def contrasts(results: Results) -> list[Table]:
+def contrasts(results: Results) -> list[PrintedTable]:
     """Paired contrasts of PECS, overall: two models of one regime, two regimes of one model; Holm's correction."""
     rows = results.contrasts
     rows = rows.loc[(rows["dataset"] == "overall") & (rows["figure"] == "pecs")]
@@ -215,10 +221,10 @@ def contrasts(results: Results) -> list[Table]:
     notes += ["missing: of both", *marks(rows)] if len(rows) else []
     trace: Trace = lambda row, field: Behind("", row["left_model"], row["left_regime"])  # noqa: E731
     why = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
-    return [Table("contrasts", "Paired contrasts", rows, columns, notes, why, trace)]
+    return [PrintedTable("contrasts", "Paired contrasts", rows, columns, notes, why, trace)]
 
 
-def regime_tests(results: Results) -> list[Table]:
+def regime_tests(results: Results) -> list[PrintedTable]:
     """McNemar's test of two regimes on the same items, by dataset, model and run."""
     rows = ordered(titled(results.regime_tests), ["dataset", "model", "run", "decision"])
     columns = [
@@ -229,10 +235,10 @@ def regime_tests(results: Results) -> list[Table]:
     ]  # fmt: skip
     trace: Trace = lambda row, field: Behind(row["dataset"], row["model"], row["left_regime"])  # noqa: E731
     why = "no model has two regimes" if results.is_study else results.why("regime_tests")
-    return [Table("regime_tests", "McNemar’s test of regimes", rows, columns, why=why, trace=trace)]
+    return [PrintedTable("regime_tests", "McNemar’s test of regimes", rows, columns, why=why, trace=trace)]
 
 
-def spreads(results: Results) -> list[Table]:
+def spreads(results: Results) -> list[PrintedTable]:
     """Quartiles of the standard deviations of PECS over runs, by family."""
     cells: pd.DataFrame = results.cells
     families = {entry.id: entry.groups.family for entry in load_models().values()}
@@ -251,10 +257,10 @@ def spreads(results: Results) -> list[Table]:
     why = "no cell has more than one run" if len(cells) else results.why("cells")
     rows = frame(rows, ["family"])
     trace: Trace = lambda row, field: Behind()  # noqa: E731
-    return [Table("run_spread", "Spread over runs", rows, columns, [*notes, epochs(cells)], why, trace)]
+    return [PrintedTable("run_spread", "Spread over runs", rows, columns, [*notes, epochs(cells)], why, trace)]
 
 
-def degenerate(results: Results) -> list[Table]:
+def degenerate(results: Results) -> list[PrintedTable]:
     """What strategies without discrimination score in expectation, and what they scored in this study."""
     rows = analyses.degenerate_strategies()
     columns = [
@@ -277,7 +283,7 @@ def degenerate(results: Results) -> list[Table]:
         Behind("", row["strategy"], "standard") if field.startswith("measured") or field in COUNTED else None
     )
     return [
-        Table(
+        PrintedTable(
             "degenerate_strategies", "Degenerate strategies", rows, columns, notes, trace=trace, dash="open, or not run"
         )
     ]

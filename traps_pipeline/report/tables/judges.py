@@ -18,13 +18,13 @@ from traps_pipeline.report.tables.shared import (
     ordered,
     titled,
 )
-from traps_pipeline.report.writing import Behind, Column, Table, Trace
+from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-def agreement(results: Results) -> list[Table]:
+def agreement(results: Results) -> list[PrintedTable]:
     """The panel's agreement by dataset and task; with the lowest agreement of two of its judges."""
     rows = results.agreement
     pairs = rows.loc[rows["judges"] != "panel"].groupby(["dataset", "task"])["agreement"].min().rename("lowest_pair")
@@ -39,7 +39,7 @@ def agreement(results: Results) -> list[Table]:
     ]  # fmt: skip
     notes = [epochs(rows), *_undefined(rows), "unanimous and κ over answers with three valid votes"]
     why = results.why("agreement")
-    return [Table("judge_agreement", "Agreement of the judges", rows, columns, notes, why, _task_trace)]
+    return [PrintedTable("judge_agreement", "Agreement of the judges", rows, columns, notes, why, _task_trace)]
 
 
 def _task_trace(row: Mapping[str, Any], field: str) -> Behind:
@@ -51,7 +51,7 @@ def _undefined(rows: pd.DataFrame) -> list[str]:
     return [f"undefined: {'; '.join(sorted(reasons))}"] if reasons else []
 
 
-def judge_bias(results: Results) -> list[Table]:
+def judge_bias(results: Results) -> list[PrintedTable]:
     """Every judge against the panel, and PECS without it."""
     bias = ordered(titled(results.bias), ["dataset", "task", "judge"])
     columns = [
@@ -71,12 +71,12 @@ def judge_bias(results: Results) -> list[Table]:
     notes = ["two judges: one against one is undecided and counts as missing", epochs(left)]
     why = results.why("bias")
     return [
-        Table("judge_bias", "Each judge against the panel", bias, columns, [epochs(bias)], why, _task_trace),
-        Table("leave_one_judge_out", "PECS without one judge", left, without, notes, why, cell_trace),
+        PrintedTable("judge_bias", "Each judge against the panel", bias, columns, [epochs(bias)], why, _task_trace),
+        PrintedTable("leave_one_judge_out", "PECS without one judge", left, without, notes, why, cell_trace),
     ]
 
 
-def validation(results: Results) -> list[Table]:
+def validation(results: Results) -> list[PrintedTable]:
     """The confabulation judge against human labels."""
     rows = results.validation
     columns = [
@@ -89,7 +89,7 @@ def validation(results: Results) -> list[Table]:
     notes = ["labels of both annotators side by side, no consensus"] + ([] if results.is_study else ["epoch original"])
     why = "no label files of annotators (`traps confabulation validate`)" if results.is_study else ""
     return [
-        Table(
+        PrintedTable(
             "judge_validation",
             "The confabulation judge against annotators",
             rows,
@@ -102,7 +102,7 @@ def validation(results: Results) -> list[Table]:
     ]
 
 
-def confabulation(results: Results) -> list[Table]:
+def confabulation(results: Results) -> list[PrintedTable]:
     """How often each axis of confabulation applies to a model's void failures."""
     rows = results.confabulation
     names = {"hp": "HP %", "ii": "II %", "hp_and_ii": "HP and II %", "es": "ES %", "doubt": "Doubt %"}
@@ -115,4 +115,4 @@ def confabulation(results: Results) -> list[Table]:
         columns += [Column("n_sampled", "Sampled", "count"), Column("evidence", "Evidence"), Column("judge", "Judge")]
     why = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""
     trace: Trace = lambda row, field: Behind("", row["model"], "standard", "void")  # noqa: E731
-    return [Table("confabulation", "Confabulation: prevalence by model", rows, columns, notes, why, trace)]
+    return [PrintedTable("confabulation", "Confabulation: prevalence by model", rows, columns, notes, why, trace)]

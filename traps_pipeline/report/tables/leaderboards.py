@@ -28,7 +28,7 @@ from traps_pipeline.report.tables.shared import (
     titled,
 )
 from traps_pipeline.report.terms import TITLES
-from traps_pipeline.report.writing import Behind, Column, Table, Trace
+from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.published import published_overall
 
@@ -36,17 +36,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def overall(results: Results) -> list[Table]:
+def overall(results: Results) -> list[PrintedTable]:
     """The overall leaderboard: every model but the replication families, best PECS first."""
     return [_overall(results, "overall", "Overall leaderboard", replication=False)]
 
 
-def replication_overall(results: Results) -> list[Table]:
+def replication_overall(results: Results) -> list[PrintedTable]:
     """The replication families, overall."""
     return [_overall(results, "replication_overall", "Replication families, overall", replication=True)]
 
 
-def _overall(results: Results, name: str, title: str, replication: bool) -> Table:
+def _overall(results: Results, name: str, title: str, replication: bool) -> PrintedTable:
     rows = marked(results.overall)
     rows = rows.loc[rows["model"].isin(analyses.models_of(group="replication")) == replication]
     columns = [MODEL, REGIME, PECS, *SHARES, J]
@@ -61,17 +61,17 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Tabl
         if rows["published_pecs"].notna().any():
             columns.append(Column("published_pecs", "published PECS", "fraction"))
             notes.append("published PECS: as the paper prints it, of its own benchmark and epochs")
-    return Table(
+    return PrintedTable(
         name, title, best_first(rows), [*columns, *COUNTS], notes, no_overall(results, replication), cell_trace
     )
 
 
-def per_dataset(results: Results) -> list[Table]:
+def per_dataset(results: Results) -> list[PrintedTable]:
     """PECS of every model and regime on each dataset, and overall."""
     return [_by_dataset(results, "per_dataset", "PECS by dataset", replication=False)]
 
 
-def replication_per_dataset(results: Results) -> list[Table]:
+def replication_per_dataset(results: Results) -> list[PrintedTable]:
     """The replication families' figures on each dataset."""
     cells = marked(results.cells)
     rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))]
@@ -79,10 +79,14 @@ def replication_per_dataset(results: Results) -> list[Table]:
     columns = [MODEL, DATASET, REGIME, PECS, *SHARES, *COUNTS, EPOCH]
     notes = [epochs(rows), *marks(rows)]
     why = "no model of the replication families"
-    return [Table("replication_per_dataset", "Replication families, by dataset", rows, columns, notes, why, cell_trace)]
+    return [
+        PrintedTable(
+            "replication_per_dataset", "Replication families, by dataset", rows, columns, notes, why, cell_trace
+        )
+    ]
 
 
-def _by_dataset(results: Results, name: str, title: str, replication: bool) -> Table:
+def _by_dataset(results: Results, name: str, title: str, replication: bool) -> PrintedTable:
     import pandas as pd
 
     cells = marked(results.cells)
@@ -106,7 +110,7 @@ def _by_dataset(results: Results, name: str, title: str, replication: bool) -> T
     rows = rows.sort_values("mean", ascending=False, na_position="last", ignore_index=True, kind="stable")
     notes = [epochs(cells), "mean: overall, of the runs that have all four datasets", *marks(cells)]
     trace: Trace = lambda row, field: Behind(field if field in DATASETS else "", row["model"], row["regime"])  # noqa: E731
-    return Table(name, title, rows, columns, notes, results.why("cells"), trace)
+    return PrintedTable(name, title, rows, columns, notes, results.why("cells"), trace)
 
 
 def _n(title: str, part: pd.DataFrame, names: Mapping[str, str]) -> str:
@@ -115,7 +119,7 @@ def _n(title: str, part: pd.DataFrame, names: Mapping[str, str]) -> str:
     return f"{title} (n = {int(counts[0])})" if len(counts) == 1 else title
 
 
-def expanded(results: Results) -> list[Table]:
+def expanded(results: Results) -> list[PrintedTable]:
     """Twelve tables, a dataset and regime each: Acc, AbsRec, FalseAbs and PECS of every model."""
     cells = marked(results.cells)
     tables = []
@@ -124,7 +128,7 @@ def expanded(results: Results) -> list[Table]:
             rows = cells.loc[(cells["dataset"] == dataset) & (cells["regime"] == regime)]
             notes = [epochs(rows), *marks(rows)]
             tables.append(
-                Table(
+                PrintedTable(
                     f"expanded_{dataset}_{regime}", f"{TITLES[dataset]}, {regime}", best_first(rows),
                     [MODEL, *SHARES, PECS, *COUNTS, EPOCH], notes, "no model was asked here", cell_trace,
                 )

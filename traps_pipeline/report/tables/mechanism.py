@@ -11,8 +11,8 @@ from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.paths import TRANSFER_PAIRS, path_name
 from traps_pipeline.partitions import SHORT, transfer_type
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.shared import MODEL, epochs, said
-from traps_pipeline.report.writing import Column, Table
+from traps_pipeline.report.tables.shared import MODEL, epochs, rightly_empty
+from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,7 +31,7 @@ def _why(results: Results, frame: pd.DataFrame) -> str:
 # --- probes -----------------------------------------------------------------------------------------------------------
 
 
-def probes(results: Results) -> list[Table]:
+def probes(results: Results) -> list[PrintedTable]:
     """Probes from one dataset on another: best layer of each pair, means by transfer type, what goes with them."""
     return [_transfer(results), _means(results), _within(results), _catch(results), _answerable(results)]
 
@@ -69,7 +69,7 @@ def _at(rows: pd.DataFrame, name: str, fields: tuple[str, ...]) -> dict[str, Any
     return {f"{name}_{field}": rows[field].iloc[0] if len(rows) else np.nan for field in fields}
 
 
-def _transfer(results: Results) -> Table:
+def _transfer(results: Results) -> PrintedTable:
     rows = best_layers(results.probes)
     columns = [
         MODEL, PATH, TYPE, Column("best_layer", "Best layer", "count"), Column("best_value", "AUROC", "fraction"),
@@ -86,10 +86,12 @@ def _transfer(results: Results) -> Table:
         "from, to: 95 %, scenarios of the target resampled, the probe held fixed",
         *([] if not len(rows) else sorted({note for note in rows["note"] if note})),
     ]
-    return Table("probe_transfer", "Probe transfer: AUROC by ordered pair", rows, columns, notes, _why(results, rows))
+    return PrintedTable(
+        "probe_transfer", "Probe transfer: AUROC by ordered pair", rows, columns, notes, _why(results, rows)
+    )
 
 
-def _means(results: Results) -> Table:
+def _means(results: Results) -> PrintedTable:
     rows = best_layers(results.probes)
     if len(rows):
         figures = ["best_value", "source_value", "held_out_value", "cf_value", "cf_own_value"]
@@ -102,7 +104,7 @@ def _means(results: Results) -> Table:
         Column("cf_own_value", "Cf→Cf, own layer", "fraction"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
     notes = _shared_controls(results)
-    return Table("probe_means", "Probe transfer: means over paths", rows, columns, notes, _why(results, rows))
+    return PrintedTable("probe_means", "Probe transfer: means over paths", rows, columns, notes, _why(results, rows))
 
 
 def _held_out(results: Results) -> list[Column]:
@@ -117,7 +119,7 @@ def _shared_controls(results: Results) -> list[str]:
     return notes + ["held out: at the best layer, fitted without the scenario that is scored"] * results.is_study
 
 
-def _within(results: Results) -> Table:
+def _within(results: Results) -> PrintedTable:
     rows = results.probes
     shuffled = rows.loc[rows["analysis"] == "shuffled"].groupby(["model", "source"], sort=False, dropna=False)
     table = shuffled.agg(shuffled=("value", "mean"), spread=("spread", "mean")).reset_index()
@@ -129,10 +131,10 @@ def _within(results: Results) -> Table:
         Column("value", "AUROC", "fraction"), Column("shuffled", "Shuffled labels", "fraction", spread="spread"),
     ]  # fmt: skip
     notes = ["cross-validated, folds by scenario; shuffled: mean over shuffles and layers ± deviation over shuffles"]
-    return Table("probe_within", "Probes within a dataset", table, columns, notes, _why(results, table))
+    return PrintedTable("probe_within", "Probes within a dataset", table, columns, notes, _why(results, table))
 
 
-def _catch(results: Results) -> Table:
+def _catch(results: Results) -> PrintedTable:
     rows = results.probes
     rows = rows.loc[rows["analysis"].isin(["centroid_void", "centroid_control"]) & (rows["scope"] != "all")]
     rows = rows.assign(sub_scenario=rows["scope"].str.removeprefix("sub_scenario:"), target=rows["target"].fillna(""))
@@ -149,10 +151,12 @@ def _catch(results: Results) -> Table:
         Column("n", "n", "count"),
     ]  # fmt: skip
     notes = ["voids that the source’s nearest centroid assigns to void, mean over the other datasets as sources"]
-    return Table("probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, _why(results, table))
+    return PrintedTable(
+        "probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, _why(results, table)
+    )
 
 
-def _answerable(results: Results) -> Table:
+def _answerable(results: Results) -> PrintedTable:
     import pandas as pd
 
     rows = results.probes
@@ -170,13 +174,13 @@ def _answerable(results: Results) -> Table:
         "where a probe sees that something hides, 1 where it sees that this cannot be known. Second: the reverse"
     ]
     why = _why(results, wide) if results.is_study else "the paper has no such control"
-    return Table("probe_answerable", "Hidden, or unknowable", wide, columns, notes, why)
+    return PrintedTable("probe_answerable", "Hidden, or unknowable", wide, columns, notes, why)
 
 
 # --- directions -------------------------------------------------------------------------------------------------------
 
 
-def cosines(results: Results) -> list[Table]:
+def cosines(results: Results) -> list[PrintedTable]:
     """Cosines of the four void directions at the steered layer, and of standard against guided ones."""
     import pandas as pd
 
@@ -202,8 +206,8 @@ def cosines(results: Results) -> list[Table]:
     why = _why(results, rows)
     printed = "" if results.is_study else "the paper’s text has 0.94 to 0.97 for qwen3-vl-8b"
     return [
-        Table("cosines", "Cosines of void directions", wide, matrix, [], why),
-        Table("cosines_standard_guided", "Standard against guided directions", across, pair, [], printed or why),
+        PrintedTable("cosines", "Cosines of void directions", wide, matrix, [], why),
+        PrintedTable("cosines_standard_guided", "Standard against guided directions", across, pair, [], printed or why),
     ]
 
 
@@ -218,7 +222,7 @@ def _place(values: pd.Series) -> pd.Series:
 # --- steering ---------------------------------------------------------------------------------------------------------
 
 
-def steering(results: Results) -> list[Table]:
+def steering(results: Results) -> list[PrintedTable]:
     """Abstention under steering: in all, by regimes and families, by domains, at the largest alpha, dose, layers."""
     return [
         _shares(results),
@@ -231,7 +235,7 @@ def steering(results: Results) -> list[Table]:
     ]
 
 
-def _shares(results: Results) -> Table:
+def _shares(results: Results) -> PrintedTable:
     rows = results.shares
     rows = rows.loc[(rows["path_set"] == "all") & (rows["directions"] == "all") & (rows["regime"] == "all")]
     keys = ["model", "kind", "layer", "alpha"]
@@ -253,10 +257,10 @@ def _shares(results: Results) -> Table:
         "from, to: 95 %, scenarios resampled, not answers; where all scenarios say the same it has no width",
     ]
     why = _why(results, wide) if results.is_study else "the paper prints no answers to resample"
-    return Table("steering_shares", "Steering in all, with intervals by scenario", wide, columns, notes, why)
+    return PrintedTable("steering_shares", "Steering in all, with intervals by scenario", wide, columns, notes, why)
 
 
-def _regimes(results: Results, name: str, title: str) -> Table:
+def _regimes(results: Results, name: str, title: str) -> PrintedTable:
     rows: pd.DataFrame = getattr(results, name)
     rows = rows.assign(path_set=rows["path_set"].replace(SETS))
     columns = [
@@ -268,10 +272,10 @@ def _regimes(results: Results, name: str, title: str) -> Table:
     notes = [
         "mean over the paths of a set; +α on controls, −α on voids; random and shuffled directions have norm 1 too"
     ]
-    return Table(name, title, rows, columns, notes, _why(results, rows))
+    return PrintedTable(name, title, rows, columns, notes, _why(results, rows))
 
 
-def _domains(results: Results) -> Table:
+def _domains(results: Results) -> PrintedTable:
     rows = results.steering_domains
     rows = rows.assign(path=_short(rows["source"]))
     columns = [
@@ -281,18 +285,18 @@ def _domains(results: Results) -> Table:
     ]  # fmt: skip
     notes = ["well-posed targets: the source’s own taxonomy against the other"]
     notes += ["* keyword judge"] if "*" in set(rows["mark"]) else []
-    return Table("steering_domains", "Same against cross domain", rows, columns, notes, _why(results, rows))
+    return PrintedTable("steering_domains", "Same against cross domain", rows, columns, notes, _why(results, rows))
 
 
-def _top(results: Results) -> Table:
+def _top(results: Results) -> PrintedTable:
     rows = effects.paths(results.effects)
     rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
     rows = _named(rows)
     columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, Column("alpha", "α", "count"), *_SIDES]
-    return Table("steering_top", "Steering at the largest α", rows, columns, [], _why(results, rows))
+    return PrintedTable("steering_top", "Steering at the largest α", rows, columns, [], _why(results, rows))
 
 
-def _dose(results: Results) -> Table:
+def _dose(results: Results) -> PrintedTable:
     rows = _named(effects.paths(results.effects))
     columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, Column("layer", "Layer", "count")]
     columns += [Column("alpha", "α", "count")]
@@ -308,10 +312,12 @@ def _dose(results: Results) -> Table:
         f"n = {counts.max():.0f} answers a cell at most, one a scenario" if len(counts) else "",
         "from, to: 95 %, Wilson" if results.is_study else "",
     ]
-    return Table("steering_dose", "Dose and response", rows, columns, [n for n in notes if n], _why(results, rows))
+    return PrintedTable(
+        "steering_dose", "Dose and response", rows, columns, [n for n in notes if n], _why(results, rows)
+    )
 
 
-def _layers(results: Results) -> Table:
+def _layers(results: Results) -> PrintedTable:
     rows = results.steering_layers
     columns = [
         MODEL, DIRECTIONS, INFERENCE, Column("layer", "Layer", "count"), Column("alpha", "α", "count"),
@@ -319,8 +325,8 @@ def _layers(results: Results) -> Table:
     ]  # fmt: skip
     notes = ["each dataset’s direction on its own controls, mean over the four splits"]
     why = "one layer was steered" if len(results.effects) else _why(results, rows)
-    table = Table("steering_layers", "Steering by layer", rows, columns, notes, why)
-    return said(table, results.is_study and bool(len(results.effects)))
+    table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, why)
+    return rightly_empty(table, results.is_study and bool(len(results.effects)))
 
 
 _SIDES = (Column("control", "Controls abstained on %", "percent"), Column("void", "Voids abstained on %", "percent"))

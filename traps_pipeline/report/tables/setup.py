@@ -12,11 +12,11 @@ from traps_pipeline.report.tables.shared import (
     MODEL,
     frame,
 )
-from traps_pipeline.report.writing import Column, Table
+from traps_pipeline.report.writing import Column, PrintedTable
 from traps_pipeline.storage.media import MediaSpec
 
 
-def models(results: Results) -> list[Table]:
+def models(results: Results) -> list[PrintedTable]:
     """The registry's entries of the models that were evaluated: who answers, how it is shown a clip, how often."""
     rows = []
     for entry in _entries(results):
@@ -31,7 +31,7 @@ def models(results: Results) -> list[Table]:
         MODEL, Column("provider_id", "Asked as"), Column("family", "Family"), Column("access", "Access"),
         Column("group", "Group"), Column("shown", "Shown"), Column("runs", "Runs at most", "count"),
     ]  # fmt: skip
-    return [Table("models", "Models", frame(rows, ["model"]), columns, why=results.why("cells"))]
+    return [PrintedTable("models", "Models", frame(rows, ["model"]), columns, why=results.why("cells"))]
 
 
 def _shown(media: MediaSpec | None) -> str:
@@ -43,7 +43,7 @@ def _shown(media: MediaSpec | None) -> str:
     return f"{media.profile}, {frames}" + (f", {media.size[0]} x {media.size[1]}" if media.size else "")
 
 
-def hyperparameters(results: Results) -> list[Table]:
+def hyperparameters(results: Results) -> list[PrintedTable]:
     """What models and judges are sent, and where that departs from the protocol."""
     judges = [*load_judges().values()]
     if results.is_study:
@@ -61,7 +61,9 @@ def hyperparameters(results: Results) -> list[Table]:
         if results.is_study
         else "Hyperparameters of the paper’s models and judges, as registered here"
     )
-    return [Table("hyperparameters", title, frame(rows, ["id"]), columns, why=results.why("cells"), dash="not sent")]
+    return [
+        PrintedTable("hyperparameters", title, frame(rows, ["id"]), columns, why=results.why("cells"), dash="not sent")
+    ]
 
 
 def _sent(entry: Entry, role: str) -> dict[str, Any]:
@@ -92,7 +94,7 @@ def _entries(results: Results) -> Iterable[ModelEntry]:
     return [entry for entry in load_models().values() if entry.id in there]
 
 
-def composition(results: Results) -> list[Table]:
+def composition(results: Results) -> list[PrintedTable]:
     """Pairs by category."""
     import pandas as pd
 
@@ -105,4 +107,4 @@ def composition(results: Results) -> list[Table]:
         Column("n", "Pairs", "count"), Column("n_ill_posed", "Ill-posed pairs", "count"),
     ]  # fmt: skip
     notes = ["the ill-posed datasets reuse the control clips with a question that they cannot answer"]
-    return [Table("composition", "Composition of the benchmark", rows, columns, notes, "no items yet")]
+    return [PrintedTable("composition", "Composition of the benchmark", rows, columns, notes, "no items yet")]

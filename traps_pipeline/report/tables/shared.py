@@ -12,7 +12,7 @@ from traps_pipeline.models.registry import load_models
 from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
-from traps_pipeline.report.writing import Behind, Column, Table, fraction
+from traps_pipeline.report.writing import Behind, Column, PrintedTable, fraction
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -155,7 +155,7 @@ def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataF
     return pd.DataFrame(list(rows)) if rows else pd.DataFrame(columns=pd.Index(list(columns)))
 
 
-def said(table: Table, run: bool) -> Table:
+def rightly_empty(table: PrintedTable, run: bool) -> PrintedTable:
     """A table that may rightly be empty says so, and not that it was not run."""
     return replace(table, none=table.why) if run and not len(table.rows) else table
 

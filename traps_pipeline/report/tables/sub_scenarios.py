@@ -19,14 +19,14 @@ from traps_pipeline.report.tables.shared import (
     titled,
 )
 from traps_pipeline.report.terms import SIDE_OF
-from traps_pipeline.report.writing import Behind, Column, Table, Trace
+from traps_pipeline.report.writing import Behind, Column, PrintedTable, Trace
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-def occlusion_sub_scenarios(results: Results) -> list[Table]:
+def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
     """Means over models of every occlusion sub-scenario, and the hidden against the others."""
     rows = _sub_rows(results, "occlusion")
     tables = [_sub_table(results, rows, "occlusion_sub_scenarios", "Occlusion sub-scenarios")]
@@ -42,10 +42,10 @@ def occlusion_sub_scenarios(results: Results) -> list[Table]:
         columns += [N, MISSING]
     title = "Hidden sub-scenarios against the others"
     why = results.why("sub_scenarios")
-    return [*tables, Table("hidden_sub_scenarios", title, hidden, columns, notes, why, _sub_trace("occlusion"))]
+    return [*tables, PrintedTable("hidden_sub_scenarios", title, hidden, columns, notes, why, _sub_trace("occlusion"))]
 
 
-def chaotic_sub_scenarios(results: Results) -> list[Table]:
+def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
     """Means over models of every chaotic family, and Acc by the control's answer."""
     rows = _sub_rows(results, "chaotic")
     labels = results.labels
@@ -60,7 +60,7 @@ def chaotic_sub_scenarios(results: Results) -> list[Table]:
     title = "Accuracy by ground truth, chaotic"
     return [
         _sub_table(results, rows, "chaotic_sub_scenarios", "Chaotic sub-scenarios"),
-        Table("accuracy_by_label", title, labels, columns, notes, why, _sub_trace("chaotic")),
+        PrintedTable("accuracy_by_label", title, labels, columns, notes, why, _sub_trace("chaotic")),
     ]
 
 
@@ -70,7 +70,7 @@ def _sub_rows(results: Results, taxonomy: str) -> pd.DataFrame:
     return rows.sort_values(["acc", "sub_scenario"], ignore_index=True)
 
 
-def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> Table:
+def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> PrintedTable:
     columns = [
         Column("sub_scenario", "Sub-scenario"), Column("answer_type", "Answer"), N,
         Column("n_models", "Models", "count"), *SHARES, PECS,
@@ -86,7 +86,7 @@ def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> T
         columns += [Column(name, f"Models, {what}", "count") for what, name in fewer.items()]
     notes += marks(rows)
     taxonomy = "occlusion" if name.startswith("occlusion") else "chaotic"
-    return Table(name, title, rows, columns, notes, results.why("sub_scenarios"), _sub_trace(taxonomy))
+    return PrintedTable(name, title, rows, columns, notes, results.why("sub_scenarios"), _sub_trace(taxonomy))
 
 
 def _left_out(results: Results) -> str:
