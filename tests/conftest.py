@@ -248,7 +248,7 @@ def forget_answers(study: Checkout) -> Checkout:
 
 @pytest.fixture(scope="session")
 def one_regime(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Checkout:
-    """The small study's items put to every reference model, scored without a disturbance. Read only."""
+    """The small study's items put to four reference models, scored without a disturbance. Read only."""
     clips, until = small.workspace / "clips", ("--until", "leaderboard")
     return run_once(tmp_path_factory, "one_regime", SMALL.with_name("one_regime.yaml"), clips, *until)
 

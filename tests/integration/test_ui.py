@@ -158,7 +158,7 @@ def test_materialize_all_goes_from_an_empty_history_to_the_report(
     wait_until(lambda: bool(written(study, "report_page")), 3 * RUN_SECONDS, "the report is made from one click")
     cells = Workspace.open(study.workspace).tables.read_all(RESPONSES, ["dataset", "model"])
     assert set(cells["model"]) == {"oracle", "flaky"}  # all of the study's, and of the registry no other
-    assert len(written(study, "responses")) == 4 * 2 * 2  # datasets x models x regimes
+    assert len(written(study, "responses")) == 4 * 2  # datasets x models
     # The unreliable model's failed calls are told; all the rest is made.
     assert "calls failed and can be asked again" in failures(study, RESPONSES)
     page.goto(f"{server}/assets/responses?view=checks&checkDetail=current")

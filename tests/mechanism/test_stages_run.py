@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
 
-from tests.conftest import EXPERIMENT, Checkout, Finished
+from tests.conftest import EXPERIMENT, Checkout, Finished, copied, once
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_VOTES
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.storage.workspace import Workspace
@@ -55,21 +57,31 @@ def counted(finished: Finished) -> tuple[int, ...]:
     return tuple(map(int, found.groups()))
 
 
-def test_traps_run_looks_into_a_model_once(study: Checkout) -> None:
-    name = with_mechanism(study)
-    until = "probes,cosines,steering_effects,steering_shares"
+@pytest.fixture
+def examined(small: Checkout, tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> tuple[Checkout, Finished]:
+    """A copy of a study that was run with a look into a tiny model, and what that run printed."""
 
-    def run() -> Finished:
-        return study.traps("run", name, "--until", until)
+    def make(folder: Path) -> str:
+        study = copied(small, folder)
+        finished = study.traps("run", with_mechanism(study))
+        assert finished.code == 0, finished.out + finished.err
+        return finished.out
 
-    extracted, answers, votes = counted(run())
+    made = once(tmp_path_factory, "examined", make)
+    shutil.copytree(made, tmp_path, symlinks=True, dirs_exist_ok=True)
+    return Checkout(tmp_path / "checkout", tmp_path / "study"), Finished(0, made.with_suffix(".out").read_text(), "")
+
+
+def test_traps_run_looks_into_a_model_once(examined: tuple[Checkout, Finished]) -> None:
+    study, finished = examined
+    extracted, answers, votes = counted(finished)
     tables = Workspace.open(study.workspace).tables
     judged, effects = tables.read_all(STEERING_VOTES), tables.read(STEERING_EFFECTS, {})
     assert extracted > 0 and answers > 0 and votes == 3 * answers
     assert len(judged) > answers  # controls stand in two datasets
     assert len(effects.groupby(["source", "target"])) == 4  # the paths between the two
     assert tables.read_all(PROBES)["note"].notna().any()  # tiny was not asked under standard: no Cf->Cf, and why
-    assert counted(run()) == (0, 0, 0)
+    assert counted(study.traps("run", "inside.yaml")) == (0, 0, 0)
 
 
 # Each stage is made once more, and while it is at work one of its inputs changes: a table or report of a stage above is
@@ -139,9 +151,10 @@ with dagster_history(workspace) as history:
 """
 
 
-def test_an_input_that_changes_while_a_stage_is_at_work_leaves_the_stage_stale(study: Checkout) -> None:
-    run = study.traps("run", with_mechanism(study))
-    assert run.code == 0, run.out + run.err
+def test_an_input_that_changes_while_a_stage_is_at_work_leaves_the_stage_stale(
+    examined: tuple[Checkout, Finished],
+) -> None:
+    study, _ = examined
     walked = study.run(sys.executable, "-W", "ignore", "-c", MEANWHILE)
     assert walked.code == 0, walked.err
     found = [json.loads(line.removeprefix("MADE ")) for line in walked.out.splitlines() if line.startswith("MADE ")]
