@@ -42,6 +42,7 @@ bench: setup ## ratios against what one would otherwise use
 	$(BIN)/python bench/extraction.py
 	$(BIN)/python bench/probes.py
 	$(BIN)/python bench/scoring.py
+	$(BIN)/python bench/shortcuts.py
 
 lint: setup
 	$(BIN)/ruff check .

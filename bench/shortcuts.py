@@ -1,0 +1,201 @@
+"""What a benchmark can be passed by, other than by seeing: measured on its records, and on a study of its arms.
+
+From the records (two frames of each are drawn, about a minute and a half on two cores): how many controls the family's
+own observer answers from the last shown frame alone; how many records of a family have a neighbour whose first frame
+looks like theirs; how far each seesaw turns; how well the state at the cut predicts the outcome of a chaotic record,
+beside always saying the commonest outcome. From a study that asked the arms (`traps run arms`): PECS, PECS-R and the
+gap of the shortcut rules and of the observer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+os.environ.setdefault("MUJOCO_GL", "osmesa")
+
+import cv2
+import mujoco
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.paths import RELEASED
+from traps_pipeline.scenes.render import Renderer
+from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.world import World
+from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
+from traps_pipeline.storage.workspace import Workspace
+
+STEP = 2  # every second frame is shown: 5 of 10 a second
+NEAR_BITS = 8  # of 64: two pictures whose hashes differ in so few look alike
+FOLDS, SEED = 5, 0
+TURN_DEG = 10.0
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What is measured of one record."""
+
+    scenario_id: str
+    family: str
+    truth: str
+    last_frame_answer: str | None
+    looks: int
+    turned_deg: float | None
+    at_cut: np.ndarray | None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--per-family", type=int, help="the first so many records of each family; default: all")
+    parser.add_argument("--specs", type=Path, default=RELEASED, help="folder of the released records")
+    parser.add_argument("--workspace", type=Path, help="a study that asked the arms; without one they are not reported")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    arguments = parser.parse_args()
+    chosen = first_of_each(load_released(arguments.specs), arguments.per_family)
+    with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
+        found = list(pool.map(partial(measure, folder=arguments.specs), chosen, chunksize=4))
+    print(f"{len(found)} records of {len({one.family for one in found})} families")
+    print_last_frame(found)
+    print_looks(found)
+    print_seesaws(found)
+    print_states(found)
+    if arguments.workspace is None:
+        print("\nPECS-R: not run; name a study of assets/experiments/arms.yaml with --workspace")
+    else:
+        print_rules(Workspace.open(arguments.workspace))
+
+
+def first_of_each(specs: dict[str, SceneSpec], most: int | None) -> list[SceneSpec]:
+    """The records, at most so many of each family."""
+    frame = pd.DataFrame({"id": list(specs), "family": [spec.family for spec in specs.values()]})
+    ids = frame["id"] if most is None else frame.groupby("family")["id"].head(most)
+    return [specs[scenario_id] for scenario_id in ids]
+
+
+def measure(spec: SceneSpec, folder: Path) -> Measured:
+    """Draw the first frame and the last shown one, of which the observer sees a still clip; read the trajectory."""
+    qpos = load_trajectory(folder / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
+    world = World.of_record(spec, qpos)
+    shown = range(0, len(qpos), STEP)
+    with Renderer(world.model, world.camera) as renderer:
+        first, last = renderer.frames(qpos[[0, shown[-1]]])
+    observe = world.family.observe
+    answer = observe(np.stack([last] * len(shown)), spec.question) if observe is not None else None
+    return Measured(
+        scenario_id=spec.scenario_id,
+        family=spec.family,
+        truth=spec.ground_truth,
+        last_frame_answer=answer,
+        looks=perceptual_hash(first),
+        turned_deg=turned_deg(world.model, qpos) if spec.family == "seesaw_sorter" else None,
+        at_cut=state_at_cut(qpos, spec.void["cut_frame"]) if spec.void_kind == "truncation" else None,
+    )
+
+
+def perceptual_hash(frame: np.ndarray) -> int:
+    """64 bits: which of the 8 x 8 lowest cosine frequencies of the 32 x 32 grey picture lie above their median."""
+    grey = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), (32, 32), interpolation=cv2.INTER_AREA)
+    low = cv2.dct(grey.astype(np.float32))[:8, :8].ravel()
+    return int("".join("1" if value > np.median(low) else "0" for value in low), 2)
+
+
+def turned_deg(model: mujoco.MjModel, qpos: np.ndarray) -> float:
+    """How far the hinge that turns most turns between its extremes."""
+    hinges = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]
+    return math.degrees(float(np.ptp(qpos[:, hinges], axis=0).max()))
+
+
+def state_at_cut(qpos: np.ndarray, cut_frame: int) -> np.ndarray:
+    """Poses in the last frame that the void shows, and how they changed since the frame before."""
+    return np.concatenate([qpos[cut_frame - 1], qpos[cut_frame - 1] - qpos[cut_frame - 2]])
+
+
+def by_family(found: Sequence[Measured]) -> dict[str, list[Measured]]:
+    families: dict[str, list[Measured]] = {}
+    for one in found:
+        families.setdefault(one.family, []).append(one)
+    return families
+
+
+def print_last_frame(found: Sequence[Measured]) -> None:
+    print("\nControls answered rightly from the last shown frame alone (right, answered at all, of)")
+    rows = {
+        family: (sum(one.last_frame_answer == one.truth for one in ones), answered(ones), len(ones))
+        for family, ones in by_family(found).items()
+    }
+    for family, (right, any_answer, n) in sorted(rows.items(), key=lambda row: row[1][0] / row[1][2]):
+        print(f"  {family:20} {right / n:6.3f} {any_answer / n:6.3f} {n:4d}")
+    right, any_answer, n = np.sum(list(rows.values()), axis=0)
+    print(f"  {'all':20} {right / n:6.3f} {any_answer / n:6.3f} {n:4d}")
+
+
+def answered(ones: Sequence[Measured]) -> int:
+    return sum(one.last_frame_answer is not None for one in ones)
+
+
+def print_looks(found: Sequence[Measured]) -> None:
+    print(
+        f"\nRecords whose first frame has a neighbour within {NEAR_BITS} of 64 bits in the family (share, median, of)"
+    )
+    for family, ones in sorted(by_family(found).items()):
+        if len(ones) > 1:
+            nearest = np.array([min((a.looks ^ b.looks).bit_count() for b in ones if b is not a) for a in ones])
+            print(f"  {family:20} {(nearest <= NEAR_BITS).mean():6.3f} {np.median(nearest):6.1f} {len(ones):4d}")
+
+
+def print_seesaws(found: Sequence[Measured]) -> None:
+    turns = np.array([one.turned_deg for one in found if one.turned_deg is not None])
+    if len(turns):
+        moved = int((turns >= TURN_DEG).sum())
+        print(f"\nSeesaws that turn by at least {TURN_DEG:g} degrees: {moved} of {len(turns)}")
+        print(f"  degrees: least {turns.min():.1f}, median {np.median(turns):.1f}, most {turns.max():.1f}")
+
+
+def print_states(found: Sequence[Measured]) -> None:
+    """Two cross-validated readers of the state at the cut; the better one is printed, which favours it."""
+    from sklearn.ensemble import ExtraTreesClassifier
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.model_selection import StratifiedKFold, cross_val_score
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    print("\nOutcome predicted from the state at the cut (best of two readers, commonest outcome, difference, of)")
+    readers = (
+        make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000)),
+        ExtraTreesClassifier(300, min_samples_leaf=3, random_state=SEED),
+    )
+    for family, ones in sorted(by_family(found).items()):
+        states = [one.at_cut for one in ones if one.at_cut is not None]
+        truths = pd.Series([one.truth for one in ones])
+        if not states or truths.value_counts().min() < FOLDS:
+            continue
+        width = max(map(len, states))
+        features = np.stack([np.pad(state, (0, width - len(state))) for state in states])
+        folds = StratifiedKFold(FOLDS, shuffle=True, random_state=SEED)
+        best = max(float(cross_val_score(reader, features, truths, cv=folds).mean()) for reader in readers)
+        prior = float(truths.value_counts(normalize=True).max())
+        print(f"  {family:20} {best:6.3f} {prior:6.3f} {best - prior:+6.3f} {len(ones):4d}")
+
+
+def print_rules(workspace: Workspace) -> None:
+    board = workspace.tables.read(LEADERBOARD, {}).query("dataset == 'overall'")
+    robust = workspace.tables.read(ROBUST, {})
+    both = board.merge(robust, on=["model", "regime"], suffixes=("", "_robust")).sort_values("model")
+    print(
+        "\nPECS, PECS-R and the shortcut gap (target: PECS-R of each rule at most 0.25, of the observer at least 0.85)"
+    )
+    for row in both.to_dict("records"):
+        print(f"  {row['model']:20} {row['regime']:9} {row['pecs']:6.3f} {row['pecs_r']:6.3f} {row['gap']:6.3f}")
+
+
+if __name__ == "__main__":
+    main()
