@@ -6,11 +6,13 @@ import io
 import re
 from html.parser import HTMLParser
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
 
 from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
+from traps_pipeline.report.arms_sheet import FRAME_IN, GAP_IN, arms_sheets
 from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet
 from traps_pipeline.report.figures.labels import Label, merged_labels
 from traps_pipeline.report.figures.landscape import landscape_figure
@@ -408,3 +410,20 @@ def test_a_contact_sheet_takes_the_first_pairs_of_each_sub_scenario(tmp_path):
     assert [p.at["void", "scenario_id"] for p in chosen_pairs(items, None)] == ["dice-0", "plinko-0", "plinko-1"]
     with pytest.raises(ValueError, match="1 to 80 pairs, not 0"):
         chosen_pairs(items[items["side"] == "control"], 1)
+
+
+def test_the_sheet_of_arms_takes_the_scenario_with_most_arms_and_draws_a_row_a_clip(tmp_path):
+    rows = [row for s in ("plinko-0", "plinko-1") for row in pair_rows(s, tmp_path)]
+    items = pd.DataFrame(rows).assign(taxonomy="chaotic")
+    held = {"arm": "held_void", "side": "void", "question": "Where?", "ground_truth": None}
+    swapped = {"arm": "choices_swapped", "side": "control", "question": "Where is it?", "ground_truth": "left"}
+    filmed = [("plinko-0", held), ("plinko-1", held), ("plinko-1", swapped)]
+    arms = pd.DataFrame([{"scenario_id": s, "clip": f"{s}-void.mp4", **arm} for s, arm in filmed])
+    (png,) = arms_sheets(items, arms, tmp_path).values()
+    (smaller,) = arms_sheets(items, arms.iloc[:2], tmp_path).values()
+    tall, less_tall = (
+        cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape[0] for data in (png, smaller)
+    )
+    row = round(150 * (FRAME_IN * 48 / 64 + GAP_IN))  # at 150 dots an inch; the clips are 64 wide and 48 high
+    assert tall - less_tall == pytest.approx(row, abs=1)  # control, void and two arms against control, void and one
+    assert arms_sheets(items, arms.assign(clip=None), tmp_path) == {}

@@ -5,7 +5,7 @@ from typing import Any
 
 import dagster as dg
 
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
+from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.defs import judging, mechanism, scoring
 from traps_pipeline.defs.shown import thumbnail
 from traps_pipeline.errors import TrapsError
@@ -58,6 +58,7 @@ def _previews(files: Mapping[str, bytes]) -> dict[str, Any]:
 
 
 def _sheet(workspace: Workspace) -> Files:
+    from traps_pipeline.report.arms_sheet import arms_sheets
     from traps_pipeline.report.contact_sheet import PAGE, contact_sheet, pairs_figure, six_pairs
     from traps_pipeline.report.writing import figure_bytes
 
@@ -65,7 +66,8 @@ def _sheet(workspace: Workspace) -> Files:
     if rows.empty:
         raise TrapsError("contact_sheet: no items yet; materialize items first")
     six = pairs_figure(six_pairs(rows), workspace.root, None, layout=PAGE)
-    return {"contact_sheet.png": contact_sheet(rows, workspace.root), "six_pairs.png": figure_bytes(six)}
+    sheets = {"contact_sheet.png": contact_sheet(rows, workspace.root), "six_pairs.png": figure_bytes(six)}
+    return sheets | arms_sheets(rows, workspace.tables.read_all(ARMS), workspace.root)
 
 
 def _gallery(workspace: Workspace) -> Files:
@@ -109,8 +111,9 @@ def _page(workspace: Workspace) -> Files:
 contact_sheet = _report(
     "contact_sheet",
     _sheet,
-    "Control and void frames of one pair of each sub-scenario, with question and ground truth.",
-    deps=["items"],
+    "Control and void frames of one pair of each sub-scenario, with question and ground truth; where arms were filmed, "
+    "one scenario of each taxonomy with all its arms.",
+    deps=["items", "arms"],
 )
 gallery = _report(
     "gallery",

@@ -114,10 +114,10 @@ def _moments(pair: pd.DataFrame, root: Path) -> tuple[SampledClip, SampledClip, 
     control, at = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
     times = at[np.linspace(0, len(at) - 1, MOMENTS).round().astype(int)]
-    return _sampled(control, at, times), _sampled(void, void_at, times), times
+    return sampled(control, at, times), sampled(void, void_at, times), times
 
 
-def _sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
+def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
     """The frames nearest to the times; a clip ends one frame after its last frame begins."""
     step = float(at[1] - at[0]) if len(at) > 1 else 0.0
     end = float(at[-1]) + step

@@ -30,8 +30,10 @@ PAGE, MARKDOWN, INDEX = "report.html", "leaderboard.md", "index.html"
 SHEETS = {
     "shortcuts.png": "Control told from void by one cue alone (0.5 is chance)",
     "contact_sheet.png": "Pairs: control above, void below",
+    "arms_occlusion.png": "Arms of a scenario with a panel",
+    "arms_chaotic.png": "Arms of a scenario with a cut",
 }
-FULL = ("contact_sheet.png",)  # wants all the width there is
+FULL = ("contact_sheet.png", "arms_occlusion.png", "arms_chaotic.png")  # wants all the width there is
 Pictures = Mapping[str, bytes]  # PNG by path below the reports
 
 
@@ -100,8 +102,9 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
 
 def _sheets(workspace: Workspace) -> Iterator[tuple[str, bytes]]:
     """What is drawn from clips: six pairs as a figure, if their clips are there; others as the workspace has them."""
+    shown = {Path(name).stem for name in SHEETS}
     for path in sorted(workspace.reports.glob("*.*")):
-        if path.stem in ("shortcuts", "contact_sheet") and not path.name.endswith(".state.json"):
+        if path.stem in shown and not path.name.endswith(".state.json"):
             yield path.name, path.read_bytes()
     pairs = six_pairs(workspace.tables.read_all(ITEMS, dataset=DATASETS))
     if len(pairs) and all(workspace.resolve(clip).is_file() for clip in pairs["clip"]):

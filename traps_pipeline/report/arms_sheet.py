@@ -1,0 +1,122 @@
+"""One scenario with all its arms: what each of them shows, and what is right for it."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.report.contact_sheet import SampledClip, sampled
+from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
+from traps_pipeline.scenes.encode import decode
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MOMENTS = 6  # frames a row
+FRAME_IN, WORDS_IN, GAP_IN, HEAD_IN = 1.5, 2.9, 0.06, 0.8
+SOFT = "#667085"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A clip on the sheet with its words."""
+
+    name: str
+    right: str
+    question: str
+    clip: SampledClip
+
+
+def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str, bytes]:
+    """`arms_<taxonomy>.png` of the scenario of each taxonomy that admits most arms (of several, the first by id).
+
+    items are ITEMS rows of the pairs, arms ARMS rows; clips lie under root. No file where no arm was filmed. Raises
+    DamagedClip when a clip cannot be decoded.
+    """
+    filmed = arms.loc[arms["clip"].notna()]
+    pairs = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
+    files: dict[str, bytes] = {}
+    for taxonomy, sides in pairs.groupby("taxonomy", sort=True):
+        own = filmed.loc[filmed["scenario_id"].isin(sides["scenario_id"])]
+        if len(own):
+            counts = own.groupby("scenario_id")["arm"].nunique().sort_index()
+            scenario = str(counts.idxmax())
+            control = sides.loc[(sides["scenario_id"] == scenario) & (sides["side"] == "control"), "clip"]
+            times = _moments(root / str(control.iloc[0]))
+            rows = list(_rows(sides, own, scenario, root, times))
+            files[f"arms_{taxonomy}.png"] = _sheet(scenario, rows, times)
+    return files
+
+
+def _moments(clip: Path) -> np.ndarray:
+    """Times (MOMENTS,) in seconds, from a clip's first frame to its last."""
+    _, at = decode(clip)
+    return at[np.linspace(0, len(at) - 1, MOMENTS).round().astype(int)]
+
+
+def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, times: np.ndarray) -> Iterator[Row]:
+    """Control and void, then the arms that must be answered, then those that must be abstained on."""
+    pair = sides.loc[sides["scenario_id"] == scenario].sort_values("side")
+    own = arms.loc[arms["scenario_id"] == scenario].sort_values(["side", "arm"])
+    for row in (*pair.to_dict("records"), *own.to_dict("records")):
+        frames, at = decode(root / str(row["clip"]))
+        truth = row["ground_truth"]
+        right = "must be abstained on" if row["side"] == "void" else f"must be answered: {truth}"
+        name = str(row.get("arm") or row["side"])
+        yield Row(name, right, str(row["question"]), sampled(frames, at, times))
+
+
+def _sheet(scenario: str, rows: list[Row], times: np.ndarray) -> bytes:
+    """PNG: a row a clip, its words on the left, frames at the control's times, hatched behind its end."""
+    _, tall, wide, _ = rows[0].clip.frames.shape
+    row_in = FRAME_IN * tall / wide + GAP_IN
+    width, height = WORDS_IN + MOMENTS * (FRAME_IN + GAP_IN), HEAD_IN + len(rows) * row_in
+    with figure_style():
+        figure = new_figure(width, height, 150, layout=None)
+        figure.text(0.1 / width, 1 - 0.1 / height, scenario, size=11, weight="bold", va="top", parse_math=False)
+        question = textwrap.shorten(rows[0].question, 150, placeholder=" …")
+        figure.text(0.1 / width, 1 - 0.34 / height, question, size=9, va="top", parse_math=False)
+        for m, time in enumerate(times):
+            centre = WORDS_IN + m * (FRAME_IN + GAP_IN) + FRAME_IN / 2
+            place = (centre / width, 1 - (HEAD_IN - 0.05) / height)
+            figure.text(*place, f"{time:.1f} s", size=7.5, color=SOFT, ha="center", va="bottom")
+        for k, row in enumerate(rows):
+            top = height - HEAD_IN - k * row_in
+            words: dict[str, Any] = {"va": "top", "linespacing": 1.3, "parse_math": False}
+            lines = [row.right, *_own_words(row, rows[0])]
+            name = row.name.replace("_", " ")
+            figure.text(0.1 / width, (top - 0.2) / height, name, size=9, weight="bold", **words)
+            figure.text(0.1 / width, (top - 0.42) / height, "\n".join(lines), size=7.5, color=SOFT, **words)
+            for m in range(MOMENTS):
+                left = WORDS_IN + m * (FRAME_IN + GAP_IN)
+                bottom = height - HEAD_IN - (k + 1) * row_in + GAP_IN
+                box = (left / width, bottom / height, FRAME_IN / width, (row_in - GAP_IN) / height)
+                _draw_frame(figure.add_axes(box), row.clip, m)
+    return figure_bytes(figure)
+
+
+def _own_words(row: Row, control: Row) -> list[str]:
+    """The question of a row that asks other words than the control."""
+    if row.question == control.question:
+        return []
+    return textwrap.wrap(f"“{row.question}”", 46, max_lines=3, placeholder=" …")
+
+
+def _draw_frame(axes: Axes, clip: SampledClip, moment: int) -> None:
+    axes.set_axis_off()
+    if moment < clip.known:
+        axes.imshow(clip.frames[moment], interpolation="antialiased", aspect="auto")
+        return
+    from matplotlib.patches import Rectangle
+
+    look: dict[str, Any] = {"hatch": "////", "facecolor": "#f2f4f7", "edgecolor": "#c3c9d2", "linewidth": 0.5}
+    axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, **look))
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 2}
+    place: dict[str, Any] = {"ha": "center", "va": "center", "transform": axes.transAxes}
+    axes.text(0.5, 0.5, f"ends at {clip.end_s:.1f} s", size=7, bbox=box, **place)
