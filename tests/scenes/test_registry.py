@@ -83,7 +83,7 @@ def test_the_family_of_the_page_is_drawn_certified_rendered_and_observed(add: Ad
         if len(answers) == 2:
             break
     assert set(answers) == {"yes", "no"}
-    for answer, found in answers.items():  # the README's commands certify two at full length
+    for answer, found in answers.items():  # the README's commands certify one at full length
         inventory = family.build(family.params_from(found.spec.params), family.physics).inventory
         ill_posed = draw_ill_posed("occlusion", inventory, np.random.default_rng(0))
         spec = found.spec.model_copy(update={"ill_posed_question": ill_posed})
