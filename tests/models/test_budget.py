@@ -144,7 +144,7 @@ class Failing:
         await asyncio.sleep(0)
         self.left -= 1
         if self.left >= 0:
-            raise TransientError(self.kind)
+            raise TransientError(self.kind, billed=self.kind != "rate_limited")
         return Outcome("answer", "left", cost_usd=0.001)
 
 

@@ -126,7 +126,7 @@ def test_a_bad_line_in_the_middle_is_named_with_the_remedy(ledger: Ledger, line:
 
 def test_reasoning_lies_in_a_sibling_file_and_comes_back_by_key(ledger: Ledger) -> None:
     with ledger.writer("m") as writer:
-        writer.append({"key": "a", "text": "left"}, reasoning="It rolls left.")
+        writer.append({"key": "a", "text": "left"}, {"reasoning": "It rolls left."})
         writer.append({"key": "b", "text": "right"})
     assert ledger.reasoning("m") == {"a": "It rolls left."}
     assert "rolls" not in segments(ledger)[0].read_text()

@@ -7,6 +7,7 @@ import time
 from typing import TYPE_CHECKING, TextIO
 
 from traps_pipeline.progress import Progress, Tally, clock
+from traps_pipeline.terminal import plain
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -92,7 +93,7 @@ class TerminalProgress(Progress):
         self._say(f"  ! {text}")
 
     def _say(self, line: str) -> None:
-        self._spoke = time.monotonic()
+        self._spoke, line = time.monotonic(), plain(line)  # a provider's or a file's words may be in it
         if self._live is not None:
             self._live.console.print(line, markup=False, highlight=False)
         else:

@@ -124,9 +124,9 @@ class _Asking:
         attempted = await attempt(participant, request, self.work.budget, self.stop, self.halted)
         if attempted is None:
             return False
-        row, reasoning = ledger_row(request, *attempted, self.work.epoch)
+        row, beside = ledger_row(request, *attempted, self.work.epoch)
         dollars = row["cost_usd"] or 0.0
-        self.writer.append(row, reasoning)
+        self.writer.append(row, beside)
         self.work.budget.booked(name, dollars)
         self.rows[request.key] = row
         progress.current().called(self.work.stage, name, not settles(row), row["latency_s"], dollars)

@@ -26,6 +26,8 @@ from traps_pipeline.errors import TrapsError
 
 SYNC_ROWS, SYNC_SECONDS = 100, 0.5
 LOCK_POLL_SECONDS = 0.1
+FAILED = ("error", "malformed")  # outcomes that settle nothing
+ASIDES = ("reasoning", "raw")  # texts kept beside a segment, each in a file of its own
 _KEY = b'{"key": "'  # how every row begins
 # Found without parsing the row, which would take ten times as long. Inside a string the quote before the colon has a
 # backslash before it, so that no text of a model can look like these.
@@ -39,7 +41,7 @@ class LockGivenUp(Exception):
 
 def settles(row: Mapping[str, Any]) -> bool:
     """Whether a row settles its key: a failed call is kept for the record, and asked again."""
-    return row["outcome"] != "error"
+    return row["outcome"] not in FAILED
 
 
 @dataclass
@@ -169,10 +171,11 @@ class SegmentWriter:
         self._sizes: dict[Path, int] = {}
         self._unsynced, self._synced_at = 0, time.monotonic()
 
-    def append(self, row: Mapping[str, Any], reasoning: str | None = None) -> None:
-        """Write one row (and its trace) at once. Raises TrapsError when the disk is full; earlier rows are safe."""
-        if reasoning is not None:
-            self._write(self.path.with_suffix(".jsonl.reasoning"), {"key": row["key"], "reasoning": reasoning})
+    def append(self, row: Mapping[str, Any], beside: Mapping[str, str] | None = None) -> None:
+        """Write one row (and what is kept beside it, by name in ASIDES) at once. Raises TrapsError when the disk is
+        full; earlier rows are safe."""
+        for name, text in (beside or {}).items():
+            self._write(self.path.with_suffix(f".jsonl.{name}"), {"key": row["key"], name: text})
         self._write(self.path, row)
         self._unsynced += 1
         self.sync_if_due()

@@ -50,7 +50,7 @@ class Answer(BaseModel):
 
     @model_validator(mode="after")
     def _text_goes_with_outcome(self) -> Answer:
-        if self.outcome == "error":
+        if self.outcome in ("error", "malformed"):
             raise ValueError("outcome: an error is no answer; leave the line out, the item stays missing")
         if (self.outcome in JUDGED) != bool((self.text or "").strip()):
             raise ValueError(f"text: outcome {self.outcome!r} {'needs one' if self.outcome in JUDGED else 'has none'}")
