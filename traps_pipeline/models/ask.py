@@ -152,6 +152,8 @@ class _Asking:
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
         asked = [(self.work.participants[name], queue) for name, queue in queues.items()]
+        if self.missing:
+            self.writer.open()
         syncing = asyncio.create_task(self.sync())
         try:
             async with asyncio.TaskGroup() as group:
@@ -172,11 +174,11 @@ async def settle_evaluation(
     Calls and rows are made and read a cell at a time: none is held once its cell is finished, and a call that two
     cells share (a steered control stands in two datasets) is found by the second.
     """
-    torn: set[str] = set()
+    told: set[str] = set()
     async with work.ledger.lock(evaluation.key, progress.current().note, stop.is_set):
         with work.ledger.writer(evaluation.key) as writer:
             for cell in cells:
-                settled = await _settle_cell(work, cell, writer, stop, torn)
+                settled = await _settle_cell(work, cell, writer, stop, told)
                 if settled is None:
                     return  # what was answered is in the ledger
                 yield settled
@@ -185,16 +187,16 @@ async def settle_evaluation(
 
 
 async def _settle_cell(
-    work: Work[AnyCell, AnyCall, Any], cell: AnyCell, writer: SegmentWriter, stop: asyncio.Event, torn: set[str]
+    work: Work[AnyCell, AnyCall, Any], cell: AnyCell, writer: SegmentWriter, stop: asyncio.Event, told: set[str]
 ) -> Settled[AnyCell, AnyCall] | None:
-    """Ask what is missing of a cell; None if that was stopped. torn: torn lines that a person was told of."""
+    """Ask what is missing of a cell; None if that was stopped. told: lines that a person was told of."""
     report = progress.current()
     calls = work.calls(cell)
     wanted = {call.request.key: call.request for call in calls}
     known = work.ledger.read(cell.evaluation.key, wanted)
-    for place in sorted({*known.torn} - torn):
-        report.note(f"{place}: torn last line ignored (a crash cut it off); its answer is asked again")
-    torn.update(known.torn)
+    for place in sorted({*known.notes} - told):
+        report.note(f"{place}: {known.notes[place]}")
+    told.update(known.notes)
     rows = known.settled
     missing = [request for key, request in wanted.items() if key not in rows]
     new = Counter(request.participant for request in missing)
