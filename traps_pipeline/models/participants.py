@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import math
 import random
+import resource
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -15,8 +16,9 @@ from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
-from traps_pipeline.models.registry import Account, Entry, load_accounts
+from traps_pipeline.models.registry import NETWORK, Account, Entry, load_accounts
 from traps_pipeline.models.request import MALFORMED, RATE_LIMITED, Backend, Outcome, Request, TransientError
 from traps_pipeline.models.traffic import Breaker, Gate, Meter
 from traps_pipeline.storage.ledger import ASIDES
@@ -25,6 +27,7 @@ from traps_pipeline.storage.study import Study
 Row = dict[str, Any]
 MAX_BACKOFF_S, MAX_RETRY_AFTER_S = 60.0, 900.0
 MALFORMED_TRIES = 2  # each is paid for, and a provider whose answers are out of order seldom mends itself
+FILES = 256  # open besides connections: segments, tables, Dagster's history, the interpreter's own
 OVERRUN = 16  # times its worst case: what a call is believed to have cost at most
 
 
@@ -37,6 +40,21 @@ class Participant:
     gate: Gate
     meter: Meter
     breaker: Breaker
+
+
+def allow_connections(wanted: int) -> None:
+    """Let this process hold so many connections open besides its files. Raises TrapsError where the shell does not
+    allow it: an answer that is paid for could not be stored."""
+    needed = wanted + FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    if hard != resource.RLIM_INFINITY and hard < needed:
+        raise TrapsError(
+            f"{wanted} connections at once need {needed} open files, and this shell allows {hard}: raise that "
+            f"(`ulimit -n {needed}`), or lower limits.concurrency of the models that are asked; nothing was sent"
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
 
 
 class Participants:
@@ -54,11 +72,15 @@ class Participants:
         self._accounts = load_accounts() if accounts is None else accounts
         self._made: dict[str, Participant] = {}
         self._meters: dict[str | None, Meter] = {}
+        self._connections = 0
 
     def __getitem__(self, name: str) -> Participant:
         if name not in self._made:
             entry = self._entries[name]
             check_money(self._study, entry)
+            if entry.backend == NETWORK:
+                self._connections += entry.limits.concurrency
+                allow_connections(self._connections)
             gate, breaker = Gate(entry.limits.concurrency), Breaker(name)
             breaker.check()
             self._made[name] = Participant(self._make(entry), entry, gate, self._meter(entry.account), breaker)
