@@ -58,6 +58,8 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
                 sync_folder(path.parent)
         finally:
             part.unlink(missing_ok=True)
+    except BrokenPipeError:
+        raise  # of what the block prints to
     except OSError as error:
         if error.filename is not None and str(error.filename) not in map(str, (part, *path.parents)):
             raise

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, experiment_of
 from traps_pipeline.cli.init import create
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.terminal import plain
 
 if TYPE_CHECKING:
     from traps_pipeline.storage.workspace import Workspace
@@ -69,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     if problems:
         for problem in problems:
-            print(f"traps: {problem}", file=sys.stderr)
+            print(f"traps: {plain(problem)}", file=sys.stderr)
         print(
             f"traps: {len(problems)} problem(s); what is done is kept: run the same command to go on",
             file=sys.stderr,
