@@ -247,9 +247,7 @@ def _sound_bytes(path: Path) -> io.BytesIO:
     place = content.rfind(_MARK) + len(_MARK)
     if place >= len(_MARK) and _WHOLE.get(path) != stamp:
         if content[place : place + len(_ZEROS)] != _sum_of(content):
-            raise TrapsError(
-                f"{path}: is not what was written (it was altered); run again, and it is made anew"
-            )
+            raise TrapsError(f"{path}: is not what was written (it was altered); run again, and it is made anew")
         _WHOLE[path] = stamp
     return io.BytesIO(content)
 
