@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -93,11 +94,8 @@ def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Nam
         money["allow_unknown_prices"] = True
     for text in arguments.budget_usd:
         name, _, amount = text.rpartition("=")
-        try:
-            dollars = float(amount)
-        except ValueError:
-            dollars = -1.0
-        if not 0 <= dollars < float("inf"):
+        dollars = float(amount) if re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,9})?", amount) else -1.0
+        if dollars < 0:
             raise TrapsError(
                 f"--budget-usd {text}: give dollars (20 or 20.50), or MODEL=dollars for one model or judge"
             )
