@@ -30,9 +30,9 @@ fast-tests: setup
 test: test-packages setup lint ## lint, types and all tests, the slow ones too
 	$(PYTEST)
 
-ui: setup ## Dagster's web server and daemon on 127.0.0.1:$(PORT)
+ui: setup ## Dagster's web server and daemon on 127.0.0.1:$(PORT); open the address that it prints
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
-	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/dagster dev -h 127.0.0.1 -p $(PORT) -m traps_pipeline.definitions
+	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/traps ui --port $(PORT)
 
 bench: setup ## ratios against what one would otherwise use
 	$(BIN)/python bench/render.py

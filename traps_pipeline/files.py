@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from collections.abc import Iterator
@@ -9,6 +10,27 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from traps_pipeline.errors import TrapsError
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space",
+    errno.EDQUOT: "free some space, or raise the quota",
+    errno.EFBIG: "raise the limit of a file's size (`ulimit -f`)",
+    errno.EROFS: "it lies on a disk that is mounted read-only: choose another folder, or mount it for writing",
+    errno.EACCES: "make its folder writable for this user, or choose another folder",
+    errno.EPERM: "make its folder writable for this user, or choose another folder",
+    errno.ENAMETOOLONG: "choose a folder with a shorter path",
+    errno.EMFILE: "let this shell open more files (`ulimit -n 4096`)",
+    errno.ENFILE: "end programs that hold many files open",
+    errno.ENOTDIR: "one of the folders of its path is a file: move that file away, or choose another folder",
+    errno.EISDIR: "a folder lies in its place: move that away",
+    errno.ENOENT: "its folder is gone: make it again, or name the right one",
+    errno.EIO: "the disk fails: look at it, or choose a folder on another one",
+}
+
+
+def remedy(error: OSError) -> str:
+    """What a person can do about a file that cannot be read or written."""
+    return _REMEDIES.get(error.errno or 0, "see to the file or its disk")
 
 
 @contextmanager
@@ -32,15 +54,28 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
                 with part.open("rb") as stream:
                     os.fsync(stream.fileno())
             part.replace(path)
+            if durable:
+                sync_folder(path.parent)
         finally:
             part.unlink(missing_ok=True)
+    except BrokenPipeError:
+        raise  # of what the block prints to
     except OSError as error:
         if error.filename is not None and str(error.filename) not in map(str, (part, *path.parents)):
             raise
         raise TrapsError(
-            f"{path}: cannot be written ({error.strerror or error}); free some space and run the same command again "
+            f"{path}: cannot be written ({error.strerror or error}); {remedy(error)} and run the same command again "
             "(nothing was half-written, and what is finished is kept)"
         ) from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to the disk: a file that is synced may still lose its name in a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from traps_pipeline.terminal import plain
+
 
 @dataclass
 class Tally:
@@ -109,7 +111,7 @@ class Progress:
 
     def note(self, text: str) -> None:
         """Something a person should know."""
-        print(text, file=sys.stderr)
+        print(plain(text), file=sys.stderr)
 
 
 def clock(seconds: float) -> str:

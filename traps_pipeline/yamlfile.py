@@ -1,8 +1,12 @@
-"""Files that people write, read safely: YAML and JSON Lines, checked by pydantic models, errors in sentences."""
+"""Files that people write, read strictly: YAML and JSON Lines give plain values or one sentence with file, line and
+complaint. What two readers could take for two things (a key twice, `yes`, `1:30`, `010`, `.inf`) is refused."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import json
+import math
+import re
+from collections.abc import Hashable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,29 +14,151 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.terminal import plain
 
 Model = TypeVar("Model", bound=BaseModel)
+MOST_YAML_BYTES, MOST_LINE_BYTES = 4 * 2**20, 4 * 2**20
+MOST_DEPTH, MOST_NODES, MOST_ALIASES = 40, 200_000, 200
+MOST_SAID = 300  # characters of a complaint
+_TAG = "tag:yaml.org,2002:"
+
+
+class _Strict(yaml.SafeLoader):
+    """YAML 1.2's plain values: no dates, no sexagesimals, no octals, true and false alone as booleans; each key once;
+    an anchor holds no alias, so that a few lines cannot stand for millions."""
+
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - the loader's own way to say it
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> Any:
+        self._depth = getattr(self, "_depth", 0) + 1
+        self._nodes = getattr(self, "_nodes", 0) + 1
+        event: Any = self.peek_event()
+        is_alias = isinstance(event, yaml.AliasEvent)
+        self._aliases, self._within = getattr(self, "_aliases", 0) + is_alias, getattr(self, "_within", 0)
+        if self._aliases > MOST_ALIASES or (is_alias and self._within):
+            raise yaml.MarkedYAMLError(None, None, "too many aliases, or one inside an anchor", event.start_mark)
+        if self._depth > MOST_DEPTH or self._nodes > MOST_NODES:
+            raise yaml.MarkedYAMLError(None, None, "nested too deeply, or too large", event.start_mark)
+        anchored = not is_alias and event.anchor is not None
+        self._within += anchored
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self._depth, self._within = self._depth - 1, self._within - anchored
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen = set[str]()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.MarkedYAMLError(None, None, "a key is a word or a number", key.start_mark)
+            if key.value in seen:
+                raise yaml.MarkedYAMLError(None, None, f"{key.value!r} stands there twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+for _kind, _pattern, _first in (
+    ("merge", r"<<", ["<"]),
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|false|True|False", list("tfTF")),
+    ("int", r"[-+]?(0|[1-9][0-9]{0,17})", list("-+0123456789")),
+    ("float", r"[-+]?(0|[1-9][0-9]{0,17})(\.[0-9]{0,30})?([eE][-+]?[0-9]{1,3})?", list("-+0123456789")),
+):
+    _Strict.add_implicit_resolver(f"{_TAG}{_kind}", re.compile(f"^(?:{_pattern})$"), _first)
+for _tag in ("timestamp", "binary", "omap", "pairs", "set"):  # `!!binary` and so on, said in the file
+    _Strict.yaml_constructors = {k: v for k, v in _Strict.yaml_constructors.items() if k != f"{_TAG}{_tag}"}
+
+
+def _float(loader: _Strict, node: yaml.ScalarNode) -> float:
+    value = float(loader.construct_scalar(node))
+    if not math.isfinite(value):
+        raise yaml.MarkedYAMLError(None, None, f"{node.value[:40]} is no finite number", node.start_mark)
+    return value
+
+
+_Strict.add_constructor(f"{_TAG}float", _float)
 
 
 def read_yaml(path: Path) -> Any:
-    """Parsed YAML (safe loader). Raises TrapsError naming file, line and the parser's complaint."""
+    """Parsed YAML. Raises TrapsError naming file, line and the parser's complaint."""
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = path.read_bytes()
     except OSError as error:
         raise TrapsError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise TrapsError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+    if len(content) > MOST_YAML_BYTES:
+        raise TrapsError(f"{path}: not valid YAML (larger than {MOST_YAML_BYTES} bytes)")
+    try:
+        value = yaml.load(content.decode("utf-8"), _Strict)  # noqa: S506 - a safe loader, made stricter
+        json.dumps(value, ensure_ascii=False).encode()  # halves of surrogate pairs
+        return value
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
+        raise TrapsError(f"{path}: not valid YAML ({_said(error)}); correct the file") from error
+
+
+def _said(error: Exception) -> str:
+    """A parser's complaint on one line."""
+    mark = getattr(error, "problem_mark", None)
+    where = f"line {mark.line + 1}: " if mark is not None else ""
+    said = getattr(error, "problem", None) or str(error)
+    return where + plain(" ".join(said.split()))[:MOST_SAID]
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """The lines of a JSON Lines file that hold anything, with their numbers from 1. Raises TrapsError."""
+    """The lines of a JSON Lines file that hold anything, with their numbers from 1. Raises TrapsError, also for JSON
+    that readers would take for different things."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise TrapsError(f"{path}: cannot be read ({error}); restore it from git") from error
+        raise TrapsError(f"{path}: cannot be read ({plain(error)[:MOST_SAID]}); restore it from git") from error
     for number, line in enumerate(text.split("\n"), start=1):  # not splitlines: JSON may hold U+2028 as it is
         if line.strip():
+            _check_line(line, f"{path}:{number}")
             yield number, line
+
+
+def _check_line(line: str, where: str) -> None:
+    """Raises TrapsError for JSON that is ambiguous or without a bound. What is no JSON is left to the reader."""
+    try:
+        if len(line) > MOST_LINE_BYTES or _depth(line) > MOST_DEPTH:
+            raise _Odd("too large, or nested too deeply")
+        json.dumps(json.loads(line, object_pairs_hook=_once, parse_constant=_finite, parse_float=_finite)).encode()
+        if re.search(r"\\u[dD][89a-fA-F]", line):
+            json.dumps(json.loads(line), ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise TrapsError(f"{where}: half of a surrogate pair stands in it; correct that line") from None
+    except _Odd as error:
+        raise TrapsError(f"{where}: {plain(error)[:MOST_SAID]}; correct that line") from None
+    except ValueError as error:
+        if "digits" in str(error):
+            raise TrapsError(f"{where}: a number of thousands of digits; correct that line") from None
+
+
+class _Odd(Exception):
+    """What a line holds that it must not."""
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise _Odd(f"{next(name for name in names if names.count(name) > 1)!r} stands there twice")
+    return found
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise _Odd(f"{text[:40]} is no finite number")
+    return value
+
+
+def _depth(line: str) -> int:
+    """How deep brackets are nested at most; those inside strings count too, which no real line comes near with."""
+    depth = most = 0
+    for char in re.sub(r'"(?:[^"\\]|\\.)*"', "", line):
+        depth += (char in "[{") - (char in "]}")
+        most = max(most, depth)
+    return most
 
 
 def parse_yaml_model(
@@ -40,12 +166,34 @@ def parse_yaml_model(
 ) -> Model:
     """Validate parsed YAML; validators see `context`. Raises TrapsError naming file, entry and field."""
     try:
-        return model.model_validate(data, context=context)
+        made = model.model_validate(data, context=context)
     except ValidationError as error:
         raise TrapsError(f"{path}{where and ': ' + where}: {explain(error)}") from error
+    for field in _other_kinds(data, made):
+        raise TrapsError(f"{path}{where and ': ' + where}: {field}")
+    return made
+
+
+def _other_kinds(data: Any, made: Any, name: str = "") -> Iterator[str]:
+    """Values that a model took for another kind than they are: true for 1, a text for a number; and no numbers."""
+    if isinstance(made, float) and not math.isfinite(made):
+        yield f"{name}: {made} is no finite number"
+    number = isinstance(made, int | float) and not isinstance(made, bool)
+    if (number and isinstance(data, bool | str)) or (isinstance(made, bool) and not isinstance(data, bool)):
+        yield f"{name}: {data!r:.60} is no {'number' if number else 'true or false'}"
+    fields = {}
+    if isinstance(data, Mapping) and isinstance(made, BaseModel):
+        aliases = {info.alias or field: field for field, info in type(made).model_fields.items()}
+        fields = {key: (data[key], getattr(made, str(aliases.get(key, key)), None)) for key in data}
+    elif isinstance(data, Mapping) and isinstance(made, Mapping):
+        fields = {key: (data[key], made[key]) for key in data if key in made}
+    elif isinstance(data, list | tuple) and isinstance(made, list | tuple):
+        fields = dict(enumerate(zip(data, made, strict=False)))
+    for key, (raw, value) in fields.items():
+        yield from _other_kinds(raw, value, f"{name}.{key}" if name else str(key))
 
 
 def explain(error: ValidationError) -> str:
     """A validation error in one line: field and complaint, `; ` between them."""
     parts = ((".".join(map(str, e["loc"])), e["msg"].removeprefix("Value error, ")) for e in error.errors())
-    return "; ".join(f"{field}: {message}" if field else message for field, message in parts)
+    return plain("; ".join(f"{field}: {message}" if field else message for field, message in parts))[:MOST_SAID]

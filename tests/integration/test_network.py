@@ -30,7 +30,7 @@ TRANSIENT = {
     "overloaded": 0.02,
     "hang": 0.005,
     "cut": 0.025,
-    "wrong_content_type": 0.02,
+    "wrong_content_type": 0.002,  # tried again once only
     "timeout_status": 0.01,
     "conflict": 0.01,
 }
@@ -208,6 +208,29 @@ def test_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider:
     assert sent <= wanted + kills * 24 * len(models)
     lost = Journal(unasked.workspace / "ledger" / "in_flight.jsonl").lost_usd
     assert sum(lost.values()) >= (sent - wanted) * min(row["cost_usd"] for row in rows)  # what nobody has is spent too
+
+
+def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, provider: Provider) -> None:
+    provider.configure(latency_s=0.5)
+    register(unasked, provider, entry("image-model", "images").replace("limits: {", "limits: {concurrency: 8, "))
+    command = ("run", str(experiment(unasked, ["image-model"])), "--budget-usd", "100")
+    for stop in (signal.SIGTERM, signal.SIGHUP):
+        before = len(settled(unasked))
+        process = unasked.start(sys.executable, "-m", "traps_pipeline.cli", *command)
+        while len(settled(unasked)) < before + 10:
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.05)
+        process.send_signal(stop)
+        stopped = time.monotonic()
+        time.sleep(0.1)
+        requests = provider.stats()["requests"]
+        out, err = process.communicate(timeout=60)
+        assert (process.returncode, "Traceback" in err) == (130, False), err
+        assert time.monotonic() - stopped < 20 and f"{stop.name}: stopping: waiting 30 s at most" in out
+        assert provider.stats()["requests"] == requests
+        assert provider.stats()["answered_in_full"] == len(settled(unasked))  # nothing that came back is lost
+        assert Journal(unasked.workspace / "ledger" / "in_flight.jsonl").lost_usd == {}
+        assert not unasked.ledger_rows("votes")
 
 
 def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Provider, tmp_path: Path) -> None:

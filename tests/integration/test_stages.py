@@ -149,13 +149,13 @@ def test_an_altered_table_is_named_and_made_again(study: Checkout) -> None:
     place = table.schema.get_field_index("acc")
     better = table.set_column(place, table.schema.field("acc"), [[1.0] * len(table)])
     pq.write_table(better.replace_schema_metadata(table.schema.metadata), path)
-    assert "is not what was written (its rows were altered)" in study.traps("status", EXPERIMENT).out
+    assert "is not what was written (it was altered)" in study.traps("status", EXPERIMENT).out
     refused = materialize(study, "leaderboard")
     assert refused.code == 1
-    assert "metrics/chaotic" in refused.out + refused.err and "its rows were altered" in refused.out + refused.err
+    assert "metrics/chaotic" in refused.out + refused.err and "it was altered" in refused.out + refused.err
     run = study.score(EXPERIMENT)
     assert run.code == 0, run.err
-    assert "its rows were altered" not in study.traps("status", EXPERIMENT).out
+    assert "it was altered" not in study.traps("status", EXPERIMENT).out
 
 
 def test_a_copied_study_and_two_studies_in_one_history_do_each_other_no_harm(study: Checkout, tmp_path: Path) -> None:

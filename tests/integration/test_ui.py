@@ -19,6 +19,7 @@ import pytest
 from playwright.sync_api import Page, expect, sync_playwright
 
 from tests.conftest import EXPERIMENT, Checkout, copied
+from tests.foreign_page import CHROMIUM, QUIET, attack
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.automation import INTERVAL_S
@@ -26,11 +27,7 @@ from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
-QUIET = (
-    "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking --disable-sync "
-    "--disable-component-update"
-)
+TOKEN = "token-of-the-user-interface"
 RUN_SECONDS = 600  # nine times what a busy machine of two cores takes
 
 
@@ -51,14 +48,12 @@ def server(request: pytest.FixtureRequest) -> Iterator[str]:
     command = (
         sys.executable,
         "-m",
-        "dagster",
-        "dev",
-        "-h",
-        "127.0.0.1",
-        "-p",
+        "traps_pipeline.cli",
+        "ui",
+        "--port",
         str(port),
-        "-m",
-        "traps_pipeline.definitions",
+        "--token",
+        TOKEN,
     )
     url, log = f"http://127.0.0.1:{port}", (study.workspace / "dagster-dev.log").open("w")
     # Its runs write to the same stream: a pipe that nobody reads would stop them.
@@ -80,7 +75,8 @@ def server(request: pytest.FixtureRequest) -> Iterator[str]:
 
 def _answers(url: str) -> bool:
     try:
-        return urllib.request.urlopen(url, timeout=2).status == 200
+        asked = urllib.request.Request(url, headers={"Authorization": f"Bearer {TOKEN}"})
+        return urllib.request.urlopen(asked, timeout=2).status == 200
     except OSError:
         return False
 
@@ -88,9 +84,10 @@ def _answers(url: str) -> bool:
 @pytest.fixture
 def page(server: str) -> Iterator[Page]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET.split())
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
         page = browser.new_page(viewport={"width": 1600, "height": 1000})
         page.set_default_timeout(60_000)
+        page.goto(f"{server}/?token={TOKEN}")
         expect.set_options(timeout=60_000)
         yield page
         browser.close()
@@ -116,6 +113,15 @@ def launch_job(page: Page, server: str, job: str) -> None:
     page.goto(f"{server}/locations/traps_pipeline.definitions/jobs/{job}/playground")
     page.get_by_role("button", name="Launch Run").click()
     expect(page.get_by_role("button", name="Launch Run")).to_have_count(0)
+
+
+# How many runs and events a history holds, and what it says of the asset that the foreign page would wipe.
+HISTORY = """
+import dagster as dg
+with dg.DagsterInstance.get() as history:
+    backfills = len(history.get_backfills())
+    print(history.get_runs_count(), backfills, history.get_latest_materialization_event(dg.AssetKey("items")) is None)
+"""
 
 
 def written(study: Checkout, name: str) -> dict[Path, int]:
@@ -215,6 +221,22 @@ def test_a_selection_of_stages_over_all_their_partitions_is_one_click(study: Che
             f"all of {name} is made anew",
         )
     assert not stale(study)  # from the same inputs the same content: nothing below is outdated
+    # Meanwhile a page of another site, and one whose name was bound to this machine, do what they can.
+    history = (sys.executable, "-W", "ignore", "-c", HISTORY)
+    before_attack = study.run(*history).out
+    port = int(server.rsplit(":", 1)[1])
+    seen = attack(port, _launch("items"))
+    assert seen and set(seen) <= {"refused", "opaque"}
+    assert study.run(*history).out == before_attack and before_attack.endswith("False\n")
+
+
+def _launch(asset: str) -> list[str]:
+    """Mutations of Dagster's API: launch what costs money, wipe an asset's history."""
+    launched = '{allPartitions: true, assetSelection: [{path: ["responses"]}]}'
+    return [
+        f"mutation {{ launchPartitionBackfill(backfillParams: {launched}) {{ __typename }} }}",
+        f'mutation {{ wipeAssets(assetPartitionRanges: [{{assetKey: {{path: ["{asset}"]}}}}]) {{ __typename }} }}',
+    ]
 
 
 def test_an_altered_table_is_a_failed_check_before_anything_below_uses_it(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import datetime
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +11,7 @@ import pytest
 from tests.conftest import KEY, SECRET
 from tests.providers.server import Provider, answer_to
 from traps_pipeline import progress
-from traps_pipeline.models.api import ApiBackend, read_response
+from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 
@@ -80,6 +79,7 @@ def test_what_may_pass_is_worth_another_try(provider: Provider, route: str, faul
         ask(provider, route)
     assert kind in (None, raised.value.kind)
     assert raised.value.retry_after_s == (7.0 if fault == "rate_limited" else None)
+    assert raised.value.billed == (fault not in ("rate_limited", "rate_limited_bare", "overloaded", "conflict"))
     assert provider.stats()["requests"] == 1  # no layer below retries
 
 
@@ -119,36 +119,3 @@ def test_a_refusal_in_words_is_no_answer(provider: Provider) -> None:
         assert (outcome.kind, outcome.text) == ("refused", None)
     provider.configure(faults={"content_filter_error": 1.0})
     assert ask(provider, "openai/m").kind == "refused"
-
-
-def said(content: str | None, finish: str = "stop", **usage: int) -> Any:
-    """A response as litellm gives it."""
-    message = SimpleNamespace(content=content)
-    return SimpleNamespace(
-        choices=[SimpleNamespace(message=message, finish_reason=finish)], usage=SimpleNamespace(**usage)
-    )
-
-
-@pytest.fixture
-def entry(provider: Provider) -> Entry:
-    return backend(provider, "openai/m")._entry
-
-
-def test_a_refused_answer_keeps_none_of_its_text(entry: Entry) -> None:
-    outcome = read_response(said("The ball goes", "content_filter", prompt_tokens=9, completion_tokens=3), entry)
-    assert (outcome.kind, outcome.text) == ("refused", None)
-
-
-def test_a_usage_that_is_not_there_is_unknown_and_not_free(entry: Entry) -> None:
-    outcome = read_response(said("left", prompt_tokens=0, completion_tokens=0), entry)
-    assert (outcome.prompt_tokens, outcome.completion_tokens, outcome.cost_usd) == (None, None, None)
-
-
-def test_a_response_without_a_choice_is_worth_another_try(entry: Entry) -> None:
-    with pytest.raises(TransientError, match="bad_response"):
-        read_response(SimpleNamespace(choices=[]), entry)
-
-
-def test_half_an_emoji_can_be_stored(entry: Entry) -> None:
-    text = read_response(said("left \ud83d", prompt_tokens=9, completion_tokens=3), entry).text
-    assert text == "left ?"

@@ -17,7 +17,7 @@ import pytest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models import participants
 from traps_pipeline.models.answers import answer_request
-from traps_pipeline.models.ask import Call, Settled, Work, run_work, settle
+from traps_pipeline.models.ask import STOPS, Call, Settled, Work, run_work, settle
 from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits, get_model
@@ -344,19 +344,36 @@ except KeyboardInterrupt:
 """
 
 
-def test_ctrl_c_waits_for_the_calls_in_flight_and_goes_on_later(tmp_path: Path) -> None:
-    run = subprocess.Popen(
-        [sys.executable, "-c", INTERRUPTED, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+def interrupted(script: str, folder: Path) -> subprocess.Popen[str]:
+    """The script when six of its calls were sent."""
+    command = [sys.executable, "-c", script, str(folder)]
+    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert run.stdout is not None and run.stdout.readline() == "six calls\n"
-    run.send_signal(signal.SIGINT)
+    return run
+
+
+@pytest.mark.parametrize("stop", STOPS)
+def test_a_stop_waits_for_the_calls_in_flight_and_goes_on_later(tmp_path: Path, stop: signal.Signals) -> None:
+    run = interrupted(INTERRUPTED, tmp_path)
+    run.send_signal(stop)
     out, err = run.communicate(timeout=10)
     assert run.returncode == 130
-    assert "waiting for the calls in flight" in err
+    assert f"{stop.name}: stopping: waiting" in err and "for the calls in flight" in err
     assert "Traceback" not in err
     rows = Ledger(tmp_path, "answers").read(CELL.evaluation.key).rows
     assert 6 <= len(rows) <= 8  # four at once: the second four, or two of them, were in flight
     assert out == f"{len(rows)} asked\n"
+
+
+def test_what_ends_a_process_by_force_later_gets_a_grace_and_ctrl_c_none(tmp_path: Path) -> None:
+    script = INTERRUPTED.replace("asyncio.sleep(0.3)", "asyncio.sleep(0.3 if Slow.asked < 6 else 60)")
+    script = script.replace("class Slow:", "from traps_pipeline.models import ask\nask.GRACE_S = 1.0\nclass Slow:")
+    run, began = interrupted(script, tmp_path), time.monotonic()
+    run.send_signal(signal.SIGTERM)
+    out, err = run.communicate(timeout=20)
+    assert run.returncode == 130 and 0.9 <= time.monotonic() - began < 10, err
+    rows = Ledger(tmp_path, "answers").read(CELL.evaluation.key).rows
+    assert len(rows) == 5 and out in ("6 asked\n", "7 asked\n", "8 asked\n", "9 asked\n")
 
 
 def test_a_second_ctrl_c_stops_at_once(tmp_path: Path) -> None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import datetime
+import json
 import random
 import shutil
+import subprocess
+import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -29,7 +32,7 @@ from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.ledger import Ledger, Spent
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -121,7 +124,58 @@ def test_spend_is_what_the_ledger_holds_repeated_answers_too(tmp_path: Path) -> 
             about = {"participant": name.split("__")[0]}
             writer.append({"key": "k", "text": trap, "cost_usd": cost, "components": about})
             writer.append({"key": "l", "text": None, "cost_usd": None, "components": about})
-    assert ledger.spent() == {"m": 0.75, "n": pytest.approx(1e-05)}
+    assert ledger.spent() == {"m": Spent(0.75, 0.5), "n": Spent(1e-05, 1e-05)}
+
+
+def test_costs_that_cannot_be_count_as_the_dearest_call_and_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rows as version 0.1.0 wrote them, of a provider that sent negative and huge numbers of tokens."""
+    workspace = Workspace.create(tmp_path, Study(budget_usd=5))
+    folder = workspace.answers.folder("m__standard__run1")
+    folder.mkdir(parents=True)
+    costs: list[Any] = [0.25, -1000.0, 36_893_508_147_419.0, "0.5", True, None]
+    rows = [{"key": f"k{n}", "cost_usd": cost, "components": {"participant": "m"}} for n, cost in enumerate(costs)]
+    rows.append({"key": "x", "text": None, "usage": {"cost_usd": -5}, "components": {"participant": "m"}})
+    (folder / "20261101.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+    with spending(workspace, [PRICED]) as budget:
+        assert budget.spent_usd == pytest.approx(5 * 0.25)
+    assert "4 rows of m are damaged or tell a cost that cannot be; each counts as $0.2500" in capsys.readouterr().err
+
+
+def test_a_short_write_in_the_journal_ends_no_later_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    journal = Journal(tmp_path / "in_flight.jsonl")
+    for dollars in (0.5, 0.25, -0.25):
+        journal.add("m", dollars)
+    journal.close()
+    first, second, third = journal.path.read_bytes().splitlines(keepends=True)
+    journal.path.write_bytes(first + second[:20] + third)  # as a half-written line before version 0.2 left it
+    assert Journal(journal.path).lost_usd == {"m": 0.5, "unknown": 0.5}
+    assert "in_flight.jsonl: line 2 not what was written; $0.5000 each are counted as spent" in capsys.readouterr().err
+    journal.path.write_bytes(first + second[:20])
+    assert Journal(journal.path).lost_usd == {"m": 0.5}  # a torn last line: its call was never sent
+    journal.path.write_text('["m", 0.5]\n["m", -0.125]\n')
+    assert Journal(journal.path).lost_usd == {"m": 0.375}  # as version 0.1.0 wrote it
+
+
+def test_a_journal_that_takes_half_a_line_takes_none(tmp_path: Path) -> None:
+    filling = """
+import resource, sys
+from pathlib import Path
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.budget import Journal
+journal = Journal(Path(sys.argv[1]))
+journal.add("m", 0.5)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+try:
+    journal.add("m", 0.25)
+except TrapsError as error:
+    print(error)
+"""
+    path = tmp_path / "in_flight.jsonl"
+    ran = subprocess.run([sys.executable, "-c", filling, str(path)], capture_output=True, check=True, text=True)
+    assert f"{path}: cannot be written (File too large); raise the limit of a file's size" in ran.stdout
+    assert Journal(path).lost_usd == {"m": 0.5}
 
 
 def test_paid_calls_want_a_budget_and_unknown_prices_a_word() -> None:
@@ -144,7 +198,7 @@ class Failing:
         await asyncio.sleep(0)
         self.left -= 1
         if self.left >= 0:
-            raise TransientError(self.kind)
+            raise TransientError(self.kind, billed=self.kind != "rate_limited")
         return Outcome("answer", "left", cost_usd=0.001)
 
 
@@ -185,7 +239,7 @@ def test_a_call_that_may_be_billed_counts_as_its_worst_case(
     row = row_after(kind, times, cap_usd, tmp_path)
     assert (row and row["outcome"]) == outcome
     assert (row and row["cost_usd"]) == (None if cost_usd is None else pytest.approx(cost_usd))
-    assert sum(Ledger(tmp_path, "answers").spent().values()) <= cap_usd
+    assert sum(its.dollars for its in Ledger(tmp_path, "answers").spent().values()) <= cap_usd
 
 
 def test_two_runs_never_spend_from_one_budget_at_once(tmp_path: Path) -> None:

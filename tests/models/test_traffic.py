@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 import time
 
 import pytest
@@ -133,3 +135,23 @@ def test_more_than_ten_errors_in_a_hundred_calls_stop_a_model() -> None:
     with pytest.raises(Stopped, match=r"11 of its last 100 calls failed \(last: timeout\)"):
         for n in range(1, 12):
             breaker.watch(ERROR if n % 2 else ANSWER)
+
+
+def test_connections_that_a_shell_does_not_allow_are_refused_before_anything_is_sent() -> None:
+    asking = """
+import resource
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.participants import allow_connections
+resource.setrlimit(resource.RLIMIT_NOFILE, (180, 400))
+allow_connections(100)
+print(resource.getrlimit(resource.RLIMIT_NOFILE))
+try:
+    allow_connections(200)
+except TrapsError as error:
+    print(error)
+"""
+    ran = subprocess.run([sys.executable, "-c", asking], capture_output=True, check=True, text=True)
+    raised, refused = ran.stdout.splitlines()
+    assert raised == "(356, 400)"
+    assert "200 connections at once need 456 open files, and this shell allows 400" in refused
+    assert "`ulimit -n 456`" in refused

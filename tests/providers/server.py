@@ -14,13 +14,14 @@ import binascii
 import hashlib
 import json
 import os
+import random
 import re
 import subprocess
 import sys
 import time
 import urllib.request
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -89,6 +90,9 @@ class Config:
     spare a body that was seen that often. scripts: by model, what it says to a request whose text holds a phrase (the
     first that fits), in the place of a good answer. Latency delays 200s only, error statuses come at once; `slow_s`
     replaces it.
+    raw_by_model: the very bytes (`content`), `status` and `type` of what a model answers. fuzzed: answers of the chat
+    API come with a few of their values, or their end, replaced. usd_a_token: what the server bills for prompt and
+    completion; an attempt that its status does not refuse is billed, and one that is odd as the most that it may take.
     hang_s: when even the server gives up. served_suffix goes behind the model's name, as real ones answer with a date.
     """
 
@@ -102,6 +106,9 @@ class Config:
     slow_s: float = 10.0
     hang_s: float = 300.0
     served_suffix: str = ""
+    raw_by_model: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    fuzzed: bool = False
+    usd_a_token: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         unknown = ({*self.faults} | {*self.fault_by_model.values()}) - {*FAULTS, None}
@@ -149,6 +156,7 @@ class Question:
     structured: bool
     shows_reasoning: bool
     prompt_tokens: int
+    most_tokens: int = 0  # that the completion may take
 
 
 def api_of(path: str) -> tuple[Api, str] | None:
@@ -178,6 +186,7 @@ def read_question(api: Api, model: str, body: Json) -> Question:
         structured=_is_structured(api, body),
         shows_reasoning=_shows_reasoning(api, body),
         prompt_tokens=sum(len(text) for _, text in texts) // 4 + 1 + media * _MEDIA_TOKENS,
+        most_tokens=int(body.get("max_tokens") or body.get("max_output_tokens") or 0),
     )
 
 
@@ -428,6 +437,45 @@ def error_body(api: Api, failure: Failure) -> Json:
     return {"error": error}
 
 
+_ODD: tuple[Any, ...] = (
+    None,
+    -1,
+    0,
+    1.5,
+    True,
+    "12",
+    2**63,
+    -(10**30),
+    [],
+    {},
+    [None],
+    "\ud800",
+    {"a": {"b": 5}},
+    1e300,
+)
+
+
+def fuzz(body: Json, number: int) -> bytes:
+    """A body with a few of its values replaced by odd ones, left out or doubled, or cut anywhere."""
+    draw = random.Random(number)
+    for _ in range(draw.randint(1, 3)):
+        places = [*_places(body)]
+        holder, key = draw.choice(places)
+        if draw.random() < 0.2:
+            del holder[key]
+        else:
+            holder[key] = draw.choice(_ODD)
+    content = json.dumps(body).encode()
+    return content[: draw.randrange(len(content))] if draw.random() < 0.2 else content
+
+
+def _places(value: Any) -> Iterator[tuple[Any, Any]]:
+    keys = [*value] if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    for key in keys:
+        yield value, key
+        yield from _places(value[key])
+
+
 # --- what is kept -----------------------------------------------------------------------------------------------------
 
 _SECRET_NAME = re.compile(r"authorization|api-?_?key|token|secret|^key$", re.IGNORECASE)
@@ -477,6 +525,7 @@ class Tallies:
     """What was seen since the start or the last reset. Counts only, unless records are kept."""
 
     requests: int = 0
+    billed_usd: float = 0.0
     max_in_flight: int = 0
     by_status: Counter[str] = field(default_factory=Counter)
     by_fault: Counter[str] = field(default_factory=Counter)
@@ -494,6 +543,7 @@ class Tallies:
         """The answer of `/_stats`."""
         return {
             "requests": self.requests,
+            "billed_usd": self.billed_usd,
             "distinct_bodies": len(self.attempts),
             "answered_in_full": self.answered_by_fault.total(),
             "by_status": dict(self.by_status),
@@ -516,6 +566,7 @@ class Reply:
     headers: Mapping[str, str] = field(default_factory=dict)
     delay_s: float = 0.0
     cut: bool = False
+    tokens: tuple[int, int] = (0, 0)  # that are billed
 
 
 def json_reply(value: Any, status: int = 200, **how: Any) -> Reply:
@@ -530,6 +581,15 @@ _UNKNOWN_PATH = Failure(404, "invalid_request_error", "unknown_url", "NOT_FOUND"
 
 def reply_to(question: Question, fault: str | None, config: Config) -> Reply:
     """What one attempt gets."""
+    most = (question.prompt_tokens, question.most_tokens)
+    if raw := config.raw_by_model.get(question.model):
+        status = int(raw.get("status", 200))
+        content = raw["content"].encode("utf-8", "surrogatepass")
+        refused = (400 <= status < 500 and status != 408) or status == 503
+        kind = raw.get("type", "application/json")
+        return Reply(
+            status, content, kind, raw.get("headers", {}), config.latency_s, tokens=(0, 0) if refused else most
+        )
     if fault in FAILURES:
         failure = FAILURES[fault]
         headers = {"Retry-After": f"{config.retry_after_s:g}"} if fault == "rate_limited" else {}
@@ -537,9 +597,19 @@ def reply_to(question: Question, fault: str | None, config: Config) -> Reply:
     if fault == "wrong_content_type":
         return Reply(200, _PAGE, "text/html", delay_s=config.latency_s)
     served = question.model + config.served_suffix
-    body = body_of(question, ending_of(question, fault, config.scripts.get(question.model, {})), served)
+    ending = ending_of(question, fault, config.scripts.get(question.model, {}))
+    body = body_of(question, ending, served)
+    if config.fuzzed:
+        number = int.from_bytes(hashlib.sha256(question.text.encode()).digest()[:8], "big")
+        tokens = body["usage"]["prompt_tokens"], body["usage"]["completion_tokens"]
+        return Reply(200, fuzz(body, number), delay_s=config.latency_s, tokens=tokens)
     waits = {"slow": config.slow_s, "hang": config.hang_s}
-    return json_reply(body, delay_s=waits.get(fault or "", config.latency_s), cut=fault in ("cut", "hang"))
+    return json_reply(
+        body,
+        delay_s=waits.get(fault or "", config.latency_s),
+        cut=fault in ("cut", "hang"),
+        tokens=(question.prompt_tokens, sum(_usage(question, ending)[1:]) + REASONING_TOKENS),
+    )
 
 
 class Server:
@@ -565,6 +635,7 @@ class Server:
     async def _provide(self, request: web.BaseRequest, tallies: Tallies) -> web.StreamResponse:
         record: Json = {"fault": None, "status": None, "answered_in_full": False}
         reply = await self._decide(request, tallies, record)
+        tallies.billed_usd += sum(n * usd for n, usd in zip(reply.tokens, self._config.usd_a_token, strict=True))
         await asyncio.sleep(reply.delay_s)
         tallies.by_status[str(reply.status)] += 1
         record["status"] = reply.status

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import gc
+import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from traps_pipeline.cli import (
     benchmark,
@@ -20,9 +24,12 @@ from traps_pipeline.cli import (
     results,
     run,
     status,
+    ui,
 )
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, Run
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import remedy
+from traps_pipeline.terminal import plain
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,16 +39,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = build_parser().parse_args(argv)
     command: Run = arguments.command
     try:
-        return command(arguments)
+        with _stopped_alike():
+            return command(arguments)
     except TrapsError as error:
-        print(f"traps: {error}", file=sys.stderr)
+        print("\n".join(plain(line) for line in f"traps: {error}".splitlines()), file=sys.stderr)
         return FAILED
     except OSError as error:
         if isinstance(error, BrokenPipeError):
-            sys.stderr.close()
-        else:
-            where = f"{error.filename}: " if error.filename else ""
-            print(f"traps: {where}{error.strerror}; mend that and run the same command again", file=sys.stderr)
+            # Nobody reads any more (`| head`); the interpreter's last flush must not complain of it either.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return FAILED
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"traps: {where}{error.strerror}; {remedy(error)} and run the same command again", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:
         print(
@@ -51,12 +60,40 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
+@contextmanager
+def _stopped_alike() -> Iterator[None]:
+    """Within the block SIGTERM and SIGHUP do what Ctrl-C does at that moment. `nohup` keeps its meaning."""
+    replaced = {}
+    for each in (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ():
+        if signal.getsignal(each) == signal.SIG_DFL:
+            replaced[each] = signal.signal(each, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        for each, former in replaced.items():
+            signal.signal(each, former)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The command line; `traps --help` lists the commands in this order."""
     parser = argparse.ArgumentParser(
         prog="traps", description="TRAPSBench: do vision-language models know when not to answer?"
     )
     commands = Commands(parser, title="commands")
-    for noun in (doctor, init, plan, run, status, results, exchange, models, judges, confabulation, benchmark, pocket):
+    for noun in (
+        doctor,
+        init,
+        plan,
+        run,
+        status,
+        ui,
+        results,
+        exchange,
+        models,
+        judges,
+        confabulation,
+        benchmark,
+        pocket,
+    ):
         noun.add(commands)
     return parser

@@ -1,6 +1,7 @@
 """What all commands share: exit codes, how a command is added to the parser, the workspace and experiment it names.
 
-Nothing of the package but `errors` is imported here before a command runs: `traps --help` answers at once.
+Nothing of the package but `errors`, `files` and `terminal` is imported before a command runs: `traps --help` answers at
+once.
 """
 
 from __future__ import annotations

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from traps_pipeline.progress import Progress, Tally, clock
+from traps_pipeline.terminal import plain
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -26,6 +30,7 @@ class TerminalProgress(Progress):
         self._live: Live | None = None
         self._done, self._total, self._began, self._spoke = 0, 0, time.monotonic(), time.monotonic()
         self._drawn = 0.0
+        self._deaf = False
 
     def stage(self, name: str, partitions: int) -> None:
         """See `Progress`."""
@@ -92,8 +97,16 @@ class TerminalProgress(Progress):
         self._say(f"  ! {text}")
 
     def _say(self, line: str) -> None:
-        self._spoke = time.monotonic()
-        if self._live is not None:
-            self._live.console.print(line, markup=False, highlight=False)
-        else:
-            print(line, file=self._stream, flush=True)
+        self._spoke, line = time.monotonic(), plain(line)  # a provider's or a file's words may be in it
+        try:
+            if self._live is not None:
+                self._live.console.print(line, markup=False, highlight=False)
+            else:
+                print(line, file=self._stream, flush=True)
+        except OSError:
+            if self._deaf:
+                return
+            # Nobody listens any more: a closed pipe, a terminal that is gone. The run ends as after SIGTERM.
+            self._deaf, self._stream = True, Path(os.devnull).open("w")  # noqa: SIM115 - until the process ends
+            self._live = None
+            signal.raise_signal(signal.SIGTERM)

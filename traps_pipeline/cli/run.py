@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, experiment_of
 from traps_pipeline.cli.init import create
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.terminal import plain
 
 if TYPE_CHECKING:
     from traps_pipeline.storage.workspace import Workspace
@@ -69,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     if problems:
         for problem in problems:
-            print(f"traps: {problem}", file=sys.stderr)
+            print(f"traps: {plain(problem)}", file=sys.stderr)
         print(
             f"traps: {len(problems)} problem(s); what is done is kept: run the same command to go on",
             file=sys.stderr,
@@ -92,11 +94,8 @@ def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Nam
         money["allow_unknown_prices"] = True
     for text in arguments.budget_usd:
         name, _, amount = text.rpartition("=")
-        try:
-            dollars = float(amount)
-        except ValueError:
-            dollars = -1.0
-        if not 0 <= dollars < float("inf"):
+        dollars = float(amount) if re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,9})?", amount) else -1.0
+        if dollars < 0:
             raise TrapsError(
                 f"--budget-usd {text}: give dollars (20 or 20.50), or MODEL=dollars for one model or judge"
             )

@@ -59,7 +59,7 @@ def final_statement(answer: str) -> str:
     """What an answer commits to: the JSON's `final_answer`, else what follows the last 'answer is', else all."""
     try:
         parsed = json.loads(strip_fence(answer))
-    except ValueError:
+    except (ValueError, RecursionError):
         parsed = None
     if isinstance(parsed, dict) and "final_answer" in parsed:
         return "" if parsed["final_answer"] is None else str(parsed["final_answer"])

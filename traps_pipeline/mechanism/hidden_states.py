@@ -28,7 +28,7 @@ import numpy as np
 from traps_pipeline import progress
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import replacing, write_bytes
+from traps_pipeline.files import remedy, replacing, write_bytes
 from traps_pipeline.models.local.capture import Pooling
 from traps_pipeline.storage.media import MediaSpec, profile_digest, sample
 
@@ -157,7 +157,7 @@ def _alone(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / ".lock").open("w")
     except OSError as error:
-        raise TrapsError(f"{folder}: cannot be written ({error.strerror or error}); free some space") from error
+        raise TrapsError(f"{folder}: cannot be written ({error.strerror or error}); {remedy(error)}") from error
     with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -6,8 +6,11 @@ price list from the network.
 
 from __future__ import annotations
 
+import json
 import logging
+import math
 import os
+import warnings
 from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
@@ -15,10 +18,23 @@ from typing import Any
 
 from traps_pipeline import progress
 from traps_pipeline.models.registry import Account, Entry, load_accounts
-from traps_pipeline.models.request import JUDGED, RATE_LIMITED, Outcome, OutcomeKind, Request, TransientError
+from traps_pipeline.models.request import (
+    JUDGED,
+    MALFORMED,
+    RATE_LIMITED,
+    Outcome,
+    OutcomeKind,
+    Request,
+    TransientError,
+)
+from traps_pipeline.models.transport import WATCHED, Exchange, watch
+from traps_pipeline.models.usage import Sizes, Usage, read_usage
 from traps_pipeline.storage.media import Media, data_uris
+from traps_pipeline.terminal import plain
 
 UNREADABLE = 422  # what litellm makes of a page that is no JSON; no provider here sends it
+MOST_KEPT = 4000  # characters of an answer that is out of order
+MOST_NAME = 200  # characters of what a provider says in a word: who answered, why it ended
 SERVED, REFUSAL = "traps_served_model", "traps_refusal"  # what the hook adds to a response's hidden parameters
 TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 
@@ -26,14 +42,17 @@ TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 @cache
 def load_litellm() -> Any:
     """The library, told to send and to fetch nothing of its own."""
+    os.environ["LITELLM_MODE"] = "PRODUCTION"  # else it takes variables from a .env of any folder above
     os.environ["LITELLM_LOCAL_MODEL_COST_MAP"] = "True"
     os.environ["LITELLM_LOCAL_ANTHROPIC_BETA_HEADERS"] = "True"
     litellm: Any = import_module("litellm")
+    warnings.filterwarnings("ignore", "Pydantic serializer warnings")  # of odd answers, which become outcomes here
     logging.getLogger("LiteLLM").setLevel(logging.ERROR)  # it warns at every call of Gemini 3 that has a temperature
     litellm.telemetry = False
     litellm.suppress_debug_info = True
     litellm.drop_params = False  # a parameter that a provider refuses is an error, never left out in silence
     litellm.callbacks = [_hook()]
+    watch(import_module("litellm.llms.custom_httpx.http_handler").AsyncHTTPHandler)
     return litellm
 
 
@@ -101,50 +120,67 @@ class ApiBackend:
             "max_retries": 0,
             **({"api_base": account.base_url} if account.base_url else {}),
         }
+        self._litellm = load_litellm()  # here, since its import takes seconds: no call's time-out runs yet
         self._told: set[str] = set()
 
     async def ask(self, request: Request) -> Outcome:
         """One attempt; see `Backend`."""
-        litellm, asked = load_litellm(), messages(self._entry, request)
+        asked, exchange = messages(self._entry, request), Exchange()
         _internal_call().set(True)
+        watched = WATCHED.set(exchange)
         try:
-            response = await litellm.acompletion(messages=asked, **request.params, **self._fixed)
-        except Exception as error:  # noqa: BLE001 - litellm raises its own, the SDKs' and httpx's errors
-            return self._failure(error, litellm)
-        return read_response(response, self._entry)
+            response = await self._litellm.acompletion(messages=asked, **request.params, **self._fixed)
+            return read_response(response, self._entry, request, exchange)
+        except Exception as error:  # noqa: BLE001 - litellm's, the SDKs' and httpx's errors; and of shapes none expected
+            return self._failure(error, exchange)
+        finally:
+            WATCHED.reset(watched)
 
-    def _failure(self, error: Exception, litellm: Any) -> Outcome:
+    def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
         """A failure as TransientError or as an outcome. Its text goes to a person, never into the ledger."""
-        if isinstance(error, litellm.ContentPolicyViolationError):
-            return Outcome("refused", error="content_policy", cost_usd=0.0)
-        kind = failure_kind(error, litellm)
-        self._tell(kind, error)
-        if kind.startswith("http_4"):
-            return Outcome("error", error=kind)
-        raise TransientError(kind, retry_after_s(error)) from None
+        status = getattr(error, "status_code", None)
+        billed = exchange.may_be_billed(status if isinstance(status, int) else None)
+        free = None if billed else 0.0
+        if isinstance(error, self._litellm.ContentPolicyViolationError):
+            return Outcome("refused", error="content_policy", cost_usd=free)
+        kind = failure_kind(error, self._litellm, exchange)
+        if kind == MALFORMED:
+            kept = self._without_key((exchange.content or b"").decode("utf-8", "replace"))
+            self._tell(kind, str(error) or type(error).__name__)
+            raise TransientError(kind, raw=kept[:MOST_KEPT]) from None
+        self._tell(kind, str(error))
+        if kind.startswith("http_"):
+            return Outcome("error", error=kind, cost_usd=free)
+        raise TransientError(kind, retry_after_s(error), billed=billed) from None
 
-    def _tell(self, kind: str, error: Exception) -> None:
+    def _without_key(self, text: str) -> str:
+        return text.replace(self._secret, "***") if self._secret else text
+
+    def _tell(self, kind: str, said: str) -> None:
         """Say once for each kind what the provider said, without the key."""
-        if kind in self._told:
-            return
-        self._told.add(kind)
-        text = " ".join(str(error).split())
-        text = text.replace(self._secret, "***") if self._secret else text  # before it is cut: a cut key is a key
-        progress.current().note(f"{self._entry.id}: {kind}: {text[:300]}")
+        if kind not in self._told:
+            self._told.add(kind)
+            said = self._without_key(" ".join(said.split()))  # before it is cut: a cut key is a key
+            progress.current().note(f"{self._entry.id}: {kind}: {plain(said)[:300]}")
 
 
-def failure_kind(error: Exception, litellm: Any) -> str:
-    """What went wrong in a word: http_<status> is final, anything else is worth another try."""
-    if isinstance(error, litellm.Timeout):
-        return "timeout"
-    if isinstance(error, litellm.APIConnectionError) or _broke_off(error):
-        return "connection"
-    status = getattr(error, "status_code", None)
-    if not isinstance(status, int) or status < 400 or status == UNREADABLE:
+def failure_kind(error: Exception, litellm: Any, exchange: Exchange) -> str:
+    """What went wrong in a word: http_<status> is final, anything else is worth another try. A status that was seen
+    counts more than what litellm makes of it."""
+    if exchange.answered:
+        return MALFORMED if exchange.content is not None else "connection"
+    status = exchange.status
+    if status is None:
+        if isinstance(error, litellm.Timeout):
+            return "timeout"
+        if isinstance(error, litellm.APIConnectionError) or _broke_off(error):
+            return "connection"
+        status = getattr(error, "status_code", None)
+    if not isinstance(status, int) or status < 300 or status == UNREADABLE:
         return "bad_response"
     if status in TRANSIENT_STATUSES:
         return TRANSIENT_STATUSES[status]
-    return f"http_{status}" if 400 <= status < 500 else "server_error"
+    return f"http_{status}" if status < 500 else "server_error"
 
 
 def _broke_off(error: BaseException | None) -> bool:
@@ -168,33 +204,43 @@ def retry_after_s(error: Exception) -> float | None:
         return None
 
 
-def read_response(response: Any, entry: Entry) -> Outcome:
-    """The outcome in a response: what is seen, what was thought, what it took."""
-    if not response.choices:
-        raise TransientError("bad_response")
+def read_response(response: Any, entry: Entry, request: Request, exchange: Exchange) -> Outcome:
+    """The outcome in a response: what is seen, what was thought, what it took. Raises what it does not understand,
+    which is malformed: ValueError where something is of a type that it cannot have."""
+    body = json.loads(exchange.content or b"null")
     choice = response.choices[0]
-    message, finish = choice.message, choice.finish_reason
-    text = _storable((message.content or "").strip())
-    usage = getattr(response, "usage", None)
-    prompt, completion = (getattr(usage, f"{kind}_tokens", None) for kind in ("prompt", "completion"))
-    if not prompt:  # litellm makes zeros of a usage that is not there; no prompt is empty
-        prompt = completion = None
-    details = getattr(usage, "completion_tokens_details", None)
+    message, finish = choice.message, _word(choice.finish_reason)
+    text = _storable(_text(message.content)).strip()
     fields: Mapping[str, Any] = getattr(message, "provider_specific_fields", None) or {}
     hidden: Mapping[str, Any] = getattr(response, "_hidden_params", None) or {}
-    refusal = fields.get("refusal") or getattr(message, "refusal", None) or hidden.get(REFUSAL)
+    refusal = _text(fields.get("refusal") or getattr(message, "refusal", None) or hidden.get(REFUSAL))
     kind = _kind(text, finish, refusal)
+    prompt_bytes = len((request.system + request.user).encode("utf-8", "replace"))
+    frames = request.sent.n_frames if request.sent else 0
+    usage = read_usage(body, Sizes(prompt_bytes, frames, len((text or refusal).encode())))
     return Outcome(
         kind,
         text=text if kind in JUDGED else None,
-        reasoning=_storable(getattr(message, "reasoning_content", None) or "") or None,
+        reasoning=_storable(_text(getattr(message, "reasoning_content", None))) or None,
         finish_reason=finish,
-        served_model=hidden.get(SERVED) or getattr(response, "model", None),
-        prompt_tokens=prompt,
-        completion_tokens=completion,
-        reasoning_tokens=getattr(details, "reasoning_tokens", None),
-        cost_usd=_cost(entry, prompt, completion),
+        served_model=_word(hidden.get(SERVED) or getattr(response, "model", None)),
+        prompt_tokens=usage and usage.prompt,
+        completion_tokens=usage and usage.completion,
+        reasoning_tokens=usage and usage.reasoning,
+        cost_usd=_cost(entry, usage),
     )
+
+
+def _text(value: Any) -> str:
+    """A text that may be missing. Raises ValueError for anything else."""
+    if value is None or isinstance(value, str):
+        return value or ""
+    raise ValueError(f"a text was expected, and not {type(value).__name__}")
+
+
+def _word(value: Any) -> str | None:
+    """What a provider says in a word, for a column of a table; None where it is none."""
+    return _storable(value)[:MOST_NAME] if isinstance(value, str) else None
 
 
 def _storable(text: str) -> str:
@@ -202,14 +248,15 @@ def _storable(text: str) -> str:
     return text.encode("utf-8", "replace").decode("utf-8")
 
 
-def _cost(entry: Entry, prompt_tokens: int | None, completion_tokens: int | None) -> float | None:
+def _cost(entry: Entry, usage: Usage | None) -> float | None:
     """Dollars; None where the price or what was used is unknown."""
-    if entry.prices is None or prompt_tokens is None or completion_tokens is None:
+    if entry.prices is None or usage is None:
         return None
-    return entry.prices.cost(prompt_tokens, completion_tokens)
+    cost = entry.prices.cost(usage.prompt, usage.completion)
+    return cost if math.isfinite(cost) else None
 
 
-def _kind(text: str, finish: str | None, refusal: str | None) -> OutcomeKind:
+def _kind(text: str, finish: str | None, refusal: str) -> OutcomeKind:
     if refusal or finish in ("content_filter", "refusal"):
         return "refused"
     if not text:

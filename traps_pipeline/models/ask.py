@@ -7,6 +7,7 @@ a correction are the same operation (docs/models.md, "Ledger").
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import threading
 from collections import Counter, deque
@@ -27,6 +28,11 @@ from traps_pipeline.progress import Tally
 from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, SegmentWriter, settles
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
+
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+GRACE_S = 30.0  # for calls in flight after SIGTERM or SIGHUP
+END_S = 1.5  # after the second signal
+INTERRUPTED = 130  # the exit code of a stopped run
 
 
 @dataclass(frozen=True)
@@ -124,9 +130,9 @@ class _Asking:
         attempted = await attempt(participant, request, self.work.budget, self.stop, self.halted)
         if attempted is None:
             return False
-        row, reasoning = ledger_row(request, *attempted, self.work.epoch)
+        row, beside = ledger_row(request, *attempted, self.work.epoch)
         dollars = row["cost_usd"] or 0.0
-        self.writer.append(row, reasoning)
+        self.writer.append(row, beside)
         self.work.budget.booked(name, dollars)
         self.rows[request.key] = row
         progress.current().called(self.work.stage, name, not settles(row), row["latency_s"], dollars)
@@ -152,6 +158,8 @@ class _Asking:
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
         asked = [(self.work.participants[name], queue) for name, queue in queues.items()]
+        if self.missing:
+            self.writer.open()
         syncing = asyncio.create_task(self.sync())
         try:
             async with asyncio.TaskGroup() as group:
@@ -172,11 +180,11 @@ async def settle_evaluation(
     Calls and rows are made and read a cell at a time: none is held once its cell is finished, and a call that two
     cells share (a steered control stands in two datasets) is found by the second.
     """
-    torn: set[str] = set()
+    told: set[str] = set()
     async with work.ledger.lock(evaluation.key, progress.current().note, stop.is_set):
         with work.ledger.writer(evaluation.key) as writer:
             for cell in cells:
-                settled = await _settle_cell(work, cell, writer, stop, torn)
+                settled = await _settle_cell(work, cell, writer, stop, told)
                 if settled is None:
                     return  # what was answered is in the ledger
                 yield settled
@@ -185,16 +193,16 @@ async def settle_evaluation(
 
 
 async def _settle_cell(
-    work: Work[AnyCell, AnyCall, Any], cell: AnyCell, writer: SegmentWriter, stop: asyncio.Event, torn: set[str]
+    work: Work[AnyCell, AnyCall, Any], cell: AnyCell, writer: SegmentWriter, stop: asyncio.Event, told: set[str]
 ) -> Settled[AnyCell, AnyCall] | None:
-    """Ask what is missing of a cell; None if that was stopped. torn: torn lines that a person was told of."""
+    """Ask what is missing of a cell; None if that was stopped. told: lines that a person was told of."""
     report = progress.current()
     calls = work.calls(cell)
     wanted = {call.request.key: call.request for call in calls}
     known = work.ledger.read(cell.evaluation.key, wanted)
-    for place in sorted({*known.torn} - torn):
-        report.note(f"{place}: torn last line ignored (a crash cut it off); its answer is asked again")
-    torn.update(known.torn)
+    for place in sorted({*known.notes} - told):
+        report.note(f"{place}: {known.notes[place]}")
+    told.update(known.notes)
     rows = known.settled
     missing = [request for key, request in wanted.items() if key not in rows]
     new = Counter(request.participant for request in missing)
@@ -258,9 +266,9 @@ async def settle(
 def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -> Iterator[Finished]:
     """Settle cells and finish each (write its table) just before it is handed on. For synchronous callers.
 
-    The first Ctrl-C stops new calls and waits for those in flight, a second one stops at once; either way
-    KeyboardInterrupt is raised and the same command goes on later. A caller that closes the iterator early stops it in
-    the same way. Exceptions of models are raised together after the others have finished.
+    The first Ctrl-C, SIGTERM or SIGHUP stops new calls and waits for those in flight, a second one stops at once;
+    either way KeyboardInterrupt is raised and the same command goes on later. A caller that closes the iterator early
+    stops it in the same way. Exceptions of models are raised together after the others have finished.
     """
     loop = asyncio.new_event_loop()
     stop = asyncio.Event()
@@ -314,29 +322,44 @@ def _raise_together(stage: str, problems: Sequence[Exception]) -> None:
 
 
 class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
-    """Route SIGINT to the stop event while a loop works in the main thread, then give it back."""
+    """Route the signals that stop a run to the stop event while a loop works in the main thread, then give them back.
+
+    A person who presses Ctrl-C can press it again; what sends SIGTERM or SIGHUP will end the process by force some time
+    later, so calls in flight get GRACE_S to come back. One that is given up stands in the journal as its worst case.
+    """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
         self._loop, self._stop = loop, stop
         self._main = threading.current_thread() is threading.main_thread()
+        self._former: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> None:
-        if self._main:
-            self._former = signal.getsignal(signal.SIGINT)
-            signal.signal(signal.SIGINT, lambda *_: self._interrupt())
+        for each in STOPS if self._main else ():
+            former = signal.getsignal(each)
+            if each is signal.SIGINT or former is not signal.SIG_IGN:  # `nohup` lets a run outlive its terminal
+                self._former[each] = former
+                signal.signal(each, lambda number, _: self._interrupt(signal.Signals(number)))
 
-    def _interrupt(self) -> None:
+    def _interrupt(self, by: signal.Signals) -> None:
         if self._stop.is_set():
             self._loop.call_soon_threadsafe(self._cancel)
+            end = threading.Timer(END_S, os._exit, (INTERRUPTED,))  # whatever still holds the process then
+            end.daemon = True
+            end.start()
             return
-        progress.current().note("stopping: waiting for the calls in flight (Ctrl-C again stops at once)")
         self._stop.set()
+        waits, again = "", "Ctrl-C again stops at once"
+        if by is not signal.SIGINT:
+            waits, again = f" {GRACE_S:.0f} s at most", f"{by.name} again stops at once"
+            self._loop.call_soon_threadsafe(self._loop.call_later, GRACE_S, self._cancel)
         self._loop.call_soon_threadsafe(lambda: None)  # wakes the loop from its select
+        progress.current().note(f"{by.name}: stopping: waiting{waits} for the calls in flight ({again})")
 
     def _cancel(self) -> None:
         for task in asyncio.all_tasks(self._loop):
             task.cancel()
 
     def __exit__(self, *_: object) -> None:
-        if self._main:
-            signal.signal(signal.SIGINT, self._former or signal.SIG_DFL)
+        for each, former in self._former.items():
+            signal.signal(each, former or signal.SIG_DFL)
+        self._former.clear()

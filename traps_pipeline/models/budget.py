@@ -16,17 +16,21 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
+from traps_pipeline.files import remedy, write_bytes
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_models
 from traps_pipeline.models.request import Request
+from traps_pipeline.storage.ledger import Spent
+from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, read_checked
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
 OVERHEAD_TOKENS = 200  # roles, separators, JSON around the text
+UNKNOWN = "unknown"  # the participant of money that nobody can tell whose call it was
 BYTES_A_TOKEN = 1  # some tokenizers make a token of every digit, and judges are shown arbitrary text
 
 
@@ -82,27 +86,59 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        left: defaultdict[str, float] = defaultdict(float)
-        for line in path.read_bytes().split(b"\n")[:-1] if path.exists() else ():
-            participant, dollars = json.loads(line)
-            left[participant] += dollars
-        self.lost_usd = {participant: dollars for participant, dollars in left.items() if dollars > 1e-6}
+        self.lost_usd = {name: dollars for name, dollars in _left_of(path).items() if dollars > 1e-6}
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, "".join(f"{json.dumps(loss)}\n" for loss in self.lost_usd.items()))
+        write_bytes(path, b"".join(_line(*loss) for loss in self.lost_usd.items()), durable=True)
         self._file = os.open(path, os.O_WRONLY | os.O_APPEND)
 
     def add(self, participant: str, dollars: float) -> None:
         """Note a change at once, so that it survives kill -9. Raises TrapsError when the disk is full."""
         try:
-            os.write(self._file, f"{json.dumps([participant, dollars])}\n".encode())
+            append_whole(self._file, _line(participant, dollars))
         except OSError as error:
             raise TrapsError(
-                f"{self.path}: cannot be written ({error.strerror}); free some space, run again"
+                f"{self.path}: cannot be written ({error.strerror}); {remedy(error)} and run the same command again"
             ) from error
 
     def close(self) -> None:
         """Close the file; it stays."""
         os.close(self._file)
+
+
+def _line(participant: str, dollars: float) -> bytes:
+    return checked_line({"who": participant, "usd": dollars})
+
+
+def _left_of(path: Path) -> Mapping[str, float]:
+    """What a journal holds, by participant. A damaged line counts as the dearest call of the others, and a person is
+    told: it says that money was on its way, and not how much."""
+    left, dearest, damaged = defaultdict[str, float](float), 0.0, list[int]()
+    for line in read_checked(path) if path.exists() else ():
+        if line.torn:
+            continue  # what it was written for was never sent
+        change = json.loads(line.content) if line.whole else _early(line.content)
+        if change is None:
+            damaged.append(line.number)
+            continue
+        left[change["who"]] += change["usd"]
+        dearest = max(dearest, change["usd"])
+    if damaged:
+        progress.current().note(
+            f"{path}: line {', '.join(map(str, damaged))} {NOT_WHOLE}; ${dearest:.4f} each are counted as spent"
+        )
+        left[UNKNOWN] += dearest * len(damaged)
+    return left
+
+
+def _early(line: bytes) -> Mapping[str, Any] | None:
+    """A line of a journal as version 0.1.0 wrote it, without a checksum: participant and dollars."""
+    try:
+        match json.loads(line):
+            case [str(who), float() | int() as usd]:
+                return {"who": who, "usd": usd}
+    except ValueError:
+        pass
+    return None
 
 
 class Budget:
@@ -204,9 +240,23 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
 def _open_budget(workspace: Workspace, journal: Journal) -> Budget:
     study, spent = workspace.study, defaultdict(float, journal.lost_usd)
     for ledger in (workspace.answers, workspace.votes):
-        for participant, dollars in ledger.spent().items():
-            spent[participant] += dollars
+        for participant, its in ledger.spent().items():
+            spent[participant] += its.dollars + its.unknown * _at_most_usd(workspace, participant, its)
     return Budget(study.budget_usd, study.model_budgets_usd, spent, journal)
+
+
+def _at_most_usd(workspace: Workspace, participant: str, its: Spent) -> float:
+    """What a call whose row is damaged, or tells a cost that cannot be, is counted as: the dearest call of the same
+    participant that is known, or all the tokens that its answer may take."""
+    entry = load_models().get(participant) or load_judges().get(participant)
+    most = entry.prices.cost(0, entry.max_tokens) if entry and entry.prices else 0.0
+    each = max(its.dearest, most)
+    if its.unknown:
+        progress.current().note(
+            f"{workspace.answers.root}: {its.unknown} rows of {participant} are damaged or tell a cost that cannot be; "
+            f"each counts as ${each:.4f}"
+        )
+    return each
 
 
 def _check_names(workspace: Workspace) -> None:

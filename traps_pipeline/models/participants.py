@@ -6,7 +6,9 @@ The one place where a call is sent; `models/ask.py` says which calls.
 from __future__ import annotations
 
 import asyncio
+import math
 import random
+import resource
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -14,14 +16,19 @@ from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
-from traps_pipeline.models.registry import Account, Entry, load_accounts
-from traps_pipeline.models.request import RATE_LIMITED, UNBILLED, Backend, Outcome, Request, TransientError
+from traps_pipeline.models.registry import NETWORK, Account, Entry, load_accounts
+from traps_pipeline.models.request import MALFORMED, RATE_LIMITED, Backend, Outcome, Request, TransientError
 from traps_pipeline.models.traffic import Breaker, Gate, Meter
+from traps_pipeline.storage.ledger import ASIDES
 from traps_pipeline.storage.study import Study
 
 Row = dict[str, Any]
 MAX_BACKOFF_S, MAX_RETRY_AFTER_S = 60.0, 900.0
+MALFORMED_TRIES = 2  # each is paid for, and a provider whose answers are out of order seldom mends itself
+FILES = 256  # open besides connections: segments, tables, Dagster's history, the interpreter's own
+OVERRUN = 16  # times its worst case: what a call is believed to have cost at most
 
 
 @dataclass(frozen=True)
@@ -33,6 +40,21 @@ class Participant:
     gate: Gate
     meter: Meter
     breaker: Breaker
+
+
+def allow_connections(wanted: int) -> None:
+    """Let this process hold so many connections open besides its files. Raises TrapsError where the shell does not
+    allow it: an answer that is paid for could not be stored."""
+    needed = wanted + FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    if hard != resource.RLIM_INFINITY and hard < needed:
+        raise TrapsError(
+            f"{wanted} connections at once need {needed} open files, and this shell allows {hard}: raise that "
+            f"(`ulimit -n {needed}`), or lower limits.concurrency of the models that are asked; nothing was sent"
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
 
 
 class Participants:
@@ -50,11 +72,15 @@ class Participants:
         self._accounts = load_accounts() if accounts is None else accounts
         self._made: dict[str, Participant] = {}
         self._meters: dict[str | None, Meter] = {}
+        self._connections = 0
 
     def __getitem__(self, name: str) -> Participant:
         if name not in self._made:
             entry = self._entries[name]
             check_money(self._study, entry)
+            if entry.backend == NETWORK:
+                self._connections += entry.limits.concurrency
+                allow_connections(self._connections)
             gate, breaker = Gate(entry.limits.concurrency), Breaker(name)
             breaker.check()
             self._made[name] = Participant(self._make(entry), entry, gate, self._meter(entry.account), breaker)
@@ -76,7 +102,7 @@ async def attempt(
     what attempts before it may have cost.
     """
     limits, tokens = participant.entry.limits, most_tokens(participant.entry, request)
-    lost_usd, seconds = 0.0, 0.0
+    lost_usd, seconds, malformed = 0.0, 0.0, 0
     for number in range(1, limits.retries + 2):
         async with participant.gate.connection():
             await participant.meter.admit(tokens.prompt + tokens.completion, halted)
@@ -98,10 +124,11 @@ async def attempt(
                 return outcome, number, time.monotonic() - began
         if failure.kind == RATE_LIMITED:
             participant.gate.slow_down()
-        if failure.kind not in UNBILLED:
+        if failure.billed:
             lost_usd += worst_case_usd(participant.entry, request)
-        if number > limits.retries:
-            return _given_up(failure.kind, number, seconds, lost_usd)
+        malformed += failure.kind == MALFORMED
+        if number > limits.retries or malformed == MALFORMED_TRIES:
+            return _given_up(failure.kind, number, seconds, lost_usd, failure.raw)
         longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
         wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
         if await _stopped_within(stop, wait):
@@ -109,17 +136,22 @@ async def attempt(
     raise AssertionError("unreachable: the last attempt returns")
 
 
-def _given_up(kind: str, attempts: int, seconds: float, lost_usd: float) -> tuple[Outcome, int, float] | None:
+def _given_up(
+    kind: str, attempts: int, seconds: float, lost_usd: float, raw: str | None = None
+) -> tuple[Outcome, int, float] | None:
     """A failure for the ledger; None for a call that was never sent, or that cost nothing and will be made again."""
     if kind in ("interrupted", "budget") and not lost_usd:
         return None
+    if kind == MALFORMED:
+        return Outcome("malformed", error=kind, cost_usd=lost_usd or None, raw=raw), attempts, seconds
     return Outcome("error", error=kind, cost_usd=lost_usd or None), attempts, seconds
 
 
 async def _send(participant: Participant, request: Request, budget: Budget) -> Outcome:
     """One attempt under a reservation. Raises TransientError and BudgetReached.
 
-    A call that was sent costs its worst case until the provider says otherwise: one that timed out may be billed.
+    A call that was sent costs its worst case until the provider says otherwise, and in a way that can be believed: one
+    that timed out may be billed.
     """
     entry = participant.entry
     worst_usd = worst_case_usd(entry, request)
@@ -128,21 +160,27 @@ async def _send(participant: Participant, request: Request, budget: Budget) -> O
     try:
         async with asyncio.timeout(entry.limits.timeout_s):
             outcome = await participant.backend.ask(request)
-        if outcome.kind == "error":
-            cost_usd = 0.0  # refused as it is: nothing was generated
-        elif outcome.cost_usd is not None:
-            cost_usd = outcome.cost_usd
-        elif entry.prices is not None:
-            outcome = replace(outcome, cost_usd=worst_usd)
+        if entry.prices is not None:
+            cost_usd = _believed(outcome.cost_usd, worst_usd)
+            outcome = replace(outcome, cost_usd=cost_usd)
         return outcome
     except TimeoutError:
         raise TransientError("timeout") from None
     except TransientError as failure:
-        if failure.kind in UNBILLED:
+        if not failure.billed:
             cost_usd = 0.0
         raise
     finally:
         await budget.settle(entry.id, worst_usd, cost_usd)
+
+
+def _believed(cost_usd: float | None, worst_usd: float) -> float:
+    """A cost that a backend read of an answer; the worst case where it is unknown or cannot be. A provider that did
+    not hold to the limits of a call is believed to have charged for more, up to a bound: a number of tokens that nobody
+    can have made would else end the study."""
+    if cost_usd is None or not math.isfinite(cost_usd) or cost_usd < 0:
+        return worst_usd
+    return min(cost_usd, OVERRUN * worst_usd)
 
 
 async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
@@ -153,10 +191,10 @@ async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
 
 def ledger_row(
     request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str
-) -> tuple[Row, str | None]:
-    """The row that stands for an answer, and its reasoning trace."""
+) -> tuple[Row, dict[str, str]]:
+    """The row that stands for an answer, and what is kept beside it: its reasoning trace, an answer out of order."""
     fields = asdict(outcome)
-    reasoning = fields.pop("reasoning")
+    beside = {name: text for name in ASIDES if (text := fields.pop(name)) is not None}
     row = {
         "key": request.key,
         "outcome": fields.pop("kind"),
@@ -165,7 +203,7 @@ def ledger_row(
         "latency_s": round(latency_s, 6),
     }
     row |= {"epoch": epoch, "created_at": datetime.now(UTC).isoformat(), "components": request.components}
-    return row, reasoning
+    return row, beside
 
 
 def when_asked(row: Row) -> Row:

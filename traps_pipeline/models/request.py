@@ -13,10 +13,10 @@ from traps_pipeline.digests import digest
 if TYPE_CHECKING:
     from traps_pipeline.storage.media import Media
 
-OutcomeKind = Literal["answer", "truncated", "empty", "refused", "error"]
+OutcomeKind = Literal["answer", "truncated", "empty", "refused", "error", "malformed"]
 JUDGED: tuple[OutcomeKind, ...] = ("answer", "truncated")  # what has a text; docs/models.md, "Request -> Outcome"
 RATE_LIMITED = "rate_limited"  # the kind of a 429
-UNBILLED = (RATE_LIMITED, "conflict", "server_error")  # failures after which nothing was generated
+MALFORMED = "malformed"  # the kind of an answer whose shape is out of order
 _VERBATIM = 600  # a text up to this long stands in the key's components as it is, so that `traps why` can show it
 
 
@@ -63,7 +63,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a request. A failure is a kind, never a text: no error string ever reaches a judge."""
+    """What came of a request. A failure is a kind, never a text: no error string ever reaches a judge.
+
+    raw: the beginning of an answer that is out of order, for a person. cost_usd: None if it is unknown.
+    """
 
     kind: OutcomeKind
     text: str | None = None
@@ -75,14 +78,20 @@ class Outcome:
     completion_tokens: int | None = None
     reasoning_tokens: int | None = None
     cost_usd: float | None = None
+    raw: str | None = None
 
 
 class TransientError(Exception):
-    """A failure worth another try: time-out, 408, 409, 429, 5xx, a cut connection."""
+    """A failure worth another try: time-out, 408, 409, 429, 5xx, a cut connection, an answer out of order.
 
-    def __init__(self, kind: str, retry_after_s: float | None = None) -> None:
+    billed: whether the provider may charge for it; raw: see `Outcome`.
+    """
+
+    def __init__(
+        self, kind: str, retry_after_s: float | None = None, *, billed: bool = True, raw: str | None = None
+    ) -> None:
         super().__init__(kind)
-        self.kind, self.retry_after_s = kind, retry_after_s
+        self.kind, self.retry_after_s, self.billed, self.raw = kind, retry_after_s, billed, raw
 
 
 class Backend(Protocol):

@@ -13,6 +13,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.request import Outcome
 
 SAME_REFUSALS = 20
+MALFORMED_IN_A_ROW = 3
 ERROR_WINDOW, ERROR_SHARE = 100, 0.10
 LOOK_S = 0.2  # how often a waiting call looks whether it is still wanted
 BURST_S = 2.0  # so many seconds' worth of calls and tokens may go out at once
@@ -120,6 +121,7 @@ class Breaker:
     def __init__(self, participant: str) -> None:
         self._participant = participant
         self._refusal, self._in_a_row = "", 0
+        self._malformed = 0  # in a row
         self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
 
     def check(self) -> None:
@@ -129,14 +131,18 @@ class Breaker:
                 raise Stopped(stopped[self._participant])
 
     def watch(self, outcome: Outcome) -> None:
-        """Raises Stopped after 20 refusals of the same kind in a row, or when over 10 of the last 100 calls failed."""
+        """Raises Stopped after 20 refusals of the same kind in a row, after three answers out of order in a row, or
+        when over 10 of the last 100 calls failed."""
         refusal = _refusal(outcome)
         self._in_a_row = self._in_a_row + 1 if refusal and refusal == self._refusal else int(bool(refusal))
         self._refusal = refusal
-        self._window.append(outcome.kind == "error")
+        self._malformed = self._malformed + 1 if outcome.kind == "malformed" else 0
+        self._window.append(outcome.kind in ("error", "malformed"))
         errors = sum(self._window)
         if self._in_a_row >= SAME_REFUSALS:
             why = f"{self._in_a_row} refusals in a row ({refusal})"
+        elif self._malformed >= MALFORMED_IN_A_ROW:
+            why = f"{self._malformed} answers in a row are out of order (they lie in the ledger, beside its rows)"
         elif len(self._window) == ERROR_WINDOW and errors > ERROR_SHARE * ERROR_WINDOW:
             why = f"{errors} of its last {ERROR_WINDOW} calls failed (last: {outcome.error or 'an answer'})"
         else:
@@ -154,4 +160,4 @@ def _refusal(outcome: Outcome) -> str:
     """The kind of a refusal by the provider (of the content, or of the call as it is); empty if it is none."""
     if outcome.kind == "refused":
         return outcome.error or outcome.finish_reason or "refused"
-    return (outcome.error or "") if outcome.kind == "error" and (outcome.error or "").startswith("http_4") else ""
+    return (outcome.error or "") if outcome.kind == "error" and (outcome.error or "").startswith("http_") else ""

@@ -17,6 +17,7 @@ from typing import Any
 import dagster as dg
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import remedy
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.models.traffic import remembering_stops
 from traps_pipeline.orchestration.graph import name_of, the_graph
@@ -66,10 +67,13 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
                 if here and PID_TAG in run.tags and not _alive(int(run.tags[PID_TAG])):
                     instance.report_run_failed(run, "its process was killed; what it had asked and made is kept")
             yield instance
+    except BrokenPipeError:
+        raise  # of what is printed to
     except (DBAPIError, OSError) as error:
+        what = remedy(error) if isinstance(error, OSError) else "free some space, or move that folder away"
         raise TrapsError(
-            f"{home}: Dagster's history cannot be read or written ({error}); free some space and run "
-            "the same command again: tables are whole, no answer is lost"
+            f"{home}: Dagster's history cannot be read or written ({' '.join(str(error).split())[:300]}); {what} and "
+            "run the same command again: tables are whole, no answer is lost"
         ) from error
 
 

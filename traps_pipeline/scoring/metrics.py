@@ -18,7 +18,7 @@ CELL = ["dataset", "model", "regime", "run"]
 FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
 BOUNDS = ["pecs_low", "pecs_high"]
 # Which outcomes each number of items counts. Answered means that there is a text, whatever the judges make of it.
-OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), "n_empty": ("empty",), "n_errors": ("error",)}
+OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), "n_empty": ("empty",), "n_errors": ("error", "malformed")}
 # How often something was decided so (numerator) and decided at all (denominator); every figure is made of these six.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
 SCOPED_BY = {"category": "category", "sub_scenario": "sub_scenario", "label": "control_answer"}

@@ -9,7 +9,6 @@ runs from asking the same key at the same time; the kernel frees it when its hol
 from __future__ import annotations
 
 import asyncio
-import errno
 import fcntl
 import json
 import os
@@ -23,13 +22,18 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import remedy, sync_folder
+from traps_pipeline.storage.lines import NOT_WHOLE, Line, append_whole, checked_line, read_checked
+from traps_pipeline.storage.rows import heal, is_cost
 
 SYNC_ROWS, SYNC_SECONDS = 100, 0.5
 LOCK_POLL_SECONDS = 0.1
+FAILED = ("error", "malformed")  # outcomes that settle nothing
+ASIDES = ("reasoning", "raw")  # texts kept beside a segment, each in a file of its own
 _KEY = b'{"key": "'  # how every row begins
-# Found without parsing the row, which would take ten times as long. Inside a string the quote before the colon has a
-# backslash before it, so that no text of a model can look like these.
-_COST = re.compile(rb'"cost_usd": ([0-9.e+-]+)[,}]')
+_CHECKED = "-v2.jsonl"  # how the names of segments end whose lines have checksums; earlier ones have none
+# Found without parsing the row, to leave most of them out. Inside a string the quote before the colon has a backslash
+# before it, so that no text of a model can look like this; what is counted is read from the parsed row.
 _PARTICIPANT = re.compile(rb'"participant": "([a-z0-9.-]+)"')
 
 
@@ -39,16 +43,16 @@ class LockGivenUp(Exception):
 
 def settles(row: Mapping[str, Any]) -> bool:
     """Whether a row settles its key: a failed call is kept for the record, and asked again."""
-    return row["outcome"] != "error"
+    return row["outcome"] not in FAILED
 
 
 @dataclass
 class Known:
     """What a ledger holds for one evaluation: the newest row of each key (a failure never takes the place of an
-    answer), and torn last lines (file:line)."""
+    answer), and what a person should know of lines that are not believed, or not all of them: by place (file:line)."""
 
     rows: dict[str, dict[str, Any]] = field(default_factory=dict)
-    torn: list[str] = field(default_factory=list)
+    notes: dict[str, str] = field(default_factory=dict)
 
     @property
     def settled(self) -> dict[str, dict[str, Any]]:
@@ -60,6 +64,24 @@ class Known:
         earlier = self.rows.get(row["key"])
         if earlier is None or settles(row) or not settles(earlier):
             self.rows[row["key"]] = row
+
+
+@dataclass
+class Spent:
+    """What rows of one participant say that was paid. dearest: one of them; unknown: rows that do not tell it in a way
+    that can be believed."""
+
+    dollars: float = 0.0
+    dearest: float = 0.0
+    unknown: int = 0
+
+    def add(self, row: Mapping[str, Any] | None) -> None:
+        """Count a row; None: a damaged one."""
+        cost = 0.0 if row is None else row.get("cost_usd") or 0.0
+        if row is None or not is_cost(cost):
+            self.unknown += 1
+            return
+        self.dollars, self.dearest = self.dollars + cost, max(self.dearest, cost)
 
 
 class Ledger:
@@ -75,50 +97,50 @@ class Ledger:
     def read(self, evaluation: str, wanted: Container[str] | None = None) -> Known:
         """The rows of an evaluation, or those of the wanted keys: the others are neither parsed nor held in memory.
 
-        A torn last line of a segment is counted; any other bad line raises TrapsError.
+        A torn last line of a segment, a line that is not what was written, and values that no table can hold are noted
+        and not believed. In a segment of version 0.1.0, whose lines have no checksums, a bad line raises TrapsError.
         """
         known = Known()
         for segment in sorted(self.folder(evaluation).glob("*.jsonl")):
-            for row, torn in _read_segment(segment, wanted):
-                if torn:
-                    known.torn.append(torn)
-                elif row is not None:
+            for place, row, note in _read_segment(segment, wanted):
+                if note:
+                    known.notes[place] = note
+                if row is not None:
                     known.add(row)
         return known
 
     def rows_of(self, participants: Container[str]) -> Iterator[dict[str, Any]]:
         """Rows of some participants, of every evaluation; lines that are not whole are left out."""
         for segment in sorted((self.root / self.kind).glob("*/*.jsonl")):
-            with segment.open("rb") as stream:
-                for line in stream:
-                    about = _PARTICIPANT.search(line)
-                    if about and about[1].decode() in participants and line.endswith(b"\n"):
-                        yield json.loads(line)
+            for line in _lines(segment):
+                about = _PARTICIPANT.search(line.content)
+                if line.whole and about and about[1].decode() in participants:
+                    yield _row(line.content)[0]
 
-    def spent(self) -> dict[str, float]:
-        """Dollars by participant, over every row of every evaluation: repeated keys were paid for as well."""
-        spent: dict[str, float] = {}
+    def spent(self) -> dict[str, Spent]:
+        """What was paid, by participant, over every row of every evaluation: repeated keys were paid for as well."""
+        spent: dict[str, Spent] = {}
         for segment in sorted((self.root / self.kind).glob("*/*.jsonl")):
-            with segment.open("rb") as stream:
-                for line in stream:
-                    cost, participant = _COST.search(line), _PARTICIPANT.search(line)
-                    if cost and participant and line.endswith(b"\n"):
-                        name = participant[1].decode()
-                        spent[name] = spent.get(name, 0.0) + float(cost[1])
+            for line in _lines(segment):
+                if not line.torn:  # what a crash cut off stands in the journal
+                    row = _parsed(line)
+                    its = spent.setdefault(_participant(row, line.content), Spent())
+                    for _ in range(1 if row else max(1, line.content.count(_KEY))):  # rows whose line ends are gone
+                        its.add(row)
         return spent
 
     def reasoning(self, evaluation: str, wanted: Container[str] | None = None) -> dict[str, str]:
         """Reasoning traces by key (of the wanted keys), in sibling segments so that reading answers stays quick."""
         traces: dict[str, str] = {}
         for segment in sorted(self.folder(evaluation).glob("*.jsonl.reasoning")):
-            traces.update({row["key"]: row["reasoning"] for row, _ in _read_segment(segment, wanted) if row})
+            traces.update({row["key"]: row["reasoning"] for _, row, _ in _read_segment(segment, wanted) if row})
         return traces
 
     @contextmanager
     def writer(self, evaluation: str) -> Iterator[SegmentWriter]:
-        """A writer of a new segment; the file appears with the first row."""
+        """A writer of a new segment; the file appears with the first row, or when it is opened."""
         second, rest = divmod(time.time_ns(), 10**9)  # one reading, so that names sort as segments were begun
-        name = f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime(second))}-{rest:09d}-{secrets.token_hex(3)}.jsonl"
+        name = f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime(second))}-{rest:09d}-{secrets.token_hex(3)}{_CHECKED}"
         writer = SegmentWriter(self.folder(evaluation) / name)
         try:
             yield writer
@@ -166,28 +188,40 @@ class SegmentWriter:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._files: dict[Path, int] = {}
-        self._sizes: dict[Path, int] = {}
+        self._dirty: set[Path] = set()
+        self._named = False  # whether the names of the files are on the disk
         self._unsynced, self._synced_at = 0, time.monotonic()
 
-    def append(self, row: Mapping[str, Any], reasoning: str | None = None) -> None:
-        """Write one row (and its trace) at once. Raises TrapsError when the disk is full; earlier rows are safe."""
-        if reasoning is not None:
-            self._write(self.path.with_suffix(".jsonl.reasoning"), {"key": row["key"], "reasoning": reasoning})
+    def open(self) -> None:
+        """Make the files now, before anything is asked whose answer they are to take. Raises TrapsError."""
+        for path in (self.path, *(self._beside(name) for name in ASIDES)):
+            self._file(path)
+
+    def _beside(self, name: str) -> Path:
+        return self.path.with_suffix(f".jsonl.{name}")
+
+    def append(self, row: Mapping[str, Any], beside: Mapping[str, str] | None = None) -> None:
+        """Write one row (and what is kept beside it, by name in ASIDES) at once. Raises TrapsError when the disk is
+        full; earlier rows are safe."""
+        for name, text in (beside or {}).items():
+            self._write(self._beside(name), {"key": row["key"], name: text})
         self._write(self.path, row)
         self._unsynced += 1
         self.sync_if_due()
 
-    def _write(self, path: Path, row: Mapping[str, Any]) -> None:
-        line = json.dumps(row, ensure_ascii=False, allow_nan=False).encode() + b"\n"
-        with _writing(path):
-            if path not in self._files:
+    def _file(self, path: Path) -> int:
+        if path not in self._files:
+            with _writing(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 self._files[path] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-                self._sizes[path] = 0
-            if os.write(self._files[path], line) < len(line):
-                os.ftruncate(self._files[path], self._sizes[path])  # a half-written line must not swallow the next one
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            self._sizes[path] += len(line)
+                self._named = False
+        return self._files[path]
+
+    def _write(self, path: Path, row: Mapping[str, Any]) -> None:
+        descriptor = self._file(path)
+        with _writing(path):
+            append_whole(descriptor, checked_line(row))
+            self._dirty.add(path)
 
     def sync_if_due(self) -> None:
         """Sync to disk when 100 rows or 0.5 s have passed since the last time."""
@@ -196,17 +230,28 @@ class SegmentWriter:
 
     def sync(self) -> None:
         """Sync what was written."""
-        for path, descriptor in self._files.items():
+        while self._dirty:
+            path = self._dirty.pop()
             with _writing(path):
-                os.fsync(descriptor)
+                os.fsync(self._files[path])
+        if not self._named:
+            for folder in (self.path.parent, self.path.parent.parent):
+                with _writing(folder):
+                    sync_folder(folder)
+            self._named = True
         self._unsynced, self._synced_at = 0, time.monotonic()
 
     def close(self) -> None:
-        """Sync and close."""
-        if self._unsynced:
-            self.sync()
-        while self._files:
-            os.close(self._files.popitem()[1])
+        """Sync and close; a file that nothing was written to goes."""
+        try:
+            if self._unsynced:
+                self.sync()
+        finally:
+            while self._files:
+                path, descriptor = self._files.popitem()
+                if os.fstat(descriptor).st_size == 0:
+                    path.unlink(missing_ok=True)
+                os.close(descriptor)
 
 
 @contextmanager
@@ -216,30 +261,64 @@ def _writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise TrapsError(
-            f"{path}: could not be written ({error.strerror}); free some space and run the same command again: "
+            f"{path}: could not be written ({error.strerror}); {remedy(error)} and run the same command again: "
             "everything answered before is kept, only what was in flight is asked again"
         ) from error
 
 
-def _read_segment(
-    path: Path, wanted: Container[str] | None = None
-) -> Iterator[tuple[dict[str, Any] | None, str | None]]:
+def _lines(path: Path) -> Iterator[Line]:
+    """The lines of a segment. One of an early segment, which has no checksums, counts as whole if it is complete."""
+    if path.name.removesuffix(path.suffix if path.suffix != ".jsonl" else "").endswith(_CHECKED):
+        yield from read_checked(path)
+        return
     with path.open("rb") as stream:
         for number, line in enumerate(stream, start=1):
-            if not line.endswith(b"\n"):
-                yield None, f"{path}:{number}"
-                return
-            if wanted is not None and line.startswith(_KEY) and _key(line) not in wanted:
-                continue
+            yield Line(number, line, line.endswith(b"\n"), torn=not line.endswith(b"\n"))
+
+
+def _read_segment(
+    path: Path, wanted: Container[str] | None = None
+) -> Iterator[tuple[str, dict[str, Any] | None, str | None]]:
+    """The place of each line, its row, and what is to be said of it."""
+    for line in _lines(path):
+        place = f"{path}:{line.number}"
+        if not line.whole:
+            what = "torn last line ignored (a crash cut it off)" if line.torn else f"{NOT_WHOLE}: it is not believed"
+            yield place, None, f"{what}; its answer is asked again"
+        elif wanted is None or not line.content.startswith(_KEY) or _key(line.content) in wanted:
             try:
-                row = json.loads(line)
-                row["key"]
+                row, healed = _row(line.content)
             except (ValueError, KeyError, TypeError) as error:
                 raise TrapsError(
-                    f"{path}:{number}: not a ledger row ({error!r}); remove that line and run again: its answer "
+                    f"{place}: not a ledger row ({error!r}); remove that line and run again: its answer "
                     "will be asked anew, all others are kept"
                 ) from error
-            yield row, None
+            yield place, row, f"{', '.join(healed)}: no possible value, counted as unknown" if healed else None
+
+
+def _parsed(line: Line) -> dict[str, Any] | None:
+    """What a line says, for counting; None if it says nothing that is to be believed."""
+    try:
+        row = json.loads(line.content) if line.whole else None
+    except ValueError:
+        return None
+    return row if isinstance(row, dict) else None
+
+
+def _row(line: bytes) -> tuple[dict[str, Any], list[str]]:
+    """A row, and the names of values in it that were not possible."""
+    row = json.loads(line)
+    row["key"]
+    row.pop("sum", None)
+    return row, heal(row)
+
+
+def _participant(row: Mapping[str, Any] | None, line: bytes) -> str:
+    """Whose call a line tells of, as far as it can be told."""
+    components = (row or {}).get("components")
+    name = components.get("participant") if isinstance(components, Mapping) else None
+    found = _PARTICIPANT.search(line)
+    return name if isinstance(name, str) else found[1].decode() if found else "unknown"
 
 
 def _key(line: bytes) -> str:

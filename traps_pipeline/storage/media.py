@@ -27,7 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes, write_text
+from traps_pipeline.files import remedy, write_bytes, write_text
 from traps_pipeline.scenes.encode import ENCODER, DamagedClip, decode, encode
 
 Profile = Literal["video", "images", "frames"]
@@ -319,7 +319,7 @@ def _alone(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
     except OSError as error:
-        raise TrapsError(f"{folder}: cannot be written ({error.strerror}); free some space and run again") from error
+        raise TrapsError(f"{folder}: cannot be written ({error.strerror}); {remedy(error)} and run again") from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import secrets
+import shutil
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,14 +22,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from traps_pipeline import progress
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import replacing, write_bytes
+from traps_pipeline.files import replacing, sync_folder, write_bytes
 from traps_pipeline.models.answers import prepare_media, wanted_questions
 from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.models.request import JUDGED, Outcome, OutcomeKind, Request
 from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.rows import MOST_TOKENS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import Experiment
+from traps_pipeline.terminal import plain
 from traps_pipeline.yamlfile import explain, read_lines
 
 REQUESTS, MEDIA = "requests.jsonl", "media"
@@ -36,21 +42,21 @@ SHOWN = 5  # bad lines named in an error
 class Answer(BaseModel):
     """One line of a file of answers."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
     key: str
     outcome: OutcomeKind = "answer"
     text: str | None = None
     reasoning: str | None = None
     finish_reason: str | None = None
     served_model: str | None = None
-    prompt_tokens: int | None = Field(default=None, ge=0)
-    completion_tokens: int | None = Field(default=None, ge=0)
-    reasoning_tokens: int | None = Field(default=None, ge=0)
-    latency_s: float = Field(default=0.0, ge=0.0)
+    prompt_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
+    completion_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
+    reasoning_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
+    latency_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
 
     @model_validator(mode="after")
     def _text_goes_with_outcome(self) -> Answer:
-        if self.outcome == "error":
+        if self.outcome in ("error", "malformed"):
             raise ValueError("outcome: an error is no answer; leave the line out, the item stays missing")
         if (self.outcome in JUDGED) != bool((self.text or "").strip()):
             raise ValueError(f"text: outcome {self.outcome!r} {'needs one' if self.outcome in JUDGED else 'has none'}")
@@ -147,7 +153,7 @@ def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> 
     for key, answer in answers.items():
         about = wanted[key].about
         by_evaluation[Evaluation(str(about["model"]), str(about["regime"]), int(about["run"]))].append(answer)
-    new = sum(asyncio.run(_append(workspace, evaluation, mine, wanted)) for evaluation, mine in by_evaluation.items())
+    new = asyncio.run(_store(workspace, by_evaluation, wanted))
     return Imported(new, len(answers) - new)
 
 
@@ -161,8 +167,8 @@ def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answ
         except ValidationError as error:
             wrong.append(f"{path}:{number}: {explain(error)}")
             continue
-        except ValueError as error:
-            wrong.append(f"{path}:{number}: not JSON ({error})")
+        except (ValueError, RecursionError) as error:
+            wrong.append(f"{path}:{number}: not JSON ({plain(error)[:200]})")
             continue
         if answer.key not in wanted:
             wrong.append(f"{path}:{number}: key {answer.key[:16]} is not wanted: question, clip or setting changed")
@@ -174,16 +180,31 @@ def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answ
     return answers
 
 
-async def _append(
-    workspace: Workspace, evaluation: Evaluation, answers: list[Answer], wanted: Mapping[str, Request]
+async def _store(
+    workspace: Workspace, answers: Mapping[Evaluation, list[Answer]], wanted: Mapping[str, Request]
 ) -> int:
-    """Append what one evaluation's ledger does not hold; how many."""
-    ledger, entry = workspace.answers, get_model(evaluation.model)
-    async with ledger.lock(evaluation.key, progress.current().note):
-        known = ledger.read(evaluation.key).settled
-        new = [a for a in answers if a.key not in known]
-        with ledger.writer(evaluation.key) as writer:
-            for answer in new:
-                outcome = answer.as_outcome(entry)
-                writer.append(*ledger_row(wanted[answer.key], outcome, 1, answer.latency_s, workspace.study.epoch))
-    return len(new)
+    """Store what the ledger does not hold, all of it or nothing: it is written beside the ledger first and then moved
+    in, which takes no more space; how many."""
+    ledger, new = workspace.answers, 0
+    staged = Ledger(ledger.root / f"importing-{secrets.token_hex(4)}", ledger.kind)
+    async with AsyncExitStack() as locks:
+        for evaluation in sorted(answers):
+            await locks.enter_async_context(ledger.lock(evaluation.key, progress.current().note))
+        try:
+            for evaluation, mine in answers.items():
+                known, entry = ledger.read(evaluation.key).settled, get_model(evaluation.model)
+                with staged.writer(evaluation.key) as writer:
+                    for answer in mine:
+                        if answer.key not in known:
+                            outcome, new = answer.as_outcome(entry), new + 1
+                            row = ledger_row(wanted[answer.key], outcome, 1, answer.latency_s, workspace.study.epoch)
+                            writer.append(*row)
+            # What stands beside rows goes first: a row without its reasoning would be taken for one that has none.
+            for path in sorted(staged.root.rglob("*.jsonl*"), key=lambda path: path.suffix == ".jsonl"):
+                target = ledger.root / path.relative_to(staged.root)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                path.replace(target)
+                sync_folder(target.parent)
+        finally:
+            shutil.rmtree(staged.root, ignore_errors=True)
+    return new

@@ -396,3 +396,29 @@ def test_another_model_of_the_library_is_one_entry_and_no_code(tmp_path: Path) -
     v = direction(of)
     steered = of.forward_states(prompts[0], steering=Steering(v, 2, (9.0,)))
     assert (steered.raw[2] == states.raw[2] + np.float32(9) * v).all()
+
+
+@pytest.mark.parametrize(
+    "file", ["config.json", "tokenizer_config.json", "processor_config.json", "video_preprocessor_config.json", "all"]
+)
+def test_code_in_a_checkpoint_never_runs_and_nobody_is_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str
+) -> None:
+    folder, canary, asked = tmp_path / "checkpoint", tmp_path / "canary", list[str]()
+    shutil.copytree(checkpoint(FAMILIES[0]), folder)
+    evil = f"from pathlib import Path\nPath({str(canary)!r}).touch()\nclass Evil:\n    pass\n"
+    (folder / "evil.py").write_text(evil)
+    auto = ("AutoConfig", "AutoTokenizer", "AutoProcessor", "AutoVideoProcessor", "AutoImageProcessor")
+    classes: dict[str, Any] = dict.fromkeys((*auto, "AutoModelForImageTextToText", "AutoModel"), "evil.Evil")
+    classes["AutoTokenizer"] = ["evil.Evil", "evil.Evil"]
+    for path in folder.glob("*config.json") if file == "all" else [folder / file]:
+        said = json.loads(path.read_text()) if path.exists() else {}
+        said |= {"auto_map": classes, "model_type": "evil", "architectures": ["Evil"]}
+        said |= {"tokenizer_class": "Evil", "processor_class": "Evil", "video_processor_type": "Evil"}
+        path.write_text(json.dumps(said))
+    (folder / "custom_generate").mkdir()
+    (folder / "custom_generate" / "generate.py").write_text(evil)
+    monkeypatch.setattr("builtins.input", lambda question="": asked.append(question) or "y")
+    with pytest.raises(TrapsError, match=r"checkpoint .*: it brings code of its own \(.*\).*never runs"):
+        load_local_model(entry(FAMILIES[0], folder))
+    assert asked == [] and not canary.exists()

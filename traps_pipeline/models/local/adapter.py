@@ -17,7 +17,7 @@ from typing import Any
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.local.checkpoint import Checkpoint, find_checkpoint, require_memory
+from traps_pipeline.models.local.checkpoint import Checkpoint, find_checkpoint, require_memory, require_no_code
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import Generated, LocalModel, States
 from traps_pipeline.models.local.prompts import Prompt
@@ -42,6 +42,7 @@ def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
     device = entry.device or "cpu"
     require_device(device)
     checkpoint = find_checkpoint(params)
+    require_no_code(checkpoint)
     loading = ("dtype", "quantisation", "nf4_skip", "attn_implementation", "template", "video")
     key = digest(
         [checkpoint.digest, str(checkpoint.folder), device, params.model_dump(mode="json", include={*loading})]
@@ -72,11 +73,15 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
     transformers = load_transformers()
     options = _precision(params, device)
     try:
-        processor = transformers.AutoProcessor.from_pretrained(checkpoint.folder, local_files_only=True)
+        processor = transformers.AutoProcessor.from_pretrained(
+            checkpoint.folder, local_files_only=True, trust_remote_code=False
+        )
         network, report = transformers.AutoModelForImageTextToText.from_pretrained(
             checkpoint.folder,
             attn_implementation=params.attn_implementation,
             local_files_only=True,
+            trust_remote_code=False,  # said, since transformers else asks on the terminal, and a `y` runs it
+            use_safetensors=True,
             output_loading_info=True,
             **options,
         )

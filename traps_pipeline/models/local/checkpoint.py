@@ -20,6 +20,7 @@ from traps_pipeline.paths import CHECKOUT
 _FILES = (".json", ".jinja", ".model", ".safetensors", ".txt")  # of a folder, what decides what the model says
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 _COMMIT = re.compile(r"[0-9a-f]{40}")
+_CONFIG_BYTES = 4 * 2**20  # of a file of settings; a vocabulary is larger, and no class is looked for in it
 _ITEM_BYTES: dict[Dtype, int] = {"float32": 4, "bfloat16": 2, "float16": 2}
 _NF4_BYTES = 0.6  # a weight in 4 bits and its share of the scales and of what is not quantised
 
@@ -101,6 +102,28 @@ def _require_whole(folder: Path, name: str, remedy: str) -> None:
     missing = [file for file in ("config.json", *sorted(shards)) if not (folder / file).exists()]
     if missing:
         raise TrapsError(f"checkpoint {name}: {folder / missing[0]} is missing ({len(missing)} files are); {remedy}")
+
+
+def require_no_code(checkpoint: Checkpoint) -> None:
+    """Raises TrapsError for a checkpoint that brings code: it could do whatever its user can."""
+    code = [path.relative_to(checkpoint.folder).as_posix() for path in sorted(checkpoint.folder.rglob("*.py"))]
+    for path in sorted(checkpoint.folder.glob("*.json")):
+        if path.stat().st_size <= _CONFIG_BYTES and _names_code(path):
+            code.append(f"auto_map in {path.name}")
+    if code:
+        more = f" and {len(code) - 1} more" if len(code) > 1 else ""
+        raise TrapsError(
+            f"checkpoint {checkpoint.name}: it brings code of its own ({code[0]}{more}), which never runs here: name a "
+            "checkpoint of a class that transformers has itself, or one that was saved again by such a class"
+        )
+
+
+def _names_code(path: Path) -> bool:
+    """Whether settings name classes of a checkpoint's own files, however the name is spelt in JSON."""
+    try:
+        return '"auto_map"' in json.dumps(json.loads(path.read_bytes()))
+    except (ValueError, RecursionError):
+        return False  # nothing that transformers reads either
 
 
 def folder_digest(folder: Path) -> str:

@@ -1,0 +1,285 @@
+"""Whatever a provider sends back, what is booked is at least what it bills, and every answer is typed and stored."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import json
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import KEY, SECRET
+from tests.providers.server import Provider
+from traps_pipeline import progress
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.api import ApiBackend
+from traps_pipeline.models.ask import Call, Work, run_work
+from traps_pipeline.models.budget import Budget, BudgetReached, Journal
+from traps_pipeline.models.participants import OVERRUN, Participants, attempt
+from traps_pipeline.models.registry import Account, Entry, Limits, Prices
+from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.study import Study
+
+# litellm serializes what it was given again; what it says of odd values goes to nobody.
+pytestmark = pytest.mark.filterwarnings("ignore:Pydantic serializer warnings")
+PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
+PRICES = Prices(input=1.0, output=10.0, as_of=datetime.date(2026, 11, 1))
+USD_A_TOKEN = (1e-6, 1e-5)
+ANSWER = "The answer is: left."
+USAGE = {"prompt_tokens": 20, "completion_tokens": 21, "total_tokens": 41}
+MESSAGE = {"role": "assistant", "content": ANSWER}
+CHOICE = {"index": 0, "message": MESSAGE, "finish_reason": "stop"}
+BODY = {"id": "x", "object": "chat.completion", "created": 1, "model": "m", "choices": [CHOICE], "usage": USAGE}
+
+
+def body(**changes: Any) -> str:
+    return json.dumps(BODY | changes)
+
+
+def usage(**changes: Any) -> str:
+    return body(usage=USAGE | changes)
+
+
+def message(**changes: Any) -> str:
+    return body(choices=[CHOICE | {"message": MESSAGE | changes}])
+
+
+# Not one of these is an answer whose usage can be believed.
+ODD = {
+    "negative-prompt": usage(prompt_tokens=-40_000_000),
+    "negative-completion": usage(completion_tokens=-1),
+    "negative-total": usage(total_tokens=-1),
+    "null-prompt": usage(prompt_tokens=None),
+    "null-completion": usage(completion_tokens=None),
+    "fraction": usage(completion_tokens=2.5),
+    "whole-fraction": usage(completion_tokens=21.0),
+    "text-count": usage(completion_tokens="21"),
+    "true-count": usage(completion_tokens=True),
+    "list-count": usage(completion_tokens=[21]),
+    "huge-prompt": usage(prompt_tokens=2**63, total_tokens=2**63 + 21),
+    "huge-completion": usage(completion_tokens=2**63, total_tokens=2**63 + 20),
+    "float-overflow": usage(completion_tokens=1e308),
+    "infinity": usage(completion_tokens=float("inf")),
+    "nan": usage(completion_tokens=float("nan")),
+    "zero-prompt": usage(prompt_tokens=0, total_tokens=21),
+    "zero-completion": usage(completion_tokens=0, total_tokens=20),
+    "less-than-the-text": usage(completion_tokens=2, total_tokens=22),
+    "less-than-the-prompt": usage(prompt_tokens=1, total_tokens=22),
+    "sum-below-parts": usage(total_tokens=5),
+    "sum-of-text": usage(total_tokens="41"),
+    "absent-completion": body(usage={"prompt_tokens": 20}),
+    "absent-prompt": body(usage={"completion_tokens": 21}),
+    "no-usage": json.dumps({name: value for name, value in BODY.items() if name != "usage"}),
+    "null-usage": body(usage=None),
+    "empty-usage": body(usage={}),
+    "list-usage": body(usage=[20, 21]),
+    "text-usage": body(usage="41"),
+    "usage-in-usage": body(usage={"usage": USAGE}),
+    "no-choices": body(choices=[]),
+    "null-choices": body(choices=None),
+    "absent-choices": json.dumps({name: value for name, value in BODY.items() if name != "choices"}),
+    "choices-of-text": body(choices="left"),
+    "choices-object": body(choices={"0": CHOICE}),
+    "choice-null": body(choices=[None]),
+    "choice-text": body(choices=["left"]),
+    "choice-without-message": body(choices=[{"index": 0, "finish_reason": "stop"}]),
+    "message-null": body(choices=[CHOICE | {"message": None}]),
+    "message-text": body(choices=[CHOICE | {"message": "left"}]),
+    "content-number": message(content=5),
+    "content-list": message(content=[{"type": "text", "text": "left"}]),
+    "content-object": message(content={"text": "left"}),
+    "content-true": message(content=True),
+    "body-null": "null",
+    "body-list": f"[{body()}]",
+    "body-text": '"left"',
+    "body-number": "12",
+    "body-empty": "",
+    "body-blank": " \n ",
+    "cut": body()[:90],
+    "two-bodies": body() + body(),
+    "event-stream": f"data: {body()}\n\ndata: [DONE]\n\n",
+    "page": "<!doctype html><h1>It works</h1>",
+    "no-utf8": "\udcff\udcfe" + body(),
+    "byte-order-mark": "\ufeff\ufeff" + body(),
+    "deep": "[" * 100_000,
+    "many-digits": usage(completion_tokens=21).replace("21", "9" * 5000),
+    "error-in-200": json.dumps({"error": {"message": "overloaded", "code": 503}}),
+    "cost-by-name": body(usage={"cost_usd": -1000}),
+    "model-and-no-usage": body(model=5, usage=None),
+}
+STATUSES = {f"status-{status}": status for status in (500, 502, 504, 520, 522, 524, 599, 408, 302, 307, 204)}
+UNBILLED = {f"status-{status}": status for status in (400, 401, 403, 404, 409, 422, 429, 503)}
+
+
+@pytest.fixture
+def odd(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
+    """The server with every odd shape, each the only answer of a model of its own; it keeps its own bill."""
+    monkeypatch.setenv(KEY, SECRET)
+    raw: dict[str, Any] = {name: {"content": content} for name, content in ODD.items()}
+    raw["event-stream"]["type"] = "text/event-stream"
+    raw |= {name: {"content": body(), "status": status} for name, status in (STATUSES | UNBILLED).items()}
+    return shared_provider.afresh(raw_by_model=raw, usd_a_token=USD_A_TOKEN)
+
+
+def entry_of(model: str, **limits: Any) -> Entry:
+    fields = {"id": "m", "backend": "api", "account": "a", "provider_id": f"openai/{model}", "params": PARAMS}
+    fields |= {"limits": Limits(timeout_s=5, backoff_s=0.001, retries=1, **limits), "prices": PRICES}
+    return Entry.model_validate(fields, context={"accounts": {"a": Account()}})
+
+
+def asking(provider: Provider, entry: Entry) -> ApiBackend:
+    return ApiBackend(entry, Account(key=KEY, base_url=f"{provider.url}/v1"))
+
+
+def request(item: int | str = "x") -> Request:
+    return Request("m", "openai/m", PARAMS, "You watch a clip of two balls.", f"Which one, {item}?", {"item_id": item})
+
+
+def participants(provider: Provider, entry: Entry, cap_usd: float) -> Participants:
+    return Participants({"m": entry}, lambda _: asking(provider, entry), Study(budget_usd=cap_usd), {"a": Account()})
+
+
+def booked_for(provider: Provider, model: str) -> tuple[Outcome | None, float]:
+    """What came of one call, and what the budget says that it cost."""
+
+    async def one() -> tuple[Outcome | None, float]:
+        budget = Budget(10.0, {}, {})
+        participant = participants(provider, entry_of(model), 10.0)["m"]
+        attempted = await attempt(participant, request(), budget, asyncio.Event(), lambda: False)
+        return attempted and attempted[0], budget.spent_usd
+
+    return asyncio.run(one())
+
+
+@pytest.mark.parametrize("shape", [*ODD, *STATUSES])
+def test_what_a_provider_bills_for_an_odd_answer_is_booked(odd: Provider, shape: str) -> None:
+    outcome, booked_usd = booked_for(odd, shape)
+    stats = odd.stats()
+    assert outcome and booked_usd >= stats["billed_usd"] > 0.0
+    assert stats["requests"] <= 2  # tried again once at most
+    assert outcome.cost_usd == pytest.approx(booked_usd)  # the ledger's row holds all of it
+    assert outcome.text in (None, ANSWER)
+
+
+@pytest.mark.parametrize("shape", UNBILLED)
+def test_a_call_that_a_provider_did_not_take_costs_nothing(odd: Provider, shape: str) -> None:
+    outcome, booked_usd = booked_for(odd, shape)
+    assert outcome and booked_usd == odd.stats()["billed_usd"] == 0.0
+
+
+def test_an_answer_is_paid_as_its_usage_says(odd: Provider) -> None:
+    odd.configure(raw_by_model={"good": {"content": body()}, "thinks": {"content": usage(total_tokens=1041)}})
+    outcome, booked_usd = booked_for(odd, "good")
+    assert outcome and (outcome.text, outcome.prompt_tokens, outcome.completion_tokens) == (ANSWER, 20, 21)
+    assert booked_usd == pytest.approx(20e-6 + 21e-5)
+    assert booked_for(odd, "thinks")[1] == pytest.approx(20e-6 + 1021e-5)  # what the sum alone tells was thought
+
+
+def test_a_limit_that_a_provider_ignores_is_believed_up_to_a_bound(odd: Provider) -> None:
+    over = {"content": usage(completion_tokens=20_000, total_tokens=20_020)}
+    absurd = {"content": usage(completion_tokens=10**9, total_tokens=10**9 + 20)}
+    odd.configure(raw_by_model={"over": over, "absurd": absurd})
+    assert booked_for(odd, "over")[1] == pytest.approx(20e-6 + 0.2)
+    assert booked_for(odd, "absurd")[1] < OVERRUN * 0.081
+
+
+def test_what_is_odd_beside_the_usage_is_typed_and_stored(odd: Provider, tmp_path: Path) -> None:
+    said = {
+        "m-number": body(model=5),
+        "m-surrogate": body(model="gpt \ud83d"),
+        "text-surrogate": message(content="left \ud83d"),
+        "finish-number": body(choices=[CHOICE | {"finish_reason": 7}]),
+        "reasoning-list": message(reasoning_content=["left"]),
+        "long-name": body(model="m" * 100_000),
+    }
+    odd.configure(raw_by_model={name: {"content": content} for name, content in said.items()})
+    for name in said:
+        outcome, _ = booked_for(odd, name)
+        assert outcome is not None
+        assert outcome.served_model is None or len(outcome.served_model) <= 200
+        json.dumps(vars(outcome)).encode()
+        for value in (outcome.text, outcome.served_model, outcome.finish_reason, outcome.reasoning):
+            assert value is None or value.encode()
+    outcome, _ = booked_for(odd, "text-surrogate")
+    assert outcome and (outcome.text, outcome.served_model, outcome.cost_usd) == ("left ?", "m", pytest.approx(0.00023))
+
+
+def work(provider: Provider, entry: Entry, cap_usd: float, items: int, folder: Path) -> Iterator[Any]:
+    budget = Budget(cap_usd, {}, {}, Journal(folder / "in_flight.jsonl"))
+    calls = [Call(request(item)) for item in range(items)]
+    asked = participants(provider, entry, cap_usd)
+    done = Work("responses", Ledger(folder, "answers"), asked, budget, "1", lambda _: calls, lambda settled: settled)
+    return run_work(done, [Cell("occlusion", Evaluation("m", "standard", 1))])
+
+
+def test_three_answers_out_of_order_in_a_row_stop_a_model_and_are_kept_aside(odd: Provider, tmp_path: Path) -> None:
+    odd.configure(raw_by_model={"m": {"content": f"\x1b[2J<h1>{SECRET}</h1>" + "x" * 9000}})
+    with pytest.raises(TrapsError, match="m is stopped: 3 answers in a row are out of order"):
+        list(work(odd, entry_of("m", concurrency=1), 100.0, 20, tmp_path))
+    assert odd.stats()["requests"] == 6
+    (kept,) = tmp_path.rglob("*.jsonl.raw")
+    rows = [json.loads(line) for line in kept.read_text().splitlines()]
+    assert [row["raw"] for row in rows] == ["\x1b[2J<h1>***</h1>" + "x" * (4000 - 16)] * 3
+    assert SECRET not in "".join(path.read_text() for path in tmp_path.rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize("connections", [1, 200])
+def test_the_cap_holds_against_fuzzed_answers(odd: Provider, tmp_path: Path, connections: int) -> None:
+    odd.configure(raw_by_model={}, fuzzed=True)
+    calls = 1000 if os.environ.get("TRAPS_MANY_CALLS") else 2 * connections + 50
+    entry = entry_of("m", concurrency=connections)
+    entry = entry.model_copy(update={"params": PARAMS | {"max_tokens": 500}})
+    participant = participants(odd, entry, 100.0)["m"]
+    cap_usd, budget = 1.0, Budget(1.0, {}, {})
+
+    async def worker(queue: list[int]) -> None:
+        while queue:
+            sent = Request("m", "openai/m", entry.params, "You watch.", f"Which, {queue.pop()}?", {})
+            await attempt(participant, sent, budget, asyncio.Event(), lambda: False)
+
+    async def run() -> bool:
+        queue = list(range(calls))
+        done = await asyncio.gather(*(worker(queue) for _ in range(connections)), return_exceptions=True)
+        assert all(each is None or isinstance(each, BudgetReached) for each in done)
+        return not queue
+
+    asked_all = asyncio.run(run())
+    billed = odd.stats()["billed_usd"]
+    assert 0.0 < billed <= budget.spent_usd <= cap_usd
+    assert asked_all or budget.spent_usd > 0.9 * cap_usd
+
+
+def test_keys_do_not_follow_a_redirect_to_another_host(odd: Provider) -> None:
+    with Provider.start() as foreign:
+        for status in (301, 302, 307, 308):
+            headers = {"Location": f"{foreign.url}/v1/chat/completions"}
+            odd.configure(raw_by_model={"m": {"content": "", "status": status, "headers": headers}})
+            outcome, booked_usd = booked_for(odd, "m")
+            assert outcome and (outcome.kind, outcome.error) == ("error", f"http_{status}") and booked_usd > 0
+        assert foreign.stats()["requests"] == 0
+
+
+def test_a_call_that_never_left_costs_nothing(odd: Provider) -> None:
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        account = Account(key=KEY, base_url=f"http://127.0.0.1:{closed.getsockname()[1]}/v1")
+        with pytest.raises(TransientError) as raised:
+            asyncio.run(ApiBackend(entry_of("m"), account).ask(request()))
+    assert (raised.value.kind, raised.value.billed) == ("connection", False)
+
+
+def test_words_of_a_provider_cannot_steer_a_terminal(odd: Provider, capsys: pytest.CaptureFixture[str]) -> None:
+    error = json.dumps({"error": {"message": "\x1b[2J\x1b]52;c;ZWNobw==\x07 \u202enever", "type": "x", "code": "y"}})
+    odd.configure(raw_by_model={"m": {"content": error, "status": 404}})
+    with progress.reporting(progress.Progress()):
+        assert booked_for(odd, "m")[0] == Outcome("error", error="http_404", cost_usd=0.0)
+    told = capsys.readouterr().err
+    assert "m: http_404" in told and told.count("\n") == 1
+    assert all(char.isprintable() for char in told[:-1])

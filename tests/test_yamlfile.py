@@ -1,0 +1,134 @@
+"""One strict door for files: any bytes give plain values or one sentence that names the file."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.conftest import ROOT
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.study.experiment import load_experiment
+from traps_pipeline.yamlfile import parse_yaml_model, read_lines, read_yaml
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "file.yaml"
+
+
+def test_what_is_shipped_reads_as_any_reader_reads_it() -> None:
+    files = [*(ROOT / "assets").rglob("*.yaml"), *(ROOT / "scene_specs").rglob("*.yaml")]
+    files += [*(ROOT / "tests" / "experiments").glob("*.yaml")]
+    assert len(files) > 10
+    for path in files:
+        plain = yaml.safe_load(path.read_text())
+        assert json.dumps(read_yaml(path)) == json.dumps(plain, default=str), path
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("a: 1\nb: 2\na: 3", "line 3: 'a' stands there twice"),
+        ("a: {b: 1, b: 2}", "'b' stands there twice"),
+        ("a: &x [1]\nb: &y [*x, *x]", "one inside an anchor"),
+        ("a: &x [1]\nb: [" + "*x, " * 300 + "]", "too many aliases"),
+        ("a: !!python/object/apply:os.system [ls]", "could not determine a constructor"),
+        ("a: !!timestamp 2026-11-21", "could not determine a constructor"),
+        ("a: !!binary aGk=", "could not determine a constructor"),
+        ("a: !!float .inf", "is no finite number|could not convert"),
+        ("a: 1e999", "is no finite number"),
+        ("? [1, 2]\n: 3", "a key is a word or a number"),
+        ("[" * 100, "nested too deeply"),
+        ('a: "\\ud800"', "surrogates not allowed"),
+        ("a: \x00", "unacceptable character"),
+    ],
+)
+def test_what_two_readers_could_take_for_two_things_is_refused(file: Path, text: str, complaint: str) -> None:
+    file.write_text(text)
+    with pytest.raises(TrapsError, match=rf"file\.yaml: not valid YAML \(.*({complaint})"):
+        read_yaml(file)
+
+
+def test_words_that_early_yaml_takes_for_something_else_are_words(file: Path) -> None:
+    said = "a: yes\nb: 1:30\nc: 010\nd: 2026-11-21\ne: .inf\nf: 0x10\ng: 1_000\nh: off\ni: ~\nj: true\nk: 1.5e-3\nl: -7"
+    file.write_text(said)
+    assert read_yaml(file) == {
+        **{"a": "yes", "b": "1:30", "c": "010", "d": "2026-11-21", "e": ".inf", "f": "0x10", "g": "1_000"},
+        **{"h": "off", "i": None, "j": True, "k": 0.0015, "l": -7},
+    }
+
+
+@pytest.mark.parametrize("said", ["yes", "true", "1:30", ".inf", ".nan", "010", '"20"', "2_0", "1e999", "-1", "[20]"])
+def test_a_budget_is_a_number_and_nothing_that_looks_like_one(tmp_path: Path, said: str) -> None:
+    (tmp_path / "study.yaml").write_text(f"format: 1\nbudget_usd: {said}\n")
+    with pytest.raises(TrapsError, match=r"study\.yaml: .*"):
+        Workspace.open(tmp_path)
+
+
+def test_a_word_is_no_truth_and_a_number_neither(file: Path) -> None:
+    for said in ("yes", "1", '"true"'):
+        file.write_text(f"allow_unknown_prices: {said}")
+        with pytest.raises(TrapsError, match=r"allow_unknown_prices: .* is no true or false"):
+            parse_yaml_model(Study, read_yaml(file), file)
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ('{"a": 1, "a": 2}', "'a' stands there twice"),
+        ('{"b": [{"a": 1, "a": 2}]}', "'a' stands there twice"),
+        ('{"a": NaN}', "NaN is no finite number"),
+        ('{"a": -Infinity}', "no finite number"),
+        ('{"a": 1e999}', "no finite number"),
+        ('{"a": "\\ud83d"}', "half of a surrogate pair"),
+        ('{"a": ' + "9" * 5000 + "}", "thousands of digits"),
+        ("[" * 5000, "nested too deeply"),
+    ],
+)
+def test_an_ambiguous_line_is_named(file: Path, line: str, complaint: str) -> None:
+    file.write_text(f'{{"a": "\\ud83d\\ude00 [[[["}}\n{line}\n')
+    lines = read_lines(file)
+    assert next(lines)[0] == 1
+    with pytest.raises(TrapsError, match=rf"file\.yaml:2: .*{complaint}") as raised:
+        next(lines)
+    assert len(str(raised.value)) < 400 + len(str(file))
+
+
+def test_damaged_files_give_values_or_one_short_sentence(tmp_path: Path) -> None:
+    """Bytes of an experiment replaced, doubled and left out, at random."""
+    draw, path = random.Random(1), tmp_path / "experiment.yaml"
+    whole = (ROOT / "tests" / "experiments" / "small.yaml").read_bytes()
+    pieces = [
+        b"\x00",
+        b"\xff",
+        b"yes",
+        b"1e999",
+        b"!!python/name:os.system",
+        b"[[[[",
+        b"&a",
+        b"*a",
+        b"<<: ",
+        b"\n- ",
+        b"~",
+    ]
+    refused = 0
+    for _ in range(300):
+        content = bytearray(whole)
+        for _ in range(draw.randint(1, 4)):
+            place = draw.randrange(len(content))
+            end = place + draw.choice((0, 1, 8, 40))
+            content[place:end] = draw.choice((*pieces, b"", content[place:end] * 2))
+        path.write_bytes(content)
+        try:
+            load_experiment(str(path))
+        except TrapsError as error:
+            refused += 1
+            assert str(path) in str(error) or "unknown" in str(error)
+            assert len(str(error)) < 1500 and "\x00" not in str(error)
+    assert refused > 100

@@ -1,0 +1,107 @@
+"""What a call took, in a provider's own words: believed where these are whole and possible, and never otherwise.
+
+They are read from the answer as it came, since litellm makes zeros of what is not there. What is not believed is
+unknown, and a call whose tokens are unknown counts as its worst case (docs/models.md, "Money").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+BYTES_A_TOKEN = 8  # of text: no provider's tokenizer puts more into a token, on average over a text
+TOKENS_A_FRAME = 8  # at least
+MOST_TOKENS = 10**9  # what is above is no count
+
+# By API: prompt tokens, those of the answer, all of them, and what of the answer (True) or of the prompt (False) is
+# told apart from these. Anthropic tells no sum.
+_FORMS: tuple[tuple[str, tuple[str, str, str | None], Mapping[str, bool]], ...] = (
+    ("usage", ("prompt_tokens", "completion_tokens", "total_tokens"), {}),
+    (
+        "usage",
+        ("input_tokens", "output_tokens", "total_tokens"),
+        {"cache_creation_input_tokens": False, "cache_read_input_tokens": False},
+    ),
+    (
+        "usageMetadata",
+        ("promptTokenCount", "candidatesTokenCount", "totalTokenCount"),
+        {"thoughtsTokenCount": True, "toolUsePromptTokenCount": False},
+    ),
+)
+_REASONING = (
+    ("completion_tokens_details", "reasoning_tokens"),
+    ("output_tokens_details", "reasoning_tokens"),
+    ("thoughtsTokenCount",),
+)
+
+
+@dataclass(frozen=True)
+class Usage:
+    """Tokens of a call; completion holds the reasoning, which may be unknown."""
+
+    prompt: int
+    completion: int
+    reasoning: int | None = None
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What we know of a call without the provider: bytes of its prompt's text, frames, bytes of the text it gave."""
+
+    prompt_bytes: int
+    frames: int
+    text_bytes: int
+
+    def contradict(self, usage: Usage) -> bool:
+        """Whether a usage is below what this takes at the very least: no answer took nothing."""
+        least = self.prompt_bytes // BYTES_A_TOKEN + self.frames * TOKENS_A_FRAME
+        return usage.prompt < least or usage.completion < max(1, -(-self.text_bytes // BYTES_A_TOKEN))
+
+
+def read_usage(body: Any, sizes: Sizes) -> Usage | None:
+    """The usage in an answer's body. None where it is not there, not whole, not possible, or below what prompt and text
+    take by our own count."""
+    for name, (prompt, completion, total), apart in _FORMS:
+        fields = body.get(name) if isinstance(body, Mapping) else None
+        if isinstance(fields, Mapping) and prompt in fields:
+            usage = _whole(fields, prompt, completion, total, apart)
+            return None if usage is None or sizes.contradict(usage) else usage
+    return None
+
+
+def _whole(
+    fields: Mapping[str, Any], prompt: str, completion: str, total: str | None, apart: Mapping[str, bool]
+) -> Usage | None:
+    told = {name: fields[name] for name in (prompt, completion, total, *apart) if name and name in fields}
+    if prompt == "promptTokenCount":
+        told.setdefault(completion, 0)  # Gemini leaves it out where all was thought; its sum is always there
+        if total not in told:
+            return None
+    if prompt == "input_tokens":
+        told = {name: value for name, value in told.items() if not (name in apart and value is None)}
+    elif told.get(str(total), 0) is None:
+        del told[str(total)]
+    if completion not in told or not all(map(_is_count, told.values())):
+        return None
+    asked = told[prompt] + sum(told.get(name, 0) for name, of_answer in apart.items() if not of_answer)
+    given = told[completion] + sum(told.get(name, 0) for name, of_answer in apart.items() if of_answer)
+    if total in told:
+        if told[total] < told[prompt] + told[completion]:
+            return None
+        given = max(given, told[total] - asked)  # some tell their reasoning in the sum alone
+    return Usage(asked, given, _reasoning(fields, given))
+
+
+def _reasoning(fields: Mapping[str, Any], most: int) -> int | None:
+    for path in _REASONING:
+        value: Any = fields
+        for name in path:
+            value = value.get(name) if isinstance(value, Mapping) else None
+        if _is_count(value) and value <= most:
+            return value
+    return None
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value <= MOST_TOKENS

@@ -1,0 +1,68 @@
+"""Lines of JSON that are appended, each with a checksum of its own: what a line says is believed only if it is what was
+written."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+_SUM = b', "sum": "'
+_TAIL = len(_SUM) + 16 + len(b'"}\n')
+NOT_WHOLE = "not what was written"
+
+
+def checked_line(row: Mapping[str, Any]) -> bytes:
+    """A row (not empty) as a line, its checksum in it as the last field. Raises ValueError for NaN."""
+    body = json.dumps(row, ensure_ascii=False, allow_nan=False).encode()[:-1]
+    return body + _SUM + _sum_of(body) + b'"}\n'
+
+
+def _sum_of(body: bytes) -> bytes:
+    return blake2b(body, digest_size=8).hexdigest().encode()
+
+
+def is_whole(line: bytes) -> bool:
+    """Whether a line is what `checked_line` made."""
+    tail = line[-_TAIL:]
+    return tail.startswith(_SUM) and tail.endswith(b'"}\n') and tail[len(_SUM) : -3] == _sum_of(line[:-_TAIL])
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a file, from 1. whole: whether it is what was written; torn: a last line that a crash cut off."""
+
+    number: int
+    content: bytes
+    whole: bool
+    torn: bool = False
+
+
+def read_checked(path: Path) -> Iterator[Line]:
+    """The lines of a file that `append_whole` and `checked_line` wrote, damaged ones too."""
+    with path.open("rb") as stream:
+        for number, line in enumerate(stream, start=1):
+            if not line.endswith(b"\n"):  # the last one; that which lacks only its end, or has another one, is whole
+                ended = line + b"\n" if is_whole(line + b"\n") else line[:-1] + b"\n"
+                yield Line(number, ended, is_whole(ended), torn=not is_whole(ended))
+            else:
+                yield Line(number, line, is_whole(line))
+
+
+def append_whole(descriptor: int, content: bytes) -> None:
+    """Append all of it, or nothing: half a line would swallow the next one. Raises OSError."""
+    size, left = os.lseek(descriptor, 0, os.SEEK_END), content
+    try:
+        while left:
+            written = os.write(descriptor, left)
+            if not written:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            left = left[written:]
+    except OSError:
+        os.ftruncate(descriptor, size)
+        raise
