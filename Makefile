@@ -18,17 +18,18 @@ demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
 demo-mechanism: setup ## the pocket model from hidden states to steering, on the CPU, no key needed
 	TRAPS_WORKSPACE=$(CURDIR)/.workspaces/mechanism $(BIN)/traps run mechanism
 
-# A worker a core: threads of their own would only wait for each other's. Workers steal what another has yet to do.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+# Threads of a worker's own would only wait for another's. Workers steal what another has yet to do.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist worksteal
 
 check: setup ## lint, types and the fast tests, side by side: under three minutes
 	$(MAKE) --no-print-directory -j2 --output-sync=line lint fast-tests
 
 fast-tests: setup
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -n 2 -m "not slow"
 
+# One more worker than the two cores that are needed: tests of servers and of Dagster's daemon wait for much of their time.
 test: test-packages setup lint ## lint, types and all tests, the slow ones too
-	$(PYTEST)
+	$(PYTEST) -n 3
 
 ui: setup ## Dagster's web server and daemon on 127.0.0.1:$(PORT); open the address that it prints
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
