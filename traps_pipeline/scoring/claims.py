@@ -1,4 +1,4 @@
-"""The arithmetic of every statement in `claims.csv`: what the published tables give for it (`audit` compares)."""
+"""The arithmetic of every statement in `claims.csv`, from the published tables (`audit` compares the results)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DOSE_AGAINST_REGIME = (
 
 @dataclass(frozen=True)
 class Recomputed:
-    """A statement as our arithmetic gives it, worded as published, and why it may differ."""
+    """A statement as recomputed, in the published wording, and the reason why it may differ."""
 
     words: str
     reason: str = ""
