@@ -1,4 +1,4 @@
-"""The rule judge: declining is abstaining, hedging is not, and an answer cannot tell its judge what to say."""
+"""The rule judge: declining is abstaining, hedging is not, and an answer cannot instruct its judge."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The confabulation judge against two annotators: hand-worked figures, scikit-learn, files that people get wrong."""
+"""The confabulation judge against two annotators: hand-worked figures, scikit-learn, and files with mistakes."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def test_a_sheet_is_written_filled_in_and_compared_by_the_commands(
     assert {row["response"] for row in rows} == {"It goes left.", "'=HYPERLINK(1)", texts[2], "Left."}
     assert {row["reasoning_trace"] for row in rows} == {""}  # the judge saw none
     assert main(["confabulation", "sheet", str(sheet), *at]) == 1  # it may hold labels by now
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
 
     with filled.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]))

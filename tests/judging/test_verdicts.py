@@ -1,4 +1,4 @@
-"""From votes to verdicts, and a real panel over real HTTP whose every vote is known."""
+"""From votes to verdicts, also with a real panel over HTTP, all of whose votes are known."""
 
 from __future__ import annotations
 

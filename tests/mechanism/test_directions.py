@@ -1,4 +1,4 @@
-"""Void directions: hand-worked vectors, controls of the same norm, which pairs, saved and read back."""
+"""Void directions: hand-worked vectors, controls of the same norm, the choice of pairs, and files read back."""
 
 from __future__ import annotations
 

@@ -45,9 +45,9 @@ def _report(
         files = make(workspace)
         return Made(files, shown=_previews(files))
 
-    there = [dep for dep in deps if shown(dep)]
-    needs: dict[str, Need] = dict.fromkeys(there, "none")
-    return stage(name, made, doc=doc, group=group, deps=[key_of(dep) for dep in there], needs=needs, kinds=kinds)
+    existing = [dep for dep in deps if shown(dep)]
+    needs: dict[str, Need] = dict.fromkeys(existing, "none")
+    return stage(name, made, doc=doc, group=group, deps=[key_of(dep) for dep in existing], needs=needs, kinds=kinds)
 
 
 def _previews(files: Mapping[str, bytes]) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def _sheet_row(workspace: Workspace, sample: str, label: Mapping[str, Any]) -> d
     if not item or sample_id(cell, item_id, response.get("text"), trace) != sample:
         raise TrapsError(
             f"{workspace.root}: the labels of {cell.key} are of earlier answers (of {item_id}, for one); materialize "
-            "confabulation, then write the sheet anew"
+            "confabulation, then write the sheet again"
         )
     shown = {
         "question": item["question"],
@@ -101,7 +101,7 @@ def _no_formula(text: str) -> str:
 def write_sheet(rows: Sequence[Mapping[str, str]], path: Path) -> None:
     """Write a sheet as CSV. Raises TrapsError if the file exists already, since it may hold labels."""
     if path.exists():
-        raise TrapsError(f"{path} is there already and may hold labels; give another name, or delete it")
+        raise TrapsError(f"{path} exists already and may hold labels; give another name, or delete it")
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
         writer.writerow(SHEET_COLUMNS)

@@ -107,8 +107,8 @@ class ProbeRun:
         }
 
     def _scenarios(self, taxonomy: str) -> pd.Index:
-        mine = self.items.loc[self.items["dataset"].str.startswith(taxonomy), "scenario_id"]
-        return pd.Index(sorted(mine.unique()))
+        ids = self.items.loc[self.items["dataset"].str.startswith(taxonomy), "scenario_id"]
+        return pd.Index(sorted(ids.unique()))
 
     def _split(self, name: str, layer: int) -> Split:
         states = np.asarray(self.read(name, layer), float)

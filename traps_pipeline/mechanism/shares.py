@@ -47,9 +47,9 @@ def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
     decided by itself: after a change of panel, a cell has votes of the old panel until its votes are made again."""
     votes_on, none = dict(iter(votes.groupby(_CELL))), votes.head(0)
     parts: list[pd.DataFrame] = []
-    for cell, mine in answers.groupby(_CELL, sort=False):
-        values, _ = ratings(votes_on.get(cell, none), answer=_ANSWER).on(mine, ABSTENTION)
-        parts.append(mine.assign(abstained=decided(majority(values))))
+    for cell, of_cell in answers.groupby(_CELL, sort=False):
+        values, _ = ratings(votes_on.get(cell, none), answer=_ANSWER).on(of_cell, ABSTENTION)
+        parts.append(of_cell.assign(abstained=decided(majority(values))))
     return pd.concat(parts, ignore_index=True)
 
 

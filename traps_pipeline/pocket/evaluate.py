@@ -180,8 +180,8 @@ def markdown(cells: Sequence[AnswerCounts]) -> str:
         f"|{' --- |' * len(COLUMNS)}",
     ]
     for family, regime in dict.fromkeys((cell.family, cell.regime) for cell in cells):
-        mine = [cell for cell in cells if (cell.family, cell.regime) == (family, regime)]
-        by_kind = {kind: [cell for cell in mine if cell.kind == kind] for kind in KINDS}
+        of_row = [cell for cell in cells if (cell.family, cell.regime) == (family, regime)]
+        by_kind = {kind: [cell for cell in of_row if cell.kind == kind] for kind in KINDS}
         control = by_kind["control"]
         columns = [
             _spread([cell.correct / cell.n for cell in control]),

@@ -90,9 +90,9 @@ def leaderboards(board: pd.DataFrame, robust: pd.DataFrame | None = None, *, bri
     The first table is `overall`; if no model has all four datasets it is the first dataset of the board. An entry
     without a row in it comes last. brief: without deviations, runs and epochs.
     """
-    there = set(board["dataset"])
-    ranked = next((name for name in TITLES if name in there), "overall")
-    others = [name for name in DATASETS if name in there and name != ranked]
+    datasets = set(board["dataset"])
+    ranked = next((name for name in TITLES if name in datasets), "overall")
+    others = [name for name in DATASETS if name in datasets and name != ranked]
     own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief) for name in others]
     rows = []
     if robust is not None and ranked == "overall":  # a null text that was read from a file is NaN

@@ -149,8 +149,8 @@ class Results:
 
 def datasets_of(cells: pd.DataFrame) -> list[str]:
     """The datasets of the cells, in the benchmark's order."""
-    there = set(cells["dataset"])
-    return [name for name in DATASETS if name in there]
+    names = set(cells["dataset"])
+    return [name for name in DATASETS if name in names]
 
 
 def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:

@@ -156,11 +156,11 @@ def holm(p: np.ndarray) -> np.ndarray:
 def _pairs(entries: Sequence[tuple[str, str, str]]) -> Iterator[tuple[str, str, _Side, _Side]]:
     """kind, dataset, left, right of every comparison, each once."""
     for dataset in (*DATASETS, "overall"):
-        there = [(model, regime) for model, regime, name in entries if name == dataset]
-        for left, right in combinations(there, 2):
+        sides = [(model, regime) for model, regime, name in entries if name == dataset]
+        for left, right in combinations(sides, 2):
             if left[1] == right[1]:
                 yield "models", dataset, left, right
-        for left, right in combinations(sorted(there, key=lambda side: (side[0], REGIMES.index(side[1]))), 2):
+        for left, right in combinations(sorted(sides, key=lambda side: (side[0], REGIMES.index(side[1]))), 2):
             if left[0] == right[0]:
                 yield "regimes", dataset, left, right
 

@@ -78,9 +78,9 @@ def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
     Among sets of the same size it is the one that most runs have, then the first in the order of ARMS."""
     sets: dict[tuple[str, ...], list[int]] = {}
     for run, rows in group.groupby("run", sort=True):
-        there = {*rows["dataset"]}
-        arms = tuple(arm for arm in ARMS if arm in there)
-        if arms and there.issuperset(DATASETS):
+        datasets = {*rows["dataset"]}
+        arms = tuple(arm for arm in ARMS if arm in datasets)
+        if arms and datasets.issuperset(DATASETS):
             sets.setdefault(arms, []).append(cast(int, run))
     if not sets:
         return [], ()

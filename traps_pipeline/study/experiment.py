@@ -36,7 +36,7 @@ class Experiment(BaseModel):
     budget_usd: float | None = Field(default=None, ge=0.0)
     model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] | None = None
     allow_unknown_prices: bool | None = None
-    mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")
+    mechanism: MechanismSettings | None = Field(default=None, description="local models to read and steer")
 
     @field_validator("datasets")
     @classmethod

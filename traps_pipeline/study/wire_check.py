@@ -163,12 +163,12 @@ def _clip_problems(clips: Sequence[ClipPart], media: Media) -> Iterator[str]:
         found.update(clip.data)
     if found.hexdigest() != media.sha256:
         yield "media: the bytes that arrive are not those that were prepared"
-    for name, seen, mine in (
+    for name, seen, declared in (
         ("type", {clip.mime for clip in clips}, _MIMES[media.profile]),
         ("fps", {clip.fps for clip in clips}, media.fps),
     ):
-        if seen != {mine}:
-            yield f"media.{name}: {mine} is declared, {', '.join(map(str, seen))} arrives"
+        if seen != {declared}:
+            yield f"media.{name}: {declared} is declared, {', '.join(map(str, seen))} arrives"
 
 
 def _wire_problems(entry: Entry, request: Request, wire: WireBody) -> Iterator[str]:

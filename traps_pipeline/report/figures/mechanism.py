@@ -193,7 +193,7 @@ def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
 
 
 def _panels(rows: pd.DataFrame) -> Mapping[tuple[str, str], pd.DataFrame]:
-    """Rows of each model and path set of which every path was steered, under the most guided regimes of the model."""
+    """Rows of each model and complete path set, under the most guided regimes of the model."""
     found: dict[tuple[str, str], pd.DataFrame] = {}
     for model, of in rows.groupby("model", sort=False):
         guided = (of["directions"] == "guided").astype(int) + 2 * (of["regime"] == "guided").astype(int)

@@ -90,8 +90,8 @@ def _flat(value: Any) -> str:
 
 def _entries(results: Results) -> Iterable[ModelEntry]:
     """Registry entries of the models with results, in the registry's order."""
-    there = set(results.cells["model"])
-    return [entry for entry in load_models().values() if entry.id in there]
+    evaluated = set(results.cells["model"])
+    return [entry for entry in load_models().values() if entry.id in evaluated]
 
 
 def composition(results: Results) -> list[PrintedTable]:
