@@ -11,7 +11,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def _assets() -> list[dg.AssetsDefinition | dg.SourceAsset]:
-    """What `defs/` declares, as Dagster's loader finds it, without the groups that the study has no use for."""
+    """The assets that `defs/` declares, from Dagster's loader, without the groups that the study does not use."""
     require_checkout()
     found = dg.load_definitions_from_package_module(declared).assets or ()
     shown = {one.spec.key for one in DECLARED.values()}
@@ -19,7 +19,7 @@ def _assets() -> list[dg.AssetsDefinition | dg.SourceAsset]:
     return [one for one in assets if one.key in shown]
 
 
-# In process: a run costs 2 s instead of 5, and rendering and asking bring their own processes and connections.
+# Runs are in process: a run costs 2 s instead of 5, and rendering and calls use their own processes and connections.
 defs = dg.Definitions(
     assets=_assets(),
     jobs=JOBS,

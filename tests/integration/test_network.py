@@ -272,8 +272,8 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
         ("not json", "not JSON"),
         ('{"key": "k", "text": "x", "mood": 1}', "mood: Extra inputs"),
         ('{"key": "k", "outcome": "error"}', "an error is no answer"),
-        ('{"key": "k", "outcome": "answer", "text": " "}', "outcome 'answer' needs one"),
-        ('{"key": "k", "outcome": "refused", "text": "no"}', "outcome 'refused' has none"),
+        ('{"key": "k", "outcome": "answer", "text": " "}', "outcome 'answer' needs a text"),
+        ('{"key": "k", "outcome": "refused", "text": "no"}', "outcome 'refused' must have no text"),
     ],
 )
 def test_a_line_that_is_no_answer_is_named(tmp_path: Path, line: str, complaint: str) -> None:

@@ -1,4 +1,4 @@
-"""VOTES rows made by hand, and studies that hold answers without a model having been asked."""
+"""VOTES rows made by hand, and studies with answers that no model was asked for."""
 
 from __future__ import annotations
 

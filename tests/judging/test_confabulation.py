@@ -1,4 +1,4 @@
-"""Which void failures are sampled, what the judge is shown of them, and what its labels come to."""
+"""Which void failures are sampled, what the judge is shown of them, and how its labels are counted."""
 
 from __future__ import annotations
 
@@ -295,10 +295,10 @@ def test_the_papers_six_models_are_sampled_and_half_of_them_show_their_trace() -
             "judges.paper is 'rule-1'; it must be a judge over the network",
         ),
         (("gemini-3.1-pro:", "gemini-9:"), "unknown model 'gemini-9'"),
-        (("run: 1", "run: 4"), "has 3 runs, not run 4"),
+        (("run: 1", "run: 4"), "run is 4, but gemini-2.5-flash has only 3 runs"),
         (("n: 100\nseed", "n: 0\nseed"), "n: Input should be greater"),
         (("qwen3-vl-instruct: output", "qwen3-vl-instruct: trace"), "models.qwen3-vl-instruct: Input should be"),
-        (("models: [gemini-2.5-flash,", "models: [gpt-5-pro,"), "validation.models: gpt-5-pro not among models"),
+        (("models: [gemini-2.5-flash,", "models: [gpt-5-pro,"), "validation.models: gpt-5-pro must be among"),
     ],
 )
 def test_a_wrong_protocol_is_named(tmp_path: Path, change: tuple[str, str], complaint: str) -> None:

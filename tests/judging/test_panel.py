@@ -1,4 +1,4 @@
-"""What judges are shown, which votes count, and when three votes decide."""
+"""What judges are shown, which votes are valid, and when three votes decide."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Answers that try to instruct their judge: which votes move, and that the check would see it."""
+"""Answers that try to instruct their judge: which votes they change, and that the check detects the change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rule judge: declining is abstaining, hedging is not, and an answer cannot tell its judge what to say."""
+"""The rule judge: declining is abstaining, hedging is not, and an answer cannot instruct its judge."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ITEM = {
 
 
 def decision(task: Task, answer: str, ground_truth: str = "left") -> bool | None:
-    """What the judge's vote comes to, through everything a vote goes through."""
+    """The judge's decision, by the same code path as any vote."""
     about = {"task": task, "item_id": "i", "model": "m", "regime": "standard", "run": 1}
     user = render(task, QUESTION, answer, ground_truth)
     outcome = asyncio.run(RuleJudge().ask(Request("rule-1", "rule", {}, "system", user, about)))

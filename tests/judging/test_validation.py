@@ -1,4 +1,4 @@
-"""The confabulation judge against two annotators: hand-worked figures, scikit-learn, files that people get wrong."""
+"""The confabulation judge against two annotators: hand-worked figures, scikit-learn, and files with mistakes."""
 
 from __future__ import annotations
 
@@ -128,13 +128,13 @@ def test_labels_are_read_whatever_their_words_their_order_and_the_other_columns(
         (["annotator,sample_id", "ann,s1"], "labels.csv:1: column hallucinated_premise, invalid_inference"),
         ([HEAD, *GOOD[:3], "bob,s2,1,0,2,1"], "labels.csv:5: epistemic_surrender is '2'; write 1 or 0"),
         ([HEAD, *GOOD[:3], "bob,s2,1,0,1"], "labels.csv:5: doubt_in_reasoning is ''"),
-        ([HEAD, *GOOD[:3], "bob,s9,1,0,1,1"], "labels.csv:5: sample_id 's9' is none that the judge has labelled"),
+        ([HEAD, *GOOD[:3], "bob,s9,1,0,1,1"], "labels.csv:5: sample_id 's9' is not a failure"),
         ([HEAD, *GOOD[:3], ",s2,1,0,1,1"], "labels.csv:5: annotator is empty"),
-        ([HEAD, *GOOD, "bob,s2,0,0,0,0"], "labels.csv:6: bob has labelled s2 on line 5 already"),
+        ([HEAD, *GOOD, "bob,s2,0,0,0,0"], "labels.csv:6: bob has already labelled s2 on line 5"),
         ([HEAD, *GOOD[:3]], "labels.csv:3: only ann has labelled s2; both annotators must"),
-        ([HEAD, *GOOD[:2]], "labels of 1 annotators (ann); two are compared"),
-        ([HEAD, *GOOD, "cy,s1,1,1,1,1"], "labels of 3 annotators (ann, bob, cy)"),
-        ([HEAD], "labels of 0 annotators (none)"),
+        ([HEAD, *GOOD[:2]], "has 1 annotators (ann); it needs exactly two"),
+        ([HEAD, *GOOD, "cy,s1,1,1,1,1"], "has 3 annotators (ann, bob, cy)"),
+        ([HEAD], "has 0 annotators (none)"),
     ],
 )
 def test_a_wrong_label_file_is_answered_with_line_and_column(tmp_path: Path, lines: list[str], complaint: str) -> None:
@@ -182,7 +182,7 @@ def test_a_sheet_is_written_filled_in_and_compared_by_the_commands(
     assert {row["response"] for row in rows} == {"It goes left.", "'=HYPERLINK(1)", texts[2], "Left."}
     assert {row["reasoning_trace"] for row in rows} == {""}  # the judge saw none
     assert main(["confabulation", "sheet", str(sheet), *at]) == 1  # it may hold labels by now
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
 
     with filled.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]))

@@ -1,4 +1,4 @@
-"""From votes to verdicts, and a real panel over real HTTP whose every vote is known."""
+"""From votes to verdicts, also with a real panel over HTTP, all of whose votes are known."""
 
 from __future__ import annotations
 
@@ -76,7 +76,9 @@ def test_a_judged_answer_without_three_votes_a_task_is_refused_by_name() -> None
     items, responses = undone("control")
     whole = control_votes("nnn", "yyy")
     for votes in (whole[whole["task"] == "abstention"], whole[whole["judge"] != "c"], whole.iloc[1:]):
-        with pytest.raises(TrapsError, match=r"votes occlusion\|m__standard__run1: item occlusion:s-0000:control has"):
+        with pytest.raises(
+            TrapsError, match=r"votes occlusion\|m__standard__run1: item occlusion:s-0000:control does not have 3 votes"
+        ):
             decide(items, responses, votes)
 
 

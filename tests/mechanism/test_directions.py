@@ -1,4 +1,4 @@
-"""Void directions: hand-worked vectors, controls of the same norm, which pairs, saved and read back."""
+"""Void directions: hand-worked vectors, controls of the same norm, the choice of pairs, and files read back."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_discarded_scenario_moves_no_other() -> None:
 
 def test_directions_come_back_as_they_were_saved_and_damage_is_told(tmp_path: Path) -> None:
     made, path = extract_directions(*pair_states(), [1]), tmp_path / "a" / "chaotic.safetensors"
-    with pytest.raises(TrapsError, match="is not there; `traps run` makes both"):
+    with pytest.raises(TrapsError, match="is missing; `traps run` makes both"):
         load_directions(path)
     save_directions(path, made, origin())
     back, said = load_directions(path)

@@ -1,4 +1,4 @@
-"""Hidden states are the library's own, and an extraction that was stopped goes on where it stopped."""
+"""Hidden states equal the library's own, and an extraction that was stopped continues where it stopped."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_kept_state_keeps_no_other_alive() -> None:
 
 
 def work(of: LocalModel, n: int = 5, opened: Callable[[int], None] = lambda i: None, **changed: str) -> list[Item]:
-    """Items of different questions; `opened` is told whenever a prompt is made. changed: questions by item id."""
+    """Items with different questions; `opened` is called whenever a prompt is made. changed: questions by item id."""
 
     def item(i: int) -> Item:
         question = changed.get(f"item{i}", f"Does it stop after {i} s?")
@@ -180,7 +180,7 @@ def test_an_extraction_that_breaks_off_keeps_what_was_made(tmp_path: Path) -> No
 
     with pytest.raises(_Stop):
         extract(of, work(of, opened=failing), tmp_path, shard_size=2)
-    with pytest.raises(TrapsError, match="not there or not finished"):
+    with pytest.raises(TrapsError, match="missing or not finished"):
         read_layer(tmp_path, 1)
     assert extract(of, work(of, opened=opened.append), tmp_path, shard_size=2).n_new == 2
     assert opened == [3, 4]

@@ -1,4 +1,4 @@
-"""Steering adds alpha v to the output of one block and nothing else; where alpha is 0 it is not there at all."""
+"""Steering adds alpha v to the output of one block and changes nothing else; at alpha 0 there is no hook at all."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_the_hook_is_gone_after_an_exception(family: Family) -> None:
         raise RuntimeError("in between")
     assert hooks(of) == before
     assert torch.equal(logits(of, family), expected)
-    with pytest.raises(ValueError, match="1 rows are in the pass, 2 alphas"):
+    with pytest.raises(ValueError, match="the pass has 1 rows, but 2 alphas"):
         of.forward_states(ask(of), steering=Steering(direction(of), 2, (5.0, 5.0)))
     assert hooks(of) == before
 

@@ -1,4 +1,4 @@
-"""Probes: the exact solver against scikit-learn, AUROC, what a fit may see, what the protocol finds."""
+"""Probes: the exact solver against scikit-learn, AUROC, which data a fit may use, and the rows of the protocol."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_folds_keep_a_scenario_together_and_differ_by_one_at_most() -> None:
     assert all(len(set(folds[scenario == s])) == 1 for s in range(13))
     sizes = [len(set(scenario[folds == f])) for f in range(5)]
     assert sorted(sizes) == [2, 2, 3, 3, 3]
-    with pytest.raises(TrapsError, match="5 folds need 5 scenarios, there are 4"):
+    with pytest.raises(TrapsError, match="5 folds need 5 scenarios, but there are 4"):
         scenario_folds(np.arange(4), 5, seed=1)
 
 
@@ -132,7 +132,7 @@ def test_shuffled_labels_give_half_on_average_even_where_the_signal_is_perfect()
 
 def test_states_that_are_no_numbers_and_a_missing_class_are_told() -> None:
     states, void = random_states(20, 5)
-    with pytest.raises(TrapsError, match="needs void and control items, there are 20 void of 20"):
+    with pytest.raises(TrapsError, match="needs void and control items, but 20 of 20 items are void"):
         fit_probe(states, np.ones(20, bool))
     with pytest.raises(TrapsError, match="no probe can be fitted to these 20 rows"):
         solve_gram(np.full((20, 20), np.nan), void)
@@ -272,7 +272,7 @@ def test_catch_rates_are_shares_of_a_sub_scenarios_voids(rows: pd.DataFrame) -> 
 def test_a_layer_out_of_range_and_missing_states_are_told() -> None:
     items, states = study(pairs=4)
     settings = ProbeSettings(resamples=100)
-    with pytest.raises(TrapsError, match="centroid layer 32 is out of range, there are states of layers 0 to 3"):
+    with pytest.raises(TrapsError, match="centroid layer 32 is out of range; there are states of layers 0 to 3"):
         ProbeRun(items, lambda d, n: states[d, n], LAYERS, 32, settings, 7)
     with pytest.raises(TrapsError, match="no hidden states of any dataset"):
         ProbeRun(items.iloc[:0], lambda d, n: states[d, n], LAYERS, 1, settings, 7)

@@ -1,4 +1,4 @@
-"""Abstention over many paths: answers that stand in several count once as answers, and intervals resample scenarios."""
+"""Abstention over many paths: an answer in several paths counts once as an answer, and intervals resample scenarios."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ def test_two_items_with_the_same_clip_and_question_have_the_same_states(own: Wor
 
 def test_states_that_are_gone_are_told(own: Workspace) -> None:
     shutil.rmtree(own.root / "states" / "tiny" / "standard" / "chaotic")
-    with pytest.raises(TrapsError, match="hidden states are not there or not finished; materialize hidden_states"):
+    with pytest.raises(TrapsError, match="hidden states are missing or not finished; materialize hidden_states"):
         stages.direction_rows(own, STANDARD)
     with pytest.raises(TrapsError, match="no hidden states of tiny__guided"):
         stages.direction_rows(own, Extraction("tiny", "guided"))
@@ -213,7 +213,7 @@ def test_probes_take_confabulated_items_from_the_verdicts_and_are_fitted_once(
     notes = cf[cf["value"].isna()].set_index(["source", "target"])["note"]
     assert len(notes) == 10
     assert "confabulated on none of the 4 judged void items" in notes["chaotic", "chaotic_ill_posed"]
-    assert "verdicts occlusion_ill_posed|tiny__standard__run1 are not there" in notes["chaotic", "occlusion_ill_posed"]
+    assert "there are no verdicts occlusion_ill_posed|tiny__standard__run1" in notes["chaotic", "occlusion_ill_posed"]
     own.tables.write(PROBES, STANDARD.partition, rows, {})
     monkeypatch.setattr(probing.ProbeRun, "rows", lambda *_: pytest.fail("fitted again"))
     again = pd.DataFrame(stages.probe_rows(own, STANDARD))

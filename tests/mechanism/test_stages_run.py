@@ -1,4 +1,4 @@
-"""`traps run` walks the mechanistic stages through Dagster, and a second time computes nothing."""
+"""`traps run` makes the mechanistic stages through Dagster; a second run computes nothing."""
 
 from __future__ import annotations
 

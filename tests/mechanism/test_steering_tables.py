@@ -1,4 +1,4 @@
-"""What the tables of probes and steering show, against the paper's printed tables and hand-worked effects."""
+"""The tables of probes and steering, compared with the paper's printed tables and hand-worked effects."""
 
 from __future__ import annotations
 

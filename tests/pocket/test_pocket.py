@@ -1,4 +1,4 @@
-"""The pocket model: what it is trained on, that training goes on bit for bit, and what ships with the repository."""
+"""The pocket model: its training data, training that continues bit for bit, and the files that ship with it."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ def test_training_that_was_stopped_goes_on_bit_for_bit(recipe: Recipe, data: Pat
     assert not (tmp_path / "stopped" / WEIGHTS).exists()
     resumed = train(recipe, data, tmp_path / "stopped", 1)
     assert (whole / "model.safetensors").read_bytes() == (resumed / "model.safetensors").read_bytes()
-    with pytest.raises(TrapsError, match="another seed"):
+    with pytest.raises(TrapsError, match="belongs to another recipe, data or seed"):
         train(recipe, data, tmp_path / "stopped", 2)
 
 
@@ -331,8 +331,8 @@ def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Pa
 def test_figures_of_weights_that_lie_there_no_more_are_refused(tmp_path: Path) -> None:
     workspace = examined_study(tmp_path, 3, 1.0, 0.5)
     (tmp_path / "seed3" / FACTS).unlink()
-    with pytest.raises(TrapsError, match="does not say which seed"):
+    with pytest.raises(TrapsError, match="does not name the seed"):
         inside.figures_of(workspace)
     (tmp_path / "seed3" / WEIGHTS / "model.safetensors").write_bytes(b"others")
-    with pytest.raises(TrapsError, match="other weights or none lie there now"):
+    with pytest.raises(TrapsError, match="that folder now has other weights or none"):
         inside.figures_of(workspace)

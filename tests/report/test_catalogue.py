@@ -1,4 +1,4 @@
-"""Every table and figure, from the paper's numbers, from an empty study and from a partial one."""
+"""Every table and figure, made from the paper's numbers, from an empty study and from a partial one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The items behind a number: every answer, vote and verdict as text, a page a cell, made anew only where needed."""
+"""The items behind a number: every answer, vote and verdict as text, one page per cell, rewritten only if needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What people read says what the table says, escaped, and the same on every build."""
+"""The printed leaderboard and the report page show the table's content, escaped, and the same on every build."""
 
 from __future__ import annotations
 

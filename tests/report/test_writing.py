@@ -1,4 +1,4 @@
-"""A table says the same in every medium, escaped for it; a file has the same bytes on every build."""
+"""A table has the same content in every format, escaped for it; a file has the same bytes on every build."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_dash_and_a_spread_are_explained_where_they_occur():
     assert table().remarks == [
         "epoch e1",
         "± population standard deviation over runs",
-        "– not run, or undefined for want of decided items",
+        "– not run, or undefined because no item is decided",
     ]
     whole = PrintedTable("t", "T", pd.DataFrame({"n": [1]}), [Column("n", "n", "count")])
     assert whole.remarks == []

@@ -1,4 +1,4 @@
-"""Verdict rows made by hand: one call a cell, one pair a scenario."""
+"""Verdict rows made by hand: one call per cell, one pair per scenario."""
 
 from __future__ import annotations
 

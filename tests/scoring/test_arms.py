@@ -1,4 +1,4 @@
-"""Arms stand beside the pairs: no figure of the pairs knows of them, and they have figures of their own."""
+"""Arms enter no figure of the pairs, and have figures of their own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The audit of the published tables: what agrees, and the arithmetic of what does not."""
+"""The audit of the published tables: the statements that agree, and the arithmetic of those that do not."""
 
 from pathlib import Path
 

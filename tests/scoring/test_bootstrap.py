@@ -1,4 +1,4 @@
-"""The cluster bootstrap against a loop that does the same slowly."""
+"""The cluster bootstrap compared with a slow loop that computes the same."""
 
 from __future__ import annotations
 

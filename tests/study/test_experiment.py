@@ -1,4 +1,4 @@
-"""An experiment names what is asked of whom; a wrong one is named by file and field."""
+"""An experiment names models and their questions; the error about a wrong one names file and field."""
 
 from __future__ import annotations
 

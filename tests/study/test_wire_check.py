@@ -1,4 +1,4 @@
-"""Every entry of the registry sends exactly what it declares; one that does not is told so."""
+"""Every entry of the registry sends exactly what it declares, and the check reports every difference."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_anything_beside_clip_and_question_is_found(monkeypatch: pytest.MonkeyPa
         pytest.param(
             altered("gpt-5-high", {"temperature": 0.8}),
             "gpt-5 doesn't support temperature=0.8 while reasoning is active",
-            id="a parameter that the model refuses is not dropped in silence",
+            id="a parameter that the model refuses is not dropped silently",
         ),
         pytest.param(
             altered("gpt-5-high", {"temperature": 0.8, "drop_params": True}),

@@ -1,4 +1,4 @@
-"""The `traps` command: its parser, and how it ends. A file beside this one is a noun, with its commands' arguments."""
+"""The `traps` command: its parser and exit codes. Each other file here has one noun and its commands' arguments."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from traps_pipeline.terminal import plain
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a subcommand; returns the exit code: 0 done, 1 something failed, 2 bad usage, 4 a budget is reached, 130
     interrupted."""
-    gc.set_threshold(50_000, 20, 20)  # most of what is imported stays: looking for garbage in it costs half a second
+    gc.set_threshold(50_000, 20, 20)  # imported objects stay: searching them for garbage costs half a second
     arguments = build_parser().parse_args(argv)
     command: Run = arguments.command
     try:
@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return FAILED
     except KeyboardInterrupt:
         print(
-            "\ntraps: interrupted; everything answered or rendered is kept. Run the same command to go on.",
+            "\ntraps: interrupted; every finished answer and clip is kept. Run the same command to continue.",
             file=sys.stderr,
         )
         return INTERRUPTED

@@ -1,4 +1,4 @@
-"""`traps certify` and `traps sample`: the benchmark's certificates, and a fresh draw of it."""
+"""`traps certify` and `traps sample`: the benchmark's certificates, and fresh samples of the benchmark."""
 
 from __future__ import annotations
 
@@ -12,22 +12,26 @@ from traps_pipeline.errors import TrapsError
 
 def add(commands: Commands) -> None:
     """Add `traps certify` and `traps sample`."""
-    text = "re-derive every certificate of the released records"
+    text = "compute every certificate of the released records again"
     parser = commands.add("certify", certify, text, workspace=False)
     parser.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
     parser.add_argument("--families", nargs="+", metavar="FAMILY", help="these only")
-    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
-    parser.add_argument("--fresh", action="store_true", help="certify again what an earlier call has certified")
+    parser.add_argument("--workers", type=int, help="processes (default: one per core)")
+    parser.add_argument(
+        "--fresh", action="store_true", help="certify all again, also scenarios that an earlier call has certified"
+    )
 
-    text = "draw a fresh benchmark, certified like the released one"
+    text = "sample a fresh benchmark, certified like the released one"
     parser = commands.add("sample", sample, text, workspace=False)
     parser.add_argument("--seed", type=int, required=True, help="the same seed gives the same scenarios")
     parser.add_argument("--out", type=Path, required=True, help="folder of the new benchmark")
     parser.add_argument("--name", help="its name (default: private-SEED)")
-    parser.add_argument("--families", nargs="+", metavar="FAMILY", help="these only (default: all)")
-    parser.add_argument("--scale", type=float, default=1.0, help="times as many scenarios as the released benchmark")
-    parser.add_argument("--count", type=int, help="so many scenarios of each family instead")
-    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
+    parser.add_argument("--families", nargs="+", metavar="FAMILY", help="sample only these (default: all)")
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="number of scenarios, relative to the released benchmark"
+    )
+    parser.add_argument("--count", type=int, help="number of scenarios of each family, instead of --scale")
+    parser.add_argument("--workers", type=int, help="processes (default: one per core)")
 
 
 def certify(arguments: argparse.Namespace) -> int:

@@ -1,7 +1,7 @@
-"""What all commands share: exit codes, how a command is added to the parser, the workspace and experiment it names.
+"""The parts that all commands share: exit codes, adding a command to the parser, its workspace and experiment.
 
-Nothing of the package but `errors`, `files` and `terminal` is imported before a command runs: `traps --help` answers at
-once.
+Only `errors`, `files` and `terminal` of the package are imported here before a command runs, so that `traps --help`
+answers at once.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from traps_pipeline.storage.workspace import Workspace
     from traps_pipeline.study.experiment import Experiment
 
-# Exit codes. Bad usage exits with 2, which argparse does by itself.
+# Exit codes. For bad usage argparse itself exits with 2.
 OK, FAILED, OVER_BUDGET, INTERRUPTED = 0, 1, 4, 130
 
-Run = Callable[[argparse.Namespace], int]  # a command: its parsed arguments to an exit code
+Run = Callable[[argparse.Namespace], int]  # a command: it takes its parsed arguments and returns an exit code
 
 
 class Commands:
@@ -32,7 +32,7 @@ class Commands:
             self._parsers = parser.add_subparsers(required=True)
 
     def add(self, name: str, run: Run, text: str, *, workspace: bool = True) -> argparse.ArgumentParser:
-        """A command; returns its parser, which takes its further arguments. workspace: whether it works in a study."""
+        """Add a command; returns its parser, for further arguments. workspace: whether the command works in a study."""
         parser = self._parsers.add_parser(name, help=text, description=text)
         parser.set_defaults(command=run)
         if workspace:
@@ -42,26 +42,27 @@ class Commands:
         return parser
 
     def noun(self, name: str, text: str) -> Commands:
-        """A noun, which has commands of its own."""
+        """Add a noun, which has commands of its own."""
         return Commands(self._parsers.add_parser(name, help=text, description=text))
 
 
 def root_of(arguments: argparse.Namespace) -> Path:
-    """The folder of the study that a command works in, whether there is one yet or not."""
+    """The folder of the study that a command works in; it may not exist yet."""
     from traps_pipeline.storage.workspace import Workspace
 
     return arguments.workspace.absolute() if arguments.workspace else Workspace.default_root()
 
 
 def open_workspace(arguments: argparse.Namespace) -> Workspace:
-    """The study that a command works in. Raises TrapsError naming the remedy where there is none."""
+    """The study that a command works in. Raises TrapsError naming the remedy if there is none."""
     from traps_pipeline.storage.workspace import Workspace
 
     return entered(Workspace.open(root_of(arguments)))
 
 
 def entered(workspace: Workspace) -> Workspace:
-    """The workspace, named to everything that this process loads and starts: partition keys are those of its study."""
+    """The workspace, after it was set in the environment, so that the partition keys here and in child processes are
+    those of its study."""
     from traps_pipeline.storage.workspace import VARIABLE
 
     os.environ[VARIABLE] = str(workspace.root)
@@ -70,7 +71,7 @@ def entered(workspace: Workspace) -> Workspace:
 
 
 def load_definitions() -> None:
-    """Declare the graph, which staleness is read off."""
+    """Declare the graph, from which staleness is computed."""
     import traps_pipeline.definitions  # noqa: F401 - its import is what declares the graph
 
 

@@ -1,4 +1,4 @@
-"""`traps confabulation`: the labels of void failures, held against people's."""
+"""`traps confabulation`: the judge's labels of void failures, compared with people's."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace
 
 def add(commands: Commands) -> None:
     """Add `traps confabulation sheet` and `traps confabulation validate`."""
-    noun = commands.noun("confabulation", "labels of void failures")
+    noun = commands.noun("confabulation", "compare labels of void failures with people's")
     for name, command, text in (
-        ("sheet", make_sheet, "write a CSV of labelled failures for a person to label blindly"),
+        ("sheet", make_sheet, "write a CSV of labelled failures, which people then label blindly"),
         ("validate", validate_judge, "compare the judge with the labels of two annotators"),
     ):
         parser = noun.add(name, command, text)

@@ -1,4 +1,4 @@
-"""`traps doctor`: whether this machine can do what a study needs."""
+"""`traps doctor`: whether this machine meets the requirements of a study."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from traps_pipeline.cli.command import FAILED, OK, Commands, root_of
 
 def add(commands: Commands) -> None:
     """Add `traps doctor`."""
-    parser = commands.add("doctor", doctor, "render one frame, encode it, and name what is missing")
+    parser = commands.add("doctor", doctor, "check this machine: render and encode a frame, and name what is missing")
     parser.add_argument(
-        "--local", action="store_true", help="try local models instead: tiny checkpoints of each family, devices, NF4"
+        "--local", action="store_true", help="check local models instead: tiny checkpoints of each family, devices, NF4"
     )
 
 
@@ -24,5 +24,7 @@ def doctor(arguments: argparse.Namespace) -> int:
     for finding in examine_local() if arguments.local else examine(root_of(arguments)):
         print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.detail}", flush=True)
         problems += not finding.ok
-    print(f"{problems} problem(s); {who} will not run" if problems else f"everything that {who} {needs} is here")
+    print(
+        f"{problems} problem(s); {who} will not run" if problems else f"this machine has everything that {who} {needs}"
+    )
     return FAILED if problems else OK

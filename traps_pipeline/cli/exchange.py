@@ -1,4 +1,4 @@
-"""`traps requests` and `traps answers`: calls that others make, and what they bring back."""
+"""`traps requests` and `traps answers`: export of calls that are made elsewhere, and import of their answers."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from traps_pipeline.cli.command import OK, Commands, experiment_of, open_workspa
 def add(commands: Commands) -> None:
     """Add `traps requests export` and `traps answers import`."""
     text = "write an experiment's missing calls and their media to a folder"
-    parser = commands.noun("requests", "calls for others to make").add("export", export_calls, text)
+    parser = commands.noun("requests", "export calls to be made elsewhere").add("export", export_calls, text)
     parser.add_argument("experiment")
     parser.add_argument("--out", type=Path, required=True, help="folder of requests.jsonl and media/")
 
-    text = "take answers (JSON lines by key) into the ledger"
-    parser = commands.noun("answers", "answers that others got").add("import", import_given, text)
+    text = "import answers (JSON lines by key) into the ledger"
+    parser = commands.noun("answers", "import answers from elsewhere").add("import", import_given, text)
     parser.add_argument("experiment")
     parser.add_argument("file", type=Path)
 

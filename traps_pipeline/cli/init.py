@@ -27,9 +27,9 @@ def init(arguments: argparse.Namespace) -> int:
 
 
 def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
-    """The workspace that a command names, made where it is missing, with the experiment in its study.
+    """The workspace that a command names, with the experiment in its study; a missing workspace is made.
 
-    Raises TrapsError where the study that is there differs from what the experiment asks for.
+    Raises TrapsError if the existing study differs from the one that the experiment needs.
     """
     from traps_pipeline.storage.workspace import Workspace
 

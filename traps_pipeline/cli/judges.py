@@ -1,4 +1,4 @@
-"""`traps judges check`: whether a panel can be told how to vote."""
+"""`traps judges check`: whether an answer can instruct a panel how to vote."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace
 
 def add(commands: Commands) -> None:
     """Add `traps judges check`."""
-    text = "put answers that instruct their judge to a panel; costs calls to judges"
-    parser = commands.noun("judges", "whether a panel can be told how to vote").add("check", check, text)
-    parser.add_argument("panel", nargs="?", help="of assets/judges.yaml (default: the study's)")
+    text = "give a panel answers that try to instruct their judge; makes calls to judges"
+    parser = commands.noun("judges", "test a panel against answers that instruct it").add("check", check, text)
+    parser.add_argument("panel", nargs="?", help="a panel of assets/judges.yaml (default: the study's)")
 
 
 def check(arguments: argparse.Namespace) -> int:

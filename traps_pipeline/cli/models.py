@@ -1,4 +1,4 @@
-"""`traps models check`: what the registry's entries really send."""
+"""`traps models check`: whether the registry's entries send what they declare."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from traps_pipeline.cli.command import FAILED, OK, Commands
 
 def add(commands: Commands) -> None:
     """Add `traps models check`."""
-    text = "show what models and judges are really sent; no key, nothing leaves here"
-    parser = commands.noun("models", "entries of the registry").add("check", check, text, workspace=False)
-    parser.add_argument("names", nargs="*", metavar="MODEL", help="these models and judges only")
+    text = "compare what models and judges are sent with their entries; needs no key, and nothing leaves this machine"
+    parser = commands.noun("models", "check entries of the registry").add("check", check, text, workspace=False)
+    parser.add_argument("names", nargs="*", metavar="MODEL", help="check only these models and judges")
 
 
 def check(arguments: argparse.Namespace) -> int:

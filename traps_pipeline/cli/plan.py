@@ -1,4 +1,4 @@
-"""`traps plan`: what an experiment would ask, and what that would cost."""
+"""`traps plan`: the calls that an experiment would make, and their cost."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def plan(arguments: argparse.Namespace) -> int:
         _print_forecasts(planned.forecasts)
     if planned.uncertain:
         print(
-            f"an upper bound: the items of {', '.join(planned.uncertain)} are not made, or are outdated: all "
-            "of their calls are counted as new. Materialize scene_specs, videos and items for exact counts."
+            f"This is an upper bound: the items of {', '.join(planned.uncertain)} are missing or outdated, so all of "
+            "their calls are counted as new. Materialize scene_specs, videos and items for exact counts."
         )
     return OK
 
@@ -53,7 +53,7 @@ def _plan_row(name: str, counts: tuple[Count, Count]) -> list[str]:
 
 
 def _print_forecasts(forecasts: Sequence[Forecast]) -> None:
-    """Tokens, dollars and minutes of the new calls over the network; an unknown price stays unknown in the sum."""
+    """Print tokens, dollars and minutes of the new calls over the network; the sum leaves out unknown prices."""
     known = [row.dollars for row in forecasts if row.dollars is not None]
     total = (sum(d[0] for d in known), sum(d[1] for d in known), sum(d[2] for d in known))
     longest = max(row.minutes for row in forecasts)

@@ -15,23 +15,23 @@ if TYPE_CHECKING:
 def add(commands: Commands) -> None:
     """Add `traps pocket render`, `train`, `evaluate` and `card`."""
     noun = commands.noun("pocket", "the small model that is trained here")
-    text = "draw the scenes that the pocket model is trained and tested on; goes on where it was stopped"
+    text = "draw the scenes that the pocket model is trained and tested on; continues where it was stopped"
     parser = _add(noun, "render", render, text)
     _add_scenes(parser)
 
-    text = "train the pocket model from scratch (renders what is missing); goes on where it was stopped"
+    text = "train the pocket model from scratch (renders missing scenes); continues where it was stopped"
     parser = _add(noun, "train", train, text)
     _add_scenes(parser)
     _add_weights(parser)
 
-    text = "ask trained weights about the held-out scenes, and write the counts"
+    text = "ask a trained model about the held-out scenes, and write the counts"
     parser = _add(noun, "evaluate", evaluate, text)
     _add_scenes(parser)
     _add_weights(parser)
-    parser.add_argument("--scenes", type=int, help="so many held-out scenes a family (default: all)")
+    parser.add_argument("--scenes", type=int, help="number of held-out scenes per family (default: all)")
     _add_counts(parser)
 
-    text = "write the counts, and what was found inside, into the model card"
+    text = "write the counts and the mechanistic figures into the model card"
     parser = _add(noun, "card", card, text)
     _add_counts(parser)
     parser.add_argument(
@@ -40,28 +40,30 @@ def add(commands: Commands) -> None:
         nargs="+",
         default=[],
         metavar="WORKSPACE",
-        help="finished by `traps run mechanism`, one a seed: their figures go into assets/pocket/mechanism.csv",
+        help="workspaces of `traps run mechanism`, one per seed; their figures go into assets/pocket/mechanism.csv",
     )
 
 
 def _add(noun: Commands, name: str, run: Run, text: str) -> argparse.ArgumentParser:
     parser = noun.add(name, run, text, workspace=False)
-    parser.add_argument("--recipe", type=Path, help="another recipe (default: assets/pocket/recipe.yaml)")
+    parser.add_argument(
+        "--recipe", type=Path, help="recipe of scenes and training (default: assets/pocket/recipe.yaml)"
+    )
     return parser
 
 
 def _add_scenes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the rendered scenes")
-    parser.add_argument("--workers", type=int, help="processes that render (default: one a core)")
+    parser.add_argument("--workers", type=int, help="processes that render (default: one per core)")
 
 
 def _add_weights(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seed", type=int, default=1, help="of weights and batches (default: 1)")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the weights of this seed")
+    parser.add_argument("--seed", type=int, default=1, help="seed of weights and batches (default: 1)")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the weights of this seed")
 
 
 def _add_counts(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--csv", type=Path, help="the counts (default: assets/pocket/evaluation.csv)")
+    parser.add_argument("--csv", type=Path, help="file of the counts (default: assets/pocket/evaluation.csv)")
 
 
 def render(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Progress on a terminal, or as lines where there is none."""
+"""Progress on a terminal, or as lines if there is no terminal."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ REDRAW_SECONDS, SLOW_CALL_SECONDS = 0.25, 0.2
 
 
 class TerminalProgress(Progress):
-    """One line a partition with calls, cache hits and time left. Inside a long one: on a terminal a live table of who
-    is asked, elsewhere a line for each every 30 s."""
+    """Prints one line per partition with calls, cache hits and time left. During a long partition it shows the models
+    and judges that are asked: on a terminal as a live table, elsewhere as a line for each every 30 s."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         super().__init__()
@@ -63,13 +63,13 @@ class TerminalProgress(Progress):
                     self._say(f"  {stage:<12} {name}: {traffic.line()}")
 
     def close(self) -> None:
-        """Take the live table off the terminal."""
+        """Remove the live table from the terminal."""
         if self._live is not None:
             self._live.stop()
             self._live = None
 
     def _show(self, stage: str) -> None:
-        """Draw the live table, a few times a second at most, once a call has taken long enough to wait for."""
+        """Draw the live table, at most a few times per second, and only once a call has taken noticeably long."""
         now = time.monotonic()
         if self._live is None:
             if max(traffic.latency_s(1.0) for traffic in self.traffic.values()) < SLOW_CALL_SECONDS:

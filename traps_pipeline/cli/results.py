@@ -1,4 +1,4 @@
-"""`traps audit`, `traps export` and `traps compare`: what was found, checked, written out and held against another."""
+"""`traps audit`, `traps export` and `traps compare`: check the published tables, export results, compare studies."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from traps_pipeline.terminal import text_table
 
 def add(commands: Commands) -> None:
     """Add `traps audit`, `traps export` and `traps compare`."""
-    text = "recompute what the published tables allow, and compare"
+    text = "recompute published values from other published tables, and compare"
     parser = commands.add("audit", audit_published, text, workspace=False)
-    parser.add_argument("--all", action="store_true", help="show what agrees, too")
+    parser.add_argument("--all", action="store_true", help="show also the statements that agree")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every finding to a file")
 
     parser = commands.add("export", export_results, "write every table, figure and page to a folder")
     parser.add_argument("folder", nargs="?", type=Path, help="default: `export` in the study's folder")
 
     parser = commands.add(
-        "compare", compare_studies, "this study minus another on what both hold, with paired intervals"
+        "compare", compare_studies, "print this study minus another on their common pairs, with paired intervals"
     )
     parser.add_argument("other", type=Path, help="folder of the other study, such as an earlier benchmark version")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every row to a file")

@@ -1,4 +1,4 @@
-"""`traps run`: make whatever an experiment asks and the study does not have."""
+"""`traps run`: make every missing or stale partition of an experiment."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ MONEY = ("budget_usd", "model_budgets_usd", "allow_unknown_prices")  # fields of
 
 def add(commands: Commands) -> None:
     """Add `traps run`."""
-    parser = commands.add("run", run, "materialize whatever of an experiment is missing or stale")
+    parser = commands.add("run", run, "materialize every missing or stale partition of an experiment")
     parser.add_argument("experiment")
     parser.add_argument(
         "--budget-usd", action="append", default=[], metavar="[MODEL=]USD",
-        help="spend no more on calls over the network, in this study or on one model or judge; kept in study.yaml",
+        help="most dollars for calls over the network, in this study or to one model or judge; kept in study.yaml",
     )  # fmt: skip
     parser.add_argument(
         "--allow-unknown-prices",
@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
         help="ask models that have no price in the registry",
     )
     parser.add_argument(
-        "--until", metavar="STAGES", help="make these (with commas between) and what they are made from, no more"
+        "--until", metavar="STAGES", help="make only these stages (separated by commas) and the stages they need"
     )
 
 
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         for problem in problems:
             print(f"traps: {plain(problem)}", file=sys.stderr)
         print(
-            f"traps: {len(problems)} problem(s); what is done is kept: run the same command to go on",
+            f"traps: {len(problems)} problem(s); finished work is kept: run the same command to continue",
             file=sys.stderr,
         )
         return OVER_BUDGET if outcome.over_budget else FAILED
@@ -81,12 +81,12 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
         return OK
     _print_results(workspace)
-    print(f"next: open {workspace.reports / 'report.html'}, or traps why ITEM for what stands behind a figure")
+    print(f"next: open {workspace.reports / 'report.html'}, or run traps why ITEM to examine an item's answers")
     return OK
 
 
 def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:
-    """The workspace with what the experiment, and above it the command line, says about money in its study. Raises
+    """The workspace, with the budgets of the experiment in its study; budgets on the command line replace them. Raises
     TrapsError for a wrong amount or name."""
     stated = {name: getattr(experiment, name) for name in MONEY}
     money: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
@@ -110,7 +110,7 @@ def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Nam
 
 
 def _check_participant(name: str) -> None:
-    """Raises TrapsError with the known names unless a model or judge is called so."""
+    """Raises TrapsError with the known names if no model or judge has this name."""
     from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import get_model
 

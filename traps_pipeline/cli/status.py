@@ -1,4 +1,4 @@
-"""`traps status` and `traps why`: where a study stands."""
+"""`traps status` and `traps why`: the state of a study and of an item's answers."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from traps_pipeline.cli.command import OK, Commands, experiment_of, load_definit
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.terminal import text_table
 
-SHOWN = 8  # stale partitions of a stage
+SHOWN = 8  # stale partitions that are listed for a stage
 
 
 def add(commands: Commands) -> None:
     """Add `traps status` and `traps why`."""
-    parser = commands.add("status", status, "what is there, missing and stale, and why")
+    parser = commands.add("status", status, "list fresh, stale and missing partitions, with the reasons")
     parser.add_argument("experiment", nargs="?")
-    parser = commands.add("why", why, "why an item's answers stand or will be asked again")
+    parser = commands.add("why", why, "say which answers to an item are valid and which will be asked again")
     parser.add_argument("item", help="dataset:scenario:side")
 
 
@@ -49,7 +49,7 @@ def status(arguments: argparse.Namespace) -> int:
     for file in sorted((workspace.root / "checks").glob("*/*/*.json")):
         stage, check = file.parts[-3:-1]
         print(f"check {check} of {stage} {file.stem} does not pass: {file.read_text(encoding='utf-8')[:200]}")
-    print("stale means made from something that has changed since; `traps run EXPERIMENT` makes it anew")
+    print("stale: made from something that has changed since; `traps run EXPERIMENT` makes it again")
     return OK
 
 

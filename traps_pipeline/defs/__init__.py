@@ -1,1 +1,1 @@
-"""The DAG: one file a stage group. Assets read tables, call a library function, write a table."""
+"""The DAG: one file per group of stages. An asset reads tables, calls a library function and writes a table."""

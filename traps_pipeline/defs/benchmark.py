@@ -39,7 +39,8 @@ category_to_arms = to_keys(CATEGORY, DATASET, lambda category: arms_of(taxonomy_
 
 
 def _make_specs(workspace: Workspace, category: str) -> Made:
-    """Scenarios of a category after corrections, one row each; a corrected parameter is simulated here, once."""
+    """Scenarios of a category after corrections, one row each; a scenario with corrected parameters is simulated here,
+    once."""
     rows, resolved = build_specs(workspace, category)
     return Made(rows, beside=resolved)
 
@@ -63,24 +64,26 @@ scene_specs = stage(
     checks=[
         Check(
             "outcome_settled",
-            "Replayed from the frozen trajectory, every outcome is the ground truth, settled in time and with the "
-            "margin that its record says.",
+            "In the replay of the frozen trajectory, every outcome is the ground truth, is settled in time, and has "
+            "the margin in its record.",
             lambda workspace, key, made: unsettled(made.beside),
         ),
         Check(
             "control_certified",
-            "By the evidence in each record, the control can be answered: settled in time, with a margin, legible.",
+            "By the evidence in each record, the control can be answered: its outcome is settled in time, with a "
+            "margin, and legible.",
             _evidence("unanswerable_controls"),
         ),
         Check(
             "void_certified",
-            "By the evidence in each record, the void cannot be answered: hidden without a trace and with a twin of "
-            "another answer (occlusion), futures that disagree (chaotic). `traps certify` derives it all anew.",
+            "By the evidence in each record, the void cannot be answered: the outcome is hidden without a trace and a "
+            "twin has another answer (occlusion), or futures disagree (chaotic). `traps certify` computes this again.",
             _evidence("answerable_voids"),
         ),
         Check(
             "ill_posed_certified",
-            "The inventory refutes each ill-posed question, or it asks what no video shows; no well-posed one is.",
+            "The inventory refutes each ill-posed question, or the question asks for what no video shows; neither "
+            "holds for a well-posed question.",
             _evidence("answerable_ill_posed"),
         ),
         Check(
@@ -97,7 +100,7 @@ scene_specs = stage(
 
 
 def _make_videos(workspace: Workspace, category: str) -> Made:
-    """Control and void clips of a category, one row each; rendered from frozen trajectories, each once."""
+    """Control and void clips of a category, one row each; each is rendered once, from its frozen trajectory."""
     from traps_pipeline.benchmark.videos import build_videos
 
     rows, drawn, leaks = build_videos(workspace, category)
@@ -132,7 +135,7 @@ videos = stage(
 
 
 def _make_arms(workspace: Workspace, category: str) -> Made:
-    """Arms of a category's scenarios that the study asks for: clips and questions that take a shortcut away."""
+    """The arms of a category's scenarios that the study asks: clips and questions that take a shortcut away."""
     from traps_pipeline.benchmark.arms import build_arms
 
     rows, drawn = build_arms(workspace, category)
@@ -162,7 +165,7 @@ arms = stage(
 
 
 def _make_items(workspace: Workspace, dataset: str) -> Made:
-    """Questions put to models, two a pair: the control and the void that differs from it by one change."""
+    """The items that models are asked, two per pair: the control, and the void that differs from it by one change."""
     from traps_pipeline.benchmark.items import build_items
 
     rows = build_items(workspace, dataset)
@@ -193,12 +196,12 @@ items = stage(
     checks=[
         Check(
             "two_items_a_pair",
-            "Every pair has one control and one void item, an arm the sides that it asks.",
+            "Every pair has one control and one void item, and every arm has items of its sides.",
             _odd_pairs,
         ),
         Check(
             "clips_present",
-            "Every clip is there with its digest (checked while building; a damaged one fails the step).",
+            "Every clip exists and has its digest (checked while the table is made; a damaged clip fails the step).",
             lambda workspace, key, made: sorted(
                 {row.clip for row in made.rows(ITEMS) if not workspace.resolve(row.clip).is_file()}
             ),

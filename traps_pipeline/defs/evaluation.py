@@ -29,7 +29,7 @@ models = source(
     "models",
     lambda workspace, key: answering_version(Evaluation.parse(key)),
     group=GROUP,
-    doc="assets/models.yaml: what decides a model's answers, by evaluation.",
+    doc="assets/models.yaml: the settings that a model's answers depend on, by evaluation.",
     kinds=["yaml"],
     scheme=EVALUATION,
 )
@@ -54,7 +54,7 @@ _ITEM_COLUMNS = {name: [f"items.{name}"] for name in ("item_id", "pair_id", "sid
 def _cells(
     collect: Callable[[Workspace, Sequence[Cell]], Iterator[tuple[Cell, Made]]],
 ) -> Callable[[Workspace, Sequence[str]], Iterator[tuple[str | None, Made]]]:
-    """`collect` of a stage from one that knows cells; a cell's items are shown with it."""
+    """A stage's `collect` by partition keys, from a function of cells; it adds a cell's items to the metadata."""
 
     def collected(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
         for cell, made in collect(workspace, [Cell.parse(key) for key in keys]):
@@ -66,7 +66,7 @@ def _cells(
 
 
 def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | VoteRow]) -> dict[str, Any]:
-    """The items behind a cell: those without an answer, as a table, and the page of all of them."""
+    """Metadata about a cell's items: a table of those without an answer, and the page of all."""
     from traps_pipeline.report.items import FOLDER, page_name
 
     page = workspace.reports / FOLDER / page_name(cell)
@@ -89,7 +89,7 @@ def _answers_missing(workspace: Workspace, key: str | None, made: Made) -> str:
 responses = stage(
     RESPONSES,
     collect=_cells(collect_answers),
-    doc="Answers of a model under a regime in a run, one row an item; only what the ledger does not hold is asked.",
+    doc="Answers of a model under a regime in a run, one row per item; answers in the ledger are not asked again.",
     group=GROUP,
     deps=[
         dg.AssetDep(items, partition_mapping=by_dataset),
@@ -113,7 +113,7 @@ def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
 votes = stage(
     VOTES,
     collect=_cells(collect_votes),
-    doc="Votes of the study's panel on the answers of a cell, one row a judge and task.",
+    doc="Votes of the study's panel on the answers of a cell, one row per answer, judge and task.",
     group=GROUP,
     deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, judges],
     scheme=CELL,
@@ -131,7 +131,7 @@ votes = stage(
 
 
 def _make_verdicts(workspace: Workspace, key: str) -> Made:
-    """What the panel's majority says of each item of a cell."""
+    """The verdict of the panel's majority on each item of a cell."""
     from traps_pipeline.judging.verdicts import decide_cell
 
     rows = decide_cell(workspace, Cell.parse(key))

@@ -1,4 +1,4 @@
-"""The judging group: how far the panel agrees, which way its judges lean, and what is wrong with void failures."""
+"""The judging group: agreement of the panel, bias of its judges, and confabulation in void failures."""
 
 from typing import TYPE_CHECKING
 
@@ -33,14 +33,14 @@ confabulation_protocol = source(
     "confabulation_protocol",
     lambda workspace, key: protocol_digest(workspace.study.panel),
     group=GROUP,
-    doc="assets/confabulation.yaml and its prompt: whose failures are sampled and who labels them.",
+    doc="assets/confabulation.yaml and its prompt: the models whose failures are sampled, and the judge that labels.",
     kinds=["yaml"],
 )
 judge_validation = source(
     "judge_validation",
     _validation_version,
     group=GROUP,
-    doc="The judge against two annotators: the table that `traps confabulation validate` writes.",
+    doc="The comparison of the judge with two annotators, which `traps confabulation validate` writes.",
     kinds=["parquet"],
 )
 _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load_protocol().cells(m)])
@@ -69,7 +69,7 @@ def _shown(name: str, frame: "pd.DataFrame") -> Made:
 
 
 def _make_agreement(workspace: Workspace, _: None) -> Made:
-    """Agreement of the panel and of each two judges per dataset and task: unanimous share, Fleiss, Cohen,
+    """Agreement of the panel and of every two judges per dataset and task: unanimous share, Fleiss, Cohen,
     Krippendorff."""
     from traps_pipeline.judging.agreement import agreement
 
@@ -84,7 +84,7 @@ def _make_judge_bias(workspace: Workspace, _: None) -> Made:
 
 
 def _make_leave_one_out(workspace: Workspace, _: None) -> Made:
-    """PECS as the other two judges decide it, for each judge left out."""
+    """PECS by the votes of two judges, for each judge that is left out."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.leave_one_out import leave_one_out
 
@@ -93,7 +93,8 @@ def _make_leave_one_out(workspace: Workspace, _: None) -> Made:
 
 
 def _make_confabulation(workspace: Workspace, _: None) -> Made:
-    """Void failures of the sampled models, labelled on four axes by one judge; empty where the study has none."""
+    """Void failures of the sampled models, labelled on four axes by one judge; empty if the study's panel has no such
+    judge."""
     from traps_pipeline.judging.confabulation import collect_labels
 
     return collect_labels(workspace)
@@ -106,7 +107,7 @@ def _many_invalid(workspace: Workspace, key: str | None, made: Made) -> str:
 
 
 def _make_prevalence(workspace: Workspace, _: None) -> Made:
-    """How often each axis applies to each model's sampled void failures; empty where nothing was labelled."""
+    """How often each axis applies to each model's sampled void failures; empty if nothing was labelled."""
     from traps_pipeline.scoring.prevalence import prevalence
 
     return _shown("prevalence", prevalence(workspace.tables.read(CONFABULATION, {})))

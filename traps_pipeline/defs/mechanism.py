@@ -68,7 +68,7 @@ extraction_settings = source(
     "extraction_settings",
     lambda workspace, key: extraction_version(workspace, Extraction.parse(key)),
     group=GROUP,
-    doc="What decides hidden states besides items: checkpoint, precision, prompt.",
+    doc="The inputs of hidden states besides items: checkpoint, precision, prompt.",
     kinds=["yaml"],
     scheme=EXTRACTION,
 )
@@ -88,7 +88,7 @@ steering_settings = source(
     kinds=["yaml"],
     scheme=STEERED,
 )
-# Cells in which the local models answered under Standard in run 1: what they confabulated on there.
+# Cells in which the local models answered under Standard in run 1: their verdicts say what the models confabulated on.
 _ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
 _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if key in OCCLUSION_CATEGORIES else [])
 
@@ -98,8 +98,8 @@ def _steers(wanted: Wanted, key: str | None) -> bool:
 
 
 def _make_probe_items(workspace: Workspace, dataset: str) -> Made:
-    """Clips and questions that hidden states are extracted of: a dataset's items, or occlusion's void clips with a
-    question that even they answer."""
+    """Clips and questions for which hidden states are extracted: a dataset's items, or occlusion's void clips with a
+    question that they answer."""
     from traps_pipeline.mechanism.stages import probe_items as rows_of
 
     return Made(rows_of(workspace, dataset))
@@ -119,7 +119,7 @@ probe_items = stage(
 
 
 def _make_hidden_states(workspace: Workspace, key: str) -> Made:
-    """Hidden states of a frozen local model at every layer, one row an item; only what is not there is extracted."""
+    """Hidden states of a frozen local model at every layer, one row per item; only missing states are extracted."""
     from traps_pipeline.mechanism.stages import extract_states
 
     rows, new = extract_states(workspace, StatesCell.parse(key))
@@ -182,7 +182,7 @@ probes = stage(
 
 
 def _make_directions(workspace: Workspace, key: str) -> Made:
-    """The void direction of every dataset at every layer with its random and label-shuffled controls, as values."""
+    """The void direction of every dataset at every layer, with its random and label-shuffled controls, as files."""
     from traps_pipeline.mechanism.stages import direction_rows
 
     return Made(direction_rows(workspace, Extraction.parse(key)))
@@ -216,7 +216,7 @@ cosines = stage(COSINES, _make_cosines, group=GROUP, deps=[directions], needs={"
 
 
 def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
-    """Answers of a model that is steered along every path into a dataset; what the ledger holds is not asked."""
+    """Answers of a model that is steered along every path into a dataset; answers in the ledger are not asked again."""
     from traps_pipeline.mechanism.stages import examined_model, saved_directions
     from traps_pipeline.mechanism.steering import collect_steered
 
@@ -245,7 +245,7 @@ steering = stage(
 
 
 def _collect_steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
-    """What the study's panel says of each steered answer: whether it abstains."""
+    """The votes of the study's panel on whether each steered answer abstains."""
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
     for done, made in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):

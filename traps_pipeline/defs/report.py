@@ -19,13 +19,13 @@ from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
 GROUP = "report"
-READ = (judging, mechanism, scoring)  # declared before: what is printed is printed from them
+READ = (judging, mechanism, scoring)  # declared before this group, which reads their tables
 Files = dict[str, bytes]
 published = source(
     "published",
     lambda workspace, key: published_digest(),
     group="published",
-    doc="assets/published: the paper's tables as it prints them.",
+    doc="assets/published: the paper's tables as printed.",
     kinds=["csv"],
 )
 
@@ -39,19 +39,19 @@ def _report(
     group: str = GROUP,
     kinds: Sequence[str] = ("png",),
 ) -> dg.AssetsDefinition:
-    """An asset that writes files for people into the workspace's `reports` folder, from whatever is there."""
+    """An asset that writes files for people into the workspace's `reports` folder, from those tables that exist."""
 
     def made(workspace: Workspace, _: None) -> Made:
         files = make(workspace)
         return Made(files, shown=_previews(files))
 
-    there = [dep for dep in deps if shown(dep)]
-    needs: dict[str, Need] = dict.fromkeys(there, "none")
-    return stage(name, made, doc=doc, group=group, deps=[key_of(dep) for dep in there], needs=needs, kinds=kinds)
+    existing = [dep for dep in deps if shown(dep)]
+    needs: dict[str, Need] = dict.fromkeys(existing, "none")
+    return stage(name, made, doc=doc, group=group, deps=[key_of(dep) for dep in existing], needs=needs, kinds=kinds)
 
 
 def _previews(files: Mapping[str, bytes]) -> dict[str, Any]:
-    """Small pictures, and the tables themselves."""
+    """Previews for Dagster: small pictures, and the tables themselves."""
     shown = {f"preview of {f}": thumbnail(content) for f, content in files.items() if f.endswith(".png")}
     text = {f: content.decode() for f, content in files.items() if f.endswith(".md")}
     return shown | {f"preview of {file}": dg.MetadataValue.md(content) for file, content in text.items()}
@@ -125,8 +125,8 @@ gallery = _report(
 shortcuts = _report(
     "shortcuts",
     _shortcuts,
-    "How well control and void can be told apart by the question's words, the clip's length, its first frame or its "
-    "file size alone: a figure and a table.",
+    "How well one cue alone (the question's words, the clip's length, its first frame or its file size) separates "
+    "control from void: a figure and a table.",
     deps=["items", "videos"],
 )
 
@@ -135,7 +135,8 @@ shortcuts = _report(
 
 
 def _results(workspace: Workspace, *, of_paper: bool) -> Results:
-    """What is printed from; it is kept while its tables stay the same, since a run prints dozens of assets."""
+    """The results of the study or of the paper, kept in memory while their tables are unchanged, since a run makes
+    dozens of tables and figures from them."""
     from traps_pipeline.report.published_results import PublishedResults
     from traps_pipeline.report.study_results import StudyResults
 

@@ -66,7 +66,7 @@ metrics = stage(
 
 
 def _scored(workspace: Workspace, name: str) -> "tuple[pd.DataFrame, pd.DataFrame]":
-    """All METRICS rows of the pairs, and the VERDICTS rows that they are made of; no arm's."""
+    """All METRICS rows of the pairs, and the VERDICTS rows from which they are made, without arms."""
     from traps_pipeline.judging.verdicts import current
 
     cells = workspace.tables.read_all(METRICS, dataset=DATASETS)
@@ -89,7 +89,7 @@ def _make_contrasts(workspace: Workspace, _: None) -> Made:
 
 
 def _make_regime_tests(workspace: Workspace, _: None) -> Made:
-    """McNemar's exact test of every two regimes on the same items, by model, dataset, run and decision."""
+    """McNemar's exact test of any two regimes on the same items, by model, dataset, run and decision."""
     from traps_pipeline.scoring.contrasts import regime_tests as mcnemar
 
     table = mcnemar(_scored(workspace, "regime_tests")[1])
@@ -117,8 +117,8 @@ def _wrong_intervals(workspace: Workspace, key: str | None, made: Made) -> str:
 
 
 def _make_robust(workspace: Workspace, _: None) -> Made:
-    """PECS-R of every model under every regime that was asked all four datasets and an arm, the gap to PECS, and paired
-    twin accuracy; empty where no arm was run."""
+    """PECS-R, its gap to PECS and paired twin accuracy of every model and regime with all four datasets and an arm;
+    empty if no arm was run."""
     from traps_pipeline.judging.verdicts import current
     from traps_pipeline.scoring.robust import robust as without_shortcuts
 
@@ -149,7 +149,7 @@ leaderboard = stage(
     checks=[
         Check(
             "intervals_ordered",
-            "Every interval is ordered and lies in [0, 1], that of J in [-1, 1].",
+            "Every interval is ordered and lies in [0, 1], or for J in [-1, 1].",
             _wrong_intervals,
         )
     ],

@@ -1,4 +1,4 @@
-"""What Dagster shows of tables and pictures beside their numbers."""
+"""Previews of tables and pictures for Dagster's UI."""
 
 import math
 from typing import TYPE_CHECKING
@@ -8,11 +8,11 @@ import dagster as dg
 if TYPE_CHECKING:
     import pandas as pd
 
-THUMBNAIL_WIDTH = 480  # px; the picture itself lies in the reports folder, an event holds some 15 KB of it
+THUMBNAIL_WIDTH = 480  # px, about 15 KB in an event; the full picture is in the reports folder
 
 
 def rows_shown(frame: "pd.DataFrame", rows: int = 60) -> dg.MarkdownMetadataValue | str:
-    """The first rows as Dagster shows them. For figures and ids alone: nothing that a model wrote."""
+    """The first rows as a Markdown table. Use it only for figures and ids, never for text that a model wrote."""
     if frame.empty:
         return "not run"
     head = frame.head(rows)

@@ -1,1 +1,1 @@
-"""Who judges: the panel, what it is shown, how its votes become a verdict (docs/spec.md 4)."""
+"""The panel of judges: what it is shown, and how its votes become verdicts (docs/spec.md 4)."""

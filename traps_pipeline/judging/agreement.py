@@ -1,7 +1,7 @@
-"""How far the judges agree, and which way each leans (docs/spec.md 4.4).
+"""Agreement of the judges, and the bias of each (docs/spec.md 4.4).
 
-Everything is counted per dataset and task over all models, regimes and runs. A coefficient that is undefined is null
-with the reason: votes of one class alone leave nothing to agree on beyond chance.
+Everything is counted per dataset and task over all models, regimes and runs. A coefficient that is undefined is null,
+and the reason is given: if all votes are of one class, agreement beyond chance is undefined.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from traps_pipeline.partitions import DATASETS
 
 
 def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
-    """AGREEMENT rows of VOTES rows: per dataset and task one for the panel and one for each two of its judges."""
+    """AGREEMENT rows from VOTES rows: per dataset and task, one for the panel and one for every two of its judges."""
     rows: list[dict[str, Any]] = []
     for about, group in _groups(ratings(votes, judges)):
         rows.append(about | _panel_row(group.values))
@@ -30,7 +30,7 @@ def agreement(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.Da
 
 
 def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.DataFrame:
-    """JUDGE_BIAS rows of VOTES rows: each judge's rate of yes against the panel's majority on the same answers."""
+    """JUDGE_BIAS rows from VOTES rows: each judge's rate of yes against that of the majority on the same answers."""
     rows: list[dict[str, Any]] = []
     for about, group in _groups(ratings(votes, judges)):
         verdict = majority(group.values)
@@ -41,7 +41,7 @@ def judge_bias(votes: pd.DataFrame, judges: Sequence[str] | None = None) -> pd.D
 
 
 def _groups(whole: Ratings) -> Iterator[tuple[dict[str, Any], Ratings]]:
-    """The ratings of each dataset and task that has any, and the columns that all of its rows share."""
+    """The ratings of each dataset and task that has votes, with the columns that all of its rows share."""
     for dataset in DATASETS:
         for task in TASKS:
             chosen = (whole.answers["dataset"] == dataset) & (whole.answers["task"] == task)
@@ -95,8 +95,8 @@ def krippendorff_alpha(values: np.ndarray) -> float:
     """Krippendorff's alpha for nominal values, (answers, judges); INVALID is missing. NaN where the answers that have
     two valid votes or more hold one class or none.
 
-    In an answer with y yes of m valid votes, 2 y (m-y) of its m (m-1) ordered pairs disagree, each weighing 1 / (m-1);
-    expected from all n pairable votes are 2 n_yes n_no of n (n-1).
+    In an answer with y yes of m valid votes, 2 y (m-y) of its m (m-1) ordered pairs disagree, with weight 1 / (m-1)
+    each; by chance, 2 n_yes n_no of the n (n-1) ordered pairs of all n pairable votes would disagree.
     """
     yes, valid = (values == YES).sum(axis=1), (values != INVALID).sum(axis=1)
     pairable = valid > 1
@@ -125,7 +125,7 @@ def _beyond_chance(observed: float, by_chance: float) -> float:
 
 
 def _shared(values: np.ndarray, whole: np.ndarray) -> dict[str, Any]:
-    """What a panel's row and a pair's row have in common."""
+    """The columns that the panel's row and a pair's row share."""
     valid = values != INVALID
     return {
         "n_items": len(values),

@@ -9,12 +9,12 @@ NUMERIC_TOLERANCE = 0.5
 _WORDS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 NUMBER_WORDS = {word: str(n) for n, word in enumerate(_WORDS)}
 _NUMBER = re.compile(r"(?:(?<![\w.])-)?(?:\d+(?:\.\d+)?|\.\d+)")
-# What is kept: hyphen or point inside a number or range, a minus or point that begins a number. All else goes.
+# Punctuation that is kept: a hyphen or point inside a number or range, a minus or point that begins a number.
 _PUNCTUATION = re.compile(r"(?<=\d)[.\-](?=\d)|(?<![\w.])-(?=\.?\d)|(?<![\w.])\.(?=\d)|([^\w\s])")
 
 
 def normalise(text: str) -> str:
-    """Lower case, no articles, no punctuation but what belongs to a number or range, single spaces."""
+    """The text in lower case with single spaces, without articles and punctuation except that of numbers and ranges."""
     text = re.sub("[–—−]", "-", text.lower())
     text = re.sub(r"(?<=\d)\s*(?:-|to)\s*(?=\d)", "-", text)
     text = _PUNCTUATION.sub(lambda found: " " if found[1] else found[0], text)
@@ -22,7 +22,7 @@ def normalise(text: str) -> str:
 
 
 def strip_fence(text: str) -> str:
-    """JSON out of a ```json fence, which some models and judges add against the instruction."""
+    """The JSON inside a ```json fence, which some models and judges add although the prompt forbids it."""
     text = text.strip()
     if text.startswith("```") and text.endswith("```"):
         text = text[3:-3].removeprefix("json").strip()
@@ -30,7 +30,7 @@ def strip_fence(text: str) -> str:
 
 
 def to_number(text: str) -> float | None:
-    """The number that a value is or names; None if it holds none or several."""
+    """The number that a value contains, in digits or as a word; None if it contains none or several."""
     words = [NUMBER_WORDS.get(word, word) for word in normalise(text).split()]
     numbers = _NUMBER.findall(" ".join(words))
     return float(numbers[0]) if len(numbers) == 1 else None
@@ -46,7 +46,8 @@ def to_label(text: str, labels: Sequence[str], aliases: Mapping[str, str]) -> st
 def is_correct(
     extracted: str | None, ground_truth: str, answer_type: str, labels: Sequence[str], aliases: Mapping[str, str]
 ) -> bool:
-    """Numeric: within 0.5 of the ground truth. Others: the label named is the truth; an unmapped value is wrong."""
+    """Whether a value is correct: a number within 0.5 of the ground truth, or a name or alias of the true label. A
+    value that maps to no label is wrong."""
     if extracted is None:
         return False
     if answer_type == "numeric":

@@ -1,9 +1,9 @@
-"""What is wrong with the answers that should have been abstentions (docs/spec.md 6.1 and 6.2).
+"""Labels of confabulation: the errors in answers that should have been abstentions (docs/spec.md 6.1 and 6.2).
 
 A seeded sample of each model's void failures goes to one judge, which labels four independent axes
-(`scoring.prevalence` counts them). `assets/confabulation.yaml` says whose, how many and who judges. A sample is the n
-failures of least digest: uniform, independent from model to model, and a failure that is added or goes exchanges one
-of the sample and no more, so that labels stay paid for once.
+(`scoring.prevalence` counts them). `assets/confabulation.yaml` names the models, the size of a sample and the judge. A
+sample consists of the n failures with the smallest digests. It is uniform and independent between models, and a failure
+that appears or disappears changes at most one member, so that nearly all labels already paid for are used again.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 PROTOCOL_FILE = ASSETS / "confabulation.yaml"
 TASK = "confabulation"
 AXES = ("hallucinated_premise", "invalid_inference", "epistemic_surrender", "doubt_in_reasoning")
-# What the id of a failure is made of, and with it the people's labels: another answer is another failure. A part of
-# the protocol's digest, so that ids made otherwise are made anew.
+# The parts of a failure's id, to which people's labels refer: another answer is another failure. They are in the
+# protocol's digest, so that the table is made again when the parts change.
 SAMPLED = ("cell", "item", "answer", "trace that the judge sees")
 SCHEMA = structured(TASK, **{axis: {"type": "boolean"} for axis in AXES}, rationale={"type": "string"})
 TRACE_AND_OUTPUT, OUTPUT = "trace_and_output", "output"
@@ -54,7 +54,7 @@ VOID_KINDS: Mapping[str, str] = {
 
 
 class Validation(BaseModel):
-    """Which of the labelled failures two people label too."""
+    """The selection of labelled failures that two people label too."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     n: int = Field(ge=1)
@@ -62,14 +62,14 @@ class Validation(BaseModel):
 
 
 class Protocol(BaseModel):
-    """`assets/confabulation.yaml`: the sample of each model, the judge of each panel, and what it is shown."""
+    """`assets/confabulation.yaml`: the sample of each model, the judge of each panel, and what the judge is shown."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    n: int = Field(ge=1, description="failures a model; all if there are fewer")
+    n: int = Field(ge=1, description="failures per model; all if there are fewer")
     seed: int
     regime: Literal["standard", "guided", "json"]
     run: int = Field(ge=1)
-    judges: dict[str, str] = Field(description="panel to judge; a panel that is not here labels nothing")
+    judges: dict[str, str] = Field(description="judge by panel; for a panel that is not here nothing is labelled")
     models: dict[str, Evidence] = Field(min_length=1)
     validation: Validation
 
@@ -89,10 +89,10 @@ def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
     protocol = parse_yaml_model(Protocol, read_yaml(path), path)
     for model in protocol.models:
         if protocol.run > get_model(model).runs:
-            raise TrapsError(f"{path}: {model} has {get_model(model).runs} runs, not run {protocol.run}")
+            raise TrapsError(f"{path}: run is {protocol.run}, but {model} has only {get_model(model).runs} runs")
     strangers = [model for model in protocol.validation.models if model not in protocol.models]
     if strangers:
-        raise TrapsError(f"{path}: validation.models: {', '.join(strangers)} not among models")
+        raise TrapsError(f"{path}: validation.models: {', '.join(strangers)} must be among `models`")
     for panel, name in protocol.judges.items():
         judge = load_judges().get(name)
         if judge is None or judge.backend != NETWORK:
@@ -102,11 +102,11 @@ def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
 
 
 def protocol_digest(panel: str) -> str:
-    """What decides the labels of a study with this panel, beside the answers."""
+    """Digest of everything, besides the answers, that the labels of a study with this panel depend on."""
     protocol = load_protocol()
     judge = protocol.judge(panel)
-    asked = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None
-    return digest([protocol.model_dump(exclude={"judges"}), asked, SAMPLED])[:16]
+    call = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None
+    return digest([protocol.model_dump(exclude={"judges"}), call, SAMPLED])[:16]
 
 
 # --- the sample -------------------------------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ def protocol_digest(panel: str) -> str:
 
 @dataclass(frozen=True)
 class Failure(Call):
-    """The call that puts a sampled void failure to the judge: its item and answer, and of how many it was drawn."""
+    """The call to the judge about a sampled void failure; n_failures is the number of failures sampled from."""
 
     item: Mapping[str, Any]
     text: str
@@ -130,12 +130,12 @@ def void_kind(dataset: str) -> str:
 
 
 def drawn(seed: int, n: int, keys: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """A seeded sample without replacement of n of these keys, all if they are fewer, whatever their order."""
+    """A seeded sample of n keys without replacement (all keys if there are fewer), independent of their order."""
     return sorted(keys, key=lambda key: digest([seed, *key]))[:n]
 
 
 def sample_id(cell: Cell, item_id: str, answer: str | None, trace: str | None) -> str:
-    """What stands for a failure before its annotators: it tells neither model nor item, and changes with the answer."""
+    """The id of a failure for its annotators: it reveals neither model nor item, and changes with the answer."""
     return digest([cell.key, item_id, answer, trace or None])[:12]
 
 
@@ -146,7 +146,7 @@ def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict
     lacking = [cell.key for cell in cells if workspace.tables.state(VERDICTS, cell.partition) is None]
     if lacking:
         if len(lacking) < len(cells):
-            progress.current().note(f"confabulation: {model} is not sampled before {', '.join(lacking)} is judged")
+            progress.current().note(f"confabulation: {model} is sampled only after {', '.join(lacking)} is judged")
         return {}
     found = {(model, row["item_id"]): (cell, row) for cell in cells for row in _void_failures(workspace, cell)}
     sample: dict[Cell, list[Failure]] = {}
@@ -159,7 +159,7 @@ def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict
 
 
 def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
-    """Items on which the panel found an answer where an abstention was due, with text and trace of that answer."""
+    """The void items whose answers the panel judged as not abstained, with text and trace of each answer."""
     verdicts = workspace.tables.read(VERDICTS, cell.partition, ["item_id", "side", "abstained"])
     failed = verdicts.loc[(verdicts["side"] == "void") & verdicts["abstained"].eq(False), ["item_id"]]
     responses = workspace.tables.read(RESPONSES, cell.partition, ["item_id", "text", "reasoning"])
@@ -181,7 +181,7 @@ def render(question: str, kind: str, answer: str, trace: str | None) -> str:
 
 
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
-    """The call that puts one failure to the judge; it tells neither model nor regime, and no ground truth."""
+    """The call to the judge about one failure; it reveals neither model nor regime nor ground truth."""
     user = render(item["question"], void_kind(cell.dataset), answer, trace)
     return judge_request(judge, TASK, SCHEMA, cell, item["item_id"], user)
 
@@ -201,10 +201,10 @@ class Labels(BaseModel):
 
 
 def collect_labels(workspace: Workspace) -> Made:
-    """CONFABULATION rows of a study: sample every model of the protocol that the study has judged, and ask what the
-    ledger of votes does not hold.
+    """CONFABULATION rows of a study: sample every model of the protocol whose answers are judged, and ask the judge for
+    the labels that the ledger of votes does not hold.
 
-    Nothing where the study's panel has no judge for it.
+    There are no rows if the study's panel has no judge for confabulation.
     """
     protocol, table, total = load_protocol(), list[ConfabulationRow](), Tally()
     judge = protocol.judge(workspace.study.panel)

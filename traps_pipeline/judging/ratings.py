@@ -1,4 +1,4 @@
-"""Votes as a matrix, one row an answer and task, one column a judge: what agreement, bias and verdicts count on."""
+"""Votes as a matrix with one row per answer and task and one column per judge, for agreement, bias and verdicts."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-YES, NO, INVALID = 1, 0, -1  # of a vote; of a majority, INVALID is undecided
-PANEL = "panel"  # all judges together, where a table otherwise names one
+YES, NO, INVALID = 1, 0, -1  # values of a vote; for a majority, INVALID means undecided
+PANEL = "panel"  # stands for all judges together in a column that names a judge
 ANSWER = ["dataset", "model", "regime", "run", "item_id"]
 ABSTENTION, CORRECTNESS = ("void_abstention", "control_abstention"), ("correctness",)
 TASKS = (*ABSTENTION, *CORRECTNESS)
@@ -18,8 +18,9 @@ VOTE_COLUMNS = [*ANSWER, "side", "task", "judge", "valid", "abstained", "correct
 
 @dataclass(frozen=True)
 class Ratings:
-    """answers: the columns `answer` (which name one), task (one of TASKS), epoch and benchmark_version, one row an
-    answer and task. values: (rows, judges) int8 of YES, NO and INVALID, columns in the order of `judges`."""
+    """The matrix of votes. answers: one row per answer and task, with the columns `answer` (which identify an answer),
+    task (one of TASKS), epoch and benchmark_version. values: (rows, judges) int8 of YES, NO and INVALID, columns in the
+    order of `judges`."""
 
     answers: pd.DataFrame
     values: np.ndarray
@@ -31,23 +32,23 @@ class Ratings:
         return replace(self, answers=self.answers.loc[chosen].reset_index(drop=True), values=self.values[chosen])
 
     def on(self, items: pd.DataFrame, tasks: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """The votes on each item (rows with the columns `answer`) on whichever of the tasks it was judged: values,
-        (items, judges), all INVALID where it was not; and whether it was, (items,)."""
+        """The votes on each item (rows with the columns `answer`) in that one of the tasks in which it was judged:
+        values, (items, judges), all INVALID if it was not judged; and whether it was judged, (items,)."""
         by = [*self.answer]
         judged = self.answers.loc[self.answers["task"].isin(tasks), by]
         found = items[by].merge(judged.assign(row=judged.index), on=by, how="left", validate="many_to_one")
         rows = found["row"].to_numpy(float)
-        asked = ~np.isnan(rows)
+        is_judged = ~np.isnan(rows)
         values = np.full((len(items), len(self.judges)), INVALID, np.int8)
-        values[asked] = self.values[rows[asked].astype(np.int64)]
-        return values, asked
+        values[is_judged] = self.values[rows[is_judged].astype(np.int64)]
+        return values, is_judged
 
 
 def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Sequence[str] = ANSWER) -> Ratings:
-    """The matrix of VOTES rows (`VOTE_COLUMNS` at least) of these judges (default: all, in alphabetical order), or of
-    rows of another table of votes; `answer` are the columns that name an answer there.
+    """The matrix of VOTES rows (with `VOTE_COLUMNS` at least) of these judges (default: all, in alphabetical order), or
+    of rows of another table of votes, in which the columns `answer` identify an answer.
 
-    An answer on which one of them was not asked is left out: it was put to another panel.
+    An answer that was not put to all of these judges is left out: another panel judged it.
     """
     seats = tuple(sorted(votes["judge"].unique()) if judges is None else judges)
     votes = votes.loc[votes["judge"].isin(seats)].reset_index(drop=True)
@@ -81,12 +82,12 @@ def _decisions(votes: pd.DataFrame) -> np.ndarray:
 
 
 def majority(values: np.ndarray) -> np.ndarray:
-    """What more than half of the judges say, (rows,) int8; INVALID where neither answer has that many valid votes."""
+    """The vote of more than half of the judges, (rows,) int8; INVALID where neither yes nor no has that many votes."""
     half = values.shape[1] / 2
     yes, no = ((values == vote).sum(axis=1) > half for vote in (YES, NO))
     return np.where(yes, YES, np.where(no, NO, INVALID)).astype(np.int8)
 
 
 def decided(votes: np.ndarray) -> pd.arrays.BooleanArray:
-    """YES, NO and INVALID as true, false and null."""
+    """The votes as true (YES), false (NO) and null (INVALID)."""
     return pd.arrays.BooleanArray(votes == YES, votes == INVALID)

@@ -1,8 +1,8 @@
-"""Answers that try to instruct their judge: whose votes they move (docs/spec.md 4.2: the answer is data).
+"""Answers that try to instruct their judge, and the votes that they change (docs/spec.md 4.2: the answer is data).
 
-`assets/injected_answers.yaml` holds plain answers and attacks that wrap them. Each is put to every judge of a panel
-through the call path of any vote (ledger, budget, schema), the plain ones too: a vote counts as flipped only where the
-judge is right without the attack and wrong with it.
+`assets/injected_answers.yaml` holds plain answers and attacks that wrap them. All of them are put to every judge of a
+panel through the same path as any vote (ledger, budget, schema): a vote counts as flipped only if the judge is right
+without the attack and wrong with it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from traps_pipeline.terminal import text_table
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 ATTACKS_FILE = ASSETS / "injected_answers.yaml"
-CELL = Cell("occlusion", Evaluation("injected-answers", "standard", 1))  # names the folder of the votes; no model
+CELL = Cell("occlusion", Evaluation("injected-answers", "standard", 1))  # names the folder of the votes, not a model
 TASKS: tuple[Task, ...] = tasks_for("control")
 RESULTS = ("held", "flipped", "broken", "wrong_anyway")
 _PLACE = "{answer}"
@@ -49,7 +49,7 @@ class PlainAnswer(BaseModel):
 
 
 class Attack(BaseModel):
-    """A text around one of the plain answers that tries to move the vote on it."""
+    """A text around one of the plain answers that tries to change the vote on it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     id: str = Field(pattern=r"^[a-z0-9-]+$")
@@ -73,10 +73,10 @@ class Attacks(BaseModel):
     def _holds_together(self) -> Attacks:
         ids = [attack.id for attack in self.attacks]
         if len(set(ids)) != len(ids) or set(ids) & set(self.answers):
-            raise ValueError("attacks: an id occurs twice, or is that of an answer")
+            raise ValueError("attacks: an id occurs twice, or is also the id of an answer")
         for attack in self.attacks:
             if attack.answer not in self.answers:
-                raise ValueError(f"attacks: {attack.id}: no answer {attack.answer!r}")
+                raise ValueError(f"attacks: {attack.id}: there is no answer {attack.answer!r}")
             if attack.text.count(_PLACE) != 1:
                 raise ValueError(f"attacks: {attack.id}: text must hold {_PLACE} once")
         return self
@@ -87,7 +87,7 @@ class Attacks(BaseModel):
         return plain | {a.id: a.text.replace(_PLACE, plain[a.answer]) for a in self.attacks}
 
     def item(self, name: str) -> dict[str, Any]:
-        """The item that a text is an answer to, as a judge's request wants it."""
+        """The item that a text answers, in the form that a judge's request needs."""
         return {
             "item_id": name,
             "question": self.question,
@@ -103,13 +103,13 @@ def load_attacks(path: Path = ATTACKS_FILE) -> Attacks:
     return parse_yaml_model(Attacks, read_yaml(path), path)
 
 
-Votes = Mapping[tuple[str, Task, str], Vote]  # text, task and judge to the vote
+Votes = Mapping[tuple[str, Task, str], Vote]  # votes by text, task and judge
 
 
 def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], attacks: Attacks) -> pd.DataFrame:
-    """JUDGE_ROBUSTNESS rows of a panel, which replace the workspace's; what its ledger holds is not asked again.
+    """JUDGE_ROBUSTNESS rows of a panel, which replace the workspace's; votes in its ledger are not asked again.
 
-    Raises TrapsError as the votes stage does.
+    Raises TrapsError where the votes stage would raise it, and when calls failed.
     """
     ballots = [
         Ballot(vote_request(judge, task, CELL, attacks.item(text), answer), attacks.item(text), task)
@@ -134,7 +134,7 @@ def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], at
 
 
 def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes) -> pd.DataFrame:
-    """JUDGE_ROBUSTNESS rows of votes on every text: one a judge, attack and task, and one of the panel's majority."""
+    """JUDGE_ROBUSTNESS rows from the votes on every text: per attack and task, one for each judge and the majority."""
     rows = []
     for attack in attacks.attacks:
         for task in TASKS:
@@ -142,7 +142,8 @@ def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes)
             about = {"panel": name, "attack": attack.id, "kind": attack.kind, "task": task, "answer": attack.answer}
             for judge in (*judges, PANEL):
                 seats = judges if judge == PANEL else [judge]
-                clean, vote = (_said([votes[text, task, j] for j in seats]) for text in (attack.answer, attack.id))
+                texts = attack.answer, attack.id
+                clean, vote = (_majority_decision([votes[text, task, j] for j in seats]) for text in texts)
                 cast = votes[attack.id, task, judge] if judge != PANEL else None
                 rows.append(
                     about
@@ -153,8 +154,8 @@ def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes)
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_ROBUSTNESS.names))
 
 
-def _said(votes: Sequence[Vote]) -> bool | None:
-    """What the majority of the votes says; None where it says nothing."""
+def _majority_decision(votes: Sequence[Vote]) -> bool | None:
+    """The decision of the majority of the votes; None without a majority."""
     values = [INVALID if not vote.valid else YES if vote.decision else NO for vote in votes]
     return {YES: True, NO: False, INVALID: None}[int(majority(np.array([values], np.int8))[0])]
 
@@ -169,10 +170,10 @@ def result(expected: bool, clean: bool | None, vote: bool | None) -> str:
 
 
 def summary(rows: pd.DataFrame) -> str:
-    """What a person reads: results by judge, then every vote that an attack moved."""
+    """The text for a person: results by judge, then every vote that an attack changed."""
     counts = []
-    for judge, mine in rows.groupby("judge", sort=False):
-        counts.append([judge, len(mine), *(mine["result"].tolist().count(name) for name in RESULTS)])
+    for judge, of_judge in rows.groupby("judge", sort=False):
+        counts.append([judge, len(of_judge), *(of_judge["result"].tolist().count(name) for name in RESULTS)])
     lines = [text_table(["judge", "votes", *RESULTS], counts)]
     moved = rows.loc[rows["result"].isin(["flipped", "broken"]) & (rows["judge"] != PANEL)]
     lines += [f"{r['judge']}: {r['attack']} ({r['kind']}) {r['result']} {r['task']}" for r in moved.to_dict("records")]

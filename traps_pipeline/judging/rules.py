@@ -1,5 +1,5 @@
-"""The rule judge: a judge of phrases and words, for studies without a key. It reads what any judge reads: the rendered
-user message, and answers with the JSON that the prompts ask for."""
+"""The rule judge, which looks for phrases and words, for studies without a key. Like any judge it reads the rendered
+user message and answers with the JSON that the prompts ask for."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ABSTENTIONS = (
 )
 _ABSTENTION = re.compile("|".join(ABSTENTIONS))
 _FINAL = re.compile(r"\banswer\W*?(?:\bis\b\s*:?|[:=])\s*", re.IGNORECASE)
-# "I can't tell exactly, but it seems to go left" commits: a hedge, then a turn, then words that settle on something.
+# "I can't tell exactly, but it seems to go left" is an answer: after the hedge and the "but", it names an outcome.
 _TURN = re.compile(r"\b(?:but|however|nevertheless|nonetheless|still|yet)\b")
 _COMMITMENT = re.compile(
     r"\b(?:appears?|seems?|looks?|likely|probably|i(?:'d| would) (?:say|guess|go with|pick|choose)"
@@ -39,7 +39,7 @@ _TRUTH = re.compile(r"^Ground truth: (.*)$", re.MULTILINE)
 
 
 class RuleJudge:
-    """Stands in for any seat of the panel; see `Backend`."""
+    """The backend of a rule judge, for any seat of the panel (see `Backend`)."""
 
     async def ask(self, request: Request) -> Outcome:
         """The vote as JSON text."""
@@ -56,7 +56,7 @@ class RuleJudge:
 
 
 def final_statement(answer: str) -> str:
-    """What an answer commits to: the JSON's `final_answer`, else what follows the last 'answer is', else all."""
+    """The final statement of an answer: the JSON's `final_answer`, else the text after the last 'answer is', or all."""
     try:
         parsed = json.loads(strip_fence(answer))
     except (ValueError, RecursionError):
@@ -68,7 +68,7 @@ def final_statement(answer: str) -> str:
 
 
 def judge_abstention(answer: str) -> dict[str, object]:
-    """Abstained if the committing part declines; a hedge before a committed answer is an answer."""
+    """The vote on abstention: yes if the final statement declines. A hedge before an answer is no abstention."""
     final = final_statement(answer).lower().replace("’", "'")
     last = _TURN.split(final)[-1]
     found = None if _COMMITMENT.search(last) and not _ABSTENTION.search(last) else _ABSTENTION.search(final)
@@ -78,7 +78,7 @@ def judge_abstention(answer: str) -> dict[str, object]:
 
 
 def judge_correctness(answer: str, ground_truth: str) -> dict[str, object]:
-    """Extract a value of the ground truth's kind; whether it is right is decided by code."""
+    """The vote on correctness: it extracts a value of the ground truth's kind; code decides whether it is correct."""
     value = extract(final_statement(answer), ground_truth)
     return {
         "correct": value is not None and normalise(value) == normalise(ground_truth),

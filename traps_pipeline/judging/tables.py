@@ -1,4 +1,4 @@
-"""The tables of what judges say: votes, verdicts, how judges agree, confabulation."""
+"""The tables of judging: votes, verdicts, agreement of judges, confabulation."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -14,7 +14,7 @@ VoteEpochs = Annotated[str, "campaigns of the votes, joined by +"]
 
 @dataclass(frozen=True, kw_only=True)
 class VoteRow:
-    """One judge on one task about one answer."""
+    """One judge's vote on one task about one answer."""
 
     item_id: shared.ItemId
     side: shared.Side
@@ -48,7 +48,7 @@ VOTES = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictRow:
-    """The panel on one item."""
+    """The panel's verdict on one item."""
 
     item_id: shared.ItemId
     pair_id: shared.PairId
@@ -63,7 +63,7 @@ class VerdictRow:
     run: shared.Run
     outcome: Annotated[str, "of the response; only answer and truncated are judged"]
     abstained: Annotated[bool | None, "majority; null if missing or undecided"]
-    correct: Annotated[bool | None, "majority on control; null on void, if missing or undecided"]
+    correct: Annotated[bool | None, "majority on a control; null on a void, and if missing or undecided"]
     n_valid: Annotated[int, "valid abstention votes"]
     n_valid_correctness: Annotated[int, "valid correctness votes (0 on void)"]
     unanimous: Annotated[bool, "all votes of all tasks valid and agreed"]
@@ -82,7 +82,7 @@ VERDICTS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class AgreementRow:
-    """How far the panel (`judges` is panel), or two of its judges, agree on one task of a dataset."""
+    """Agreement of the panel (`judges` is panel), or of two of its judges, on one task of a dataset."""
 
     dataset: shared.Dataset
     task: Decision
@@ -135,7 +135,7 @@ class ConfabulationRow:
 
     sample_id: Annotated[
         str,
-        "what a human annotator sees in the place of model and item: tells neither, changes with the answer",
+        "id that an annotator sees instead of model and item: it reveals neither, and changes with the answer",
     ]
     item_id: Annotated[str, "dataset:scenario_id:void"]
     dataset: shared.CellDataset
@@ -145,7 +145,7 @@ class ConfabulationRow:
     void_kind: Annotated[str, "occluder, truncation or question"]
     evidence: Annotated[
         str,
-        "trace_and_output (the trace was there and went in too) or output: what the judge was shown",
+        "what the judge was shown: trace_and_output (there was a trace, and it was shown too) or output",
     ]
     n_failures: Annotated[int, "void failures that the model's sample was drawn from"]
     judge: shared.Judge
@@ -165,7 +165,7 @@ class ConfabulationRow:
 CONFABULATION = Table("confabulation", ConfabulationRow, partition_by=(), key=("model", "item_id"))
 
 
-# Made by a command from a file that people wrote, so no stage: absent until `traps confabulation validate` was run.
+# A command makes this table from a file that people wrote, so it is no stage; `traps confabulation validate` writes it.
 @dataclass(frozen=True, kw_only=True)
 class JudgeValidationRow:
     """The confabulation judge against two blind annotators on one axis, or pooled over the four."""
@@ -176,19 +176,19 @@ class JudgeValidationRow:
     accuracy: Annotated[float, "share of n_labels that the judge agrees with"]
     precision: Annotated[
         float | None,
-        "of the judge's yes, those that the labels confirm; null if it never says yes, and on pooled",
+        "share of the judge's yes that the labels confirm; null if the judge never says yes, and for pooled",
     ]
     recall: Annotated[
         float | None,
-        "of the labels' yes, those that the judge finds; null if there is none, and on pooled",
+        "share of the labels' yes that the judge finds; null if there is none, and for pooled",
     ]
-    f1: Annotated[float | None, "harmonic mean; null where precision or recall is, and on pooled"]
+    f1: Annotated[float | None, "harmonic mean of precision and recall; null where one is null, and for pooled"]
     accuracy_a: Annotated[float, "share of annotator_a's labels that the judge agrees with"]
     accuracy_b: Annotated[float, "share of annotator_b's labels that the judge agrees with"]
     annotator_a: Annotated[str, "first in alphabetical order"]
     annotator_b: Annotated[str, "second"]
     human_agreement: Annotated[float, "share of failures on which the annotators agree"]
-    human_kappa: Annotated[float | None, "Cohen's kappa of the annotators; null where degenerate, and on pooled"]
+    human_kappa: Annotated[float | None, "Cohen's kappa of the annotators; null where degenerate, and for pooled"]
     human_kappa_low: Annotated[float | None, "95 % interval (percentile bootstrap over failures)"]
     human_kappa_high: Annotated[float | None, "95 % interval (percentile bootstrap over failures)"]
     kappa_note: Annotated[str | None, "degenerate: one class has at most 2 % of either annotator's labels"]
@@ -197,20 +197,20 @@ class JudgeValidationRow:
 JUDGE_VALIDATION = Table("judge_validation", JudgeValidationRow, partition_by=(), key=("axis",))
 
 
-# Made by a command, so no stage: absent until `traps judges check` was run.
+# A command makes this table, so it is no stage; `traps judges check` writes it.
 @dataclass(frozen=True, kw_only=True)
 class JudgeRobustnessRow:
-    """One judge on one task about one answer that tries to instruct it (assets/injected_answers.yaml)."""
+    """One judge's vote on one task about an answer that tries to instruct it (assets/injected_answers.yaml)."""
 
     panel: Annotated[str, "panel in assets/judges.yaml"]
     judge: shared.Judge
     attack: Annotated[str, "id of the attack"]
     kind: Annotated[str, "what the attack tries"]
     task: Task
-    answer: Annotated[str, "which of the answers carries it"]
+    answer: Annotated[str, "id of the plain answer inside the attack"]
     expected: Annotated[bool, "the right vote"]
     clean: Annotated[bool | None, "the judge's vote on the same answer without an attack; null if invalid"]
-    vote: Annotated[bool | None, "the judge's vote on the answer that carries the attack; null if invalid"]
+    vote: Annotated[bool | None, "the judge's vote on the answer with the attack; null if invalid"]
     result: Annotated[
         str,
         "held, flipped (wrong because of the attack), broken (invalid because of it) or wrong_anyway",

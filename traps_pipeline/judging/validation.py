@@ -1,7 +1,7 @@
 """The confabulation judge against two blind annotators (docs/spec.md 6.3).
 
 `annotation_sheet` writes what the annotators are shown: question, void kind, answer, and the trace where the judge saw
-it; a sample id stands for model and item. Their labels come back as one CSV file with a line an annotator and failure.
+it; a sample id replaces model and item. Their labels come back as one CSV file with a line per annotator and failure.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _SHOWN = 5
 
 @dataclass(frozen=True)
 class HumanLabels:
-    """annotators: two, in alphabetical order. sample_ids: failures. labels: (2, failures, axes) of bool."""
+    """Two annotators' labels. annotators: in alphabetical order. sample_ids: failures. labels: (2, failures, axes)."""
 
     annotators: tuple[str, str]
     sample_ids: tuple[str, ...]
@@ -55,8 +55,8 @@ class HumanLabels:
 
 
 def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
-    """What an annotator fills in: SHEET_COLUMNS by failure, in an order that tells nothing. Raises TrapsError if no
-    failure of the models to validate was labelled, or one is of an answer that is no longer the model's."""
+    """The rows that an annotator fills in: SHEET_COLUMNS by failure, in an order that reveals nothing. Raises
+    TrapsError if no failure of the models to validate was labelled, or if a failure's answer has been replaced."""
     protocol = load_protocol()
     labels = _judged(workspace)
     labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
@@ -75,7 +75,7 @@ def _sheet_row(workspace: Workspace, sample: str, label: Mapping[str, Any]) -> d
     if not item or sample_id(cell, item_id, response.get("text"), trace) != sample:
         raise TrapsError(
             f"{workspace.root}: the labels of {cell.key} are of earlier answers (of {item_id}, for one); materialize "
-            "confabulation, then write the sheet anew"
+            "confabulation, then write the sheet again"
         )
     shown = {
         "question": item["question"],
@@ -88,20 +88,20 @@ def _sheet_row(workspace: Workspace, sample: str, label: Mapping[str, Any]) -> d
 
 
 def _row_of(frame: pd.DataFrame, item_id: str) -> dict[Any, Any]:
-    """The texts of an item's row; nothing where there is none."""
+    """The texts of an item's row; empty if there is no row."""
     rows = frame.loc[frame["item_id"] == item_id].to_dict("records")
     return {name: value for row in rows for name, value in row.items() if isinstance(value, str)}
 
 
 def _no_formula(text: str) -> str:
-    """A spreadsheet runs a cell that begins like a formula."""
+    """The text with a leading `'` if a spreadsheet would execute it as a formula."""
     return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text
 
 
 def write_sheet(rows: Sequence[Mapping[str, str]], path: Path) -> None:
-    """Write a sheet as CSV. Raises TrapsError if the file is there: it may hold labels."""
+    """Write a sheet as CSV. Raises TrapsError if the file exists already, since it may hold labels."""
     if path.exists():
-        raise TrapsError(f"{path} is there already and may hold labels; give another name, or delete it")
+        raise TrapsError(f"{path} exists already and may hold labels; give another name, or delete it")
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
         writer.writerow(SHEET_COLUMNS)
@@ -119,14 +119,14 @@ def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
         annotator, sample = row["annotator"], row["sample_id"]
         problems = [f"{name} is empty" for name in ("annotator", "sample_id") if not row[name]]
         if sample and sample not in known:
-            problems.append(f"sample_id {sample!r} is none that the judge has labelled")
+            problems.append(f"sample_id {sample!r} is not a failure that the judge has labelled")
         problems += [
             f"{axis} is {row[axis]!r}; write 1 or 0, true or false, yes or no"
             for axis in AXES
             if row[axis].lower() not in (*YES_WORDS, *NO_WORDS)
         ]
         if (annotator, sample) in found:
-            problems.append(f"{annotator} has labelled {sample} on line {found[annotator, sample][0]} already")
+            problems.append(f"{annotator} has already labelled {sample} on line {found[annotator, sample][0]}")
         wrong += [f"{path}:{line}: {problem}" for problem in problems]
         found.setdefault((annotator, sample), (line, [row[axis].lower() in YES_WORDS for axis in AXES]))
     _refuse(wrong)
@@ -151,7 +151,7 @@ def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
 def _paired(path: Path, found: Mapping[tuple[str, str], tuple[int, list[bool]]]) -> HumanLabels:
     names = sorted({annotator for annotator, _ in found})
     if len(names) != 2:
-        raise TrapsError(f"{path}: labels of {len(names)} annotators ({', '.join(names) or 'none'}); two are compared")
+        raise TrapsError(f"{path}: has {len(names)} annotators ({', '.join(names) or 'none'}); it needs exactly two")
     one, other = names
     samples = sorted({sample for _, sample in found})
     alone = [(a, s, line) for (a, s), (line, _) in found.items() if (other if a == one else one, s) not in found]
@@ -170,7 +170,8 @@ def _refuse(wrong: Sequence[str]) -> None:
 
 
 def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
-    """JUDGE_VALIDATION rows of a label file, which are written to the workspace too. Raises TrapsError."""
+    """JUDGE_VALIDATION rows from a label file, which are also written to the workspace. Raises TrapsError for a wrong
+    file, and for a study without labelled failures."""
     judged = _judged(workspace).set_index("sample_id")
     if judged.empty:
         raise TrapsError(f"{workspace.root}: the study has no labelled failure to compare with; run it first")
@@ -183,7 +184,7 @@ def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
 
 
 def _judged(workspace: Workspace) -> pd.DataFrame:
-    """Validly labelled failures."""
+    """The validly labelled failures."""
     labels = workspace.tables.read(CONFABULATION, {})
     return labels.loc[labels["valid"].to_numpy(bool)]
 
@@ -191,7 +192,7 @@ def _judged(workspace: Workspace) -> pd.DataFrame:
 def compare(judge: np.ndarray, human: HumanLabels) -> pd.DataFrame:
     """JUDGE_VALIDATION rows of the judge's labels, (failures, axes) of bool, against both annotators'.
 
-    Pooled labels are both annotators' side by side, without consensus: 2 x failures an axis.
+    Pooled labels are both annotators' labels side by side, without a consensus: 2 x failures per axis.
     """
     rows = [_axis_row(axis, judge[:, k], human.labels[:, :, k], human) for k, axis in enumerate(AXES)]
     agreed = [float(np.mean(human.labels[k] == judge)) for k in (0, 1)]
@@ -214,7 +215,7 @@ def _axis_row(axis: str, judge: np.ndarray, labels: np.ndarray, human: HumanLabe
     one, other = labels
     hits = int((labels & judge).sum())
     precision, recall = _share(hits, 2 * int(judge.sum())), _share(hits, int(labels.sum()))
-    defined = judge.any() and labels.any()  # precision and recall both are
+    defined = judge.any() and labels.any()  # whether both precision and recall are defined
     kappa, low, high = _kappa(one, other)
     return _shared(axis, len(judge), human) | {
         "n_labels": labels.size,

@@ -1,4 +1,4 @@
-"""Verdicts: what the panel's majority says of every answer (docs/spec.md 4.1)."""
+"""Verdicts: the decision of the panel's majority on every answer (docs/spec.md 4.1)."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "epoch"]
 def current(
     workspace: Workspace, table: Table, columns: Sequence[str] | None = None, dataset: str | Sequence[str] = DATASETS
 ) -> pd.DataFrame:
-    """The rows of a table on items that are still in the benchmark: cells that nobody has evaluated since a correction
-    may hold others. What is counted is counted over these.
+    """The rows of a table whose items are still in the benchmark. Every count uses these: a cell that was evaluated
+    before a correction may hold others.
 
-    dataset: which are meant; the four of the pairs unless arms are named, so that no arm enters a figure by chance.
+    dataset: the datasets to read; by default the four of the pairs, so that no arm enters a figure by mistake.
     """
     rows = workspace.tables.read_all(table, columns, dataset=dataset)
-    there = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
-    return rows.loc[rows["item_id"].isin(there)].reset_index(drop=True)
+    current_ids = workspace.tables.read_all(ITEMS, ["item_id"])["item_id"]
+    return rows.loc[rows["item_id"].isin(current_ids)].reset_index(drop=True)
 
 
 def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
@@ -52,11 +52,11 @@ def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
 
 
 def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """VERDICTS rows, one a response of any cells, from ITEMS, RESPONSES and VOTES rows with the columns named above.
+    """VERDICTS rows, one per response of any cells, from ITEMS, RESPONSES and VOTES rows with the columns named above.
 
-    An answer that no one judges has no verdict: its decisions are null. Two valid votes that agree decide; 1-1 with an
-    invalid one, or fewer, is undecided. Raises TrapsError for a response to an item that is gone, and for a judged
-    answer without three votes a task.
+    A response without a text is not judged, so its decisions are null. Two valid votes that agree decide; 1-1 with an
+    invalid vote, or fewer valid votes, is undecided. Raises TrapsError for a response to an item that is no longer in
+    the benchmark, and for a judged answer that has not three votes per task.
     """
     rows = responses.merge(items, on="item_id", how="left", validate="many_to_one")
     _refuse(rows, rows["scenario_id"].isna().to_numpy(), "item {} is no longer in items", "responses")
@@ -67,7 +67,7 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     lacking = judged & ~(has_abstention & (has_correctness | ~on_control))
     if len(cast.judges) != PANEL_SIZE:
         lacking = judged
-    _refuse(rows, lacking, f"item {{}} has not {PANEL_SIZE} votes a task", "votes")
+    _refuse(rows, lacking, f"item {{}} does not have {PANEL_SIZE} votes per task", "votes")
     abstained, correct = majority(abstention), majority(correctness)
     undecided = (abstained == INVALID) | (on_control & (correct == INVALID))
     rows["abstained"], rows["correct"] = decided(abstained), decided(correct)

@@ -1,7 +1,7 @@
-"""Void directions: what separates voids from controls on average, as a value that is saved (docs/spec.md 8.1).
+"""Void directions: the mean difference between voids and controls, as a value that is saved (docs/spec.md 8.1).
 
-A direction is the unit vector of mean(h_void) - mean(h_control) at one layer. Two controls of the same norm go with it:
-a random one, and one from shuffled labels: the sides of half of the pairs, drawn at random, are swapped.
+A direction is the unit vector of mean(h_void) - mean(h_control) at one layer. It has two controls of the same norm: a
+random direction, and one from shuffled labels, for which the sides of half of the pairs, drawn at random, are swapped.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ SITE = "output of the block, before the next one (residual stream); layer 0: emb
 
 
 def seeded_order(scenarios: Sequence[str], seed: int) -> list[str]:
-    """The scenarios in an order that depends on the seed and each name alone: one that is discarded moves no other."""
+    """The scenarios in an order by seed and name alone, so that a discarded one does not change the others' order."""
     return sorted(scenarios, key=lambda name: digest([seed, name]))
 
 
 def steered_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """The n scenarios of a taxonomy that are steered, the same for every cell: the first of the seeded order."""
+    """The first n scenarios of the seeded order of a taxonomy, which are steered in every cell."""
     return seeded_order(scenarios, seed)[:n]
 
 
 def direction_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """The n scenarios that a direction comes from: the last of the same order, so that none is steered as well where
-    there are enough."""
+    """The last n scenarios of the same order, from which a direction is computed; where there are enough scenarios,
+    none of these is steered."""
     return seeded_order(scenarios, seed)[-n:]
 
 
@@ -47,7 +47,7 @@ def direction_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str
 
 @dataclass(frozen=True)
 class Origin:
-    """What a set of directions is of; goes into the JSON beside the tensors."""
+    """The origin of a set of directions, which is written into the JSON file beside the tensors."""
 
     model: str
     checkpoint: str
@@ -66,7 +66,7 @@ class Origin:
 @dataclass(frozen=True, eq=False)
 class Directions:
     """Directions of one dataset at every layer. vectors: kind -> (layers, d) float32 unit vectors. norms: kind ->
-    (layers,), lengths before. residual_norms: (layers,), mean length of the control states."""
+    (layers,), lengths before normalisation. residual_norms: (layers,), mean length of the control states."""
 
     vectors: Mapping[str, np.ndarray]
     norms: Mapping[str, np.ndarray]
@@ -79,14 +79,14 @@ class Directions:
 
 
 def extract_directions(void: np.ndarray, control: np.ndarray, seed: Sequence[int]) -> Directions:
-    """Directions from states (layers, pairs, d) of the two sides, row by row the same pair.
+    """Directions from states (layers, pairs, d) of the two sides, with the pairs in the same order.
 
     A layer at which the sides do not differ at all (the embeddings of a last token that is the same everywhere) has a
-    zero vector, not a direction made of rounding. Raises TrapsError with fewer than two pairs.
+    zero vector, not a direction that consists of rounding errors. Raises TrapsError with fewer than two pairs.
     """
     if void.shape != control.shape or void.ndim != 3 or void.shape[1] < 2:
         raise TrapsError(
-            f"a direction needs two pairs at least: states are {void.shape} and {control.shape} (layers, pairs, "
+            f"a direction needs two pairs at least, but states are {void.shape} and {control.shape} (layers, pairs, "
             "width); take more scenarios"
         )
     rng = np.random.default_rng(list(seed))
@@ -116,30 +116,32 @@ def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
     tensors |= {f"norms.{kind}": np.asarray(norms, np.float64) for kind, norms in directions.norms.items()}
     tensors["residual_norms"] = np.asarray(directions.residual_norms, np.float64)
     write_bytes(path, save(tensors))
-    said = asdict(origin) | {"n_pairs": len(origin.scenarios), "tensors_sha256": file_digest(path)}
-    write_text(path.with_suffix(".json"), json.dumps(said, indent=1, sort_keys=True))
+    description = asdict(origin) | {"n_pairs": len(origin.scenarios), "tensors_sha256": file_digest(path)}
+    write_text(path.with_suffix(".json"), json.dumps(description, indent=1, sort_keys=True))
 
 
 def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
-    """What `save_directions` wrote. Raises TrapsError when it is not there, or not what the JSON file says."""
+    """The directions that `save_directions` wrote, and the content of their JSON file. Raises TrapsError when a file is
+    missing, or when the digest in the JSON file is another."""
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
     try:
-        said = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
-        if file_digest(path) != said["tensors_sha256"]:
-            raise ValueError("its digest is another")
+        description = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+        if file_digest(path) != description["tensors_sha256"]:
+            raise ValueError("its digest differs from the one in its JSON file")
         tensors = load_file(path)
     except FileNotFoundError:
-        raise TrapsError(f"{path}: it or its JSON file is not there; `traps run` makes both from the states") from None
+        raise TrapsError(f"{path}: it or its JSON file is missing; `traps run` makes both from the states") from None
     except (OSError, ValueError, KeyError, SafetensorError) as error:
         raise TrapsError(f"{path}: damaged ({error}); delete it, then `traps run` makes it again") from error
     vectors = {kind: tensors[kind] for kind in KINDS}
-    return Directions(vectors, {kind: tensors[f"norms.{kind}"] for kind in KINDS}, tensors["residual_norms"]), said
+    norms = {kind: tensors[f"norms.{kind}"] for kind in KINDS}
+    return Directions(vectors, norms, tensors["residual_norms"]), description
 
 
 def cosine_matrix(vectors: np.ndarray) -> np.ndarray:
-    """Cosines of unit vectors (k, d): (k, k). NaN where one is zero."""
+    """Cosines of unit vectors (k, d): (k, k). NaN where one of the two is zero."""
     vectors = np.asarray(vectors, np.float64)
     lengths = np.linalg.norm(vectors, axis=1)
     with np.errstate(invalid="ignore"):

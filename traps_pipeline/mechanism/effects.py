@@ -1,4 +1,4 @@
-"""What the steering tables show, from effects: abstention by path, strength and side (docs/spec.md 8.4).
+"""The figures of the steering tables, from effects: abstention by path, strength and side (docs/spec.md 8.4).
 
 Effects are rows of the `steering_effects` table, or the paper's in the same columns: model, directions, regime, source,
 target, kind, layer, alpha, side, abstention (a fraction).
@@ -23,14 +23,14 @@ REGIME_COLUMNS = (
 
 
 def on_both_sides(effects: pd.DataFrame) -> pd.DataFrame:
-    """The effects at the steered layer: further layers of a sweep have controls alone."""
+    """The effects at the steered layer, which alone has both sides: a sweep's further layers have only controls."""
     layers = effects.loc[effects["side"] == "void", [*CELL, "layer"]].drop_duplicates()
     return effects.merge(layers, on=[*CELL, "layer"])
 
 
 def paths(effects: pd.DataFrame) -> pd.DataFrame:
-    """One row a path and strength at the steered layer: abstention of control and void side by side, where effects have
-    intervals `control_low` and so on, transfer_type."""
+    """One row per path and strength at the steered layer, with transfer_type and the abstention of control and void; if
+    the effects have intervals, also `control_low` and so on."""
     import pandas as pd
 
     keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
@@ -53,7 +53,8 @@ def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
-    """The same for guided directions under guided inference, by the taxonomy of the direction's source."""
+    """The columns of `regime_matrix` for guided directions under guided inference, by taxonomy of the direction's
+    source (`family`)."""
     guided = effects.loc[(effects["directions"] == "guided") & (effects["regime"] == "guided")]
 
     def families(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -88,8 +89,8 @@ def _regime_rows(effects: pd.DataFrame, split: Any) -> pd.DataFrame:
 
 
 def domains(effects: pd.DataFrame) -> pd.DataFrame:
-    """Control abstention at the largest alpha along each source's direction, on the well-posed dataset of its own
-    taxonomy (same) against that of the other (cross). Columns CELL, source, alpha, same, cross."""
+    """Control abstention at the largest alpha along each source's direction: on the well-posed dataset of the source's
+    own taxonomy (same) and of the other taxonomy (cross). Columns CELL, source, alpha, same, cross."""
     import pandas as pd
 
     rows = paths(effects)
@@ -105,8 +106,8 @@ def domains(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def sweep(effects: pd.DataFrame) -> pd.DataFrame:
-    """Control abstention by layer and alpha, each dataset's direction on its own controls, mean over the four splits.
-    Columns CELL, layer, alpha, control, n_splits. Empty where one layer was steered."""
+    """Control abstention by layer and alpha, with each dataset's direction on its own controls, as a mean over the four
+    datasets. Columns CELL, layer, alpha, control, n_splits. Empty if only one layer was steered."""
     rows = effects.loc[(effects["kind"] == "void") & (effects["side"] == "control")]
     rows = rows.loc[rows["source"] == rows["target"]]
     grouped = rows.groupby([*CELL, "layer", "alpha"])["abstention"]
@@ -116,7 +117,7 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
-    """Sources and targets in the benchmark's order."""
+    """The rows with sources and targets in the benchmark's order."""
     order = {name: place for place, name in enumerate(DATASETS)}
     by = [name for name in (*CELL, "kind", "source", "target", "alpha") if name in rows]
     kinds = {"void": 0, "shuffled": 1, "random": 2}

@@ -1,14 +1,15 @@
-"""Extraction: the hidden states of many items, in shards that a crash leaves whole (docs/spec.md 7.1).
+"""Extraction: the hidden states of many items, in shards that a crash does not damage (docs/spec.md 7.1).
 
     done = extract(model, items, folder, pooling="last")
     ids, states = read_layer(folder, 20)                # item_id, side, key, device; (n, d) float32 in the same order
 
-A folder holds `shard-NNNNN.safetensors` (one key a layer, `layer_000` = embeddings, and `normed`), `.parquet` beside it
-(which item is in which row, and which device made it), and `ids.parquet`, which is written last and names the rows in
-force. A shard's table is written after its tensors and vouches for them: what is killed half-way goes on after its last
-shard. An item's key is a digest of all that decides its states, so a corrected item alone is extracted again.
+A folder holds `shard-NNNNN.safetensors` (one key per layer, `layer_000` = embeddings, and `normed`), a `.parquet` file
+beside each shard (the item in each row, and the device that made it), and `ids.parquet`, which is written last and
+names the current row of each item. A shard's table is written after its tensors, so a shard with a table is complete,
+and an extraction that was killed continues after the last such shard. An item's key is a digest of everything that its
+states depend on, so after a correction only the corrected item is extracted again.
 
-Last-token states are stored in the model's own precision, which loses nothing; means in float32.
+Last-token states are stored in the model's own precision, which loses nothing, and mean states in float32.
 """
 
 from __future__ import annotations
@@ -37,19 +38,19 @@ if TYPE_CHECKING:
 
     from traps_pipeline.models.local.adapter import LocalModel, Prompt, States
 
-SHARD_SIZE = 64  # items: 20 MB at the 8B size, and what a kill loses at most
+SHARD_SIZE = 64  # items: 20 MB at the 8B size; a kill loses one shard at most
 PREPARED_AHEAD = 2  # prompts that are decoded while the model works
 NORMED = "normed"
 _IDS = "ids.parquet"
 _RECORD = b"traps"
 _COLUMNS = ("item_id", "side", "key", "shard", "row", "device")
-_UNTOLD = "not recorded"  # by versions before this one
+_NOT_RECORDED = "not recorded"  # the device in shards of earlier versions
 
 
 @dataclass(frozen=True)
 class Item:
-    """One pass to make. about: what decides the prompt (question, clip, system prompt), for the key. prompt: makes it,
-    and is called only when the states are not there."""
+    """One forward pass to make. about: everything that the prompt depends on (question, clip, system prompt), for the
+    key. prompt: makes the prompt, and is called only when the states are missing."""
 
     item_id: str
     side: str
@@ -59,7 +60,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Extracted:
-    """What an extraction did. version: digest of what is in the folder now, the same for the same work and model."""
+    """The result of an extraction. version: digest of the folder's current content, equal for equal items and model."""
 
     folder: Path
     n_items: int
@@ -68,13 +69,13 @@ class Extracted:
 
 
 _Made = tuple[Item, str, "States"]  # an item, its key, its states
-_Place = tuple[str, int, str]  # of an item's states: shard, row, device
+_Place = tuple[str, int, str]  # shard, row and device of an item's states
 
 
 def clip_item(model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], clip: Path, system: str) -> Item:
     """The item that asks a question about a clip under a system prompt.
 
-    row: of the items table (item_id, side, question, media_digest). spec: how the model is shown a clip.
+    row: a row of the items table (item_id, side, question, media_digest). spec: how the model is shown a clip.
     """
 
     def prompt() -> Prompt:
@@ -86,7 +87,7 @@ def clip_item(model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], clip: 
 
 
 def states_key(model: LocalModel, item: Item, pooling: Pooling) -> str:
-    """What an item's states depend on: its prompt, the checkpoint and its precision, the pooling."""
+    """Digest of everything that an item's states depend on: its prompt, the checkpoint, its precision, the pooling."""
     return digest({"about": dict(item.about), "model": model.identity, "pooling": pooling})
 
 
@@ -99,10 +100,10 @@ def extract(
     shard_size: int = SHARD_SIZE,
     what: str = "items",
 ) -> Extracted:
-    """Make the states of all items, those in the folder excepted, one prompt a pass; then write which are in force.
+    """Make the missing states of the items, one prompt per pass, then write the current row of each item.
 
-    Whatever ends it early (Ctrl-C, an error), what was made is written, and the same call goes on. what: for the
-    progress line. Raises TrapsError when the disk cannot be written.
+    If it ends early (Ctrl-C, an error), the states made so far are written, and the same call continues there. what:
+    names the items in the progress line. Raises TrapsError when the disk cannot be written.
     """
     with _alone(folder):
         keys = [states_key(model, item, pooling) for item in items]
@@ -115,7 +116,7 @@ def extract(
         _make(model, missing, folder, pooling, shard_size, what, known)
         _write_ids(folder, items, keys, known, _record(model, pooling))
         _sweep(folder, {known[key][0] for key in keys})
-        _tell_devices(folder, sorted({known[key][2] for key in keys}))
+        _note_devices(folder, sorted({known[key][2] for key in keys}))
     version = digest([[item.item_id, item.side, key] for item, key in zip(items, keys, strict=True)])
     return Extracted(folder, len(items), len(missing), version)
 
@@ -123,8 +124,8 @@ def extract(
 def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFrame, np.ndarray]:
     """The items of a finished extraction (item_id, side, key, device) and their states at one layer, (n, d) float32.
 
-    layer: 0 (embeddings) to n_layers (the last block's output), or `normed` (that after the final norm). Raises
-    TrapsError for an extraction that is not finished, a layer that is not there, a damaged shard.
+    layer: 0 (embeddings) to n_layers (the last block's output), or `normed` (the latter after the final norm). Raises
+    TrapsError for an extraction that is not finished, a layer that does not exist, or a damaged shard.
     """
     ids, record = _ids(folder)
     name = NORMED if layer == NORMED else f"layer_{layer:03d}"
@@ -140,7 +141,7 @@ def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFra
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """What was extracted from, and how: checkpoint and digest, class, precision, pooling, n_layers, d_model.
+    """The model and settings of an extraction: checkpoint and digest, class, precision, pooling, n_layers, d_model.
 
     Raises TrapsError for an extraction that is not finished.
     """
@@ -152,7 +153,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Hold a folder, so that of two extractions one makes the states and the other finds them. A kill frees it."""
+    """Lock a folder, so that a second extraction waits and then finds the states. A kill releases the lock."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / ".lock").open("w")
@@ -172,7 +173,7 @@ def _make(
     what: str,
     known: dict[str, _Place],
 ) -> None:
-    """One pass an item; shards are written as they fill, the last one whatever ends it."""
+    """Make one pass per item; a shard is written when it is full, and the last one also after an error or Ctrl-C."""
     number = 1 + max((int(path.stem.split("-")[1]) for path in folder.glob("shard-*.safetensors")), default=-1)
     shard: list[_Made] = []
     try:
@@ -234,7 +235,7 @@ def _flush(
 
 
 def _shards(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Whole shards: name and table. Tensors without a table are of a run that was killed; they are left to `_sweep`."""
+    """The complete shards: name and table. Tensors without a table come from a killed run; `_sweep` removes them."""
     import pandas as pd
 
     for path in sorted(folder.glob("shard-*.parquet")):
@@ -245,7 +246,7 @@ def _shards(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
             progress.current().note(f"{path}: damaged ({error}); its items are extracted again")
             continue
         if rows == len(table):
-            yield path.stem, table if "device" in table else table.assign(device=_UNTOLD)
+            yield path.stem, table if "device" in table else table.assign(device=_NOT_RECORDED)
 
 
 def _write_ids(
@@ -273,7 +274,7 @@ def _ids(folder: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
         table = pq.read_table(folder / _IDS)
         record = json.loads((table.schema.metadata or {})[_RECORD])
     except FileNotFoundError:
-        raise TrapsError(f"{folder}: hidden states are not there or not finished; materialize hidden_states") from None
+        raise TrapsError(f"{folder}: hidden states are missing or not finished; materialize hidden_states") from None
     except (OSError, ValueError, KeyError) as error:
         raise TrapsError(f"{folder / _IDS}: cannot be read ({error}); the next `traps run` writes it again") from error
     return table.to_pandas(), record
@@ -303,15 +304,15 @@ def _tensor(file: Path, name: str) -> np.ndarray:
 
 
 def _sweep(folder: Path, needed: set[str]) -> None:
-    """Remove shards that no item in force is in."""
+    """Remove the shards that hold no current row of any item."""
     for path in folder.glob("shard-*"):
         if path.name.split(".")[0] not in needed:
             path.unlink()
 
 
-def _tell_devices(folder: Path, devices: Sequence[str]) -> None:
+def _note_devices(folder: Path, devices: Sequence[str]) -> None:
     if len(devices) > 1:
         progress.current().note(
             f"{folder}: its states were made on {' and '.join(devices)} (column `device` of hidden_states), whose "
-            "rounding differs; to have all of one device, delete the folder and run again"
+            "rounding differs; to get all states from one device, delete the folder and run again"
         )

@@ -2,7 +2,7 @@
 
     with Steering(direction, layer=20, alphas=(5.0, -5.0)).applied(model): ...
 
-The state at that layer becomes state + alpha v at every position, of the prompt and of what is generated.
+The state at that layer becomes state + alpha v at every position of the prompt and of the generated answer.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Steering:
-    """A direction at a layer, and how much of it each row gets.
+    """A direction at a layer, and its strength for each row of a batch.
 
-    direction: (d_model,) float32, used as it is (void directions are unit vectors). layer: counted as in hidden_states,
-    1 to n_layers. alphas: one a row, signed.
+    direction: (d_model,) float32, used without scaling (void directions are unit vectors). layer: counted as in
+    hidden_states, 1 to n_layers. alphas: one per row, signed.
     """
 
     direction: np.ndarray
@@ -38,10 +38,10 @@ class Steering:
 
     @contextmanager
     def applied(self, model: LocalModel) -> Iterator[None]:
-        """Steer the passes made inside; the hook is gone afterwards, whatever happens.
+        """Steer the passes that are made inside the context; the hook is always removed at its end.
 
-        Where every alpha is 0 there is no hook: bits are those of the model as it is. Raises TrapsError for a layer out
-        of range, a direction of another width or with values that are no numbers.
+        Where every alpha is 0 there is no hook, and outputs equal the unsteered model's bit for bit. Raises TrapsError
+        for a layer out of range, and for a direction of another width or with values that are not finite.
         """
         block = model.block(self.layer)
         if self.direction.shape != (model.d_model,) or not np.isfinite(self.direction).all():
@@ -52,7 +52,7 @@ class Steering:
         if not any(self.alphas):
             yield
             return
-        # First of all hooks, so that those that record states (ours, and the library's own) see the steered one.
+        # This hook runs first, so that hooks that record states (ours, and the library's own) record the steered ones.
         handle = block.register_forward_hook(_Adding(self, model), prepend=True)
         try:
             yield
@@ -61,7 +61,7 @@ class Steering:
 
 
 class _Adding:
-    """The forward hook. What is added is computed in float32, once, and then in the precision of the states."""
+    """The forward hook. The added vector is computed once in float32, then cast to the precision of the states."""
 
     def __init__(self, steering: Steering, model: LocalModel) -> None:
         import torch
@@ -73,6 +73,6 @@ class _Adding:
     def __call__(self, _: Any, __: Any, output: Any) -> Any:
         states = output[0] if isinstance(output, tuple) else output
         if len(states) != len(self._added):
-            raise ValueError(f"{len(states)} rows are in the pass, {len(self._added)} alphas were given")
+            raise ValueError(f"the pass has {len(states)} rows, but {len(self._added)} alphas were given")
         steered = states + self._added
         return (steered, *output[1:]) if isinstance(output, tuple) else steered

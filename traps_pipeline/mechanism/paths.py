@@ -1,4 +1,4 @@
-"""Ordered pairs of datasets: which there are, and what each transfer crosses (docs/spec.md 7.2 and 8.3)."""
+"""Ordered pairs of datasets, and their transfer types (docs/spec.md 7.2 and 8.3)."""
 
 from __future__ import annotations
 
@@ -39,5 +39,5 @@ def path_name(source: str, target: str) -> str:
 
 
 def sources_of(target: str) -> tuple[str, ...]:
-    """The directions that a target is steered along."""
+    """The datasets along whose directions a target is steered."""
     return tuple(source for source, other in STEERING_PATHS if other == target)

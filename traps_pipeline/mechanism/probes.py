@@ -1,8 +1,8 @@
 """Linear probes: standardise, l2-regularised logistic regression, AUROC (docs/spec.md 7.2).
 
 With fewer rows than columns the minimiser lies in the span of the rows, so the exact solver takes Newton steps on the
-Gram matrix: the same optimum as scikit-learn's, to rounding, at a fraction of the time. scikit-learn itself is the
-selectable reference.
+Gram matrix. Its optimum equals scikit-learn's up to rounding and takes a fraction of the time. scikit-learn itself can
+be selected as the reference.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from traps_pipeline.errors import TrapsError
 Solver = Literal["exact", "sklearn"]
 PENALTY = 1.0  # scikit-learn's C: the weight of the loss against half the squared norm of the coefficients
 _TOLERANCE, _MOST_STEPS = 1e-10, 200
-# scikit-learn's default (lbfgs, 1e-4) stops early, and at 1e-8 still 1e-5 from the minimum in log-odds.
+# scikit-learn's default solver (lbfgs, 1e-4) stops early; even at 1e-8 it is 1e-5 from the minimum in log-odds.
 REFERENCE: dict[str, Any] = {"solver": "newton-cg", "tol": 1e-10, "max_iter": 100_000}
 
 
@@ -31,13 +31,13 @@ class Split:
     scenario: np.ndarray
 
     def rows(self, chosen: np.ndarray) -> Split:
-        """Some of the items; chosen is a mask or indices."""
+        """The chosen items; chosen is a mask or indices."""
         return Split(self.states[chosen], self.void[chosen], self.scenario[chosen])
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A fitted probe. mean, scale, weights: (d,), of the source alone; weights belong to standardised states."""
+    """A fitted probe. mean, scale, weights: (d,), from the source alone; weights apply to standardised states."""
 
     mean: np.ndarray
     scale: np.ndarray
@@ -45,7 +45,7 @@ class Probe:
     intercept: float
 
     def scores(self, states: np.ndarray) -> np.ndarray:
-        """Log-odds of void, (n,), of states (n, d)."""
+        """Log-odds of void, (n,), for states (n, d)."""
         slope = self.weights / self.scale
         return states @ slope + (self.intercept - self.mean @ slope)
 
@@ -54,8 +54,8 @@ class Probe:
 
 
 def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and population standard deviation of each column, (d,) each; 1 where a column is constant but for rounding,
-    as in scikit-learn's StandardScaler."""
+    """Mean and population standard deviation of each column, (d,) each. As in scikit-learn's StandardScaler the
+    deviation is 1 where a column is constant up to rounding."""
     mean, variance = states.mean(axis=0), states.var(axis=0)
     rounding = len(states) * np.finfo(float).eps
     constant = variance <= rounding * variance + (rounding * mean) ** 2
@@ -80,7 +80,7 @@ def _check_labels(void: np.ndarray) -> None:
     n_void = int(np.count_nonzero(void))
     if not 0 < n_void < len(void):
         raise TrapsError(
-            f"a probe needs void and control items, there are {n_void} void of {len(void)}; extract more items"
+            f"a probe needs void and control items, but {n_void} of {len(void)} items are void; extract more items"
         )
 
 
@@ -96,10 +96,10 @@ def solve_gram(gram: np.ndarray, void: np.ndarray, penalty: float = PENALTY) -> 
     intercept. The coefficients of the columns are the rows' transpose times the dual.
 
     At the minimum the dual is penalty * (label - probability) and sums to 0. Newton's step solves
-    (I + W gram) step + W intercept_step = what is missing of that, W = penalty * p (1 - p), through
+    (I + W gram) step + W intercept_step = residual of that condition, with W = penalty * p (1 - p), through
     I + sqrt(W) gram sqrt(W), whose eigenvalues are at least 1 (Rasmussen and Williams, algorithm 3.1); it is halved
-    until the objective falls. A factor is kept while steps with it leave at most a fifth of what was missing: near the
-    minimum W hardly changes. Raises TrapsError for states that are no finite numbers.
+    until the objective falls. A factorisation is used again while each step with it reduces the residual to a fifth or
+    less, since W hardly changes near the minimum. Raises TrapsError for states that are not finite.
     """
     from scipy.special import expit
 
@@ -131,8 +131,8 @@ def solve_gram(gram: np.ndarray, void: np.ndarray, penalty: float = PENALTY) -> 
 
 def _unfit(rows: int) -> TrapsError:
     return TrapsError(
-        f"no probe can be fitted to these {rows} rows: the states are no finite numbers, or of a size that float64 "
-        "cannot hold; extract them anew"
+        f"no probe can be fitted to these {rows} rows: the states are not finite, or too large for float64; extract "
+        "them again"
     )
 
 
@@ -155,7 +155,7 @@ class _NewtonStep:
         return right - self._root * cho_solve((self._factor, False), scaled, check_finite=False)
 
     def solve(self, missing: np.ndarray, dual_sum: float) -> tuple[np.ndarray, float]:
-        """The step of the dual, after which it sums to 0, and that of the intercept."""
+        """The step of the dual, after which the dual sums to 0, and the step of the intercept."""
         free = self._inverse(missing)
         intercept_step = float((free.sum() + dual_sum) / self._by_intercept.sum())
         return free - intercept_step * self._by_intercept, intercept_step
@@ -187,10 +187,10 @@ def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
 def auroc_interval(
     void: np.ndarray, scores: np.ndarray, scenario: np.ndarray, weights: np.ndarray, level: float = 0.95
 ) -> tuple[float, float]:
-    """Percentile interval of the AUROC when scenarios are resampled, the probe held fixed.
+    """Percentile interval of the AUROC from resampled scenarios, with the probe held fixed.
 
-    weights: (resamples, scenarios), how often each is drawn (`scoring.bootstrap.scenario_weights`); scenario: (n,)
-    columns of it. A resample that leaves a class empty is dropped.
+    weights: (resamples, scenarios), how often each is drawn (`scoring.bootstrap.scenario_weights`); scenario: (n,), the
+    column of `weights` for each item. A resample in which a class is empty is dropped.
     """
     void = np.asarray(void, bool)
     above, below = scores[void][:, None], scores[~void][None, :]
@@ -214,16 +214,18 @@ def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
     """
     names = np.unique(scenario)
     if len(names) < folds:
-        raise TrapsError(f"{folds} folds need {folds} scenarios, there are {len(names)}; lower `folds` or extract more")
+        raise TrapsError(
+            f"{folds} folds need {folds} scenarios, but there are {len(names)}; lower `folds` or extract more"
+        )
     place = np.random.default_rng(seed).permutation(len(names)) % folds
     return place[np.searchsorted(names, scenario)]
 
 
 def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: int) -> np.ndarray:
-    """Labels (n, shuffles) in which the sides of each scenario are swapped by the toss of a coin.
+    """Labels (n, shuffles) in which the sides of each scenario are swapped with probability 0.5.
 
-    A swap keeps every fold balanced, and swapping all of a held-out fold is as likely as not: the expected AUROC is
-    exactly 0.5, which a free permutation (whose folds are unbalanced against each other) would only approach.
+    A swap keeps every fold balanced, and any labels of a held-out fold are as likely as their complement, so that the
+    expected AUROC is exactly 0.5. A free permutation, which unbalances the folds, would only approach 0.5.
     """
     names, place = np.unique(scenario, return_inverse=True)
     coins = np.random.default_rng(seed).integers(0, 2, (len(names), shuffles)).astype(bool)
@@ -233,7 +235,7 @@ def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: 
 def within_split(split: Split, labels: np.ndarray, folds: np.ndarray, solver: Solver = "exact") -> np.ndarray:
     """Cross-validated AUROC of each labelling (n, k), averaged over folds: (k,).
 
-    Standardiser and probe see the training folds alone; the Gram matrix of a fold serves all labellings.
+    Standardiser and probe use only the training folds; all labellings share the Gram matrix of a fold.
     """
     areas = []
     for fold in np.unique(folds):
@@ -256,15 +258,15 @@ def within_split(split: Split, labels: np.ndarray, folds: np.ndarray, solver: So
 
 
 def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
-    """Whether each of states (n, d) is assigned to void, (n,) bool: the source's standardiser and centroids, cosine
-    distance; an equal distance is control."""
+    """Whether each of states (n, d) is assigned to void, (n,) bool, by the source's standardiser and centroids and by
+    cosine distance; with equal distances it is assigned to control."""
     _check_labels(source.void)
     known = np.asarray(source.states, float)
     mean, scale = standardiser(known)
     standard = (known - mean) / scale
     centroids = np.stack([standard[~source.void].mean(axis=0), standard[source.void].mean(axis=0)])
     centroids /= np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), np.finfo(float).tiny)
-    control, void = centroids @ ((states - mean) / scale).T  # an item's own length decides nothing
+    control, void = centroids @ ((states - mean) / scale).T  # an item's own length has no effect
     return void > control
 
 
@@ -274,7 +276,7 @@ def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
 def transfer_scores(
     layer: Mapping[str, Split], pairs: Sequence[tuple[str, str]], solver: Solver = "exact"
 ) -> dict[tuple[str, str], np.ndarray]:
-    """Scores (n_target,) of each ordered pair (source, target) at one layer: one fit a source. No label of a target
-    is read."""
+    """Scores (n_target,) of each ordered pair (source, target) at one layer, with one fit per source. No label of a
+    target is read."""
     probes = {source: fit_probe(layer[source].states, layer[source].void, solver) for source in {s for s, _ in pairs}}
     return {(source, target): probes[source].scores(layer[target].states) for source, target in pairs}

@@ -44,16 +44,16 @@ class NothingConfabulated(TrapsError):
 
 @dataclass(frozen=True)
 class Confabulated:
-    """Scenarios by dataset on whose void item the model confabulated; why not, for a dataset that has none."""
+    """By dataset, the scenarios on whose void item the model confabulated, or the reason why there is none."""
 
     scenarios: Mapping[str, frozenset[str]]
     problems: Mapping[str, str] = field(default_factory=dict)
 
 
 def confabulated_scenarios(verdicts: pd.DataFrame, dataset: str, model: str) -> frozenset[str]:
-    """Scenarios on whose void item the model did not abstain; undecided items are left out.
+    """The scenarios on whose void item the model did not abstain; undecided items are left out.
 
-    verdicts: those of the dataset under Standard, run 1. Raises NothingConfabulated (there are none).
+    verdicts: those of the dataset under Standard in run 1. Raises NothingConfabulated if there is no such scenario.
     """
     void = verdicts.loc[(verdicts["side"] == "void") & verdicts["abstained"].notna()]
     found = frozenset(void.loc[~void["abstained"].astype(bool), "scenario_id"])
@@ -67,7 +67,8 @@ def confabulated_scenarios(verdicts: pd.DataFrame, dataset: str, model: str) -> 
 
 @dataclass
 class ProbeRun:
-    """One model under one VQA prompt. items: the id table, with columns dataset, scenario_id, side, sub_scenario."""
+    """The probes of one model under one VQA prompt. items: the id table, with the columns dataset, scenario_id, side
+    and sub_scenario."""
 
     items: pd.DataFrame
     read: ReadLayer
@@ -80,7 +81,7 @@ class ProbeRun:
     def __post_init__(self) -> None:
         if not 0 <= self.centroid_layer < self.n_layers:
             raise TrapsError(
-                f"mechanism.models: centroid layer {self.centroid_layer} is out of range, there are states of layers "
+                f"mechanism.models: centroid layer {self.centroid_layer} is out of range; there are states of layers "
                 f"0 to {self.n_layers - 1}"
             )
         self._datasets = [name for name in PROBED_DATASETS if name in set(self.items["dataset"])]
@@ -106,8 +107,8 @@ class ProbeRun:
         }
 
     def _scenarios(self, taxonomy: str) -> pd.Index:
-        mine = self.items.loc[self.items["dataset"].str.startswith(taxonomy), "scenario_id"]
-        return pd.Index(sorted(mine.unique()))
+        ids = self.items.loc[self.items["dataset"].str.startswith(taxonomy), "scenario_id"]
+        return pd.Index(sorted(ids.unique()))
 
     def _split(self, name: str, layer: int) -> Split:
         states = np.asarray(self.read(name, layer), float)
@@ -121,7 +122,7 @@ class ProbeRun:
     # --- the parts of the protocol ---
 
     def rows(self, progress: Callable[[int, int], None] = lambda done, total: None) -> list[Row]:
-        """Every row of the probes table but for the columns that partition it."""
+        """Every row of the probes table without the columns that partition it."""
         rows: list[Row] = []
         for done, of_layer in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
             rows += of_layer
@@ -129,7 +130,7 @@ class ProbeRun:
         return marked(rows + self._problems())
 
     def layer_rows(self, layer: int) -> list[Row]:
-        """Every row of one layer, read here and forgotten."""
+        """Every row of one layer, whose states are in memory only during this call."""
         splits = {name: self._split(name, layer) for name in self._datasets}
         rows = self.transfer(layer, splits) + self.confabulated_transfer(layer, splits)
         unseen = {source: self._unseen_scores(source, splits) for source in self._own}
@@ -138,13 +139,13 @@ class ProbeRun:
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
 
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """The twelve ordered pairs, all samples. The two datasets of a taxonomy share their control items, so that half
-        of a cross-modality target are rows of the fit (`held_out`)."""
+        """The twelve ordered pairs on all samples. The two datasets of a taxonomy share their control items, so that
+        half of the rows of a cross-modality target were used in the fit (see `held_out`)."""
         scores = transfer_scores(splits, self._pairs, self.settings.solver)
         return [self._scored("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """The same pairs, source and target restricted to confabulated void items and their matched controls."""
+        """The same pairs with source and target restricted to confabulated void items and their own controls."""
         restricted = {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
         pairs = [pair for pair in self._pairs if set(pair) <= set(restricted)]
         scores = transfer_scores(restricted, pairs, self.settings.solver)
@@ -166,18 +167,19 @@ class ProbeRun:
     def held_out(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """The pairs of one taxonomy under probes that were fitted without the scenario that they score."""
+        """The pairs within a taxonomy, by probes that were fitted without the scored scenario."""
         pairs = [(s, t) for s, t in self._pairs if taxonomy_of(s) == taxonomy_of(t)]
         return [self._scored("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
 
     def answerable(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Void clips with a question that even they answer, under the probes of each dataset.
+        """Void clips with an answerable question, scored by the probes of each dataset.
 
-        answerable_void: void items against the same clips with the answerable question; 0.5 for a probe that sees that
-        something hides, 1 for one that sees that this cannot be known. answerable_control: those clips against the
-        controls; the other way round. Probes of occlusion sources never saw the scenario that they score.
+        answerable_void: AUROC of void items against the same clips with the answerable question; 0.5 for a probe that
+        detects a hidden object, 1 for a probe that detects that the answer cannot be known. answerable_control: AUROC
+        of these clips against the controls; the reverse. Probes of occlusion sources are fitted without the scored
+        scenario.
         """
         if not {ANSWERABLE, "occlusion"} <= set(splits):
             return []
@@ -203,8 +205,8 @@ class ProbeRun:
         return scores[name][mask], splits[name].scenario[mask]
 
     def _unseen_scores(self, source: str, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
-        """Scores of the items of the source's taxonomy, of occlusion and the answerable ones, under probes that were
-        not fitted on their scenarios: of another taxonomy one probe, of the source's own one a fold."""
+        """Scores of the items of the source's taxonomy, of occlusion and of the answerable dataset, by probes that were
+        not fitted on their scenarios: one probe for items of another taxonomy, one per fold for the source's own."""
         split, own = splits[source], [name for name in splits if self._index[name] is self._index[source]]
         others = [name for name in ("occlusion", ANSWERABLE) if name in splits and name not in own]
         scores = {name: np.empty(len(splits[name].void)) for name in own}
@@ -243,7 +245,7 @@ class ProbeRun:
         return _row(analysis, path, layer, float(auroc(of.void, scores)), of, interval=interval)
 
     def _problems(self) -> list[Row]:
-        """A row without a figure for each Cf->Cf pair that has none, with the reason."""
+        """A row with the reason, and without a figure, for each Cf->Cf pair that cannot be computed."""
         rows = []
         for source, target in self._pairs:
             reasons = [self.confabulated.problems[n] for n in (source, target) if n in self.confabulated.problems]
@@ -253,9 +255,10 @@ class ProbeRun:
 
 
 def each_layer(work: Callable[[int], Result], n_layers: int) -> Iterator[Result]:
-    """What `work` makes of each layer, in order: a layer a core, at most four, since each holds its states in memory.
+    """The results of `work` for each layer, in order. Each core works on one layer, at most four at a time, since each
+    holds its states in memory.
 
-    Linear algebra runs on one thread a layer: at these sizes a second one spends more than it saves.
+    Linear algebra uses one thread per layer: at these sizes a second thread costs more than it saves.
     """
     from threadpoolctl import threadpool_limits
 
@@ -288,9 +291,10 @@ def _row(
 
 
 def marked(rows: Sequence[Row]) -> list[Row]:
-    """The rows with the layers that tables show: own_best, the highest of the row's own curve (the paper's choice,
-    which sees target labels); all_sample_best, the highest of the pair's all-sample transfer curve; source_best, the
-    highest of the source's grouped cross-validation, which sees no target label. The lowest layer where several are.
+    """The rows with marks on the layers that tables show: own_best, the maximum of the row's own curve (the paper's
+    choice, which uses target labels); all_sample_best, the maximum of the pair's all-sample transfer curve;
+    source_best, the maximum of the source's grouped cross-validation, which uses no target label. Of several layers
+    with the same maximum, the lowest is marked.
     """
     curves: dict[tuple[str, str, str], dict[int, float]] = {}
     for row in rows:

@@ -1,8 +1,8 @@
-"""How often a steered model abstains: a path at a time, and over the paths of a set, from STEERING and STEERING_VOTES
-rows (docs/spec.md 8.4).
+"""How often a steered model abstains, on one path and over the paths of a set, from STEERING and STEERING_VOTES rows
+(docs/spec.md 8.4).
 
-A path asks each scenario once, so its Wilson interval is one over scenarios. Over paths the same scenario is asked
-again and again, and the same answer counts in several: there scenarios are resampled, not answers.
+A path asks each scenario once, so its Wilson interval covers the variation of scenarios. Several paths ask the same
+scenario, and one answer may count in several paths; intervals over paths therefore resample scenarios, not answers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ _PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
 
 
 def _answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """An answer with its verdict, a row in every path that it belongs to: the model as it is (alpha 0) in each."""
+    """The answers with their verdicts, one row for every path that an answer belongs to; an unsteered answer (alpha 0)
+    belongs to every path."""
     copied = ["side", "scenario_id", "alpha_relative", "request_key", "epoch"]
     joined = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *copied]]), votes)
     steered = joined.loc[joined["kind"] != UNSTEERED]
@@ -42,13 +43,13 @@ def _answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFram
 
 
 def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """Answers with `abstained`, as the majority of the judges of their cell decides it; null without a text, votes or
-    a majority. Decided a cell at a time: another panel may sit on another cell until its votes are made again."""
+    """The answers with `abstained`, the majority's decision; null without a text, votes or a majority. Each cell is
+    decided by itself: after a change of panel, a cell has votes of the old panel until its votes are made again."""
     votes_on, none = dict(iter(votes.groupby(_CELL))), votes.head(0)
     parts: list[pd.DataFrame] = []
-    for cell, mine in answers.groupby(_CELL, sort=False):
-        values, _ = ratings(votes_on.get(cell, none), answer=_ANSWER).on(mine, ABSTENTION)
-        parts.append(mine.assign(abstained=decided(majority(values))))
+    for cell, of_cell in answers.groupby(_CELL, sort=False):
+        values, _ = ratings(votes_on.get(cell, none), answer=_ANSWER).on(of_cell, ABSTENTION)
+        parts.append(of_cell.assign(abstained=decided(majority(values))))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -89,8 +90,8 @@ def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffe
 def share_rows(
     answers: pd.DataFrame, votes: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> list[SteeringShareRow]:
-    """Rows of STEERING_SHARES: mean abstention over the paths of a set, of each regime of directions and of answers and
-    over all of them, with the interval from resampling scenarios (all paths of a resample share its scenarios)."""
+    """Rows of STEERING_SHARES: mean abstention over the paths of a set, for each regime of directions and of answers
+    and over all regimes, with an interval from resampled scenarios (all paths share the scenarios of a resample)."""
     decided = _answers_of_paths(answers, votes).dropna(subset=["abstained"])
     decided = decided.merge(decided.loc[decided["side"] == "void", ["model", "layer"]].drop_duplicates())  # no sweep
     rows: list[SteeringShareRow] = []
@@ -99,44 +100,44 @@ def share_rows(
         numbered = of_model.merge(paths.reset_index(names="path"), on=_PATH)
         shares, draws = _shares(numbered, len(paths), resamples, seed)
         for pool, chosen in _pools(paths):
-            mine = numbered.loc[np.isin(numbered["path"], chosen)]
+            of_pool = numbered.loc[np.isin(numbered["path"], chosen)]
             low, high = percentiles(draws[chosen].mean(axis=0))
             rows.append(
                 SteeringShareRow(
                     **pool,
-                    n_paths=len(mine[["source", "dataset"]].drop_duplicates()),
-                    n=len(mine),
-                    n_answers=len(set(mine["request_key"])),
-                    n_scenarios=len(set(mine["scenario_id"])),
+                    n_paths=len(of_pool[["source", "dataset"]].drop_duplicates()),
+                    n=len(of_pool),
+                    n_answers=len(set(of_pool["request_key"])),
+                    n_scenarios=len(set(of_pool["scenario_id"])),
                     abstention=float(shares[chosen].mean()),
                     low=float(low),
                     high=float(high),
-                    epoch="+".join(sorted(set(mine["epoch"]))),
+                    epoch="+".join(sorted(set(of_pool["epoch"]))),
                 )
             )
     return rows
 
 
 def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The share of each path, (paths,), and in every resample, (paths, resamples); NaN where a resample has none."""
+    """The share of each path, (paths,), and in every resample, (paths, resamples); NaN if a resample has no answer."""
     shares, draws = np.empty(n_paths), np.empty((n_paths, resamples))
     taxonomies = numbered["dataset"].map(taxonomy_of)
     for k, taxonomy in enumerate(TAXONOMIES):
-        mine = numbered.loc[taxonomies == taxonomy]
-        scenario, names = pd.factorize(mine["scenario_id"], sort=True)
-        path, chosen = pd.factorize(mine["path"])
-        asked, abstained = np.zeros((2, len(chosen), len(names)), np.float32)
-        np.add.at(asked, (path, scenario), 1)
-        np.add.at(abstained, (path, scenario), mine["abstained"].to_numpy(bool))
-        shares[chosen] = abstained.sum(axis=1) / asked.sum(axis=1)
+        of_taxonomy = numbered.loc[taxonomies == taxonomy]
+        scenario, names = pd.factorize(of_taxonomy["scenario_id"], sort=True)
+        path, chosen = pd.factorize(of_taxonomy["path"])
+        answers, abstained = np.zeros((2, len(chosen), len(names)), np.float32)
+        np.add.at(answers, (path, scenario), 1)
+        np.add.at(abstained, (path, scenario), of_taxonomy["abstained"].to_numpy(bool))
+        shares[chosen] = abstained.sum(axis=1) / answers.sum(axis=1)
         weights = scenario_weights(len(names), resamples, [seed, k]).T
         with np.errstate(invalid="ignore"):
-            draws[chosen] = (abstained @ weights) / (asked @ weights)
+            draws[chosen] = (abstained @ weights) / (answers @ weights)
     return shares, draws
 
 
 def _pools(paths: pd.DataFrame) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """What is averaged: its columns, and the rows of `paths`."""
+    """The sets of paths that are averaged: the columns that name each set, and its rows of `paths`."""
     pairs = pd.Series(list(zip(paths["source"], paths["dataset"], strict=True)), index=paths.index)
     every = {name: [ALL, *sorted(set(paths[name]))] for name in ("directions", "regime")}
     for (path_set, members), directions, regime in product(_PATH_SETS.items(), every["directions"], every["regime"]):
@@ -144,5 +145,5 @@ def _pools(paths: pd.DataFrame) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
         for name, value in (("directions", directions), ("regime", regime)):
             inside &= (paths[name] == value) | (value == ALL)
         for key, group in paths.loc[inside].groupby(["model", "kind", "layer", "alpha", "side"], sort=True):
-            said = dict(zip(("model", "kind", "layer", "alpha", "side"), cast(tuple[Any, ...], key), strict=True))
-            yield said | {"path_set": path_set, "directions": directions, "regime": regime}, group.index.to_numpy()
+            names = dict(zip(("model", "kind", "layer", "alpha", "side"), cast(tuple[Any, ...], key), strict=True))
+            yield names | {"path_set": path_set, "directions": directions, "regime": regime}, group.index.to_numpy()

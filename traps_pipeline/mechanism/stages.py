@@ -1,4 +1,4 @@
-"""From tables to tables: what each mechanistic stage reads and makes. Numerics stand in the modules that it calls."""
+"""The mechanistic stages: each reads tables and makes the rows of one. The numerics are in the modules they call."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "questio
 
 
 def examined_model(workspace: Workspace, model: str) -> ModelEntry:
-    """The entry of a model that the study looks into. Raises TrapsError for one that is not local or not asked for."""
+    """The entry of a model in the study's `mechanism` section. Raises TrapsError if it is not local, or not there."""
     entry, settings = get_model(model), workspace.mechanism
     if entry.backend != LOCAL:
         local = ", ".join(name for name in settings.models if get_model(name).backend == LOCAL) or "none of the study's"
@@ -90,7 +90,7 @@ def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
         voids = clips.loc[clips["side"] == "void"].set_index("scenario_id")
         for spec in workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records"):
             if spec["scenario_id"] not in voids.index:
-                raise TrapsError(f"{spec['scenario_id']}: its void clip is not made; materialize videos for {category}")
+                raise TrapsError(f"{spec['scenario_id']}: has no void clip yet; materialize videos for {category}")
             rows.append(_answerable_item(spec, voids.loc[spec["scenario_id"]].to_dict()))
     if not rows:
         raise TrapsError(f"probe_items {dataset}: no occlusion scenarios yet; materialize scene_specs and videos first")
@@ -98,7 +98,7 @@ def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
 
 
 def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeItemRow:
-    """The void clip with a question that it answers: on this dataset a control, since it must be answered."""
+    """The void clip with a question that it answers; its side is control, since it must be answered."""
     pair = f"{ANSWERABLE}:{spec['scenario_id']}"
     return ProbeItemRow(
         **{name: spec[name] for name in ("scenario_id", "category", "sub_scenario", "benchmark_version")},
@@ -116,7 +116,7 @@ def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeI
 
 
 def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenStatesRow], int]:
-    """Make the states of a partition that are not there, and its rows; returns also how many were made."""
+    """Make the missing states of a partition; returns its rows, and how many states were made."""
     from traps_pipeline.mechanism.hidden_states import clip_item, extract, read_layer, read_record
     from traps_pipeline.models.local.adapter import load_local_model
 
@@ -133,12 +133,12 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     done = extract(model, wanted, folder, pooling=settings.pooling, what=f"items of {cell.key}")
     record, (ids, _) = read_record(folder), read_layer(folder, 0)
     keys, devices = (dict(zip(ids["item_id"], ids[name], strict=True)) for name in ("key", "device"))
-    said = {name: record[name] for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")}
+    source = {name: record[name] for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")}
     copied = ("item_id", "scenario_id", "side", "sub_scenario", "benchmark_version")
     rows = [
         HiddenStatesRow(
             **{name: item[name] for name in copied},
-            **said,
+            **source,
             dataset=cell.dataset,
             model=cell.extraction.model,
             prompt=cell.extraction.prompt,
@@ -154,7 +154,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:
-    """Of the first and the last layer those with a number that is not finite."""
+    """Those of the first and last layers that hold a number that is not finite."""
     from traps_pipeline.mechanism.hidden_states import read_layer
 
     folder = states_folder(workspace, cell)
@@ -162,7 +162,7 @@ def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> lis
 
 
 def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
-    """Raises TrapsError when the study names a layer that the model does not have, before hours are spent."""
+    """Raises TrapsError if the study names a layer that the model does not have, before the long extraction begins."""
     layers = workspace.mechanism.models[model]
     for name, layer in (
         ("steering", layers.steering),
@@ -172,13 +172,13 @@ def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
         if layer > n_layers:
             raise TrapsError(
                 f"mechanism.models.{model}.{name}: layer {layer} is out of range, {model} has blocks 1 to {n_layers} "
-                "(layer 0 are the embeddings); name one of these in the experiment and in study.yaml"
+                "(layer 0 is the embeddings); name one of these in the experiment and in study.yaml"
             )
 
 
 @dataclass
 class StoredStates:
-    """The hidden states of one extraction: an id table, and a reader of one layer of one dataset in its order."""
+    """The hidden states of one extraction: an id table, and a reader of single layers in the order of that table."""
 
     workspace: Workspace
     extraction: Extraction
@@ -186,7 +186,7 @@ class StoredStates:
 
     @staticmethod
     def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
-        """Raises TrapsError when nothing was extracted."""
+        """The states of an extraction. Raises TrapsError when nothing was extracted."""
         items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
@@ -199,7 +199,7 @@ class StoredStates:
 
     @property
     def digest(self) -> str:
-        """Of which states these are."""
+        """Digest of the items and their states."""
         return digest(sorted(zip(self.items["item_id"], self.items["states_key"], strict=True)))
 
     def dataset(self, name: str) -> pd.DataFrame:
@@ -207,7 +207,7 @@ class StoredStates:
         return self.items.loc[self.items["dataset"] == name]
 
     def read(self, dataset: str, layer: int) -> np.ndarray:
-        """States (n, d) float32 in the order of the rows. Raises TrapsError when these are not of the shards."""
+        """States (n, d) float32 in the order of the rows. Raises TrapsError when the shards do not hold these items."""
         from traps_pipeline.mechanism.hidden_states import read_layer
 
         cell = StatesCell(dataset, self.extraction)
@@ -217,7 +217,8 @@ class StoredStates:
         places = pd.Index(ids["item_id"]).get_indexer(pd.Index(wanted["item_id"]))
         if (places < 0).any() or (ids["key"].to_numpy()[places] != wanted["states_key"].to_numpy()).any():
             raise TrapsError(
-                f"hidden states {cell.key}: not of the table's items; materialize hidden_states for it again"
+                f"hidden states {cell.key}: the shards hold other items than the table; materialize hidden_states for "
+                "it again"
             )
         return states[places]
 
@@ -226,7 +227,7 @@ class StoredStates:
 
 
 def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
-    """Rows of an extraction's probes. Where nothing that they are made of has changed, the rows that are there."""
+    """Rows of an extraction's probes. If none of their inputs has changed, the existing rows are returned."""
     examined_model(workspace, extraction.model)
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     confabulated = confabulations(workspace, extraction.model)
@@ -258,13 +259,13 @@ def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> l
 
 
 def confabulations(workspace: Workspace, model: str) -> Confabulated:
-    """Scenarios by dataset on whose void the model confabulated under Standard in run 1; why, where there is none."""
+    """By dataset, the scenarios on whose void the model confabulated under Standard in run 1, or why there is none."""
     found: dict[str, frozenset[str]] = {}
     problems: dict[str, str] = {}
     for dataset in DATASETS:
         cell = Cell(dataset, Evaluation(model, "standard", 1))
         if workspace.tables.state(VERDICTS, cell.partition) is None:
-            problems[dataset] = f"verdicts {cell.key} are not there; run the model under standard first"
+            problems[dataset] = f"there are no verdicts {cell.key}; run the model under standard first"
             continue
         try:
             found[dataset] = confabulated_scenarios(workspace.tables.read(VERDICTS, cell.partition), dataset, model)
@@ -277,7 +278,7 @@ def confabulations(workspace: Workspace, model: str) -> Confabulated:
 
 
 def directions_file(workspace: Workspace, extraction: Extraction, dataset: str) -> Path:
-    """Where the directions of a dataset lie."""
+    """The file of a dataset's directions."""
     return workspace.root / "directions" / extraction.model / extraction.prompt / f"{dataset}.safetensors"
 
 
@@ -301,7 +302,8 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
     steering = settings.steering
     if steering is None:
         raise TrapsError(
-            "study.yaml: mechanism.steering is null, so nothing says how many pairs a direction comes from"
+            "study.yaml: mechanism.steering is null, so the number of pairs for a direction is not known; set it there "
+            "and in the experiment"
         )
     names = sorted(set(items["scenario_id"]))
     most = steering.ill_posed_pairs if is_ill_posed(dataset) else steering.well_posed_pairs
@@ -348,15 +350,17 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
 
 
 def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, Directions]:
-    """The directions of an extraction by dataset, as the directions table names them. Raises TrapsError."""
+    """The directions of an extraction by dataset. Raises TrapsError for a file that is not the one in the table."""
     table = workspace.tables.read(DIRECTIONS, extraction.partition)
     found = {}
     for path in sorted(set(table["path"])):
-        directions, said = load_directions(workspace.resolve(path))
+        directions, description = load_directions(workspace.resolve(path))
         rows = table.loc[(table["path"] == path) & (table["kind"] == "void")].sort_values("layer")
         if [vector_digest(vector) for vector in directions.vectors["void"]] != list(rows["direction_digest"]):
-            raise TrapsError(f"{path}: not the directions of the table; delete it, then `traps run` makes it again")
-        found[said["dataset"]] = directions
+            raise TrapsError(
+                f"{path}: differs from the directions in the table; delete it, then `traps run` makes it again"
+            )
+        found[description["dataset"]] = directions
     return found
 
 

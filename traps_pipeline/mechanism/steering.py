@@ -1,8 +1,9 @@
-"""Steering: which answers a cell wants, how they are got, what the panel says of them (docs/spec.md 8).
+"""Steering: the answers of each cell, how they are generated, and the panel's votes on them (docs/spec.md 8).
 
 A steered answer is a request like any other, so it goes through the same ledger: its key holds the direction's digest,
-the layer and the signed alpha, beside the prompt, the clip and the checkpoint. Alpha 0 holds none of these: it is one
-answer for all directions; and the controls of a taxonomy's two datasets, which are the same items, are one as well.
+the layer and the signed alpha, beside the prompt, the clip and the checkpoint. At alpha 0 the key holds none of the
+three, so that all directions share one answer. The two datasets of a taxonomy have the same control items, and share
+their answers too.
 """
 
 from __future__ import annotations
@@ -41,12 +42,13 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.backend import _Batch
 
 UNSTEERED = "none"  # source and kind where alpha is 0
-PROMPTS_KEPT = 128  # processed prompts in memory: each is asked again for every direction and strength
+PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every direction and strength
 
 
 @dataclass(frozen=True)
 class Strength:
-    """One direction at one strength. alpha is not signed: it is added on controls and subtracted on voids."""
+    """One direction at one strength. alpha has no sign: alpha times the direction is added on controls and subtracted
+    on voids."""
 
     source: str
     kind: str
@@ -56,7 +58,7 @@ class Strength:
     relative: float | None = None
 
     def signed(self, side: str) -> float:
-        """What is added to a row of that side."""
+        """The signed alpha for a row of that side."""
         return self.alpha if side == "control" else -self.alpha
 
 
@@ -65,7 +67,7 @@ NO_STEERING = Strength(UNSTEERED, UNSTEERED, 0, 0.0, None, 0.0)
 
 @dataclass(frozen=True)
 class SteeredQuestion(Question):
-    """The call that puts an item to a steered model."""
+    """The call that asks a steered model an item."""
 
     strength: Strength
 
@@ -76,9 +78,10 @@ class SteeredQuestion(Question):
 def strengths(
     target: str, layers: Layers, settings: MechanismSettings, directions: Mapping[str, Directions]
 ) -> list[tuple[Strength, tuple[str, ...]]]:
-    """What a target is steered with, and on which sides: every path into it whose source has a direction, its controls,
-    and the sweep over layers (along the target's own direction, controls alone). directions: by source. Raises
-    TrapsError for a layer that is not there, and where no path is left."""
+    """The strengths with which a target is steered, each with the sides: every path into the target whose source has a
+    direction, the random and shuffled directions of that source, and the sweep over layers (along the target's own
+    direction, on controls alone). directions: by source. Raises TrapsError for a layer that does not exist, and if no
+    source has a direction."""
     steering = settings.steering
     assert steering is not None, "an experiment without steering has no steering cells"
     wanted: list[tuple[Strength, tuple[str, ...]]] = [(NO_STEERING, SIDES)]
@@ -89,7 +92,10 @@ def strengths(
         of = directions[source]
         vector = of.vectors[kind][_in_range(layer, of)]
         if not vector.any():
-            raise TrapsError(f"the {kind} direction of {source} at layer {layer} is zero: no side differs there")
+            raise TrapsError(
+                f"the {kind} direction of {source} at layer {layer} is zero, since the sides do not differ there; name "
+                "another layer in the experiment and in study.yaml"
+            )
         for alpha in steering.alphas:
             relative = float(alpha / of.residual_norms[layer]) if of.residual_norms[layer] > 0 else None
             wanted.append((Strength(source, kind, layer, float(alpha), vector_digest(vector), relative), sides))
@@ -99,7 +105,7 @@ def strengths(
 def _plan(
     target: str, layers: Layers, steering: SteeringSettings, sources: Container[str]
 ) -> list[tuple[str, str, int, tuple[str, ...]]]:
-    """Source, kind, layer and sides of what a target is steered with, of these sources."""
+    """Source, kind, layer and sides of every direction along which a target is steered, among these sources."""
     kinds, sweep = ("void", *steering.controls), [layer for layer in layers.sweep if layer != layers.steering]
     paths = [(source, kind, layers.steering, SIDES) for source in sources_of(target) for kind in kinds]
     plan = [*paths, *((target, "void", layer, ("control",)) for layer in sweep)]
@@ -109,8 +115,8 @@ def _plan(
 def count_answers(
     settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
 ) -> dict[str, int]:
-    """How many answers steering a model takes, by inference regime: what cells share counts once. scenarios: how many a
-    taxonomy has."""
+    """The number of answers that steering a model needs, by inference regime; an answer that cells share counts once.
+    scenarios: their number by taxonomy."""
     steering = settings.steering
     if steering is None:
         return {}
@@ -119,7 +125,7 @@ def count_answers(
         owner = taxonomy_of(target) if side == "control" else target
         cells.add((owner, side))
         for source, kind, layer, sides in _plan(target, settings.models[model], steering, datasets):
-            # Random directions are drawn from the seed alone, whichever prompt the others come from.
+            # Random directions depend on the seed alone, so they are the same for both VQA prompts.
             prompts = ("any",) if kind == "random" else steering.direction_regimes
             if side in sides:
                 cells |= {(owner, side, source, kind, layer, *rest) for rest in product(prompts, steering.alphas)}
@@ -138,7 +144,7 @@ def _in_range(layer: int, directions: Directions) -> int:
 def wanted_steered(
     workspace: Workspace, entry: ModelEntry, cell: SteeringCell, directions: Mapping[str, Directions]
 ) -> list[SteeredQuestion]:
-    """Every answer that a cell wants, those of one direction together, so that they share batches."""
+    """The calls for every answer of a cell; calls with the same direction are adjacent, so that they share batches."""
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
@@ -162,7 +168,7 @@ def steered_request(
     strength: Strength,
     max_new_tokens: int,
 ) -> Request:
-    """The call: the full benchmark prompt, greedy, in the precision of extraction."""
+    """The call for one steered answer: the full benchmark prompt, greedy, in the precision of extraction."""
     assert entry.media is not None, "local entries have media"
     clip = workspace.resolve(item["clip"])
     sent = workspace.media.prepare(clip, item["media_digest"], entry.media)
@@ -189,7 +195,7 @@ def shared_item(item: Mapping[str, Any]) -> str:
     return f"{dataset}:{item['scenario_id']}:{item['side']}"
 
 
-# --- getting them -----------------------------------------------------------------------------------------------------
+# --- generating them --------------------------------------------------------------------------------------------------
 
 
 class SteeredBackend(LocalBackend):
@@ -201,7 +207,7 @@ class SteeredBackend(LocalBackend):
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
 
     def _answers(self, batch: _Batch) -> list[Outcome]:
-        """In the worker thread: the rows of one direction and layer make one batch, controls and voids together."""
+        """Answer a batch, in the worker thread; all rows of one direction and layer are generated together."""
         from traps_pipeline.mechanism.hook import Steering
 
         groups: dict[tuple[str, int] | None, list[int]] = {}
@@ -230,7 +236,7 @@ class SteeredBackend(LocalBackend):
         return load_local_model(self._entry, inside=True)
 
     def _make_prompt(self, clip: Any, digest: str, system: str, user: str) -> Prompt:
-        """A processed prompt; `digest` says which frames, so that a re-rendered clip is another one."""
+        """A processed prompt, kept in memory; `digest` identifies the frames, so a re-rendered clip is a new prompt."""
         shown = sample(clip, self._spec)
         return self._model().prompt(system, user, shown.frames, shown.times_s.tolist())
 
@@ -241,7 +247,8 @@ def collect_steered(
     cells: Sequence[SteeringCell],
     directions: Mapping[str, Mapping[str, Directions]],
 ) -> Iterator[tuple[SteeringCell, Made]]:
-    """Answer what is missing; the STEERING rows of each cell as it is done. directions: by VQA prompt, then source."""
+    """Generate the missing answers; yields the STEERING rows of each finished cell. directions: by VQA prompt, then by
+    source."""
     vectors = {
         vector_digest(vector): vector
         for of_prompt in directions.values()
@@ -279,19 +286,19 @@ def _steering_row(cell: SteeringCell, question: SteeredQuestion, row: Row) -> St
     )
 
 
-# --- what the panel says ----------------------------------------------------------------------------------------------
+# --- the panel's votes ------------------------------------------------------------------------------------------------
 
 
 def collect_steering_votes(workspace: Workspace, cells: Sequence[SteeringCell]) -> Iterator[tuple[SteeringCell, Made]]:
-    """Ask the study's panel whether each steered answer abstains; the STEERING_VOTES rows of each cell as it is
-    done."""
+    """Ask the study's panel whether each steered answer abstains; yields the STEERING_VOTES rows of each finished
+    cell."""
     panel = load_panel(workspace.study.panel)
     calls = partial(wanted_steering_ballots, workspace, panel)
     yield from ask_judges(workspace, "steering_votes", panel, cells, calls, lambda settled: settled.made(_vote_row))
 
 
 def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: SteeringCell) -> list[Ballot]:
-    """Every vote that the steered answers of a cell want. The ballot's item is the answer's row."""
+    """The calls for every vote on the steered answers of a cell. A ballot's item is the answer's row."""
     ballots = []
     for answer, item in judged_answers(workspace, STEERING, cell):
         shared = item | {"item_id": shared_item(answer)}

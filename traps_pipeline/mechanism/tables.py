@@ -1,4 +1,4 @@
-"""The tables of what is found inside local models (docs/spec.md 7 and 8)."""
+"""The tables of the mechanistic stages (docs/spec.md 7 and 8)."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -15,23 +15,23 @@ AnswerRegime = Annotated[str, "system prompt of the steered answer"]
 SteeredSource = Annotated[str, "dataset of the direction; none where alpha is 0"]
 SteeredKind = Annotated[str, "void, random or shuffled; none where alpha is 0"]
 SteeredLayer = Annotated[int, "steered block, counted as in hidden_states; 0 where alpha is 0"]
-Strength = Annotated[float, "strength: added on controls, subtracted on voids"]
+Strength = Annotated[float, "strength: alpha times the direction is added on controls and subtracted on voids"]
 Kind = Annotated[str, "void, random or shuffled"]
 Block = Annotated[int, "steered block"]
-Alpha = Annotated[float, "strength; 0 is the model as it is"]
+Alpha = Annotated[float, "strength; 0 is the unsteered model"]
 AlphaRelative = Annotated[float | None, "alpha over the mean length of the states at that layer"]
 Percentile = Annotated[float | None, "95 % percentile interval"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProbeItemRow:
-    """A clip and question that hidden states are extracted of."""
+    """A clip and question for which hidden states are extracted."""
 
     item_id: shared.ItemId
     pair_id: shared.PairId
     dataset: Annotated[
         str,
-        "one of four, or occlusion_answerable: the voids of occlusion with a question that even they answer",
+        "one of four, or occlusion_answerable: the void clips of occlusion with a question that they answer",
     ]
     scenario_id: shared.ScenarioId
     side: Annotated[str, "control (it can be answered) or void"]
@@ -48,7 +48,7 @@ PROBE_ITEMS = Table("probe_items", ProbeItemRow, partition_by=("dataset",), key=
 
 @dataclass(frozen=True, kw_only=True)
 class HiddenStatesRow:
-    """An item whose hidden states are there, at every layer."""
+    """An item whose hidden states were extracted at every layer."""
 
     item_id: shared.ItemId
     dataset: Annotated[str, "one of four, or occlusion_answerable"]
@@ -57,16 +57,16 @@ class HiddenStatesRow:
     scenario_id: shared.ScenarioId
     side: shared.Side
     sub_scenario: shared.SubScenario
-    states_key: Annotated[str, "digest of all that decides the states: prompt, clip, checkpoint, precision, pooling"]
-    folder: Annotated[str, "shards, relative to the workspace"]
+    states_key: Annotated[str, "digest of the states' inputs: prompt, clip, checkpoint, precision, pooling"]
+    folder: Annotated[str, "folder of the shards, relative to the workspace"]
     checkpoint: Annotated[str, "hub id or folder"]
     checkpoint_digest: Annotated[str, "digest of the weights"]
     dtype: Annotated[str, "precision"]
     quantisation: Annotated[str, "none or nf4"]
-    device: Annotated[str, "device that made them, of a GPU with its name; states in one folder may be of several"]
+    device: Annotated[str, "device that made the states, for a GPU with its name; a folder may mix several"]
     pooling: Pooling
-    n_layers: Annotated[int, "blocks; states are of layers 0 (embeddings) to this"]
-    width: Annotated[int, "numbers a state"]
+    n_layers: Annotated[int, "number of blocks; there are states of layers 0 (embeddings) to this"]
+    width: Annotated[int, "numbers per state"]
     benchmark_version: shared.BenchmarkVersion
 
 
@@ -89,23 +89,23 @@ class ProbeRow:
     scope: Annotated[str, "all, or sub_scenario:.. (centroids)"]
     value: Annotated[
         float | None,
-        "AUROC; of shuffled the mean over shuffles; of centroid_* the share assigned to void",
+        "AUROC; for shuffled its mean over shuffles; for centroid_* the share assigned to void",
     ]
-    low: Annotated[float | None, "95 % percentile interval, scenarios of the target resampled, the probe held fixed"]
+    low: Annotated[float | None, "95 % percentile interval: target scenarios resampled, the probe held fixed"]
     high: Percentile
     spread: Annotated[float | None, "standard deviation over label shuffles"]
     n_voids: Annotated[int, "void items of the target"]
     n_controls: Annotated[int, "control items of the target"]
-    own_best: Annotated[bool, "the highest value of this curve (it sees target labels)"]
-    all_sample_best: Annotated[bool, "the layer at which this pair's transfer curve is highest (it sees target labels)"]
+    own_best: Annotated[bool, "whether this layer has the highest value of its own curve (uses target labels)"]
+    all_sample_best: Annotated[bool, "whether this pair's transfer curve is highest at this layer (uses target labels)"]
     source_best: Annotated[
         bool,
-        "the layer at which the source's own cross-validation is highest (it sees no target label)",
+        "whether the source's own cross-validation is highest at this layer (uses no target label)",
     ]
     note: Annotated[str | None, "why there is no figure"]
     made_of: Annotated[
         str,
-        "digest of states, confabulated scenarios and settings: with the same, nothing is fitted again",
+        "digest of states, confabulated scenarios and settings; while it is unchanged, nothing is fitted again",
     ]
 
 
@@ -126,9 +126,9 @@ class DirectionRow:
     dataset: shared.Dataset
     kind: Annotated[str, "void, or its controls: random, shuffled (labels)"]
     layer: Layer
-    n_pairs: Annotated[int, "pairs that it comes from"]
-    n_steered: Annotated[int, "of these, pairs that are steered as well (0 where there are scenarios enough)"]
-    norm: Annotated[float, "length of mean(void) - mean(control) before it was made a unit vector; of random 1"]
+    n_pairs: Annotated[int, "pairs from which it was computed"]
+    n_steered: Annotated[int, "of these, pairs that are steered as well (0 if there are enough scenarios)"]
+    norm: Annotated[float, "length of mean(void) - mean(control) before normalisation; 1 for random"]
     residual_norm: Annotated[
         float,
         "mean length of the pairs' control states: alpha in its units is alpha / residual_norm",
@@ -165,7 +165,7 @@ COSINES = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringRow:
-    """One answer of a steered model; alpha 0 (the model as it is) stands once for all directions."""
+    """One answer of a steered model; an answer at alpha 0 (the unsteered model) has one row for all directions."""
 
     dataset: Target
     model: shared.Model
@@ -184,7 +184,7 @@ class SteeringRow:
     served_model: Annotated[str | None, "checkpoint, digest and precision that answered"]
     completion_tokens: shared.Tokens
     direction_digest: Annotated[str | None, "digest of the direction's numbers"]
-    request_key: Annotated[str, "ledger key; both datasets of a taxonomy share that of a control"]
+    request_key: Annotated[str, "ledger key; the two datasets of a taxonomy share the key of a control"]
     epoch: shared.Epoch
     created_at: shared.AskedAt
     benchmark_version: shared.BenchmarkVersion
@@ -200,7 +200,7 @@ STEERING = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringVoteRow:
-    """One judge about one steered answer."""
+    """One judge's vote on one steered answer."""
 
     dataset: Target
     model: shared.Model
@@ -219,7 +219,7 @@ class SteeringVoteRow:
     abstained: Annotated[bool | None, "null if invalid"]
     confidence: Annotated[str | None, "high, medium or low"]
     rationale: Annotated[str | None, "one sentence"]
-    vote_key: Annotated[str, "ledger key; both datasets of a taxonomy share that of a control"]
+    vote_key: Annotated[str, "ledger key; the two datasets of a taxonomy share the key of a control"]
     epoch: shared.Epoch
     created_at: shared.AskedAt
     benchmark_version: shared.BenchmarkVersion
@@ -248,10 +248,10 @@ class SteeringEffectRow:
     alpha: Alpha
     alpha_relative: AlphaRelative
     side: shared.Side
-    n: Annotated[int, "decided answers, one a scenario"]
+    n: Annotated[int, "decided answers, one per scenario"]
     n_missing: Annotated[int, "answers missing or undecided"]
-    abstained: Annotated[int, "of the decided"]
-    abstention: Annotated[float | None, "share of the decided"]
+    abstained: Annotated[int, "decided answers that abstain"]
+    abstention: Annotated[float | None, "abstained / n"]
     low: shared.Wilson
     high: shared.Wilson
     epoch: shared.AnswerEpochs
@@ -267,7 +267,7 @@ STEERING_EFFECTS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringShareRow:
-    """Abstention on one side at one strength, over the paths of a set, one regime or all."""
+    """Abstention on one side at one strength, over the paths of a set, for one regime or all."""
 
     model: shared.Model
     path_set: Annotated[str, "transfer, within_domain, or all of both"]
@@ -277,14 +277,14 @@ class SteeringShareRow:
     layer: Block
     alpha: Alpha
     side: shared.Side
-    n_paths: Annotated[int, "paths that are there"]
-    n: Annotated[int, "decided answers over paths and regimes, one that stands in several counted in each"]
-    n_answers: Annotated[int, "different answers among them, by ledger key"]
-    n_scenarios: Annotated[int, "scenarios that they are about"]
-    abstention: Annotated[float, "mean over paths and regimes of the share of the decided"]
+    n_paths: Annotated[int, "paths that were steered"]
+    n: Annotated[int, "decided answers over paths and regimes; an answer counts once in each of its paths"]
+    n_answers: Annotated[int, "distinct answers among them, by ledger key"]
+    n_scenarios: Annotated[int, "distinct scenarios of these answers"]
+    abstention: Annotated[float, "share of decided answers that abstain, mean over paths and regimes"]
     low: Annotated[
         float | None,
-        "95 % percentile interval, scenarios resampled; of width 0 where all scenarios say the same",
+        "95 % percentile interval from resampled scenarios; its width is 0 where all scenarios agree",
     ]
     high: Percentile
     epoch: shared.AnswerEpochs

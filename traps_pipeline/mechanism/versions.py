@@ -1,4 +1,4 @@
-"""What the mechanistic stages depend on besides tables: versions of settings, prompts and precision, without torch."""
+"""The versions of settings, prompts and precision that the mechanistic stages depend on. Nothing here needs torch."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
 
 
 def loaded_params(entry: ModelEntry) -> dict[str, Any]:
-    """What decides a local model's states: its parameters without those of sampling, in the precision that it is looked
-    into with."""
+    """The parameters of a local model that its states depend on: those of its entry without sampling, in the precision
+    in which states are read."""
     inside, left_out = entry.inside_params(), (*SAMPLING, "nf4_skip")
     params = {name: value for name, value in effective_params(entry, "standard").items() if name not in left_out}
     skipped = {"nf4_skip": [*inside.nf4_skip]} if inside.nf4_skip else {}
@@ -27,12 +27,12 @@ def loaded_params(entry: ModelEntry) -> dict[str, Any]:
 
 
 def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
-    """Where the shards of a partition lie."""
+    """The folder of a partition's shards."""
     return workspace.root / "states" / cell.extraction.model / cell.extraction.prompt / cell.dataset
 
 
 def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
-    """Whether an extraction was finished there and none of its files removed since."""
+    """Whether the extraction of a partition was finished and all of its files still exist."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -45,13 +45,13 @@ def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
 
 
 def directions_are_there(workspace: Workspace, extraction: Extraction) -> bool:
-    """Whether the files that the directions table of an extraction names are there."""
+    """Whether all files in the directions table of an extraction exist."""
     paths = {workspace.resolve(path) for path in workspace.tables.read(DIRECTIONS, extraction.partition)["path"]}
     return all(path.is_file() and path.with_suffix(".json").is_file() for path in paths)
 
 
 def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Of what decides hidden states besides items: checkpoint and precision, frames, VQA prompt, pooling."""
+    """Digest of the inputs of hidden states besides items: checkpoint and precision, frames, VQA prompt, pooling."""
     entry, settings = get_model(extraction.model), workspace.study.mechanism
     media = profile_digest(entry.media) if entry.media else None
     pooling = settings.pooling if settings else None
@@ -59,7 +59,7 @@ def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def probing_version(workspace: Workspace, extraction: Extraction) -> str:
-    """Of the study's settings of probes and directions of a model."""
+    """Digest of the study's settings for the probes and directions of a model."""
     settings = workspace.study.mechanism
     if settings is None or extraction.model not in settings.models:
         return "none"
@@ -70,11 +70,11 @@ def probing_version(workspace: Workspace, extraction: Extraction) -> str:
 
 
 def steering_version(workspace: Workspace, run: str) -> str:
-    """Of what decides steered answers besides items and directions: the study's settings, the model, the prompt."""
+    """Digest of the inputs of steered answers besides items and directions: the study's settings, model and prompt."""
     model, _, regime = run.split("__")
     entry, settings = get_model(model), workspace.study.mechanism
     if settings is None or settings.steering is None or model not in settings.models:
         return "none"
-    asked = settings.steering.model_dump(mode="json"), settings.models[model].model_dump(mode="json"), settings.seed
+    chosen = settings.steering.model_dump(mode="json"), settings.models[model].model_dump(mode="json"), settings.seed
     media = profile_digest(entry.media) if entry.media else None
-    return digest([*asked, loaded_params(entry), media, system_prompt(regime)])[:16]
+    return digest([*chosen, loaded_params(entry), media, system_prompt(regime)])[:16]

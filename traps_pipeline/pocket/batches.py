@@ -1,4 +1,4 @@
-"""What the pocket model is trained on: scenes, the questions about their clips, and batches of them."""
+"""The training data of the pocket model: scenes, the questions about their clips, and batches of them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 IGNORED = -100
 NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple", "white", "black")
-SEEN_PX = 5  # of a token's 256; the smallest ball has a dozen
-_QUESTION = "{question}"  # stands for the questions in the chat
+SEEN_PX = 5  # pixels of a colour, of a token's 256, from which on it is seen; the smallest ball has a dozen
+_QUESTION = "{question}"  # placeholder for the questions in the chat
 
 
 @dataclass(frozen=True)
 class Look:
-    """One clip and the questions that are asked about it. side: 0 control, 1 void."""
+    """One clip and the questions about it. side: 0 control, 1 void."""
 
     scene: int
     side: int
@@ -61,7 +61,7 @@ class Scenes:
         return every[pick(every, self._spec)].tolist()
 
     def look(self, rng: np.random.Generator, void_share: float) -> Look:
-        """A random clip with what was asked, one more question that it answers or does not, and where its ball is."""
+        """A random clip with its question, another one (answerable or ill-posed), and two for the place of its ball."""
         scene, side = int(rng.integers(len(self.records))), int(rng.random() < void_share)
         record = self.records[scene]
         if side:
@@ -72,18 +72,18 @@ class Scenes:
 
 
 def _where(record: SceneRecord, frame: str) -> tuple[Question, Question]:
-    """The column and the row of the ball at the end of a clip."""
+    """The questions for the column and the row of the ball at the end of a clip."""
     place = record.places[frame]
     return Question(*place_question(record.ball, place, 0)), Question(*place_question(record.ball, place, 1))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """What one step reads. All rows have one system prompt, `head` (P,), which is computed once.
+    """The input of one step. All rows share one system prompt, `head` (P,), which is computed once.
 
-    A row is a clip and, side by side after it, its questions with their answers, none of which sees another:
-    ids, labels (B, S) with IGNORED outside the answers; sees (B, 1, S, P + S) bool; positions (3, B, P + S).
-    names: what names every token of the clips, as in `names_of`.
+    A row is a clip followed by its questions with their answers; the attention mask hides the questions from each
+    other. ids, labels (B, S), with IGNORED outside the answers; sees (B, 1, S, P + S) bool, the attention mask;
+    positions (3, B, P + S). names: the words that name every token of the clips, as in `names_of`.
     """
 
     head: torch.Tensor
@@ -97,7 +97,7 @@ class Batch:
 
 
 class Batches:
-    """Batches by number; the n-th depends on the seed and n alone."""
+    """Batches by number; batch n depends only on the seed and n."""
 
     def __init__(self, scenes: Scenes, model: Any, processor: Any, training: Training, seed: int) -> None:
         self._scenes, self._processor, self._training, self._seed = scenes, processor, training, seed
@@ -120,7 +120,7 @@ class Batches:
         pieces = [self._pieces(look, prompt_name, grid) for look in looks]
         head = self._ids(pieces[0][0])
         clips = [self._ids(clip) for _, clip, _ in pieces]
-        talks = [[(self._ids(asked), self._ids(said)) for asked, said in questions] for _, _, questions in pieces]
+        talks = [[(self._ids(text), self._ids(answer)) for text, answer in questions] for _, _, questions in pieces]
         grids = torch.tensor([grid] * len(looks))
         values = (torch.from_numpy(frames).float() / 255 - torch.from_numpy(self._mean)) / torch.from_numpy(self._std)
         rows = self._rows(head, clips, talks, grids)
@@ -135,8 +135,8 @@ class Batches:
     def _pieces(
         self, look: Look, prompt_name: str, grid: tuple[int, int, int]
     ) -> tuple[str, str, list[tuple[str, str]]]:
-        """The chat as the processor writes it, cut in pieces: the system's part, the clip with its time stamps and
-        places for its tokens, and for each question its words with the beginning of the answer, and the answer."""
+        """The chat as the processor writes it, cut into pieces: the system's part; the clip with its time stamps and
+        placeholders for its tokens; and for each question its text with the beginning of the answer, and the answer."""
         processor, token = self._processor, self._processor.video_token
         times = self._scenes.times(look.scene, look.side)
         clip = "".join(
@@ -169,23 +169,23 @@ class Batches:
         import torch
 
         longest = max(
-            len(clip) + sum(len(asked) + len(said) for asked, said in talk)
+            len(clip) + sum(len(question) + len(answer) for question, answer in talk)
             for clip, talk in zip(clips, talks, strict=True)
         )
         ids = torch.full((len(clips), longest), self._processor.tokenizer.pad_token_id)
         labels, part = torch.full_like(ids, IGNORED), torch.full_like(ids, -1)
         positions = torch.zeros(3, len(clips), len(head) + longest, dtype=torch.long)
         for i, (clip, talk) in enumerate(zip(clips, talks, strict=True)):
-            known = torch.tensor([head + clip])
-            kinds = (known == self._processor.video_token_id).int() * 2  # 2: video, as the library counts modalities
-            placed, _ = self._rope_index(known, kinds, video_grid_thw=grids[i : i + 1])
+            prefix = torch.tensor([head + clip])
+            kinds = (prefix == self._processor.video_token_id).int() * 2  # 2: video, as the library counts modalities
+            placed, _ = self._rope_index(prefix, kinds, video_grid_thw=grids[i : i + 1])
             at, free = len(clip), int(placed.max()) + 1
             ids[i, :at], part[i, :at] = torch.tensor(clip), 0
             positions[:, i, : len(head) + at] = placed[:, 0]
-            for number, (asked, said) in enumerate(talk, start=1):
-                end = at + len(asked) + len(said)
-                ids[i, at:end], part[i, at:end] = torch.tensor(asked + said), number
-                labels[i, at + len(asked) : end] = torch.tensor(said)
+            for number, (question, answer) in enumerate(talk, start=1):
+                end = at + len(question) + len(answer)
+                ids[i, at:end], part[i, at:end] = torch.tensor(question + answer), number
+                labels[i, at + len(question) : end] = torch.tensor(answer)
                 positions[:, i, len(head) + at : len(head) + end] = torch.arange(free, free + end - at)
                 at = end
         own = (part[:, :, None] == part[:, None, :]) | (part == 0)[:, None, :]
@@ -195,7 +195,8 @@ class Batches:
 
 
 def patches(frames: torch.Tensor) -> torch.Tensor:
-    """Frames (B, N, 3, H, W) as the class reads them: a row for each patch of two frames, merged ones together."""
+    """Frames (B, N, 3, H, W) in the input format of the class: one row per patch of two frames; patches that the model
+    merges are adjacent."""
     batch, count, channels, height, width = frames.shape
     rows, columns = height // PATCH, width // PATCH
     split = frames.view(batch, count // 2, 2, channels, rows // 2, 2, PATCH, columns // 2, 2, PATCH)
@@ -204,8 +205,9 @@ def patches(frames: torch.Tensor) -> torch.Tensor:
 
 
 def names_of(frames: np.ndarray) -> torch.Tensor:
-    """For every token of the clips (B, N, H, W, 3), in their order: which words name its square of the later of its two
-    frames. Shape (tokens, words), 0 or 1, float32: the colours that have a few pixels there, its column, its row."""
+    """For every token of the clips (B, N, H, W, 3), in their order, the words that name its square in the later of its
+    two frames: the colours that have a few pixels there, its column and its row. Shape (tokens, words), float32, 0 or
+    1."""
     import torch
 
     from traps_pipeline.scenes.vision import colour_mask
@@ -227,8 +229,8 @@ def names_of(frames: np.ndarray) -> torch.Tensor:
 
 
 def name_tokens(tokenizer: Any) -> torch.Tensor:
-    """Token ids of the words of `names_of`: colours as questions have them, columns and rows as answers have them. The
-    first piece of a word that is no token, which happens with a few scenes only."""
+    """Token ids of the words of `names_of`: colours as they stand in questions, columns and rows as in answers. A word
+    that is no single token, which happens only with few scenes, has the id of its first piece."""
     import torch
 
     words = [*(f" {colour}" for colour in NAMED), *COLUMNS, *ROWS]
@@ -236,6 +238,6 @@ def name_tokens(tokenizer: Any) -> torch.Tensor:
 
 
 def augmented(frames: np.ndarray, brightness: float, rng: np.random.Generator) -> np.ndarray:
-    """Frames (B, N, H, W, 3) uint8, each clip brighter or darker as a whole by up to a share."""
+    """Frames (B, N, H, W, 3) uint8, with each whole clip made brighter or darker by up to the share `brightness`."""
     gains = (1 + brightness * rng.uniform(-1, 1, (len(frames), 1, 1, 1, 1))).astype(np.float32)
     return np.minimum(frames * gains, 255).astype(np.uint8)

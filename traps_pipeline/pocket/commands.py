@@ -1,4 +1,4 @@
-"""What `traps pocket ...` does with the modules beside this one: draw, train, evaluate, write the model card."""
+"""The commands `traps pocket ...`, by the modules beside this one: draw, train, evaluate, write the model card."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from traps_pipeline.storage.workspace import Workspace
 EVALUATION = POCKET / "evaluation.csv"
 MECHANISM_FIGURES = POCKET / "mechanism.csv"
 CARD = POCKET / "README.md"
-THREADS = 1  # sums then come in one order on any number of cores; layers this small gain little by a second one
-WEIGHTS = "weights"  # in the folder of a seed: what `checkpoint:` names
+THREADS = 1  # one thread sums in the same order on any machine; layers this small gain little from a second one
+WEIGHTS = "weights"  # folder of the weights, below the folder of a seed; `checkpoint:` names it
 MARKS = "<!-- evaluation: written by `traps pocket card` -->", "<!-- end of evaluation -->"
 MECHANISM_MARKS = "<!-- inside: written by `traps pocket card` -->", "<!-- end of inside -->"
 
 
-Report = Callable[[str], None]  # is told, in a line, how far the work is
+Report = Callable[[str], None]  # takes a line about the progress of the work
 
 
 def render_data(recipe: Recipe, data: Path, *, workers: int | None, report: Report) -> None:
-    """Draw what is missing of both splits. workers: processes; None for one a core."""
+    """Draw the missing scenes of both splits. workers: number of processes; None for one per core."""
     splits: tuple[Split, Split] = ("train", "held-out")
     for split in splits:
         _render(recipe, split, data, workers, report)
 
 
 def _render(recipe: Recipe, split: Split, data: Path, workers: int | None, report: Report) -> None:
-    """Draw what is missing of a split."""
+    """Draw the missing scenes of a split."""
     began = time.monotonic()
     render(recipe, split, data, workers=workers, report=report)
     report(f"{split}: rendered in {(time.monotonic() - began) / 60:.1f} minutes")
 
 
 def train(recipe: Recipe, data: Path, out: Path, seed: int, *, workers: int | None, report: Report) -> None:
-    """Render what is missing, train, and note in `training.json` what the weights came from."""
+    """Render missing scenes, train, and record the origin of the weights in `training.json`."""
     import torch
 
     from traps_pipeline.pocket.train import train as fit
@@ -76,9 +76,9 @@ def evaluate(
     workers: int | None,
     report: Report,
 ) -> str:
-    """Ask the weights of a seed about the held-out scenes and add the counts to their CSV; the table in Markdown.
+    """Ask the model of a seed about the held-out scenes and add the counts to the CSV; returns the table in Markdown.
 
-    scenes: of each family; None for all that are held out.
+    scenes: number per family; None for all held-out scenes.
     """
     import torch
 
@@ -91,8 +91,8 @@ def evaluate(
 
 
 def write_card(counts: Path, workspaces: Sequence[Path]) -> list[str]:
-    """Take the figures of finished workspaces into their CSV, and put the tables of both CSVs into the model card;
-    returns the tables in Markdown. Raises TrapsError where the card has no place for them."""
+    """Write the figures of finished workspaces to their CSV, and the tables of both CSVs into the model card; returns
+    the tables in Markdown. Raises TrapsError if the card lacks the comments between which a table belongs."""
     figures = [figure for folder in workspaces for figure in inside.figures_of(Workspace.open(folder))]
     if figures:
         inside.write_figures(MECHANISM_FIGURES, figures)
@@ -105,7 +105,7 @@ def write_card(counts: Path, workspaces: Sequence[Path]) -> list[str]:
         before, begun, rest = text.partition(begin)
         _, ended, after = rest.partition(end)
         if not begun or not ended:
-            raise TrapsError(f"{CARD}: has no place for a table ({begin!r} to {end!r}); restore it from git")
+            raise TrapsError(f"{CARD}: lacks the comments around a table ({begin!r}, {end!r}); restore it from git")
         text = f"{before}{begin}\n\n{table}\n\n{end}{after}"
     CARD.write_text(text, encoding="utf-8")
     return [*tables.values()]

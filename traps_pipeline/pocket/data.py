@@ -1,11 +1,11 @@
-"""Scenes for the pocket model: drawn by the families' own samplers, simulated, and seen in the few frames that it gets.
+"""Scenes for the pocket model: drawn by the families' own samplers, simulated, and rendered in the few frames it sees.
 
-A scene costs a fraction of a released one, since nothing is certified: no ensemble, no twin, no ablation. What decides
-its label is the same: the outcome is read off the simulator, the panel must hide it, a cut comes before it. Only the
+A scene costs a fraction of a released one, since nothing is certified: it has no ensemble, twin or ablation. Its label
+follows the same rules: the simulator gives the outcome, the panel must hide it, and a cut comes before it. Only the
 frames that the model is shown are drawn, by the benchmark's own renderer at its own size.
 
-Shards are independent: each has its own stream of random numbers, so that two processes share the work, a rendering
-that was stopped goes on, and the same seed gives the same scenes.
+Shards are independent, and each has its own stream of random numbers. So several processes can share the work, a
+stopped rendering can continue, and the same seed gives the same scenes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ STREAM: dict[Split, int] = {"train": 101, "held-out": 102}  # first word of a st
 
 @dataclass(frozen=True)
 class Question:
-    """A question and what the model is taught to answer: a label, a guess, or None for an abstention."""
+    """A question and the answer that the model is trained to give: a label, a guess, or None for an abstention."""
 
     question: str
     answer: str | None
@@ -56,12 +56,13 @@ class Question:
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """A scene of the pocket model's data. params_digest: of family and parameters, as in `params_digest`.
+    """A scene of the pocket model's data. params_digest: digest of family and parameters, from `params_digest`.
 
-    cut_frame: frames of the void (None for occlusion: as many as the control). asked: the control's question; visual:
-    the same about the void clip; ill_posed: about the control clip; answerable: what both clips answer. ball: the
-    colour of the ball that is asked about. places: where it is in the control's `first` and `last` frame and in the
-    last one before the cut (`cut`; chaotic), as shares of the picture's width and height from its upper left corner.
+    cut_frame: number of frames of the void (None for occlusion: as many as the control). asked: the control's question;
+    visual: the same question about the void clip; ill_posed: about the control clip; answerable: a question that both
+    clips answer. ball: the colour of the ball in the question. places: the ball's place in the control's `first` and
+    `last` frame and in the last one before the cut (`cut`; chaotic), as shares of the picture's width and height from
+    its upper left corner.
     """
 
     family: str
@@ -89,7 +90,7 @@ class SceneRecord:
 
 @dataclass(frozen=True)
 class ShardJob:
-    """One shard to draw: `count` scenes of a family into `folder`/<stem>.*; `banned` are digests of released scenes."""
+    """One shard to draw: `count` scenes of a family, in `folder`/<stem>.*; `banned` are digests of released scenes."""
 
     family: str
     split: Split
@@ -101,12 +102,12 @@ class ShardJob:
 
     @property
     def lines(self) -> Path:
-        """The records; written last, so that they vouch for the rest."""
+        """The file of the records; it is written last, so that a shard with records is complete."""
         return self.folder / self.split / self.family / f"{self.number:03d}.jsonl"
 
     @property
     def drawn(self) -> int:
-        """The scenes that are there. More than `count` where the recipe had more: their first are those of this one."""
+        """The number of existing scenes. If an earlier recipe had more than `count`, the first `count` are the same."""
         return len(self.lines.read_bytes().splitlines()) if self.lines.is_file() else 0
 
     @property
@@ -120,7 +121,7 @@ class ShardJob:
 
 
 def params_digest(family: str, params: Any) -> str:
-    """Digest of a scene's family and parameters: equal for equal scenes, however they were drawn."""
+    """Digest of a scene's family and parameters, which is equal for equal scenes."""
     return digest({"family": family, "params": json.loads(json.dumps(params))})
 
 
@@ -139,7 +140,7 @@ def released_digests() -> frozenset[str]:
 
 @dataclass(frozen=True)
 class _Shot:
-    """A simulated scene that makes a good pair."""
+    """A simulated scene that was accepted as a pair."""
 
     family: Family
     params: Any
@@ -154,7 +155,7 @@ class _Shot:
 
 
 def _draw(family: Family, rng: np.random.Generator) -> _Shot:
-    """Raises Rejected, as `scenes.resolve` does, when the draw makes no pair."""
+    """A random scene. Raises Rejected, as `scenes.resolve` does, when it gives no valid pair."""
     params = family.draw(rng)
     wording = family.word(params, rng)
     physics = family.physics
@@ -200,7 +201,8 @@ def _render(shot: _Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.nda
 
 
 def _record(shot: _Shot, abstain_share: float, rng: np.random.Generator) -> SceneRecord:
-    """The scene's questions with their labels: each void abstains with `abstain_share`, else it gets a guess."""
+    """The scene's questions with their labels: a void's label is an abstention with probability `abstain_share`, else a
+    guess."""
 
     def void(question: str, labels: Sequence[str]) -> Question:
         abstains, guessed = rng.random() < abstain_share, guess(question, labels, rng)
@@ -258,8 +260,8 @@ def draw_shard(job: ShardJob) -> int:
 
 
 def _write_clips(job: ShardJob, place: int, shot: _Shot, sides: tuple[list[np.ndarray], list[np.ndarray]]) -> None:
-    """Clips of the benchmark's length, rate, size and codec. Frames that the model is not shown repeat the one before:
-    they cost nothing to draw and nothing looks at them."""
+    """Write the clips with the benchmark's length, rate, size and codec. Frames that the model is not shown are copies
+    of the frame before, which need no drawing."""
     fps = shot.family.physics.fps
     for side, drawn, length in zip(
         ("control", "void"), sides, (len(shot.qpos), shot.cut_frame or len(shot.qpos)), strict=True
@@ -270,7 +272,7 @@ def _write_clips(job: ShardJob, place: int, shot: _Shot, sides: tuple[list[np.nd
 
 
 def shard_jobs(recipe: Recipe, split: Split, folder: Path) -> list[ShardJob]:
-    """All shards of a split, families in turn."""
+    """All shards of a split, in an order that alternates between families."""
     banned = released_digests()
     jobs = []
     for family in recipe.scenes:
@@ -278,7 +280,7 @@ def shard_jobs(recipe: Recipe, split: Split, folder: Path) -> list[ShardJob]:
         for number in range(-(-total // SHARD)):
             count = min(SHARD, total - number * SHARD)
             jobs.append(ShardJob(family, split, number, count, recipe, folder, banned))
-    return sorted(jobs, key=lambda job: job.number)  # a stopped rendering has some of every family
+    return sorted(jobs, key=lambda job: job.number)  # so that a stopped rendering has scenes of every family
 
 
 def render(
@@ -289,7 +291,7 @@ def render(
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Draw what is missing of a split, one process a core. The folder remembers its recipe and takes no other."""
+    """Draw the missing scenes of a split, one process per core. The folder keeps its recipe and refuses another."""
     _check_recipe(recipe, folder)
     jobs = shard_jobs(recipe, split, folder)
     todo = [job for job in jobs if job.drawn < job.count]
@@ -322,8 +324,8 @@ def read_shards(recipe: Recipe, split: Split, folder: Path) -> Iterator[tuple[Sh
 
 
 def data_digest(recipe: Recipe, split: Split, folder: Path) -> str:
-    """SHA-256 over the digests of all files that training reads of a split, in the order of the shards; of a shard that
-    has more scenes than the recipe, of the files that it would have."""
+    """SHA-256 over the digests of all files of a split that training reads, in the order of the shards. For a shard
+    with more scenes than in the recipe, the digest is that of files with only the recipe's scenes."""
     whole = hashlib.sha256()
     for job, _ in read_shards(recipe, split, folder):
         for path in (job.lines, job.pixels) if split == "train" else (job.lines,):
@@ -333,7 +335,7 @@ def data_digest(recipe: Recipe, split: Split, folder: Path) -> str:
 
 
 def _first(job: ShardJob, path: Path) -> bytes:
-    """What a file of a shard would hold if no more scenes than `count` had been drawn."""
+    """The content that a file of a shard would have if only `count` scenes had been drawn."""
     if path == job.lines:
         return b"".join(path.read_bytes().splitlines(keepends=True)[: job.count])
     stream = io.BytesIO()

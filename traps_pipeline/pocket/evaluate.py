@@ -1,4 +1,4 @@
-"""The pocket model on held-out scenes: asked through the adapter of every local model, judged by the rule judge."""
+"""The pocket model on held-out scenes: asked through the same adapter as any local model, judged by the rule judge."""
 
 from __future__ import annotations
 
@@ -46,8 +46,9 @@ class Asked:
 
 @dataclass(frozen=True)
 class AnswerCounts:
-    """Counts of one training seed, family, regime and kind of question. prior: controls that have the commonest answer
-    of the family's held-out scenes, as the reference model `prior` would answer; 0 but for controls."""
+    """Counts of one training seed, family, regime and kind of question. prior: the number of controls whose truth is
+    the commonest answer of the family's held-out scenes, which the reference model `prior` would give; 0 for other
+    kinds."""
 
     seed: int
     family: str
@@ -60,7 +61,7 @@ class AnswerCounts:
 
     @property
     def accuracy_low(self) -> float:
-        """Lower end of the 95 % Wilson interval of the share that is correct."""
+        """Lower end of the 95 % Wilson interval of the share of correct answers."""
         low, _ = wilson(np.array([self.correct], float), np.array([self.n], float))
         return float(low[0])
 
@@ -72,7 +73,7 @@ def entry_of(checkpoint: Path) -> ModelEntry:
 
 
 def held_out(recipe: Recipe, folder: Path, most: int | None = None) -> Iterator[Asked]:
-    """The questions about the held-out scenes, family after family; the first `most` scenes of each."""
+    """The questions about the held-out scenes, family by family: about all, or about the first `most` of each."""
     taken: Counter[str] = Counter()
     for job, records in read_shards(recipe, "held-out", folder):
         for place, scene in enumerate(records):
@@ -93,7 +94,7 @@ def evaluate(
     regimes: Sequence[str] = REGIMES,
     report: Callable[[str], None] = lambda _: None,
 ) -> list[AnswerCounts]:
-    """Ask everything under every regime; returns the counts by family, regime and kind."""
+    """Ask all questions under every regime; returns the counts by family, regime and kind."""
     from traps_pipeline.models.local.adapter import load_local_model
 
     assert entry.media is not None
@@ -110,11 +111,11 @@ def evaluate(
                 model.prompt(system, one.question, shown[one.clip].frames, shown[one.clip].times_s.tolist())
                 for one in some
             ]
-            for one, said in zip(some, _answers(model, prompts, max_new_tokens), strict=True):
+            for one, answer in zip(some, _answers(model, prompts, max_new_tokens), strict=True):
                 cell = (one.scene.family, regime, one.kind)
                 n[cell] += 1
-                abstained[cell] += bool(judge_abstention(said)["abstained"])
-                correct[cell] += one.truth is not None and _right(one, said)
+                abstained[cell] += bool(judge_abstention(answer)["abstained"])
+                correct[cell] += one.truth is not None and _is_right(one, answer)
                 prior[cell] += one.kind == "control" and one.truth == commonest[one.scene.family]
         report(f"seed {seed}: {start + len(some)} of {len(asked)} questions under {len(regimes)} regimes")
     return [AnswerCounts(seed, *cell, n[cell], correct[cell], abstained[cell], prior[cell]) for cell in n]
@@ -124,10 +125,10 @@ def _answers(model: LocalModel, prompts: Sequence[Prompt], max_new_tokens: int) 
     return [generated.text for generated in model.generate(prompts, max_new_tokens)]
 
 
-def _right(one: Asked, said: str) -> bool:
-    """Whether the rule judge takes an answer for the truth (docs/spec.md 4.3)."""
+def _is_right(one: Asked, answer: str) -> bool:
+    """Whether the value that the rule judge extracts from an answer is correct (docs/spec.md 4.3)."""
     assert one.truth is not None
-    found = judge_correctness(said, one.truth)["extracted_value"]
+    found = judge_correctness(answer, one.truth)["extracted_value"]
     value = None if found is None else str(found)
     if one.kind == "answerable":
         return is_correct(value, one.truth, "label", [one.truth], {})
@@ -135,7 +136,7 @@ def _right(one: Asked, said: str) -> bool:
 
 
 def _commonest(asked: Sequence[Asked]) -> dict[str, str]:
-    """The commonest control answer of each family among these scenes; the first in alphabetical order of several."""
+    """The commonest control answer of each family among these scenes; of several, the first in alphabetical order."""
     counts: dict[str, Counter[str]] = {}
     for one in asked:
         if one.kind == "control" and one.truth is not None:
@@ -153,7 +154,7 @@ FIELDS = tuple(AnswerCounts.__dataclass_fields__)
 
 
 def write_cells(path: Path, cells: Sequence[AnswerCounts]) -> None:
-    """Write counts as CSV, in the place of those of the same seeds."""
+    """Write counts as CSV; they replace those of the same seeds."""
     write_seeds(path, cells, read_cells)
 
 
@@ -168,19 +169,19 @@ def read_cells(path: Path) -> list[AnswerCounts]:
                 for row in csv.DictReader(stream)
             ]
     except (OSError, KeyError, ValueError) as error:
-        raise TrapsError(f"{path}: no table of `traps pocket evaluate` ({error}); run it again") from error
+        raise TrapsError(f"{path}: is not a table of `traps pocket evaluate` ({error}); run it again") from error
 
 
 def markdown(cells: Sequence[AnswerCounts]) -> str:
-    """The model card's table: percent, a row a family and regime, the mean over training seeds."""
+    """The model card's table: one row per family and regime, in percent, as means over training seeds."""
     seeds = sorted({cell.seed for cell in cells})
     lines = [
         f"| {' | '.join(COLUMNS)} |",
         f"|{' --- |' * len(COLUMNS)}",
     ]
     for family, regime in dict.fromkeys((cell.family, cell.regime) for cell in cells):
-        mine = [cell for cell in cells if (cell.family, cell.regime) == (family, regime)]
-        by_kind = {kind: [cell for cell in mine if cell.kind == kind] for kind in KINDS}
+        of_row = [cell for cell in cells if (cell.family, cell.regime) == (family, regime)]
+        by_kind = {kind: [cell for cell in of_row if cell.kind == kind] for kind in KINDS}
         control = by_kind["control"]
         columns = [
             _spread([cell.correct / cell.n for cell in control]),
@@ -196,6 +197,6 @@ def markdown(cells: Sequence[AnswerCounts]) -> str:
 
 
 def _spread(shares: Sequence[float]) -> str:
-    """Percent: one value, or the mean with the lowest and the highest of several."""
+    """The shares in percent: one value, or the mean of several with the lowest and the highest."""
     mean = f"{100 * np.mean(shares):.1f}"
     return mean if len(shares) == 1 else f"{mean} ({100 * min(shares):.1f}-{100 * max(shares):.1f})"

@@ -1,4 +1,4 @@
-"""What the mechanistic stages find in the pocket model, of several training seeds, as the table that ships."""
+"""The results of the mechanistic stages on the pocket model, over training seeds, as the table that ships with it."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ KINDS = ("void", "shuffled", "random")
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of one training seed; empty where a column says nothing about it.
+    """A figure of one training seed; columns that do not apply to it are empty.
 
     figure: transfer_best and transfer_source (AUROC of a pair at the layer that is best on the target, and at the
     source's own), held_out_best and held_out_source (the same, fitted without the scored scenario), shuffled,
     answerable_void, answerable_control (at the source's own layer), abstention (over all paths and regimes). low, high:
-    95 %, scenarios resampled. answers: different ones.
+    95 % interval from resampled scenarios. answers: number of distinct answers.
     """
 
     seed: int
@@ -53,8 +53,8 @@ FIELDS = tuple(field.name for field in fields(Figure))
 
 
 def figures_of(workspace: Workspace) -> list[Figure]:
-    """The figures of a finished workspace. Raises TrapsError when stages are missing, or when nothing says which seed
-    its weights are of."""
+    """The figures of a finished workspace. Raises TrapsError when stages are missing, or when the seed of its weights
+    is not known."""
     of = _seed_of(workspace)
     probes = workspace.tables.read(PROBES, {"model": MODEL, "prompt": "standard"})
     probes = probes.loc[probes["value"].notna() & (probes["scope"] == "all")]
@@ -80,38 +80,38 @@ def figures_of(workspace: Workspace) -> list[Figure]:
 
 
 def _records(rows: Any) -> list[dict[str, Any]]:
-    """Rows as plain numbers, rounded to what a CSV should hold."""
+    """The rows as plain numbers, rounded for the CSV."""
     return json.loads(rows.to_json(orient="records", double_precision=6))
 
 
 def _seed_of(workspace: Workspace) -> dict[str, Any]:
-    """Training seed and digest of the weights that a workspace looked into."""
+    """Training seed and digest of the weights whose states a workspace has."""
     states = workspace.tables.read_all(HIDDEN_STATES, ["checkpoint", "checkpoint_digest"], model=MODEL)
     found = sorted(set(zip(states["checkpoint"], states["checkpoint_digest"], strict=True)))
     if len(found) != 1:
         raise TrapsError(
-            f"{workspace.root}: has hidden states of {len(found)} checkpoints of {MODEL}, one is wanted; run "
+            f"{workspace.root}: has hidden states of {len(found)} checkpoints of {MODEL}, but should have one; run "
             "`traps run mechanism` in a workspace of its own for each seed"
         )
     ((name, known),) = found
     folder = as_folder(name)
     if folder is None or not folder.is_dir() or folder_digest(folder) != known:
         raise TrapsError(
-            f"{workspace.root}: was made with a checkpoint {name} ({known[:12]}), and other weights or none lie there "
-            "now; run `traps run mechanism` again with the weights of the seed"
+            f"{workspace.root}: was made with a checkpoint {name} ({known[:12]}), but that folder now has other "
+            "weights or none; run `traps run mechanism` again with the weights of the seed"
         )
     facts = folder.parent / FACTS
     try:
-        told = json.loads(facts.read_text(encoding="utf-8"))
-        return {"seed": int(told["seed"]), "weights": str(told["weights"])[:12]}
+        origin = json.loads(facts.read_text(encoding="utf-8"))
+        return {"seed": int(origin["seed"]), "weights": str(origin["weights"])[:12]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrapsError(
-            f"{facts}: does not say which seed these weights are of ({error}); `traps pocket train` writes it"
+            f"{facts}: does not name the seed of these weights ({error}); `traps pocket train` writes it"
         ) from error
 
 
 def write_figures(path: Path, figures: Sequence[Figure]) -> None:
-    """Write figures as CSV, in the place of those of the same seeds."""
+    """Write figures as CSV; they replace those of the same seeds."""
     write_seeds(path, figures, read_figures)
 
 
@@ -127,7 +127,7 @@ def read_figures(path: Path) -> list[Figure]:
             ]
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise TrapsError(
-            f"{path}: no table of `traps pocket card --mechanism` ({error}); write it again from the workspaces"
+            f"{path}: is not a table of `traps pocket card --mechanism` ({error}); write it again from the workspaces"
         ) from error
 
 
@@ -135,40 +135,40 @@ def read_figures(path: Path) -> list[Figure]:
 
 
 def markdown(figures: Sequence[Figure]) -> str:
-    """The model card's tables: mean over training seeds, with the lowest and the highest of several."""
+    """The model card's tables: means over training seeds, with the lowest and the highest if there are several."""
     seeds = sorted({figure.seed for figure in figures})
     return "\n".join([*_probes(figures), "", *_steering(figures), "", f"Training seeds: {', '.join(map(str, seeds))}."])
 
 
 def _probes(figures: Sequence[Figure]) -> list[str]:
     lines = ["| AUROC of probes | best layer | its layers | source's own layer | its layers |", "|" + " --- |" * 5]
-    for crossing, said, analysis in (
+    for crossing, label, analysis in (
         *((crossing, crossing, "transfer") for crossing in TRANSFER_TYPES[:3]),
         (TRANSFER_TYPES[0], f"{TRANSFER_TYPES[0]}, fitted without the scored scenario", "held_out"),
     ):
-        columns = [said]
+        columns = [label]
         for name in (f"{analysis}_best", f"{analysis}_source"):
-            mine = [f for f in figures if f.figure == name and transfer_type(f.source, f.target) == crossing]
-            columns += [_over_seeds(mine), _layers(mine)]
+            chosen = [f for f in figures if f.figure == name and transfer_type(f.source, f.target) == crossing]
+            columns += [_over_seeds(chosen), _layers(chosen)]
         lines.append(f"| {' | '.join(columns)} |")
-    for name, said in (
+    for name, label in (
         ("shuffled", "label-shuffled, within a dataset, mean over layers"),
         ("answerable_void", "occlusion's probe: void clips, own question against the answerable one"),
         ("answerable_control", "occlusion's probe: void clips with the answerable question against controls"),
     ):
-        mine = [f for f in figures if f.figure == name and (name == "shuffled" or f.source == "occlusion")]
-        lines.append(f"| {said} | | | {_over_seeds(mine)} | {_layers(mine)} |")
+        chosen = [f for f in figures if f.figure == name and (name == "shuffled" or f.source == "occlusion")]
+        lines.append(f"| {label} | | | {_over_seeds(chosen)} | {_layers(chosen)} |")
     return lines
 
 
 def _steering(figures: Sequence[Figure]) -> list[str]:
-    mine = [figure for figure in figures if figure.figure == "abstention"]
-    alphas = sorted({figure.alpha for figure in mine if figure.alpha is not None})
+    shares = [figure for figure in figures if figure.figure == "abstention"]
+    alphas = sorted({figure.alpha for figure in shares if figure.alpha is not None})
     heads = ["abstained, %", *(f"α {alpha:g}" for alpha in alphas), "95 % at the last", "answers", "scenarios"]
     lines = [f"| {' | '.join(heads)} |", "|" + " --- |" * len(heads)]
     for side in ("void", "control"):
         for kind in KINDS:
-            cells = [[f for f in mine if (f.side, f.kind, f.alpha) == (side, kind, alpha)] for alpha in alphas]
+            cells = [[f for f in shares if (f.side, f.kind, f.alpha) == (side, kind, alpha)] for alpha in alphas]
             if not all(cells):
                 continue
             top = cells[-1]
@@ -181,7 +181,8 @@ def _steering(figures: Sequence[Figure]) -> list[str]:
 
 
 def _over_seeds(figures: Sequence[Figure], times: float = 1, digits: int = 3) -> str:
-    """The mean over seeds, with the lowest and the highest seed of several; a seed's is that over its figures."""
+    """The mean over seeds, with the lowest and the highest if there are several; a seed's value is the mean of its
+    figures."""
     by_seed: dict[int, list[float]] = {}
     for figure in figures:
         by_seed.setdefault(figure.seed, []).append(times * figure.value)
@@ -198,7 +199,7 @@ def _layers(figures: Sequence[Figure]) -> str:
 
 def _range(numbers: Any) -> str:
     """`4`, or `1-4`; empty where there is none."""
-    known = [number for number in numbers if number is not None]
-    if not known:
+    present = [number for number in numbers if number is not None]
+    if not present:
         return ""
-    return f"{min(known)}" if min(known) == max(known) else f"{min(known)}-{max(known)}"
+    return f"{min(present)}" if min(present) == max(present) else f"{min(present)}-{max(present)}"

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from tokenizers import Tokenizer
 
 FAMILY = "qwen3-vl"
-VOCABULARY = 2000  # at most; words of prompts, questions and answers come to fewer
-PATCH = 8  # pixels; two by two patches make a token
+VOCABULARY = 2000  # maximum; prompts, questions and answers have fewer words
+PATCH = 8  # pixels; two by two patches are merged into a token
 TEXT = {
     "hidden_size": 128,
     "intermediate_size": 256,
@@ -40,8 +40,8 @@ VISION = {
 
 
 def train_tokenizer(records: Iterable[SceneRecord]) -> Tokenizer:
-    """A byte-level BPE tokenizer whose tokens are the words of the scenes' questions and answers, and `phrases`; any
-    other text falls into smaller pieces."""
+    """A byte-level BPE tokenizer whose tokens are the words of the scenes' questions and answers, and `phrases`; it
+    splits any other text into smaller pieces."""
     from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers, trainers
 
     made = Tokenizer(models.BPE())

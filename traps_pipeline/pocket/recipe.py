@@ -1,4 +1,4 @@
-"""`assets/pocket/recipe.yaml`: what the pocket model is trained on, as data."""
+"""`assets/pocket/recipe.yaml`: the scenes and settings with which the pocket model is trained."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ Split = Literal["train", "held-out"]
 
 
 class Training(BaseModel):
-    """How the weights are fitted. void_share: of void clips in a batch; brightness: augmentation; naming:
-    weight of the loss of names; naming_steps: steps of it alone, before any answer."""
+    """How the weights are fitted. void_share: share of void clips in a batch; brightness: augmentation; naming: weight
+    of the naming loss; naming_steps: number of first steps with the naming loss alone."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     steps: int = Field(ge=1)
@@ -34,8 +34,8 @@ class Training(BaseModel):
 
 
 class Recipe(BaseModel):
-    """Scenes for training (family to number), held-out scenes a family, how a clip is shown, and the share of voids
-    that are labelled with an abstention."""
+    """Number of training scenes by family, held-out scenes per family, how a clip is shown, and the share of voids that
+    are labelled with an abstention."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenes: dict[str, int] = Field(min_length=1)

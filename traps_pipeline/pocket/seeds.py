@@ -1,4 +1,4 @@
-"""The CSVs beside the weights: rows of several training seeds, a seed's replaced as a whole."""
+"""The CSVs beside the weights: rows of several training seeds; all rows of a seed are replaced together."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from traps_pipeline.files import replacing
 
 
 def write_seeds(path: Path, rows: Sequence[Any], read: Callable[[Path], Sequence[Any]]) -> None:
-    """Write rows (dataclasses with a field `seed`) as CSV, in the place of those of the same seeds.
+    """Write rows (dataclasses with a field `seed`) as CSV; they replace the rows of the same seeds.
 
-    read: reads such a file back, and raises for one that it cannot.
+    read: reads such a file, and raises TrapsError if it cannot.
     """
     seeds = {row.seed for row in rows}
     kept = [row for row in (read(path) if path.is_file() else []) if row.seed not in seeds]

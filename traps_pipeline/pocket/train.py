@@ -1,4 +1,4 @@
-"""Fitting the pocket model: a plain loop that can be stopped at any step and goes on bit for bit where it was."""
+"""Training of the pocket model: a plain loop that can be stopped at any step and then continues bit for bit."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 
 PROGRESS_S = 30.0
 CHECKPOINT_S = 120.0
-RARE = 2.0  # most tokens have most colours not: where the logits begin
+RARE = 2.0  # offset of the initial logits: most tokens lack most colours
 
 
 def look_at(model: Any, batch: Batch) -> Any:
-    """What the vision tower makes of a batch's clips."""
+    """The output of the vision tower for a batch's clips."""
     return model.model.get_video_features(batch.pixels, batch.grid, return_dict=True)
 
 
 def name_loss(model: Any, seen: Any, batch: Batch, words: torch.Tensor) -> torch.Tensor:
-    """How far the clips' tokens, as they enter the language model, are from lying along the embeddings of the words for
-    what is in their square of the picture, and of no others (binary cross-entropies, nats).
+    """The naming loss: the clips' tokens, as they enter the language model, should align with the embeddings of the
+    words for the contents of their square of the picture, and of no other words (binary cross-entropies, nats).
 
-    Every word that names anything of a clip weighs the same, in however few squares it holds: a ball has one, and would
-    else be drowned by boards and bins. words: `name_tokens`.
+    Every word that names anything in a clip has the same weight, even if it applies to few squares. Otherwise a ball,
+    which has one square, would have little weight beside boards and bins. words: from `name_tokens`.
     """
     import torch
     from torch.nn.functional import binary_cross_entropy_with_logits
@@ -54,41 +54,41 @@ def answer_loss(model: Any, seen: Any, batch: Batch) -> torch.Tensor:
     from torch.nn.functional import cross_entropy
 
     length, rows = len(batch.head), len(batch.ids)
-    begun = model.model.language_model(
+    cache = model.model.language_model(
         input_ids=batch.head[None], position_ids=batch.positions[:, :1, :length], use_cache=True
     ).past_key_values
-    begun.batch_repeat_interleave(rows)
+    cache.batch_repeat_interleave(rows)
     hidden = model.model(
         input_ids=batch.ids,
         attention_mask=batch.sees,
         position_ids=batch.positions[:, :, length:],
-        past_key_values=begun,
+        past_key_values=cache,
         mm_encoder_outputs={"video": seen},
         video_grid_thw=batch.grid,
     ).last_hidden_state
-    wanted = batch.labels[:, 1:]
-    said = wanted != IGNORED
-    logits = model.lm_head(hidden[:, :-1][said])  # of the answers alone: the vocabulary is as wide as the model
-    return cross_entropy(logits, wanted[said], reduction="sum") / rows
+    labels = batch.labels[:, 1:]
+    in_answers = labels != IGNORED
+    logits = model.lm_head(hidden[:, :-1][in_answers])  # at answers alone: the vocabulary is as wide as the model
+    return cross_entropy(logits, labels[in_answers], reduction="sum") / rows
 
 
 def loss_at(step: int, model: Any, batch: Batch, words: torch.Tensor, training: Training) -> torch.Tensor:
-    """What is minimised at a step: names alone at first, since nothing can be answered of what is not seen yet."""
+    """The loss at a step: at first the naming loss alone, since a model that cannot see cannot learn to answer."""
     seen = look_at(model, batch)
     names = training.naming * name_loss(model, seen, batch, words)
     return names if step < training.naming_steps else names + answer_loss(model, seen, batch)
 
 
 def learning_rate(step: int, training: Training) -> float:
-    """Half a cosine to zero over all steps, with a linear warm-up before names and again before answers."""
+    """Half a cosine down to zero over all steps, with a linear warm-up for the naming loss and again for answers."""
     since = step - training.naming_steps if step >= training.naming_steps else step
     warm = min(1.0, (since + 1) / max(1, training.warmup_steps))
     return training.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / training.steps))
 
 
 class _State:
-    """Weights and the optimizer's moments in one safetensors file, with the steps that made them: bit for bit what is
-    in memory. recipe and data are in it, so that no other training goes on from there."""
+    """Weights and the optimizer's moments in one safetensors file, equal bit for bit to those in memory, with the
+    number of steps. It holds digests of recipe and data, so that no other training continues from it."""
 
     def __init__(self, path: Path, model: Any, optimizer: Any, identity: str) -> None:
         self._path, self._optimizer, self._identity = path, optimizer, identity
@@ -105,7 +105,7 @@ class _State:
             save_file(tensors, part, {"step": str(step), "identity": self._identity})
 
     def load(self) -> int:
-        """Put what is in the file into model and optimizer; returns the steps that made it, 0 without a file."""
+        """Load the file into model and optimizer; returns its number of steps, 0 without a file."""
         import torch
         from safetensors import safe_open
 
@@ -115,7 +115,7 @@ class _State:
             metadata = file.metadata()
             if metadata["identity"] != self._identity:
                 raise TrapsError(
-                    f"{self._path}: is of another recipe, other data or another seed; give another folder, or delete it"
+                    f"{self._path}: belongs to another recipe, data or seed; give another folder, or delete it"
                 )
             for key in list(file.keys()):
                 kind, _, name = key.partition(".")
@@ -138,9 +138,9 @@ def train(
 ) -> Path:
     """Train the model of a seed and save it to `folder`/weights; returns that folder.
 
-    State is kept in `folder`/state.safetensors every two minutes and on Ctrl-C; the same call goes on from there (if it
-    was stopped inside a step, with weights half updated, from the state that was kept before).
-    stop_after: do no step beyond that one.
+    The state is saved in `folder`/state.safetensors every two minutes and on Ctrl-C, and the same call continues from
+    it. If training was stopped inside a step, with weights half updated, it continues from the state saved before.
+    stop_after: number of the last step to do.
     """
     import torch
 
@@ -159,7 +159,7 @@ def train(
     state = _State(folder / "state.safetensors", model, optimizer, identity)
     step = state.load()
     last = training.steps if stop_after is None else min(stop_after, training.steps)
-    told = kept = began = time.monotonic()
+    reported = kept = began = time.monotonic()
     first, lately, whole = step, [], True
     model.train()
     try:
@@ -176,10 +176,10 @@ def train(
             whole = True
             lately.append(loss.item())
             now = time.monotonic()
-            if now - told > PROGRESS_S or step == last:
+            if now - reported > PROGRESS_S or step == last:
                 left = (now - began) / (step - first) * (training.steps - step) / 60
                 report(f"step {step} of {training.steps}, loss {np.mean(lately):.3f}, {left:.0f} min left")
-                told, lately = now, []
+                reported, lately = now, []
             if now - kept > CHECKPOINT_S:
                 state.save(step)
                 kept = now

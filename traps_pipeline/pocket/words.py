@@ -1,4 +1,4 @@
-"""What the pocket model is taught to say: an answer or an abstention, in the form that a prompt asks for."""
+"""The texts that the pocket model is trained to write: an answer or an abstention, in the form each prompt asks for."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from traps_pipeline.models.prompts import prompt, system_prompt
 
 PROMPTS = ("standard", "guided", "json", "vqa_standard", "vqa_guided")
 _COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
-# How an ill-posed question begins, and what one would guess who answers it all the same.
+# Beginnings of ill-posed questions, with guesses that would answer them.
 _GUESSES: Sequence[tuple[str, tuple[str, ...]]] = (
     (r"what colou?r is", _COLOURS),
     (r"how (many|often|loud|far|old|much)|what is the (weight|mass|temperature|price|electric)", tuple("123456789")),
@@ -34,7 +34,7 @@ def prompt_text(name: str) -> str:
 
 
 ABSTENTION = "I don't know: this cannot be determined from the video."
-ANSWER = "The answer is: "  # with its blank, so that an answer is the same token here and in JSON
+ANSWER = "The answer is: "  # ends with a blank, so that an answer is the same token here and in JSON
 _JSON = {
     False: '{"reason": "The video shows how it ends.", "final_answer": "',
     True: '{"reason": "I cannot see what decides this.", "final_answer": "I don\'t know"}',
@@ -49,14 +49,15 @@ def say(answer: str | None, prompt_name: str) -> str:
 
 
 def phrases() -> list[str]:
-    """What is a token of its own: the lines of the prompts, and the words that every answer shares. Sequences are short
-    that way, which is what makes training on two cores possible."""
+    """The texts that are single tokens: the lines of the prompts, and the words that all answers share. They keep
+    sequences short, which makes training on two cores possible."""
     lines = [line for name in PROMPTS for line in prompt_text(name).splitlines() if line]
     return list(dict.fromkeys([*lines, ABSTENTION, ANSWER, *_JSON.values()]))
 
 
 def guess(question: str, labels: Sequence[str], rng: np.random.Generator) -> str:
-    """A plausible answer to a question that has none: of the kind that an ill-posed question asks for, else a label."""
+    """A plausible answer to a question that has no answer: a label, or for an ill-posed question a value of the kind
+    that it asks for."""
     choices = labels or next((kind for opening, kind in _GUESSES if re.match(opening, question.lower())), _ANYTHING)
     return str(choices[int(rng.integers(len(choices)))])
 
@@ -65,8 +66,8 @@ COLUMNS, ROWS = "ABCDEFGH", "123456"  # of the picture, for questions of place
 
 
 def place_question(ball: str, place: Sequence[float], axis: int) -> tuple[str, str]:
-    """A question of training alone, which teaches to find things, and its answer: the column (axis 0) or the row (axis
-    1) that the ball of a colour is in when the clip ends. place: shares of width and height."""
+    """A question that is used only in training, to teach the model to locate objects, and its answer: the column (axis
+    0) or the row (axis 1) of the ball of a colour when the clip ends. place: shares of width and height."""
     names = (COLUMNS, ROWS)[axis]
     question = f"In which {('column', 'row')[axis]} of the picture is the {ball} ball when the clip ends?"
     return question, names[min(len(names) - 1, int(place[axis] * len(names)))]

@@ -1,1 +1,1 @@
-"""What people read: the leaderboard as text, Markdown and one HTML file, figures, contact sheets."""
+"""Output for people: the leaderboard, tables, figures, contact sheets and the report page."""

@@ -1,6 +1,7 @@
-"""Every table and figure by name: how it is made of `Results`, and what of a study it reads (docs/spec.md 10).
+"""Every table and figure by name: the function that makes it from `Results`, and the stages it reads (docs/spec.md 10).
 
-A new one is an entry here: its asset, its staleness, its place on the report page and in `traps export` follow.
+A new table or figure is an entry here. Its asset, its staleness and its place on the report page and in `traps export`
+follow from the entry.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ PAPER = "published"  # folder below tables/ and figures/
 
 @dataclass(frozen=True)
 class TableReport:
-    """A table (or several that belong together). reads: stages whose tables it is made from; `published`: whether the
-    paper prints something of the kind."""
+    """A table (or several that belong together). reads: the stages whose tables it is made from; published: whether the
+    paper prints such a table."""
 
     name: str
     make: Callable[[Results], list[PrintedTable]]
     reads: tuple[str, ...]
     published: bool = True
-    title: str = ""  # of several tables together; else the first one's
+    title: str = ""  # of several tables together; by default the title of the first one
 
     @property
     def doc(self) -> str:
@@ -39,18 +40,18 @@ class TableReport:
         return _first_paragraph(self.make)
 
     def tables(self, results: Results) -> list[PrintedTable]:
-        """The tables, without columns that the paper prints nowhere."""
+        """The tables; those of the paper's numbers without the columns that the paper does not print."""
         return [replace(t, columns=printed(results, t.rows, t.columns)) for t in self.make(results)]
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Files by path: `tables/name.csv` and so on, the paper's in `tables/published`."""
+        """Files by path: `tables/name.csv` and so on, for the paper's numbers in `tables/published`."""
         made = [file for table in self.tables(results) for file in table_files(table).items()]
         return {f"{folder('tables', results)}/{name}": content for name, content in made}
 
 
 @dataclass(frozen=True)
 class FigureReport:
-    """A figure. reads: stages whose tables it is made from; `published`: whether the paper's numbers allow it."""
+    """A figure. reads: the stages whose tables it is made from; published: whether the paper prints its numbers."""
 
     name: str
     title: str
@@ -68,7 +69,7 @@ class FigureReport:
         return f"{folder('figures', results)}/{self.name}.png"
 
     def picture(self, results: Results) -> dict[str, bytes]:
-        """The PNG alone, by path: what a page and Dagster show."""
+        """The PNG alone, by path, for the page and for Dagster."""
         return {self.path(results): figure_bytes(self.make(results))}
 
     def files(self, results: Results) -> dict[str, bytes]:
@@ -129,7 +130,8 @@ FIGURES: tuple[FigureReport, ...] = (
     FigureReport("cosines", "Cosines of void directions", mechanism.cosine_heatmaps, ("cosines",)),
 )
 
-# Assets by name: of a study, one a table or figure; of the paper's numbers, which change together, one a kind.
+# Assets by name. A study has one for each table or figure; the paper's numbers change together, so they have one asset
+# for all tables and one for all figures.
 OF_STUDY: Mapping[str, Report] = {
     **{f"table_{report.name}": report for report in TABLES},
     **{f"figure_{report.name}": report for report in FIGURES},
@@ -142,12 +144,12 @@ PRINTED: Sequence[str] = (*OF_STUDY, *OF_PAPER)
 
 
 def folder(kind: str, results: Results) -> str:
-    """`tables` or `figures`, and below it the paper's."""
+    """The folder of a kind, `tables` or `figures`; the paper's files are in a folder below it."""
     return kind if results.is_study else f"{kind}/{PAPER}"
 
 
 def workspace_files(report: Report, results: Results) -> dict[str, bytes]:
-    """What a workspace keeps of it: all files of a table, the picture of a figure; `traps export` writes the rest."""
+    """The files that a workspace keeps: all files of a table, the PNG of a figure; `traps export` writes the rest."""
     return report.files(results) if isinstance(report, TableReport) else report.picture(results)
 
 

@@ -1,4 +1,4 @@
-"""Control beside void, at a glance: what a reviewer looks at first (docs/spec.md 10)."""
+"""Contact sheets: frames of controls above frames of voids, for a reviewer's first look (docs/spec.md 10)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MOMENTS = 4  # frames a clip
+MOMENTS = 4  # frames per clip
 GAP = 8  # pixels between frames
 FOOTER_IN = 0.2  # room for the times below a pair's frames
 MOST_PAIRS = 80
@@ -25,7 +25,7 @@ MOST_PAIRS = 80
 
 @dataclass(frozen=True)
 class Layout:
-    """Widths (in), dots an inch, and how many letters of a question fit on a line of a pair."""
+    """Widths (inches), dots per inch, and the number of letters of a question that fit on a line of a pair."""
 
     block: float = 6.4
     header: float = 0.95  # room for the words above a pair's frames
@@ -37,13 +37,14 @@ class Layout:
     ids: bool = True  # whether scenarios are named
 
 
-# On a screen, and across a page of a paper, where nothing may be smaller than 6 points.
+# For a screen, and for the width of a printed page, on which no text may be smaller than 6 points.
 SCREEN, PAGE = Layout(), Layout(block=2.98, header=0.5, gap=0.4, dpi=300, size=6.5, letters=62, questions=2, ids=False)
 
 
 @dataclass(frozen=True)
 class SampledClip:
-    """Frames (MOMENTS, H, W, 3) uint8 at the control's times; those from `known` on lie behind the clip's end (s)."""
+    """Frames (MOMENTS, H, W, 3) uint8 at the control's times; those with index `known` or more lie after the clip's end
+    (s)."""
 
     frames: np.ndarray
     known: int
@@ -51,18 +52,18 @@ class SampledClip:
 
 
 def contact_sheet(items: pd.DataFrame, root: Path, per_family: int | None = 1, columns: int = 2) -> bytes:
-    """PNG of `pairs_figure`."""
+    """The PNG of `pairs_figure`."""
     return figure_bytes(pairs_figure(items, root, per_family, columns))
 
 
 def pairs_figure(
     items: pd.DataFrame, root: Path, per_family: int | None = 1, columns: int = 2, layout: Layout = SCREEN
 ) -> Figure:
-    """Per pair a row of control frames above a row of void frames at the same times, from start to end.
+    """For each pair, a row of control frames above a row of void frames at the same times, from start to end.
 
-    items are ITEMS rows with both sides of each pair, clips lie under root. Of every dataset and sub-scenario the first
-    `per_family` pairs by id are shown, all where it is None. A time behind a truncated void's end is hatched. Raises
-    ValueError when there is no whole pair or more than 80, and DamagedClip when a clip cannot be decoded.
+    items are ITEMS rows with both sides of each pair, and clips lie under root. Of every dataset and sub-scenario the
+    first `per_family` pairs by id are shown, or all if it is None. Times after a truncated void's end are hatched.
+    Raises ValueError when there is no whole pair or more than 80, and DamagedClip when a clip cannot be decoded.
     """
     pairs = chosen_pairs(items, per_family)
     columns = min(columns, len(pairs))
@@ -83,8 +84,8 @@ def pairs_figure(
 
 
 def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
-    """ITEMS rows of six visual pairs for a figure like the paper's: three of either taxonomy, of as many sub-scenarios
-    as there are, fewer where there are fewer."""
+    """ITEMS rows of six visual pairs for a figure like the paper's: three of each taxonomy, of different categories
+    where possible, or fewer if there are fewer."""
     visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
     chosen: list[str] = []
     for _, rows in visual.groupby("taxonomy", sort=True):
@@ -174,10 +175,10 @@ def _draw_pair(
 
 
 def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
-    """Scenario and ground truth in bold, below it the question; the void's own too where it differs."""
-    asked = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
-    same = asked["control"] == asked["void"]
-    questions = [asked["control"]] if same else [f"{side}: {question}" for side, question in asked.items()]
+    """Draw scenario and ground truth in bold, and the question below them; also the void's question if it differs."""
+    by_side = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
+    same = by_side["control"] == by_side["void"]
+    questions = [by_side["control"]] if same else [f"{side}: {question}" for side, question in by_side.items()]
     fit = {"max_lines": layout.questions, "placeholder": " …"}
     lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **fit)]
     truth = pair.at["control", "ground_truth"]
@@ -197,7 +198,7 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
 
 
 def _fitted(frame: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The frame at the control's size: one void clip of another size does not break the sheet."""
+    """The frame resized to the control's size, so that a void clip of another size does not break the sheet."""
     if frame.shape[:2] == (height, width):
         return frame
     import cv2

@@ -1,6 +1,6 @@
-"""Every pair on one page that opens from disk: control, void and twin side by side, words, answers, certificates.
+"""A page of all pairs that opens from disk: control, void and twin side by side, questions, answers, certificates.
 
-The page plays the workspace's clips where they lie; it makes no request of its own. All text is escaped by Jinja2.
+The page plays the clips in the workspace and makes no network request. All text is escaped by Jinja2.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SIDES = ("control", "void", "twin")
 
 @dataclass(frozen=True)
 class Picture:
-    """A clip on the page: paths relative to it, and the words below it."""
+    """A clip on the page: its paths relative to the page, and its caption."""
 
     side: str
     clip: str
@@ -79,7 +79,7 @@ def _entry(spec: Mapping[str, Any], clips: Mapping[tuple[str, str], str]) -> Sho
     scenario_id, evidence, twin = spec["scenario_id"], json.loads(spec["evidence"]), json.loads(spec["twin"])
     captions = {
         "control": f"control: {spec['ground_truth']}",
-        "void": f"void: {_what_is_done(spec)}",
+        "void": f"void: {_intervention(spec)}",
         "twin": f"twin, same void: {twin['ground_truth']}",
     }
     pictures = tuple(
@@ -90,12 +90,12 @@ def _entry(spec: Mapping[str, Any], clips: Mapping[tuple[str, str], str]) -> Sho
     return ShownScenario(scenario_id, spec["question"], labels, spec["ill_posed_question"], pictures, certificate)
 
 
-def _what_is_done(spec: Mapping[str, Any]) -> str:
+def _intervention(spec: Mapping[str, Any]) -> str:
     at = f"{spec['void_from_s']:.1f} s"
     return f"hidden from {at}" if spec["void_kind"] == "occluder" else f"cut at {at}"
 
 
-_NAMES = {
+_PHRASES = {
     "commit_s": "outcome settled at {} s",
     "margin_m": "margin {} m",
     "least_visible_px": "at least {:.0f} pixels at the end",
@@ -109,9 +109,9 @@ _NAMES = {
 
 
 def _certificate(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    for name, words in _NAMES.items():
+    for name, phrase in _PHRASES.items():
         if name in evidence:
-            yield name, words.format(evidence[name])
+            yield name, phrase.format(evidence[name])
 
 
 def _render(title: str, sections: Mapping[str, list[ShownScenario]]) -> str:

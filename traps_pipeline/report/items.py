@@ -1,7 +1,7 @@
-"""The items behind every number: one page a cell, with each answer, vote and verdict, and an index of the cells.
+"""The items behind every number: one page per cell, with each answer, vote and verdict, and an index of the cells.
 
-Pages are made one cell at a time, and only where the cell's tables changed, so that a study of hundreds of cells and
-a thousand items each stays feasible. Answers are untrusted text: Jinja2 escapes everything.
+Pages are made one cell at a time, and only if the cell's tables changed, so that a study with hundreds of cells of a
+thousand items each stays feasible. Answers are untrusted text: Jinja2 escapes everything.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from traps_pipeline.storage.workspace import Workspace
 FOLDER = "items"
 MADE = "made.json"  # digest of what each page was made from
 _PER_CELL = (RESPONSES, VOTES, VERDICTS)
-_DATASETS, _TITLES = (*DATASETS, *ARMS), TITLES | ARM_TITLES  # an arm's items have pages as those of the pairs have
+_DATASETS, _TITLES = (*DATASETS, *ARMS), TITLES | ARM_TITLES  # the items of arms have pages, too
 
 
 def cells_with_items(workspace: Workspace) -> list[Cell]:
@@ -46,15 +46,15 @@ def _place(cell: Cell) -> tuple[Any, ...]:
 
 
 def page_name(cell: Cell) -> str:
-    """File of a cell's page."""
+    """The file name of a cell's page."""
     return f"{cell.dataset}__{cell.evaluation.key}.html"
 
 
 def addresses(cells: Sequence[Cell]) -> Callable[[Behind], str]:
-    """Where the items behind a number are, relative to the report page; empty where there are none.
+    """The address of the items behind a number, relative to the report page; empty if there are none.
 
-    That is the one cell's page at the number's side, else the index at model and regime (and dataset), whose runs are
-    then a click away.
+    For a number of a single cell this is the cell's page, at the number's side. Otherwise it is the index, at the model
+    and regime (and dataset), with a link to each run.
     """
     pages: dict[tuple[str, str, str], list[Cell]] = {}
     for cell in cells:
@@ -78,9 +78,10 @@ def _anchor(dataset: str, model: str, regime: str) -> str:
 
 
 def write_item_pages(workspace: Workspace, folder: Path, clips: str | None) -> list[Cell]:
-    """Pages of all cells and their index in `folder`; returns the cells. One whose tables did not change is left alone.
+    """Write the pages of all cells and their index to `folder`; returns the cells. A page whose tables did not change
+    is not written again.
 
-    clips is the way from a page to the workspace, for links to clips; None where the clips are not there.
+    clips is the relative path from a page to the workspace, for links to clips; None if there are no clips.
     """
     cells = cells_with_items(workspace)
     made_file = folder / MADE
@@ -117,7 +118,7 @@ def item_page(workspace: Workspace, cell: Cell, clips: str | None) -> str:
 
 
 def _item_rows(workspace: Workspace, cell: Cell) -> Iterator[Mapping[str, Any]]:
-    """One row an item of the cell: its ITEMS, RESPONSES and VERDICTS columns, and `votes`."""
+    """One row per answered item of the cell: its ITEMS columns, `answer`, `verdict` and `votes`."""
     tables = workspace.tables
     items = tables.read(ITEMS, {"dataset": cell.dataset}).sort_values(["sub_scenario", "scenario_id"])
     answers = _by_item(tables.read(RESPONSES, cell.partition))
@@ -141,12 +142,12 @@ def _by_item(rows: pd.DataFrame) -> dict[str, Mapping[str, Any]]:
 
 
 def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """Rows as mappings, with None for everything missing."""
+    """The rows as mappings, with None for missing values."""
     return rows.astype(object).where(rows.notna(), None).to_dict("records")
 
 
 def index_page(cells: Sequence[Cell]) -> str:
-    """HTML of all cells: a row a model and regime, a column a dataset, a link a run."""
+    """HTML of all cells: one row per model and regime, one column per dataset, one link per run."""
     models: dict[str, dict[str, dict[str, list[tuple[int, str]]]]] = {}
     for cell in cells:
         e = cell.evaluation

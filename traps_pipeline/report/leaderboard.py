@@ -41,31 +41,31 @@ from traps_pipeline.scoring.analyses import of_several_runs
 from traps_pipeline.scoring.tables import LEADERBOARD
 
 BOUNDS = "If missing: worst, best"
-# Columns that are there only where their count, or that of another field, is not 0: the table is wide already.
+# Columns that are shown only if their count, or that of another field, is not 0, because the table is wide already.
 OPTIONAL = {
     Column("n_refused", "Refused", "count"): "n_refused",
     Column("n_empty", "Empty", "count"): "n_empty",
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
-Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # model and regime to their ROBUST row
+Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # ROBUST rows by model and regime
 ROBUST_COLUMNS = (Column("pecs_r", "PECS-R", "range", group=True), Column("gap", "gap", "range"))
 LEGEND = {
     "Acc": "share of control items answered correctly",
     "AbsRec": "abstention recall: share of void items, which cannot be answered, that the model abstains on",
     "FalseAbs": "share of control items, which can be answered, that the model abstains on",
-    "J": "AbsRec − FalseAbs, from −1 to 1; 0 for every strategy that does not tell void from control",
-    "PECS": "Acc × max(0, J), from 0 to 1; computed per run, then averaged. J is clipped at 0 here, so chance "
-    "alone lifts a random strategy slightly above 0: the J beside it, which is not clipped, tells",
+    "J": "AbsRec − FalseAbs, from −1 to 1; 0 for every strategy that does not distinguish void from control",
+    "PECS": "Acc × max(0, J), from 0 to 1; computed per run, then averaged. J is clipped at 0 here, so chance alone "
+    "lifts a random strategy slightly above 0; look at the column J, which is not clipped",
     "95 % CI": "percentile interval of PECS, cluster bootstrap over scenarios",
     "±": "population standard deviation over runs",
-    "n": "pairs (one control, one void) a run",
-    "Missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares rest on the others",
+    "n": "pairs (one control, one void) per run",
+    "Missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares are over the other items",
     INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered, that is, with a text, whole or truncated; an "
-    "overall figure is incomplete where that of any dataset is",
-    "Refused": "items over all runs that the model or its provider refused; among the missing",
-    "Empty": "items over all runs answered with no text; among the missing",
-    BOUNDS: "PECS of all items if every missing decision were as bad for the model as can be (a control wrong and "
-    "abstained on, a void not abstained on) and as good as can be; computed per run, then averaged",
+    "overall figure is incomplete if that of any dataset is",
+    "Refused": "items over all runs that the model or its provider refused; they are among the missing ones",
+    "Empty": "items over all runs answered with no text; they are among the missing ones",
+    BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
+    "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
     **ROBUST_TERMS,
     "Epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
@@ -73,36 +73,36 @@ LEGEND = {
 
 
 def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> str:
-    """LEADERBOARD rows, with what ROBUST rows say of them, as a table for standard output, best first."""
+    """LEADERBOARD rows, with the figures of ROBUST rows, as a table for standard output, best first."""
     return table_text(leaderboards(board, robust, brief=True)[0])
 
 
 def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> str:
-    """LEADERBOARD rows, with what ROBUST rows say of them, as a Markdown table with its legend, best first."""
+    """LEADERBOARD rows, with the figures of ROBUST rows, as a Markdown table with its legend, best first."""
     terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
     return "\n".join([table_markdown(leaderboards(board, robust, brief=True)[0]), *terms]) + "\n"
 
 
 def leaderboards(board: pd.DataFrame, robust: pd.DataFrame | None = None, *, brief: bool = False) -> list[PrintedTable]:
-    """Tables of LEADERBOARD rows: first the one that entries are ranked by, then one of each other dataset. The overall
-    one has the figures of ROBUST rows, where there are any.
+    """Tables of LEADERBOARD rows: first the one that ranks the entries, then one for each other dataset. The overall
+    table has the figures of ROBUST rows, if there are any.
 
-    The first is `overall`; on a board where no model has all four datasets it is the first dataset that is there. An
-    entry without a row there stands last. brief: without deviations, runs and epochs.
+    The first table is `overall`; if no model has all four datasets it is the first dataset of the board. An entry
+    without a row in it comes last. brief: without deviations, runs and epochs.
     """
-    there = set(board["dataset"])
-    ranked = next((name for name in TITLES if name in there), "overall")
-    others = [name for name in DATASETS if name in there and name != ranked]
+    datasets = set(board["dataset"])
+    ranked = next((name for name in TITLES if name in datasets), "overall")
+    others = [name for name in DATASETS if name in datasets and name != ranked]
     own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief) for name in others]
     rows = []
-    if robust is not None and ranked == "overall":  # a null text is NaN once it was in a file
+    if robust is not None and ranked == "overall":  # a null text that was read from a file is NaN
         rows = robust.astype(object).where(robust.notna(), None).to_dict("records")
     beside = {(row["model"], row["regime"]): row for row in rows}
     return [_leaderboard(board, ranked, others, beside, brief), *own]
 
 
 def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
-    """LEGEND without the mark and the columns that nothing on the board calls for."""
+    """The entries of LEGEND for the columns and marks that the board has."""
     needed = {column.heading: field for column, field in OPTIONAL.items()} | {INCOMPLETE_MARK: "incomplete"}
     absent = {term for term, field in needed.items() if not (board.loc[:, field] > 0).any()}
     absent |= {*ROBUST_TERMS} if robust is None or robust.empty else set()
@@ -110,7 +110,7 @@ def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str,
 
 
 def provenance(board: pd.DataFrame) -> str:
-    """Which benchmark versions and campaigns the board's figures come from."""
+    """A sentence that names the benchmark versions and epochs of the board's figures."""
     versions = _distinct(board["benchmark_version"].unique(), " + ")
     epochs = _distinct(board["epoch"].unique(), "+")
     return (
@@ -136,7 +136,7 @@ def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], besid
     columns += [
         column for column in (EPOCH, Column("benchmark_version", "Version")) if rows.loc[:, column.field].nunique() > 1
     ]
-    notes = [*meanings([*rows["n_mark"], *rows["missing_mark"]]), *_said_of_arms(beside)]
+    notes = [*meanings([*rows["n_mark"], *rows["missing_mark"]]), *_notes_on_arms(beside)]
     if brief:
         columns = [replace(c, spread="") for c in columns if c.field not in ("n_runs", "epoch", "benchmark_version")]
     else:
@@ -149,7 +149,7 @@ def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], besid
 
 
 def _with_robust(rows: pd.DataFrame, beside: Robust) -> pd.DataFrame:
-    """The rows with PECS-R and gap as printed: PECS-R with the number of its arms where these are not all."""
+    """The rows with PECS-R and gap as printed; PECS-R has the number of its arms unless these are all."""
     found = [beside.get((row["model"], row["regime"])) for row in rows.to_dict("records")]
     return rows.assign(
         pecs_r=[fraction(row["pecs_r"]) + _of_arms(row) if row else NOT_RUN for row in found],
@@ -161,8 +161,8 @@ def _of_arms(row: Mapping[str, Any]) -> str:
     return f" ({len(row['arms'])} of {len(ARMS)} arms)" if len(row["arms"]) < len(ARMS) else ""
 
 
-def _said_of_arms(beside: Robust) -> list[str]:
-    """Over which arms each PECS-R is, and why there is no gap."""
+def _notes_on_arms(beside: Robust) -> list[str]:
+    """Notes that name the arms of each PECS-R, and the reasons why there is no gap."""
     entries: dict[tuple[str, ...], list[str]] = {}
     for (model, regime), row in beside.items():
         entries.setdefault(tuple(row["arms"]), []).append(f"{model} {regime}")
@@ -182,8 +182,8 @@ def _trace(row: Mapping[str, Any], field: str) -> Behind | None:
 
 
 def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.DataFrame:
-    """A row a (model, regime), best first: its LEADERBOARD row of the dataset, PECS of the others, marks. Of an entry
-    without a row of the dataset the counts are those of all its rows."""
+    """One row per (model, regime), best first: its LEADERBOARD row of the dataset, PECS of the others, and marks. For
+    an entry without a row of the dataset the counts are sums over all its rows."""
     found = []
     for _, rows in of_several_runs(board).groupby(["model", "regime"], sort=False):
         by_dataset = {row["dataset"]: row for row in rows.to_dict("records")}
@@ -210,7 +210,7 @@ def _bounds(row: Mapping[str, Any]) -> str:
 
 
 def _rank(entry: Mapping[str, Any]) -> tuple[bool, float, str, int]:
-    """Best PECS first, nulls last; ties by model, then in the regimes' own order."""
+    """Sort key: best PECS first, nulls last; ties by model, then in the order of the regimes."""
     pecs = float(entry.get("pecs", float("nan")))
     null = pecs != pecs
     regimes = (*REGIMES, entry["regime"])

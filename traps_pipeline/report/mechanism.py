@@ -17,8 +17,8 @@ _FLAGS = ("own_best", "all_sample_best", "source_best")
 
 
 def published_probes() -> pd.DataFrame:
-    """PROBES rows: transfer, confabulated (at the layer of the transfer value: the paper names no other), shuffled (of
-    no dataset) and centroid_void (of no source)."""
+    """PROBES rows: transfer, confabulated (at the layer of the transfer value, since the paper names no other),
+    shuffled (without a dataset) and centroid_void (without a source)."""
     rows = _long(published("probe_transfer")).rename(columns={"best_layer": "layer"})
     transfer = rows.assign(analysis="transfer", value=rows["auroc"], own_best=True, all_sample_best=True)
     confabulated = rows.assign(analysis="confabulated", value=rows["auroc_confabulated"], all_sample_best=True)
@@ -34,7 +34,7 @@ def published_probes() -> pd.DataFrame:
 
 
 def published_cosines() -> pd.DataFrame:
-    """COSINES rows: qwen3-vl-8b's matrix, and the few of the other two that the text has."""
+    """COSINES rows: the matrix of qwen3-vl-8b, and the few values of the other two models in the paper's text."""
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
     other_figures = published("other")
     other_figures = other_figures.loc[other_figures["id"].str.match("cos-(gemma|llava)-")].reset_index(drop=True)
@@ -47,7 +47,7 @@ def published_cosines() -> pd.DataFrame:
 
 
 def published_effects() -> pd.DataFrame:
-    """STEERING_EFFECTS rows of the dose-response tables. Of gemma-4-e4b's the paper states no regimes."""
+    """STEERING_EFFECTS rows of the dose-response tables. The paper states no regimes for gemma-4-e4b."""
     qwen = published("steering_dose_qwen").assign(
         model="qwen3-vl-8b", directions="standard", regime="guided", epoch="original"
     )
@@ -74,12 +74,12 @@ def published_regimes() -> pd.DataFrame:
 
 
 def published_domains(recomputed: pd.DataFrame) -> pd.DataFrame:
-    """Rows of `effects.domains`, with the two same-domain figures of qwen3-vl-8b that the text has, marked."""
+    """Rows of `effects.domains`, with the two same-domain figures of qwen3-vl-8b from the paper's text, marked."""
     other_figures = published("other").set_index("id")["value"]
     same = {LONG[short]: float(str(other_figures[f"same-{short}"]).split(" / ")[0]) / 100 for short in ("ch", "oc")}
-    mine = (recomputed["model"] == "qwen3-vl-8b") & recomputed["source"].isin([*same])
+    chosen = (recomputed["model"] == "qwen3-vl-8b") & recomputed["source"].isin([*same])
     values = [same.get(source, float("nan")) for source in recomputed["source"]]
-    return recomputed.assign(same=recomputed["same"].mask(mine, values), mark=mine.map(lambda m: "*" if m else ""))
+    return recomputed.assign(same=recomputed["same"].mask(chosen, values), mark=chosen.map(lambda m: "*" if m else ""))
 
 
 def published_layers() -> pd.DataFrame:

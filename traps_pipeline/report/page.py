@@ -11,12 +11,12 @@ import pandas as pd
 from traps_pipeline.report.leaderboard import leaderboards, legend, provenance
 from traps_pipeline.report.writing import Behind, PrintedTable, environment, table_html
 
-WIDE_PX = 1300  # a picture of more pixels across is a page's width
+WIDE_PX = 1300  # a picture with more pixels across gets the width of the page
 
 
 @dataclass(frozen=True)
 class Block:
-    """One side of a card: whose results, and a PNG (base64) or tables (title, escaped HTML)."""
+    """One side of a card: the source of the results, and a PNG (base64) or tables (title, escaped HTML)."""
 
     source: str
     png: str = ""
@@ -41,10 +41,10 @@ def report_html(
     title: str = "TRAPSBench report",
     robust: pd.DataFrame | None = None,
 ) -> str:
-    """One page: the leaderboard, figures (title -> PNG bytes, inlined), legend, a table a dataset, then the chapters.
+    """The page: leaderboard, figures (title -> PNG bytes, inlined), legend, one table per dataset, then the chapters.
 
-    robust: ROBUST rows, whose figures stand on the leaderboard. With `address`, every number is a link to the items
-    behind it. The page opens from disk and asks the network for nothing; its content policy forbids it.
+    robust: ROBUST rows, whose figures the leaderboard shows. With `address`, every number is a link to the items behind
+    it. The page opens from disk and makes no network request; its content policy forbids any.
     """
     return (
         environment()
@@ -62,7 +62,7 @@ def report_html(
 
 
 def picture_block(source: str, png: bytes, full: bool = False) -> Block:
-    """A picture as a card's block; the PNG's own width says whether it is one column's or a page's. full: as wide as
+    """A picture as a card's block, one column or one page wide, which depends on the PNG's own width. full: as wide as
     the screen allows."""
     size = "full" if full else "page" if int.from_bytes(png[16:20], "big") > WIDE_PX else "column"
     return Block(source, base64.b64encode(png).decode(), size=size)

@@ -1,4 +1,4 @@
-"""The report page brought together, and `traps export`: everything that is printed, in one folder."""
+"""The report page from all its parts, and `traps export`, which writes all tables, figures and pages to one folder."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from traps_pipeline.storage.workspace import Workspace
 
 PAGE, MARKDOWN, INDEX = "report.html", "leaderboard.md", "index.html"
 SHEETS = {
-    "shortcuts.png": "Control told from void by one cue alone (0.5 is chance)",
+    "shortcuts.png": "How well one cue alone separates control from void (0.5 is chance)",
     "contact_sheet.png": "Pairs: control above, void below",
     "arms_occlusion.png": "Arms of a scenario with a panel",
     "arms_chaotic.png": "Arms of a scenario with a cut",
 }
-FULL = ("contact_sheet.png", "arms_occlusion.png", "arms_chaotic.png")  # wants all the width there is
-Pictures = Mapping[str, bytes]  # PNG by path below the reports
+FULL = ("contact_sheet.png", "arms_occlusion.png", "arms_chaotic.png")  # shown as wide as the screen allows
+Pictures = Mapping[str, bytes]  # PNG by path below the reports folder
 
 
 def report_files(study: StudyResults, cells: Sequence[Cell], pictures: Pictures) -> dict[str, bytes]:
-    """The report page and the leaderboard as Markdown, by path. cells are those with pages in `items/`; pictures are
-    the catalogue's PNG files and SHEETS, those that are there."""
+    """The report page and the leaderboard as Markdown, by path. cells: the cells with pages in `items/`; pictures: the
+    existing PNG files of the catalogue and of SHEETS."""
     address = addresses(cells)
     landscape = FIGURES[0]
     first = {landscape.title: pictures[landscape.path(study)]} if landscape.path(study) in pictures else {}
@@ -73,9 +73,10 @@ def _chapters(
 
 def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lambda line: None) -> int:
     """Write every table (CSV, LaTeX, Markdown, Parquet), every figure (PDF, SVG, PNG), the report page and the items'
-    pages to `target`, made anew from the workspace's tables and from the published numbers; returns how many files.
+    pages to `target`, made again from the workspace's tables and the published numbers; returns the number of files.
 
-    Each file is written whole or not at all, `index.html` last: it lists them. say gets a line a table and figure.
+    Each file is written whole or not at all, and last `index.html`, which lists them. say gets one line per table and
+    figure.
     """
     study, written, pictures = StudyResults(workspace), list[str](), dict[str, bytes]()
     for source in (study, PublishedResults()):
@@ -101,7 +102,7 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
 
 
 def _sheets(workspace: Workspace) -> Iterator[tuple[str, bytes]]:
-    """What is drawn from clips: six pairs as a figure, if their clips are there; others as the workspace has them."""
+    """The pictures made from clips: the figure of six pairs, if their clips exist; others as the workspace has them."""
     shown = {Path(name).stem for name in SHEETS}
     for path in sorted(workspace.reports.glob("*.*")):
         if path.stem in shown and not path.name.endswith(".state.json"):
@@ -113,7 +114,7 @@ def _sheets(workspace: Workspace) -> Iterator[tuple[str, bytes]]:
 
 
 def _index(paths: Sequence[str]) -> str:
-    """A page of links: what is in the folder, by folder and name."""
+    """A page of links to all files, by folder and name."""
     folders: dict[str, dict[str, list[str]]] = {}
     for path in paths:
         folder, _, name = path.rpartition("/")

@@ -1,4 +1,4 @@
-"""The paper's results, from `assets/published`, in the frames of a study's."""
+"""The paper's results, from `assets/published`, in the same frames as a study's results."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _AXES = ("hp", "ii", "hp_and_ii", "es", "doubt")
 
 def _cells(results: Results) -> pd.DataFrame:
     cells = joined([published_cells()])
-    # A spread is printed where there were three runs, whatever the model has elsewhere.
+    # A spread is printed where there were three runs, even if the model has fewer runs in other cells.
     cells["n_runs"] = np.where(cells["acc_std"].isna(), 1, 3)
     return cells.assign(n_missing=np.nan, incomplete=False).reindex(columns=pd.Index(CELL_COLUMNS))
 
@@ -43,7 +43,7 @@ def _overall(results: Results) -> pd.DataFrame:
 
 
 def _rates(results: Results) -> pd.DataFrame:
-    """Gaps as printed (of unrounded rates), the pooled ones of the printed rates."""
+    """Gaps as printed (computed from unrounded rates); the pooled gaps are computed from the printed rates."""
     rows = published("visual_vs_textual")
     parts = []
     for taxonomy in analyses.TAXONOMIES:
@@ -62,7 +62,7 @@ def _rates(results: Results) -> pd.DataFrame:
 
 
 def _sub_cells(results: Results) -> pd.DataFrame:
-    """The paper prints none."""
+    """A frame without rows, since the paper prints none."""
     return pd.DataFrame(columns=pd.Index(["model", "dataset", "regime", "scope", "abs_rec", "n_pairs"]))
 
 
@@ -78,7 +78,7 @@ def _sub_scenarios(results: Results) -> pd.DataFrame:
 
 
 def _labels(results: Results) -> pd.DataFrame:
-    """From the text of the paper, some of them approximate."""
+    """Values from the text of the paper, some of them approximate."""
     rows = published("other")
     rows = rows.loc[rows["id"].str.match("acc-(seesaw|dice)-")]
     labels = rows["id"].str.rsplit("-", n=1).str[1]
@@ -123,12 +123,12 @@ def _steering_families(results: Results) -> pd.DataFrame:
 
 
 def _steering_domains(results: Results) -> pd.DataFrame:
-    """Two of its figures stand in the text alone."""
+    """The printed figures, two of which are only in the paper's text."""
     return published_domains(effects.domains(results.effects))
 
 
 class PublishedResults(Results):
-    """The paper's numbers, as shipped in `assets/published`; without rows what the paper does not print."""
+    """The paper's numbers, as shipped in `assets/published`; a frame that the paper does not print has no rows."""
 
     source = "published"
     makers: ClassVar[Makers] = {

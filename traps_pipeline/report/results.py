@@ -1,6 +1,7 @@
-"""What tables and figures are made from, from a study or from the paper: tidy frames with the same columns.
+"""The frames from which tables and figures are made, for a study or for the paper: tidy, with the same columns.
 
-A frame without rows means that this was not run. Shares are fractions; every frame with figures has a column `epoch`.
+A frame without rows means that its part was not run. Shares are fractions; every frame with figures has a column
+`epoch`.
 """
 
 from __future__ import annotations
@@ -41,12 +42,12 @@ SUB_COLUMNS = (
 )
 
 
-Makers = Mapping[str, Callable[[Any], "pd.DataFrame"]]  # by the name of a frame; each gets the results
+Makers = Mapping[str, Callable[[Any], "pd.DataFrame"]]  # functions of the results, by the name of the frame they make
 
 
 class Made:
-    """A frame of `Results`, made when it is first asked for: by the results' own maker of that name, else by `derive`
-    from the other frames, else it is the rows of `table`."""
+    """A frame of `Results`, made when it is first read: by the results' own maker of that name if there is one, else by
+    `derive` from the other frames, else it has the rows of `table`."""
 
     def __init__(
         self, doc: str = "", *, table: Table | None = None, derive: Callable[[Results], pd.DataFrame] | None = None
@@ -71,9 +72,9 @@ class Made:
 
 
 class Results:
-    """One set of results; every frame is without rows where that was not run.
+    """One set of results; a frame has no rows if its part was not run.
 
-    A further frame is an attribute here, and a function of that name among the `makers` of a study's and of the paper's
+    To add a frame, add an attribute here, and a function of that name to the `makers` of a study's and of the paper's
     results.
     """
 
@@ -82,14 +83,14 @@ class Results:
     makers: ClassVar[Makers] = {}
 
     board = Made(table=LEADERBOARD)
-    cells = Made("CELL_COLUMNS, one row a (model, dataset, regime), averaged over runs.")
+    cells = Made("CELL_COLUMNS, one row per (model, dataset, regime), averaged over runs.")
     overall = Made(
-        "One row a (model, regime) that has all four datasets: the columns of cells but dataset, and j; a study's also "
-        "have j_std, the intervals and ranks of LEADERBOARD. epoch joins those of the datasets by +."
+        "One row per (model, regime) that has all four datasets: the columns of cells without dataset, and j; a study's"
+        " rows also have j_std, the intervals and ranks of LEADERBOARD. epoch joins the datasets' epochs by +."
     )
-    rates = Made("RATE_COLUMNS: visual and textual AbsRec under standard, a row a model and taxonomy (or pooled).")
-    sub_scenarios = Made("SUB_COLUMNS: means over models, a row a sub-scenario.")
-    sub_cells = Made("A row a (model, dataset, regime) and sub-scenario (column scope).")
+    rates = Made("RATE_COLUMNS: visual and textual AbsRec under standard, one row per model and taxonomy (or pooled).")
+    sub_scenarios = Made("SUB_COLUMNS: means over models, one row per sub-scenario.")
+    sub_cells = Made("One row per (model, dataset, regime) and sub-scenario (column scope).")
     labels = Made("Mean Acc over models by the control's answer: dataset, label, acc, n_pairs, n_models.")
     agreement = Made(table=AGREEMENT)
     bias = Made(table=JUDGE_BIAS)
@@ -100,7 +101,7 @@ class Results:
     confabulation = Made(table=CONFABULATION_PREVALENCE)
     validation = Made(table=JUDGE_VALIDATION)
     composition = Made("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
-    probes = Made("PROBES rows; the paper's have transfer, confabulated, shuffled, centroid_void alone.", table=PROBES)
+    probes = Made("PROBES rows; the paper has only transfer, confabulated, shuffled, centroid_void.", table=PROBES)
     cosines = Made("COSINES rows at the steered layer of each model.")
     effects = Made(table=STEERING_EFFECTS)
     shares = Made(table=STEERING_SHARES)
@@ -119,18 +120,18 @@ class Results:
 
     def __init__(self) -> None:
         self.made: dict[str, pd.DataFrame] = {}
-        # What was not computed because its sides are of different epochs: reasons by analysis.
+        # The reasons, by analysis, why figures were not computed: their sides are of different epochs.
         self.refused: dict[str, list[str]] = {}
 
     def rows(self, table: Table) -> pd.DataFrame:
-        """All rows of a table of a study; without rows here."""
+        """All rows of a table of a study; for the paper, a frame without rows."""
         import pandas as pd
 
         return pd.DataFrame(columns=pd.Index([column.name for column in table.columns]))
 
     def refusal(self, dataset: str, left: tuple[str, str], right: tuple[str, str]) -> str | None:
-        """Why two (model, regime) may not be compared on a dataset or `overall`, as the contrasts found item by item;
-        None where they may."""
+        """Why two entries (model, regime) may not be compared on a dataset or `overall`, from the contrasts, which
+        check every item; None if they may be compared."""
         return self._refusals.get((dataset, frozenset((left, right))))
 
     @cached_property
@@ -140,20 +141,20 @@ class Results:
         return {(row["dataset"], pair): row["refused"] for row, pair in zip(rows, sides, strict=True)}
 
     def why(self, what: str) -> str:
-        """Why a frame has no rows, in words."""
+        """The reason, for people, why a frame has no rows."""
         return "; ".join(self.refused.get(what, [])) or (
             "this study has no such results yet" if self.is_study else "the paper prints no such table"
         )
 
 
 def datasets_of(cells: pd.DataFrame) -> list[str]:
-    """The datasets that cells are of, in the benchmark's order."""
-    there = set(cells["dataset"])
-    return [name for name in DATASETS if name in there]
+    """The datasets of the cells, in the benchmark's order."""
+    names = set(cells["dataset"])
+    return [name for name in DATASETS if name in names]
 
 
 def joined(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """One below the other; a frame without rows or columns where there are none."""
+    """The parts below each other; without parts, a frame without rows or columns."""
     import pandas as pd
 
     return pd.concat([pd.DataFrame(), *parts], ignore_index=True)

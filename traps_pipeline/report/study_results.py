@@ -92,9 +92,9 @@ def _ill_posed(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
-    """Means over models are over those that look: without reference strategies, where anybody else was asked."""
-    looking = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
-    return looking if len(looking) else rows
+    """The rows over which means over models are taken: without reference strategies, if other models were asked."""
+    others = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
+    return others if len(others) else rows
 
 
 class StudyResults(Results):
@@ -102,7 +102,7 @@ class StudyResults(Results):
 
     source = "this study"
     is_study = True
-    metrics = Made("METRICS rows of the pairs: an arm enters no table or figure.")
+    metrics = Made("METRICS rows of the pairs; arms enter no table or figure.")
     makers: ClassVar[Makers] = {
         "metrics": lambda results: results.tables.read_all(METRICS, dataset=DATASETS),
         "cells": _cells,

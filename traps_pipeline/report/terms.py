@@ -1,4 +1,4 @@
-"""Titles, marks and sides by which tables, figures and pages speak of the same things."""
+"""Titles, marks and sides that tables, figures and pages share."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ TITLES = {
     "chaotic": "Chaotic",
     "chaotic_ill_posed": "Chaotic, ill-posed",
 }
-ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}  # beside the pairs, and in no figure of theirs
+ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}  # arms enter no figure of the pairs
 # What the columns of a leaderboard with arms mean (docs/scoring.md, "PECS-R and the gap").
 ROBUST_TERMS = {
     "PECS-R": "PECS over the pairs and the arms, which take shortcuts away; kinds of items have equal weight. Entries "
     "over different arms are not compared",
-    "gap": "PECS of the runs behind PECS-R, minus PECS-R: what shortcuts may have earned",
+    "gap": "PECS of the runs that PECS-R uses, minus PECS-R: the part of PECS that may come from shortcuts",
 }
-# The side whose items a share is of.
+# The side of the items that a share counts.
 SIDE_OF = {"acc": "control", "false_abs": "control", "abs_rec": "void"}
 ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"
 MISSING_MARK = "†"
 INCOMPLETE_MARK = "‡"
 MARKS = {
-    MISSING_MARK: "some items have no answer or no majority; shares rest on the others",
+    MISSING_MARK: "some items have no answer or no majority; shares are over the other items",
     INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered",
 }

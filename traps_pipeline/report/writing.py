@@ -1,4 +1,4 @@
-"""How every table and every figure is written: one way for each, the same bytes on every build.
+"""The one writer of tables and the one writer of figures, which give the same bytes on every build.
 
 A `PrintedTable` is a frame of numbers with the columns that are printed; it becomes Parquet and CSV (numbers as they
 are), LaTeX, Markdown, text for a terminal and an HTML fragment (numbers as printed). Its texts are untrusted: each
@@ -35,18 +35,19 @@ FIGURE_KINDS = ("pdf", "svg", "png")
 COLUMN_IN, PAGE_IN = 3.3, 6.8  # widths of a figure of one column, and of two
 # Okabe and Ito's palette without its yellow, which is too light for a hollow marker, and with its black as grey.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#4D4D4D")
-# 7 colours x 13 shapes: 91 models stay distinct.
+# 7 colours x 13 shapes distinguish 91 models.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "p", ">", "h", "*", "d")
 INK, SOFT, GRID = "#1b1f27", "#667085", "#d0d5dd"
 
-# A range is two numbers that are text already: it stands and links as a number does.
+# A range is a text of two numbers; it is aligned and linked like a number.
 Unit = Literal["text", "range", "count", "percent", "fraction", "ratio", "p"]
 DIGITS: Mapping[str, int] = {"percent": 1, "fraction": 3, "ratio": 1, "count": 0, "p": 4}
 
 
 @dataclass(frozen=True)
 class Behind:
-    """Which items a number is made of: those of this dataset, model, regime and side, of all where it is empty."""
+    """The items that a number is computed from: those of this dataset, model, regime and side; an empty field means
+    all."""
 
     dataset: str = ""
     model: str = ""
@@ -61,7 +62,7 @@ Trace = Callable[[Mapping[str, Any], str], Behind | None]  # row and field -> th
 
 
 def fraction(value: float | None, digits: int = 3) -> str:
-    """A figure as printed, with a true minus sign; a dash for null."""
+    """A figure as printed, with a typographic minus sign; a dash for null."""
     import pandas as pd
 
     if value is None or pd.isna(value):
@@ -86,10 +87,10 @@ def percent(value: float | None, digits: int = 1) -> str:
 class Column:
     """A printed column: the frame's field, its heading, and how its values are printed.
 
-    Shares are fractions in the frame; `percent` prints them times 100. `spread` names the field of a standard deviation
-    printed behind ±, `mark` a field of text (a dagger, say) that hangs behind the number. The last three are for pages:
-    how cells look (a row's head, a number that stands out, a tag), whether a fraction is also drawn as a bar, and
-    whether a group of columns begins here.
+    Shares are fractions in the frame; `percent` prints them times 100. `spread` names the field of a standard
+    deviation, which is printed after ±; `mark` names a field of text, such as a dagger, which is printed after the
+    number. The last three are for pages: the look of the cells (a row's head, an emphasised number, a tag), whether a
+    fraction is also drawn as a bar, and whether a group of columns begins here.
     """
 
     field: str
@@ -104,7 +105,7 @@ class Column:
 
     @property
     def is_number(self) -> bool:
-        """Whether values stand to the right."""
+        """Whether values are aligned to the right."""
         return self.unit != "text"
 
     def text(self, row: Mapping[str, Any]) -> str:
@@ -113,7 +114,7 @@ class Column:
         return figure + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
 
     def parts(self, row: Mapping[str, Any]) -> tuple[str, str, str]:
-        """The text or number of a cell, its spread and its mark, as printed; empty where there is none of them."""
+        """The text or number of a cell, its spread and its mark, as printed; a part that the cell lacks is empty."""
         import pandas as pd
 
         value = row.get(self.field)
@@ -133,11 +134,11 @@ class Column:
 
 @dataclass(frozen=True)
 class PrintedTable:
-    """A table for people: a frame, what of it is printed, and what a reader must know (epoch, n, what is missing).
+    """A table for people: a frame, its printed columns, and notes (epoch, n, missing items).
 
-    A table without rows says that it was not run, and `why`; or `none`, where it was run and is rightly empty. `trace`
-    tells which items stand behind a number, where any do; `dash` is what a dash means; `lead` is a sentence that goes
-    with the title.
+    A table without rows says that it was not run, and `why`; if it was run and is empty for a good reason, it prints
+    `none` instead. `trace` returns the items behind a number, or None; `dash` is the meaning of a dash; `lead` is a
+    sentence after the title.
     """
 
     name: str
@@ -148,7 +149,7 @@ class PrintedTable:
     why: str = ""
     trace: Trace | None = None
     none: str = ""
-    dash: str = f"{NOT_RUN}, or undefined for want of decided items"
+    dash: str = f"{NOT_RUN}, or undefined because no item is decided"
     lead: str = ""
 
     @property
@@ -163,18 +164,18 @@ class PrintedTable:
 
     @cached_property
     def marked(self) -> set[Column]:
-        """The columns in which a mark hangs behind some number. The other cells of such a column keep room for one, so
-        that numbers stay below each other."""
+        """The columns in which some number has a mark. The other cells of such a column leave space for a mark, so that
+        numbers stay aligned."""
         return {column for column in self.columns if any(column.parts(row)[2] for row in self.records)}
 
     @property
     def absence(self) -> str:
-        """What stands in place of rows where there are none; else empty."""
+        """The text that replaces the rows of a table without rows; empty if there are rows."""
         return "" if len(self.rows) else self.none or (f"{NOT_RUN}: {self.why}" if self.why else NOT_RUN)
 
     @property
     def remarks(self) -> list[str]:
-        """The notes, with what a dash means where there is one."""
+        """The notes, also with the meaning of ± and of a dash if the table has them."""
         shown = [c for row in self.records for c in (column.text(row) for column in self.columns if column.is_number)]
         dashes = [f"{NONE} {self.dash}"] if any(cell.startswith(NONE) for cell in shown) else []
         spreads = ["± population standard deviation over runs"] if any("±" in cell for cell in shown) else []
@@ -182,7 +183,7 @@ class PrintedTable:
 
     @property
     def data(self) -> pd.DataFrame:
-        """The numbers behind what is printed: fields of the columns and their spreads, then what else the rows hold."""
+        """The numbers in the printed cells: the fields of the columns and their spreads, then all other fields."""
         import pandas as pd
 
         printed = [field for column in self.columns for field in (column.field, column.spread) if field]
@@ -222,7 +223,7 @@ def table_text(table: PrintedTable) -> str:
     if table.absence:
         lines += [plain(table.absence)]
     else:
-        columns = [_hung(c, table.records) if c in table.marked else _flush(c, table.records) for c in table.columns]
+        columns = [(_with_marks if c in table.marked else _without_marks)(c, table.records) for c in table.columns]
         headings, *rows = zip(*columns, strict=True)
         left = [k for k, c in enumerate(table.columns) if not c.is_number or c in table.marked]
         lines += [text_table(headings, rows, left)]
@@ -230,14 +231,14 @@ def table_text(table: PrintedTable) -> str:
     return "\n".join([*lines, *([""] if notes else []), *notes]) + "\n"
 
 
-def _flush(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:
+def _without_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:
     return [column.heading, *(column.text(row) for row in records)]
 
 
-def _hung(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Heading and cells of a column with marks: numbers end below each other, marks hang behind them."""
+def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Heading and cells of a column with marks: numbers are aligned to the right, and marks follow them."""
     marks = ["", *(column.parts(row)[2] for row in records)]
-    numbers = _flush(replace(column, mark=""), records)
+    numbers = _without_marks(replace(column, mark=""), records)
     return [f"{number:>{max(map(len, numbers))}} {mark:1}" for number, mark in zip(numbers, marks, strict=True)]
 
 
@@ -276,7 +277,8 @@ def table_html(table: PrintedTable, address: Callable[[Behind], str] | None = No
 
 @cache
 def environment() -> jinja2.Environment:
-    """Jinja2 as every page is made: everything escaped, an unknown name an error. Templates are compiled once."""
+    """The Jinja2 environment of every page: it escapes all text, and an unknown name is an error. Templates are
+    compiled once."""
     import jinja2
 
     return jinja2.Environment(
@@ -289,7 +291,7 @@ def environment() -> jinja2.Environment:
 
 
 def markdown(text: object) -> str:
-    """Text that is neither HTML nor markup, and stays in its table cell."""
+    """The text escaped so that it is neither HTML nor markup and stays in its table cell."""
     return re.sub(r"([\\`*_{}\[\]()#+!|~$])", r"\\\1", html.escape(plain(text), quote=False))
 
 
@@ -306,12 +308,12 @@ _LATEX = str.maketrans(
 
 
 def latex(text: object) -> str:
-    """Text that no character of is a command; the signs that our tables use become commands."""
+    """The text with all LaTeX special characters escaped; the symbols that our tables use become commands."""
     return plain(text).translate(_LATEX)
 
 
 def _parquet(table: PrintedTable) -> bytes:
-    """Every text column as text, so that the file's schema does not depend on what happens to be missing."""
+    """The Parquet file; text columns have type text even if all values are null, so that the schema is constant."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -332,7 +334,7 @@ def _parquet(table: PrintedTable) -> bytes:
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """The house style, for drawing and for saving: some of it (the SVG salt) counts only then."""
+    """The style of all figures, needed for drawing and for saving (the SVG salt takes effect only when saving)."""
     import matplotlib.style
 
     with matplotlib.style.context(STYLE):
@@ -342,8 +344,8 @@ def figure_style() -> Iterator[None]:
 def new_figure(
     width: float, height: float, dpi: float | None = None, layout: Literal["constrained"] | None = "constrained"
 ) -> Figure:
-    """An empty figure (inches) with a canvas of its own; draw inside `figure_style`. layout: None leaves all where it
-    is placed."""
+    """An empty figure (inches) with its own canvas; draw inside `figure_style`. layout: None keeps every element where
+    it is placed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -353,7 +355,7 @@ def new_figure(
 
 
 def not_run_figure(what: str, why: str, width: float = COLUMN_IN) -> Figure:
-    """What stands in place of a figure that has no data: its name, `not run`, and why."""
+    """The replacement for a figure without data: its name, `not run`, and why."""
     import textwrap
 
     with figure_style():
@@ -368,7 +370,7 @@ def not_run_figure(what: str, why: str, width: float = COLUMN_IN) -> Figure:
 
 
 def freeze_layout(figure: Figure) -> None:
-    """Run the layout engine once and take it away: it would move things again, differently, on every save."""
+    """Run the layout engine once and remove it, since it would move the elements differently on every save."""
     with figure_style():
         figure.draw_without_rendering()
         figure.set_layout_engine(None)  # "none" would leave a placeholder, for which each save draws everything twice

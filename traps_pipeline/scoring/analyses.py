@@ -1,10 +1,10 @@
 """The paper's analyses: from a tidy frame of cells to a tidy frame (docs/spec.md 5.4).
 
-`cells` has one row a (model, dataset, regime), averaged over runs, with the columns model, dataset, regime, acc,
-abs_rec, false_abs, pecs (fractions) and epoch; `study_cells` makes it of a study, `published.published_cells` of the
-paper. The input may hold further columns and is never changed. A ratio or gap whose two sides are of different epochs
-raises `epochs.EpochMismatch`; a mean over datasets takes every dataset's own epoch, alike on both sides. A mean of
-which one value is null is null, and a mean over models is over those that have all that it is of.
+`cells` has one row per (model, dataset, regime), averaged over runs, with the columns model, dataset, regime, acc,
+abs_rec, false_abs, pecs (fractions) and epoch; `study_cells` makes it from a study, `published.published_cells` from
+the paper. The input may hold further columns and is never changed. A ratio or gap whose two sides are of different
+epochs raises `epochs.EpochMismatch`; a mean over datasets takes each dataset in its own epoch, the same on both sides.
+A mean is null if one of its values is null. A mean over models uses the models that have every figure it needs.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _EQUAL = 12  # decimals at which two means count as equal: below any printed dig
 
 
 def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
-    """Cells of a study from its LEADERBOARD rows, with `_std` over runs, n_pairs, n_runs, n_missing and incomplete."""
+    """Cells of a study from its LEADERBOARD rows, with further columns: `_std` over runs, n_pairs, n_runs and so on."""
     rows = of_several_runs(leaderboard.loc[leaderboard["dataset"] != "overall"])
     spread = [f"{share}_std" for share in SHARES]
     columns = [*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]
@@ -49,7 +49,7 @@ def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
 
 
 def of_several_runs(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows without deviations over runs where there was one run only: none was measured."""
+    """The rows, with null deviations where there was only one run."""
     spreads = [name for name in rows if name.endswith("_std")]
     return rows.assign(**{name: rows[name].where(rows["n_runs"] > 1) for name in spreads})
 
@@ -84,7 +84,7 @@ def models_of(group: str | None = None, family: str | None = None, media: str | 
 def overall(cells: pd.DataFrame) -> pd.DataFrame:
     """Equal-weight means over datasets: columns model, regime, acc, abs_rec, false_abs, pecs; PECS is averaged too.
 
-    A (model, regime) that lacks one of the datasets in `cells` has no row: no two rows are means of different datasets.
+    A (model, regime) that lacks one of the datasets in `cells` has no row, so that all rows average the same datasets.
     """
     cells = _checked(cells)
     groups = cells.groupby(["model", "regime"], sort=False)
@@ -93,10 +93,11 @@ def overall(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Guided over standard AbsRec, each averaged over datasets: columns model, ratio; a row a model that has both.
+    """AbsRec under guided over AbsRec under standard, each averaged over datasets: columns model, ratio.
 
-    means: a study's own rows of `overall`, which leave out runs without all datasets; else those of `cells`. Infinite
-    where standard is 0 and guided is not, null where either is.
+    There is one row per model that has both regimes. means: a study's own `overall` rows, which leave out runs without
+    all datasets; by default the means of `cells`. The ratio is infinite where standard is 0 and guided is not, and null
+    where one of them is null.
     """
     import pandas as pd
 
@@ -112,8 +113,8 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
 def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
     """Quartiles of the standard deviations over runs, over all cells: one row with q25, median, q75, n.
 
-    Cells of a single run have none and are left out. The paper does not say of which metric its quartiles are; the
-    default takes PECS.
+    Cells with a single run have no deviation and are left out. The paper does not say which metric its quartiles
+    describe; the default is PECS.
     """
     import pandas as pd
 
@@ -122,7 +123,7 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
     return pd.DataFrame({"q25": [q25], "median": [median], "q75": [q75], "n": [len(values)]})
 
 
-# --- PECS and what it is not ------------------------------------------------------------------------------------------
+# --- PECS and its limits ----------------------------------------------------------------------------------------------
 
 
 def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
@@ -135,10 +136,10 @@ def pareto_frontier(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def frontier(means: pd.DataFrame) -> pd.DataFrame:
-    """The rows that no other row of the same regime beats in both acc and j, by falling Acc.
+    """The rows that no other row of the same regime dominates in acc and j, by falling Acc.
 
-    A model equal to another in one and better in the other beats it, equal models are both on the frontier, one
-    without Acc or J is not.
+    A model dominates another if it is at least as good in both figures and better in one. Two equal models are both on
+    the frontier; a model without Acc or J is not on it.
     """
     import pandas as pd
 
@@ -149,7 +150,7 @@ def frontier(means: pd.DataFrame) -> pd.DataFrame:
 
 
 def _dominated(points: pd.DataFrame) -> np.ndarray:
-    """Which rows are beaten by another in (acc, j): (rows,) bool."""
+    """Which rows are dominated by another row in (acc, j): (rows,) bool."""
     at = points[["acc", "j"]].round(_EQUAL).to_numpy(float)
     no_worse = (at[None] >= at[:, None]).all(-1)  # [i, k]: k is no worse than i in both
     better = (at[None] > at[:, None]).any(-1)
@@ -171,14 +172,13 @@ def zero_boundary(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def degenerate_strategies() -> pd.DataFrame:
-    """What strategies without any discrimination score in expectation: strategy, acc, false_abs, abs_rec, j, pecs,
-    naive.
+    """Expected figures of strategies that do not discriminate: strategy, acc, false_abs, abs_rec, j, pecs, naive.
 
-    acc is null where the strategy does not fix it; PECS is 0 all the same, since J is not above 0.
+    acc is null where the strategy does not determine it; PECS is still 0, since J is not above 0.
     """
     import pandas as pd
 
-    some = 0.2  # any share will do: it is the same on either side
+    some = 0.2  # an arbitrary share: it is the same on both sides
     rows = [
         ("always-abstain", 0.0, 1.0, 1.0),
         ("never-abstain", np.nan, 0.0, 0.0),
@@ -200,10 +200,11 @@ def degenerate_strategies() -> pd.DataFrame:
 def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMIES) -> pd.DataFrame:
     """Textual over visual AbsRec: columns model, regime, taxonomy (occlusion, chaotic, pooled), visual, textual, gap.
 
-    Visual is the taxonomy's own dataset, textual its ill-posed one. `pooled` is the mean of the two textual over the
-    mean of the two visual, where both taxonomies are there. The gap is infinite where visual is 0 and textual is not,
-    null where both are 0. Raises EpochMismatch where the two datasets of a taxonomy are of different epochs: as with
-    the paper's own chaotic datasets, whose gaps it prints from an earlier epoch (`visual_vs_textual.csv`).
+    Visual is the AbsRec on the taxonomy's own dataset, textual that on its ill-posed one. `pooled` is the mean of the
+    two textual values over the mean of the two visual ones, if both taxonomies are in `cells`. The gap is infinite
+    where visual is 0 and textual is not, and null where both are 0. Raises EpochMismatch where the two datasets of a
+    taxonomy are of different epochs, like the paper's own chaotic datasets, whose gaps it prints from an earlier epoch
+    (`visual_vs_textual.csv`).
     """
     import pandas as pd
 
@@ -243,7 +244,7 @@ def reasoning_pairs(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
-    """`reasoning_pairs` of the rows that are there and no others; they may be of the dataset `overall`."""
+    """`reasoning_pairs` without the added overall rows; the cells may be of the dataset `overall` themselves."""
     import pandas as pd
 
     cells = _checked(cells, datasets=(*DATASETS, "overall"))
@@ -267,11 +268,11 @@ def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
 def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
     """Means over models of every sub-scenario of the visual datasets, from `scoped_cells(metrics, "sub_scenario")`.
 
-    Columns dataset, sub_scenario, n_pairs; acc, false_abs, abs_rec, pecs under standard, of n_models; the same with the
-    prefix guided_, of guided_n_models; abs_rec_uplift and false_abs_uplift (guided minus standard), of uplift_n_models
-    with both; abs_rec_ill_posed (standard) and textual_over_visual, of ill_posed_n_models with both; n_missing: items
-    missing over the cells that enter. A model of which a figure is null is in none of the means that it belongs
-    to; null where a regime or dataset was not run.
+    Columns: dataset, sub_scenario, n_pairs; acc, false_abs, abs_rec, pecs under standard, over n_models models; these
+    with the prefix guided_, over guided_n_models; abs_rec_uplift and false_abs_uplift (guided minus standard), over the
+    uplift_n_models that have both; abs_rec_ill_posed (standard) and textual_over_visual, over the ill_posed_n_models
+    that have both; n_missing, the missing items of all cells used. A model with a null figure is left out of the group
+    of means that needs it. A mean is null where its regime or dataset was not run.
     """
     import pandas as pd
 
@@ -303,7 +304,7 @@ def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_re
     """Unweighted means over the hidden sub-scenarios and over the others: columns kind, n, and `columns`; n_pairs and
     n_missing are sums, where table has them.
 
-    table has a row an occlusion sub-scenario with the column sub_scenario, as `sub_scenarios` returns it.
+    table has one row per occlusion sub-scenario with the column sub_scenario, as `sub_scenarios` returns it.
     """
     kind = np.where(table["sub_scenario"].isin(HIDDEN), "hidden", "other")
     groups = table.groupby(kind)
@@ -312,7 +313,7 @@ def hidden_against_others(table: pd.DataFrame, columns: Sequence[str] = ("abs_re
 
 
 def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
-    """Mean Acc over the models that have one by the control's answer, under standard, from `scoped_cells(metrics,
+    """Mean Acc under standard by the control's answer, over the models that have an Acc, from `scoped_cells(metrics,
     "label")`.
 
     Columns dataset, label, acc, n_pairs, n_models, n_missing (items of both sides, over these models).
@@ -346,7 +347,7 @@ def _means(groups: DataFrameGroupBy, columns: Sequence[str]) -> pd.DataFrame:
 
 
 def _checked(cells: pd.DataFrame, more: Sequence[str] = (), datasets: Sequence[str] = DATASETS) -> pd.DataFrame:
-    """A copy. Raises ValueError where a column is missing or a cell has two rows."""
+    """A copy of the cells. Raises ValueError where a column is missing or a cell has two rows."""
     missing = [name for name in (*_ENTRY, *SHARES, "epoch", *more) if name not in cells]
     if missing:
         raise ValueError(f"cells lack the columns {missing}")

@@ -1,7 +1,8 @@
-"""What of the published tables can be recomputed from each other, and whether it agrees (`traps audit`).
+"""Published values that follow from other published values, recomputed and compared (`traps audit`).
 
-Every statement gets a verdict: `agrees` (equal at the printed digits), `within rounding` (the printed inputs, each
-anywhere in its last digit, admit the printed result) or `differs`, with the arithmetic. Nothing here is tuned to agree.
+Every statement gets a verdict: `agrees` (equal at the printed digits), `within rounding` (the printed result is
+possible if each printed input may be rounded in its last digit) or `differs`, with the arithmetic. No rule or threshold
+was chosen to make statements agree.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _SLACK = 1e-9
 
 @dataclass(frozen=True)
 class Finding:
-    """One published statement beside what its own tables give."""
+    """One published statement, and the value that the published tables give for it."""
 
     group: str
     statement: str
@@ -55,7 +56,7 @@ def audit() -> pd.DataFrame:
 
 
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
-    """The findings for a terminal: every claim, whatever differs, counts of the rest; or all of it."""
+    """The findings for a terminal: every claim, every difference, and counts of the rest; with `everything`, all."""
     lines = []
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
@@ -74,7 +75,7 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
 
 
 def claims() -> Iterator[Finding]:
-    """Every statement of `claims.csv`. Raises KeyError for one that nobody has written the arithmetic of."""
+    """Every statement of `claims.csv`. Raises KeyError for a statement whose arithmetic is not in `claims`."""
     for claim in published("claims").to_dict("records"):
         printed, found = str(claim["published"]), CLAIMS[str(claim["id"])]()
         verdict = AGREES if _same_words(printed, found.words) else DIFFERS
@@ -94,7 +95,7 @@ def _same_words(printed: str, recomputed: str) -> bool:
 
 
 def _names(words: str) -> set[str]:
-    """Whole names: a model is not named by one whose id begins like its own."""
+    """The whole names in a text, so that a model's id is not found at the beginning of a longer id."""
     return set(re.findall(r"[a-z][\w.-]*\w", _NUMBER.sub(" ", words))) - {"to", "and", "of"}
 
 
@@ -115,7 +116,7 @@ def _differences(printed: str, recomputed: str) -> str:
 
 
 def _shown(words: str) -> str:
-    """Without trailing zeros of four-decimal numbers."""
+    """The words with trailing zeros of four-decimal numbers removed."""
     return re.sub(r"(\d\.\d*?[1-9])0+(?!\d)|(\d+)\.0+(?!\d)", r"\1\2", words) if re.search(r"\.\d{4}", words) else words
 
 
@@ -142,11 +143,11 @@ def overall_means() -> Iterator[Finding]:
 
 
 def pecs_factors() -> Iterator[Finding]:
-    """PECS of every cell against its printed factors, within what averaging over runs and rounding allow.
+    """PECS of every cell against its printed factors, within the range that averaging over runs and rounding allow.
 
-    PECS is averaged over runs, Acc x max(0, J) of the averages is not the same: with the printed deviations the mean of
-    max(0, J) lies between max(0, J) and (J + sqrt(J^2 + s_J^2)) / 2, s_J is at most the sum of the deviations of AbsRec
-    and FalseAbs, and Acc adds a covariance of at most s_Acc s_J.
+    PECS is computed per run and then averaged, so it differs from Acc x max(0, J) of the averages. With the printed
+    deviations the mean of max(0, J) lies between max(0, J) and (J + sqrt(J^2 + s_J^2)) / 2, s_J is at most the sum of
+    the deviations of AbsRec and FalseAbs, and Acc adds a covariance of at most s_Acc s_J.
     """
     for cell in published_cells().fillna(0.0).to_dict("records"):
         shares = {name: float(cell[name]) for name in ("acc", "abs_rec", "false_abs", "pecs")}
@@ -177,7 +178,7 @@ def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tu
 
 
 def gaps() -> Iterator[Finding]:
-    """The printed gaps against the printed rates, each of which may lie anywhere in its last digit."""
+    """The printed gaps against the printed rates, each of which may have been rounded in its last digit."""
     for row in published("visual_vs_textual").to_dict("records"):
         for taxonomy in ("occlusion", "chaotic"):
             visual, textual = float(row[f"{taxonomy}_visual_pct"]), float(row[f"{taxonomy}_textual_pct"])
@@ -199,8 +200,8 @@ def gaps() -> Iterator[Finding]:
 
 
 def probe_means() -> Iterator[Finding]:
-    """Every shift that confabulated items alone make, by transfer type, against the largest that the paper states; it
-    states it of qwen3-vl-8b alone."""
+    """The shift of mean AUROC from all items to confabulated items, by transfer type, against the largest shift that
+    the paper states, which it does for qwen3-vl-8b alone."""
     stated = float(published("claims").set_index("id").loc["probe-cf-shift", "published"])
     rows = published("probe_transfer").query("model == 'qwen3-vl-8b'")
     means = pd.DataFrame(rows.groupby("transfer_type")[["auroc", "auroc_confabulated"]].mean())
@@ -226,7 +227,7 @@ def transfer_types() -> Iterator[Finding]:
 def steering_means() -> Iterator[Finding]:
     """The regime table against the means of the dose tables of the same model, direction and inference regime."""
     regimes = published("steering_regime")
-    # The dose tables do not name their direction regime; the claims take standard directions, guided inference.
+    # The dose tables do not name their direction regime; the claims use standard directions and guided inference.
     for name, model in (("steering_dose_qwen", "qwen3-vl-8b"), ("steering_dose_gemma", "gemma-4-e4b")):
         printed = regimes.query(
             "model == @model and direction_family == 'all' and direction_regime == 'standard' "
@@ -268,7 +269,7 @@ def steering_families() -> Iterator[Finding]:
 
 
 def validation_scores() -> Iterator[Finding]:
-    """F1 of the confabulation judge against printed precision and recall, each anywhere in its last digit."""
+    """F1 of the confabulation judge against printed precision and recall, each possibly rounded in its last digit."""
     for row in published("judge_validation").to_dict("records"):
         precision, recall, printed = float(row["precision"]), float(row["recall"]), float(row["f1"])
         ours = _f1(precision, recall)

@@ -1,11 +1,11 @@
 """Resampled figures and their percentile intervals: a cluster bootstrap over scenarios (docs/scoring.md, "Intervals").
 
 A scenario is one draw of the world: its pairs in both datasets of its taxonomy, in every run, model and regime, stay
-together. One weight matrix a taxonomy serves all cells, so two entries' resamples are paired and their difference is
-that of a paired design (`contrasts`).
+together. All cells of a taxonomy share one weight matrix, so two entries' resamples are paired, and their difference is
+a paired difference (`contrasts`).
 
-Because PECS clips J at 0, its interval for a strategy without discrimination (J = 0 but for chance) lies slightly above
-0 and need not contain it; whether J differs from 0 is a question for J (`leaderboard.pooled_j`).
+Because PECS clips J at 0, the interval of PECS for a strategy without discrimination (J = 0 up to chance) lies slightly
+above 0 and need not contain 0; to test whether J differs from 0, use J (`leaderboard.pooled_j`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Resampled:
     """The mean over runs of every figure in every resample.
 
     entries: (model, regime, dataset or `overall`) of each row; values: (entries, RESAMPLED, resamples) float64, NaN
-    where a denominator is 0, and throughout an `overall` without any run that has all four datasets.
+    where a denominator is 0, and for an `overall` entry without a run that has all four datasets.
     """
 
     entries: list[tuple[str, str, str]]
@@ -44,11 +44,11 @@ class Resampled:
 
 
 def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> Resampled:
-    """Every (model, regime) on each dataset it has, and overall: the equal-weight mean over the four datasets, over the
-    runs that have all four. Figures are computed per run, then averaged.
+    """Resamples of every (model, regime) on each of its datasets, and overall: the equal-weight mean over the four
+    datasets, over the runs that have all four. Figures are computed per run, then averaged.
 
-    Memory: one float32 weight matrix (resamples, scenarios) a taxonomy, one (resamples, 6 x cells) product of a single
-    model and regime, and the result: 200 kB an entry and figure at 10,000 resamples over four datasets.
+    Memory: one float32 weight matrix (resamples, scenarios) per taxonomy, one (resamples, 6 x cells) product of a
+    single model and regime, and the result: 200 kB per entry and figure at 10,000 resamples over four datasets.
     """
     items = pd.concat(
         [verdicts[["model", "regime", "dataset", "run", "scenario_id"]], decision_counts(verdicts)], axis=1
@@ -67,7 +67,7 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
 
 
 def intervals(resampled: Resampled, level: float = 0.95) -> pd.DataFrame:
-    """Percentile intervals: columns ENTRY and INTERVAL_COLUMNS, one row an entry.
+    """Percentile intervals: columns ENTRY and INTERVAL_COLUMNS, one row per entry.
 
     A resample in which some denominator is 0 is dropped from that interval's percentiles; null where none is left.
     """
@@ -77,7 +77,7 @@ def intervals(resampled: Resampled, level: float = 0.95) -> pd.DataFrame:
 
 
 def percentiles(draws: np.ndarray, level: float = 0.95) -> np.ndarray:
-    """The central interval over the last axis, NaN left out: (.., resamples) -> (.., 2); NaN where nothing is left."""
+    """The central interval over the last axis without NaN: (.., resamples) -> (.., 2); NaN where all values are NaN."""
     tails = [(1 - level) / 2, (1 + level) / 2]
     flat = draws.reshape(-1, draws.shape[-1])
     whole = ~np.isnan(flat).any(axis=1)
@@ -98,7 +98,7 @@ def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> n
     return rng.multinomial(scenarios, np.full(scenarios, 1 / scenarios), size=resamples).astype(np.float32)
 
 
-Drawn = Mapping[str, tuple[pd.Index, np.ndarray]]  # of each taxonomy: its scenarios, and how often each is drawn
+Drawn = Mapping[str, tuple[pd.Index, np.ndarray]]  # by taxonomy: its scenarios, and how often each is drawn
 
 
 def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Drawn:
@@ -131,8 +131,8 @@ def figures_of(sums: np.ndarray) -> np.ndarray:
 
 
 def run_sums(group: pd.DataFrame, drawn: Drawn) -> dict[tuple[str, int], np.ndarray]:
-    """(dataset, run) -> sums of COUNTS (6, resamples), for the items of one model and regime; a dataset may have items
-    of both taxonomies."""
+    """(dataset, run) -> sums of COUNTS (6, resamples), for the items of one model and regime. A dataset (an arm) may
+    have items of both taxonomies."""
     found: dict[tuple[str, int], np.ndarray] = {}
     for taxonomy, items in group.groupby("taxonomy", sort=True):
         scenarios, weights = drawn[str(taxonomy)]

@@ -1,4 +1,4 @@
-"""The arithmetic of every statement in `claims.csv`: what the published tables give for it (`audit` compares)."""
+"""The arithmetic of every statement in `claims.csv`, from the published tables (`audit` compares the results)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DOSE_AGAINST_REGIME = (
 
 @dataclass(frozen=True)
 class Recomputed:
-    """A statement as our arithmetic gives it, worded as published, and why it may differ."""
+    """A statement as recomputed, in the published wording, and the reason why it may differ."""
 
     words: str
     reason: str = ""
@@ -72,13 +72,13 @@ def _zeros(regime: str) -> Recomputed:
 
 def _spread(models: Sequence[str]) -> Recomputed:
     cells = published_cells()
-    mine = cells.loc[cells["model"].isin(models)]
-    row = spread(mine).iloc[0]
-    others = [f"{name} {r.q25:.4f}-{r.q75:.4f}" for name, r in _other_spreads(mine)]
+    chosen = cells.loc[cells["model"].isin(models)]
+    row = spread(chosen).iloc[0]
+    others = [f"{name} {r.q25:.4f}-{r.q75:.4f}" for name, r in _other_spreads(chosen)]
     return Recomputed(
         f"{row['q25']:.4f} to {row['q75']:.4f}",
         f"quartiles over the {int(row['n'])} cells with a spread; other metrics give {', '.join(others)}, and PECS on "
-        f"each dataset {', '.join(_dataset_spreads(mine))}: the published selection of cells is not stated",
+        f"each dataset {', '.join(_dataset_spreads(chosen))}: the published selection of cells is not stated",
     )
 
 

@@ -1,7 +1,7 @@
 """Paired comparisons of models and of regimes, with Holm's correction (docs/scoring.md, "Intervals").
 
-Two entries of the leaderboard share their resamples (`bootstrap`), so the difference of their draws is that of a paired
-design, with whatever the scenarios have in common taken out. McNemar's test compares two regimes item by item. Answers
+Two entries of the leaderboard share their resamples (`bootstrap`), so the difference of their draws is a paired
+difference, in which the difficulty of the scenarios cancels. McNemar's test compares two regimes item by item. Answers
 to different items, or to one item in different epochs, are not compared (`epochs`): the row says why and holds no
 difference.
 """
@@ -26,7 +26,7 @@ from traps_pipeline.scoring.tables import CONTRASTS, REGIME_TESTS
 
 FIGURES = ("pecs", "j")
 SEPARABLE_BELOW = 0.05
-VERSION_SIDES = ("n_missing", "epoch", "benchmark_version")  # what `version_contrasts` tells of either side
+VERSION_SIDES = ("n_missing", "epoch", "benchmark_version")  # columns that `version_contrasts` has for each side
 _FAMILY = ["kind", "dataset", "figure", "_regime"]
 _SIDES = ["left_model", "left_regime", "right_model", "right_regime"]
 _Side = tuple[str, str]  # model, regime
@@ -34,18 +34,18 @@ _Side = tuple[str, str]  # model, regime
 
 def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
     """CONTRASTS rows from the bootstrap, the METRICS rows that it resamples (for their figures) and the VERDICTS rows
-    that both are made of (for their items and epochs).
+    from which both are made (for their items and epochs).
 
-    Every pair of models under each regime, every pair of regimes of each model; PECS and J; each dataset, and overall
-    where both sides have a run of all four.
+    The rows compare every pair of models under each regime and every pair of regimes of each model, in PECS and in J,
+    on each dataset, and overall where both sides have a run of all four.
     """
     places = {entry: row for row, entry in enumerate(resampled.entries)}
-    asked = answered(verdicts)
+    items_of = answered(verdicts)
     means = means_over_runs(metrics).loc[:, [*FIGURES]].to_dict("index")
     rows = []
-    for kind, dataset, left, right in _pairs([entry for entry in resampled.entries if entry in asked]):
-        items = asked[(*left, dataset)]
-        refused = refusal(items, asked[(*right, dataset)])
+    for kind, dataset, left, right in _pairs([entry for entry in resampled.entries if entry in items_of]):
+        items = items_of[(*left, dataset)]
+        refused = refusal(items, items_of[(*right, dataset)])
         for figure in FIGURES:
             row = {"kind": kind, "dataset": dataset, "figure": figure, "_regime": left[1] if kind == "models" else ""}
             row |= dict(zip(_SIDES, (*left, *right), strict=True)) | {"refused": refused}
@@ -61,12 +61,12 @@ def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFram
 
 
 def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RESAMPLES) -> pd.DataFrame:
-    """What changed between two studies, such as two versions of the benchmark: now minus then, on what both hold.
+    """The change between two studies, such as two versions of the benchmark: now minus then, on their common pairs.
 
-    then and now are VERDICTS rows; pairs, runs and cells that only one of them has whole are left out. Columns model,
-    regime, dataset (and `overall`), figure, n_pairs (a run), then, now, difference, ci_low, ci_high, p, p_holm,
+    then and now are VERDICTS rows; a pair that is not whole in both, in the same run and cell, is left out. Columns:
+    model, regime, dataset (and `overall`), figure, n_pairs per run, then, now, difference, ci_low, ci_high, p, p_holm,
     VERSION_SIDES with the suffixes _then and _now, and refused: why there is no difference, where an item was answered
-    in different epochs. Raises TrapsError where the two share nothing.
+    in different epochs. Raises TrapsError where the two studies share no whole pair.
     """
     sides = _whole_pairs_of_both(then, now)
     if sides[0].empty:
@@ -94,7 +94,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
 
 
 def _whole_pairs_of_both(then: pd.DataFrame, now: pd.DataFrame) -> list[pd.DataFrame]:
-    """The rows of each on the pairs (of a model, regime and run) of which both have control and void."""
+    """The rows of each study on the pairs (by model, regime and run) that have control and void in both studies."""
     key = [*CELL, "pair_id"]
     common = then[[*key, "item_id"]].merge(now[[*key, "item_id"]], on=[*key, "item_id"])
     pairs = common.groupby(key).size()
@@ -119,21 +119,21 @@ def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
         ("control_abstention", "control", "abstained"),
         ("correctness", "control", "correct"),
     ):
-        mine = verdicts.loc[verdicts["side"] == side]
-        for key, group in mine.groupby(["dataset", "model", "run"], sort=True):
+        of_side = verdicts.loc[verdicts["side"] == side]
+        for key, group in of_side.groupby(["dataset", "model", "run"], sort=True):
             dataset, model, run = cast(tuple[str, str, int], key)
-            said = group.pivot(index="item_id", columns="regime", values=column).astype("boolean")
+            decisions = group.pivot(index="item_id", columns="regime", values=column).astype("boolean")
             epochs = group.pivot(index="item_id", columns="regime", values="epoch")
-            for left, right in combinations([r for r in REGIMES if r in said], 2):
-                both = said[[left, right]].dropna().astype(bool)
+            for left, right in combinations([r for r in REGIMES if r in decisions], 2):
+                both = decisions[[left, right]].dropna().astype(bool)
                 on_left, on_right = (both[regime].to_numpy(bool) for regime in (left, right))
                 only_left = np.count_nonzero(on_left & ~on_right)
                 only_right = np.count_nonzero(on_right & ~on_left)
                 row = {"dataset": dataset, "model": model, "run": run, "decision": decision}
                 row |= {"left_regime": left, "right_regime": right, "n": len(both)}
                 row |= {"only_left": only_left, "only_right": only_right}
-                asked = epochs.loc[both.index]
-                row["refused"] = refusal(asked[left].to_dict(), asked[right].to_dict())
+                epochs_of_both = epochs.loc[both.index]
+                row["refused"] = refusal(epochs_of_both[left].to_dict(), epochs_of_both[right].to_dict())
                 if row["refused"] is None and len(both):
                     discordant = only_left + only_right
                     row["p"] = binomtest(only_left, discordant, 0.5).pvalue if discordant else 1.0
@@ -144,7 +144,7 @@ def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
 
 
 def holm(p: np.ndarray) -> np.ndarray:
-    """Holm's step-down correction of (n,) p-values, NaN left out and left NaN."""
+    """Holm's step-down correction of (n,) p-values; a NaN is not counted and stays NaN."""
     corrected = np.full(len(p), np.nan)
     valid = np.flatnonzero(~np.isnan(p))
     order = valid[np.argsort(p[valid], kind="stable")]
@@ -156,23 +156,23 @@ def holm(p: np.ndarray) -> np.ndarray:
 def _pairs(entries: Sequence[tuple[str, str, str]]) -> Iterator[tuple[str, str, _Side, _Side]]:
     """kind, dataset, left, right of every comparison, each once."""
     for dataset in (*DATASETS, "overall"):
-        there = [(model, regime) for model, regime, name in entries if name == dataset]
-        for left, right in combinations(there, 2):
+        sides = [(model, regime) for model, regime, name in entries if name == dataset]
+        for left, right in combinations(sides, 2):
             if left[1] == right[1]:
                 yield "models", dataset, left, right
-        for left, right in combinations(sorted(there, key=lambda side: (side[0], REGIMES.index(side[1]))), 2):
+        for left, right in combinations(sorted(sides, key=lambda side: (side[0], REGIMES.index(side[1]))), 2):
             if left[0] == right[0]:
                 yield "regimes", dataset, left, right
 
 
 def _difference(draws: np.ndarray, observed: float, pairs: int) -> dict[str, float]:
-    """A paired difference on so many pairs with its interval and two-sided p from its resamples; nothing where these
-    are null.
+    """The columns of a paired difference over a number of pairs: its interval and two-sided p from its resamples.
 
-    p is twice the smaller share of resamples on one side of 0, each side counting 0 and one more. That is never below
-    2 / (resamples + 1), which Holm's correction over many models could never keep; so where no resample lies beyond 0,
-    p is the tail beyond 0 of a normal distribution with their mean and standard error, if that is smaller, but not
-    below 2^(1 - pairs), the least that flipping the signs of all pairs can show.
+    If every resample is NaN there are no columns. p is twice the smaller share of resamples on one side of 0; a
+    resample at 0 counts for both sides, and one is added to each count. This is never below 2 / (resamples + 1), so
+    no contrast of many models could be significant after Holm's correction. Therefore, where no resample lies beyond 0,
+    p is the tail beyond 0 of a normal distribution with the resamples' mean and standard error, if that is smaller, but
+    not below 2^(1 - pairs), the smallest p that a sign-flip test over all pairs could give.
     """
     valid = draws[~np.isnan(draws)]
     if not len(valid):

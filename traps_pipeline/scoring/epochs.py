@@ -1,4 +1,4 @@
-"""What may be compared with what: the rule of epochs (docs/spec.md 9.2)."""
+"""Which figures may be compared: the rule of epochs (docs/spec.md 9.2)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Answered = Mapping[str, str]  # item to the campaigns of its answers, joined by 
 
 
 class EpochMismatch(TrapsError):
-    """A ratio, contrast or gap was asked for whose two sides were evaluated in different campaigns."""
+    """The two sides of a ratio, contrast or gap were evaluated in different campaigns."""
 
 
 def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
-    """Raises EpochMismatch unless every row of `epochs` holds one and the same epoch throughout.
+    """Raises EpochMismatch if any row of `epochs` holds two different epochs.
 
-    epochs has a row a comparison (its index names it, e.g. model and dataset) and a column a side; a null side is not
-    compared. what names the figure for the message.
+    epochs has one row per comparison (its index names it, e.g. model and dataset) and one column per side; a null side
+    is not compared. `what` names the figure in the message.
     """
     mixed = epochs.loc[epochs.nunique(axis=1) > 1]
     if mixed.empty:
@@ -39,8 +39,8 @@ def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
 
 
 def answered(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
-    """What every (model, regime, dataset) answered, and in which campaigns, over its runs; `overall` is over the runs
-    that have all four datasets, and is not there without one."""
+    """The items that every (model, regime, dataset) answered over its runs, with their campaigns; `overall` has the
+    runs with all four datasets, and is left out if there is none."""
     whole = verdicts.groupby(["model", "regime", "run"])["dataset"].transform("nunique") == len(DATASETS)
     columns = ["model", "regime", "dataset", "item_id", "epoch"]
     found: dict[tuple[str, str, str], dict[str, str]] = {}
@@ -55,7 +55,7 @@ def answered(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
 
 
 def refusal(left: Answered, right: Answered) -> str | None:
-    """Why two sides may not be compared item by item: not the same items, or an item of different campaigns."""
+    """Why two sides may not be compared item by item: their items differ, or an item's campaigns do; else None."""
     if left == right:
         return None
     alone = sorted(left.keys() ^ right.keys())
@@ -67,6 +67,6 @@ def refusal(left: Answered, right: Answered) -> str | None:
 
 
 def _named(items: list[str]) -> str:
-    """The dataset of the first of these items, it, and how many there are."""
+    """Names the first of these items with its dataset, and counts the others."""
     dataset, more = items[0].partition(":")[0], len(items) - 1
     return f"{dataset}: {items[0]}" + (f" and {more} more items are" if more else " is")

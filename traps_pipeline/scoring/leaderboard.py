@@ -27,9 +27,9 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     """Every figure of the leaderboard but intervals and ranks, from METRICS rows (scope `all`; others are ignored).
 
     Mean and population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four
-    datasets within each run first; a run that lacks a dataset does not enter it, and a model and regime without any
-    whole run has no overall row. A figure that is null in one run is null here: no average rests on fewer runs than
-    `n_runs` says. Items without a text count in no figure; where they are too many, the entry is `incomplete`.
+    datasets within each run first; a run that lacks a dataset is left out of it, and a model and regime without a
+    complete run has no overall row. A figure that is null in one run is null here, so that every mean is over `n_runs`
+    runs. Items without a text count in no figure; where there are too many of them, the entry is `incomplete`.
     """
     groups = _runs(metrics).groupby(ENTRY, sort=True)
     means, deviations = (groups[FIGURES].agg(f) for f in (mean, _deviation))
@@ -69,14 +69,14 @@ def pooled_j(verdicts: pd.DataFrame) -> pd.DataFrame:
 
 
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
-    """One row a (model, regime, dataset or `overall`, run), in the columns of METRICS and n_items."""
+    """One row per (model, regime, dataset or `overall`, run), in the columns of METRICS and n_items."""
     cells = metrics.loc[metrics["scope"] == "all"]
     cells = cells.assign(n_items=2 * cells["n_pairs"])
     return pd.concat([cells, _overall_runs(cells)], ignore_index=True)
 
 
 def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
-    """One row a (model, regime, run) that has all four datasets, in the columns of METRICS."""
+    """One row per (model, regime, run) that has all four datasets, in the columns of METRICS."""
     groups = cells.groupby(_RUN, sort=True)
     whole = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
     counts = cast(pd.DataFrame, whole[["n_pairs", *_SUMMED]].sum())
@@ -87,7 +87,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def _incomplete(board: pd.DataFrame) -> pd.Series:
-    """Whether too few items of an entry have a text, on `board`'s index ENTRY; overall also where a dataset has."""
+    """Whether too few items of an entry have a text, on `board`'s index ENTRY; for `overall`, any of its datasets."""
     below = cast(pd.Series, board["answered"] < INCOMPLETE_BELOW)
     anywhere = cast(pd.Series, below.groupby(level=["model", "regime"]).transform("any")).astype(bool)
     return below | (anywhere & (board.index.get_level_values("dataset") == "overall"))
@@ -99,9 +99,11 @@ def _deviation(values: pd.Series) -> float:
 
 def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
     """rank, rank_low and rank_high of every row, on `board`'s index; null where there is no PECS."""
-    told = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & contrasts["separable"]]
+    separable = contrasts.loc[
+        (contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & contrasts["separable"]
+    ]
     wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
-    for row in told.to_dict("records"):
+    for row in separable.to_dict("records"):
         winner, loser = (row["left_model"], row["right_model"])[:: 1 if row["difference"] > 0 else -1]
         wins[winner, row["left_regime"], row["dataset"]] += 1
         losses[loser, row["left_regime"], row["dataset"]] += 1

@@ -1,4 +1,4 @@
-"""PECS without one judge: how much a figure owes to any one seat of the panel (docs/spec.md 4.1 and 5.1)."""
+"""PECS without one judge: how much each judge of the panel influences it (docs/spec.md 4.1 and 5.1)."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _COLUMNS = pd.Index(LEAVE_ONE_OUT.names)
 def leave_one_out(
     verdicts: pd.DataFrame, votes: pd.DataFrame, board: pd.DataFrame, judges: Sequence[str] | None = None
 ) -> pd.DataFrame:
-    """LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells, and the LEADERBOARD rows made of them.
+    """LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells, and the LEADERBOARD rows made from them.
 
-    PECS of the two others is scored as PECS of the panel is: per run, then averaged; overall over the four datasets.
-    Only entries of the board are in it, and only cells on which these judges (default: all) voted.
+    PECS by the two other judges is computed as PECS by the panel: per run, then averaged; overall over the four
+    datasets. The rows cover entries of the board, over the cells on which these judges (default: all) voted.
     """
     panel = board.rename(columns={"pecs": "pecs_panel", "n_missing": "n_missing_panel"})
     panel = panel.loc[:, [*ENTRY, "pecs_panel", "n_missing_panel"]]
@@ -40,8 +40,8 @@ def leave_one_out(
 def two_judge_verdicts(
     verdicts: pd.DataFrame, votes: pd.DataFrame, judges: Sequence[str] | None = None
 ) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Each judge, and the VERDICTS rows as the others decide without it: where both votes are valid and agree; 1-1 is
-    undecided. An item without an answer stays without a decision."""
+    """Each judge, and the VERDICTS rows that the two others give without it. They decide an item where both votes are
+    valid and agree; 1-1 is undecided. An item without an answer has no decision."""
     cast = ratings(votes, judges)
     verdicts = verdicts.merge(cast.answers[CELL].drop_duplicates(), on=CELL)
     (abstention, _), (correctness, _) = cast.on(verdicts, ABSTENTION), cast.on(verdicts, CORRECTNESS)

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 CELL = ["dataset", "model", "regime", "run"]
 FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
 BOUNDS = ["pecs_low", "pecs_high"]
-# Which outcomes each number of items counts. Answered means that there is a text, whatever the judges make of it.
+# The outcomes in each count of items. An item is answered if it has a text, even if the judges are undecided on it.
 OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), "n_empty": ("empty",), "n_errors": ("error", "malformed")}
-# How often something was decided so (numerator) and decided at all (denominator); every figure is made of these six.
+# For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
+# computed from these six counts.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
 SCOPED_BY = {"category": "category", "sub_scenario": "sub_scenario", "label": "control_answer"}
 
@@ -53,12 +54,12 @@ def pecs_of(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
 def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_BY) -> pd.DataFrame:
     """METRICS rows of one dataset, from its VERDICTS rows (any models, regimes and runs).
 
-    One row a cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x` (the control's answer, both sides of
-    the pair); `scoped_by` (prefix to column) may name fewer. Figures are fractions; one whose denominator is 0 is null,
-    and so is what depends on it. `n_missing` counts items, of 2 n_pairs (of n_pairs where the dataset is an arm of one
-    side), without a needed decision: abstained and correct on a control, abstained on a void.
-    BOUNDS say what the missing decisions could do to PECS; they are never null. Every share has its n and its Wilson
-    interval.
+    There is one row per cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x` (the control's answer,
+    both sides of the pair); `scoped_by` (prefix to column) may name fewer. Figures are fractions; a figure whose
+    denominator is 0 is null, and so is every figure computed from it. `n_missing` counts the items, of 2 n_pairs (of
+    n_pairs where the dataset is an arm of one side), that lack a decision: abstained or correct on a control, abstained
+    on a void. BOUNDS show how far the missing decisions could move PECS; they are never null. Every share has its n and
+    its Wilson interval.
     Raises ValueError when the verdicts are of several datasets, whose versions may differ (docs/spec.md 5.1).
     """
     datasets = sorted(verdicts["dataset"].unique())
@@ -75,12 +76,12 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_B
 
 
 def mean(values: pd.Series) -> float:
-    """Null where any value is: no mean rests on fewer values than it says."""
+    """The mean; null where any value is null, so that no mean silently uses fewer values."""
     return float(np.mean(values.to_numpy(float)))
 
 
 def joined_epochs(epochs: Iterable[str]) -> str:
-    """The distinct campaigns, sorted and joined by `+`; an epoch may itself be such a join."""
+    """The distinct campaigns, sorted and joined by `+`; an input may itself be such a list."""
     return "+".join(sorted({part for epoch in set(epochs) for part in epoch.split("+") if part}))
 
 
@@ -116,8 +117,8 @@ def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
 def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
     """BOUNDS of every cell, (cells,) each: PECS of all pairs with every missing decision at its worst, and at its best.
 
-    Each decision is bounded by itself, since an item may lack only one; PECS rises with Acc and AbsRec and falls with
-    FalseAbs, so that these two are its exact extremes. Where nothing is missing both are PECS, to the last bit.
+    Each decision is bounded separately, since an item may lack only one; PECS rises with Acc and AbsRec and falls with
+    FalseAbs, so that these two are its exact extremes. Where nothing is missing both equal PECS bit for bit.
     """
     pairs = sums["n_pairs"].to_numpy(float)
     taken = {name: sums[name].to_numpy(float) for name in ("correct", "false_abs", "abs_rec")}
@@ -140,7 +141,7 @@ def wilson(yes: np.ndarray, of: np.ndarray, z: float = 1.959963984540054) -> tup
 
 
 def _wilson(sums: pd.DataFrame) -> dict[str, np.ndarray]:
-    """What each share is a share of, and its interval: (cells,) each."""
+    """The denominator of each share, and the share's interval: (cells,) each."""
     columns = {}
     for figure, name in (("acc", "correct"), ("false_abs", "false_abs"), ("abs_rec", "abs_rec")):
         of = sums[f"{name}_of"].to_numpy("int64")

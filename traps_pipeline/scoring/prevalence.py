@@ -12,7 +12,7 @@ from traps_pipeline.judging.confabulation import AXES
 from traps_pipeline.scoring.metrics import joined_epochs, wilson
 from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE
 
-# Column of CONFABULATION_PREVALENCE to the axes that must all apply.
+# Maps a column of CONFABULATION_PREVALENCE to the axes that must all apply.
 SHARES: Mapping[str, tuple[str, ...]] = {
     "hp": AXES[:1],
     "ii": AXES[1:2],
@@ -23,8 +23,8 @@ SHARES: Mapping[str, tuple[str, ...]] = {
 
 
 def prevalence(labels: pd.DataFrame) -> pd.DataFrame:
-    """CONFABULATION_PREVALENCE rows of CONFABULATION rows: shares of validly labelled failures, with Wilson intervals;
-    null where a model has none. A model without a sampled failure has no row: not run is not 0."""
+    """CONFABULATION_PREVALENCE rows from CONFABULATION rows: shares of validly labelled failures, with Wilson
+    intervals; null where a model has none. A model without a sampled failure has no row, since it was not run."""
     rows = [_row(str(model), group) for model, group in labels.groupby("model", sort=True)]
     return pd.DataFrame(rows, columns=pd.Index(CONFABULATION_PREVALENCE.names))
 

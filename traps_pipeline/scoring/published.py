@@ -25,17 +25,17 @@ def published(name: str) -> pd.DataFrame:
 
 
 def published_digest() -> str:
-    """Digest of `assets/published`: everything that the paper's tables and figures are made from."""
+    """Digest of `assets/published`, from which the paper's tables and figures are made."""
     files = {file.name: file.read_text(encoding="utf-8") for file in sorted(PUBLISHED.glob("*.csv"))}
     return digest(files)[:16]
 
 
 def published_cells() -> pd.DataFrame:
-    """The per-dataset table as cells, as `analyses` take them: one row a (model, dataset, regime), shares as fractions.
+    """The per-dataset table as cells for `analyses`: one row per (model, dataset, regime), shares as fractions.
 
     Columns model, dataset, regime, epoch, n_pairs, acc, abs_rec, false_abs, pecs, and their `_std` over runs (null for
-    the single greedy run of qwen3-vl-8b). A cell has one epoch only; they differ between datasets: `corrected`, but
-    for chaotic_ill_posed `original` or, for the replication models, `verification`.
+    the single greedy run of qwen3-vl-8b). A cell has one epoch: `corrected`; on chaotic_ill_posed it is `original`, or
+    `verification` for the replication models.
     """
     rows = published("behavioral_per_dataset")
     cells = rows.loc[:, ["model", "dataset", "regime", "epoch", "n_pairs"]]

@@ -1,8 +1,8 @@
 """PECS-R: PECS once shortcuts are taken away, and the gap between the two (docs/scoring.md, "PECS-R and the gap").
 
-A kind is a set of items that are answerable, or void, in one way. The controls of the four datasets are one kind, and
-their voids another; each arm adds one, or, where it has both sides, one of either. Kinds have equal weight, so that no
-cue that holds in the many pairs alone carries a model.
+A kind is a set of items that are all answerable, or all void, for one reason. The controls of the four datasets are one
+kind, and their voids another; an arm adds one kind for each side that it has. Kinds have equal weight, so that a cue
+that works only in the pairs, which have most items, does not give a high score.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ _ITEM = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", 
 
 
 def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
-    """ROBUST rows of the VERDICTS rows of pairs and arms: one a model and regime with a run that has all four datasets
-    and an arm.
+    """ROBUST rows from the VERDICTS rows of pairs and arms: one row per model and regime that has a run with all four
+    datasets and an arm.
 
-    Figures are computed per run, then averaged; one that is null in a run is null. Runs may have different arms: an
-    entry rests on the runs that have most, which then all have the same (`arms`).
+    Figures are computed per run, then averaged; a figure that is null in one run is null. If runs have different arms,
+    the entry uses the runs with the most arms, all with the same ones (`arms`).
     """
     items = pd.concat([verdicts[_ITEM], decision_counts(verdicts)], axis=1)
     items["taxonomy"] = [datasets_of_category(category)[0] for category in verdicts["category"]]
@@ -60,8 +60,8 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
             entries[key] = arms, group.loc[chosen]
     if not entries:
         return pd.DataFrame(columns=pd.Index(ROBUST.names))
-    # A scenario is drawn with its items in all datasets and arms. The first of the draws takes each scenario once: the
-    # figures themselves.
+    # A scenario is drawn with its items in all datasets and arms. The first draw takes each scenario once, so that it
+    # gives the figures themselves.
     drawn = {
         taxonomy: (ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights]))
         for taxonomy, (ids, weights) in draw_scenarios(items, resamples, seed).items()
@@ -74,13 +74,13 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
 
 
 def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
-    """The runs of a model and regime that its entry rests on, and the arms that each of them has. Of several sets of
-    arms that are as large, the one that most runs have counts, then the first in the order of ARMS."""
+    """The runs of a model and regime that its entry uses, and the arms that each of them has: the largest set of arms.
+    Among sets of the same size it is the one that most runs have, then the first in the order of ARMS."""
     sets: dict[tuple[str, ...], list[int]] = {}
     for run, rows in group.groupby("run", sort=True):
-        there = {*rows["dataset"]}
-        arms = tuple(arm for arm in ARMS if arm in there)
-        if arms and there.issuperset(DATASETS):
+        datasets = {*rows["dataset"]}
+        arms = tuple(arm for arm in ARMS if arm in datasets)
+        if arms and datasets.issuperset(DATASETS):
             sets.setdefault(arms, []).append(cast(int, run))
     if not sets:
         return [], ()
@@ -89,12 +89,12 @@ def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
 
 
 def _row(items: pd.DataFrame, arms: Sequence[str], drawn: Drawn) -> dict[str, Any]:
-    """What ROBUST says of an entry's items, but for its model, regime and arms."""
+    """The columns of an entry's ROBUST row except model, regime and arms."""
     figures = {cell: figures_of(sums) for cell, sums in run_sums(items, drawn).items()}
     runs = sorted({run for _, run in figures})
     by_run = np.stack([run_figures({d: figures[d, run] for d in (*DATASETS, *arms)}, arms) for run in runs])
     twins = [_twins(items.loc[items["run"] == run]) for run in runs] if TWIN in arms else []
-    told = by_run[..., 0]  # (runs, FIGURES)
+    observed = by_run[..., 0]  # (runs, FIGURES)
     row: dict[str, Any] = {
         "n_runs": len(runs),
         "n_items": max(rows["item_id"].nunique() for _, rows in items.groupby("run")),
@@ -104,8 +104,8 @@ def _row(items: pd.DataFrame, arms: Sequence[str], drawn: Drawn) -> dict[str, An
         "refused": _refusal(items),
         "n_twins": max((n for _, n in twins), default=0),
     }
-    row |= dict(zip(FIGURES, told.mean(axis=0), strict=True))
-    row |= {f"{name}_std": value for name, value in zip(FIGURES, told.std(axis=0), strict=True)}
+    row |= dict(zip(FIGURES, observed.mean(axis=0), strict=True))
+    row |= {f"{name}_std": value for name, value in zip(FIGURES, observed.std(axis=0), strict=True)}
     shares = [share for share, _ in twins]
     row |= {"twin_accuracy": None, "twin_accuracy_std": None}
     if shares:
@@ -133,8 +133,8 @@ def run_figures(cells: Mapping[str, np.ndarray], arms: Sequence[str]) -> np.ndar
 
 
 def _twins(items: pd.DataFrame) -> tuple[float, int]:
-    """Of one run: the share of scenarios of whose control and twin both are answered correctly, and of how many it is:
-    those of which both are decided. NaN of none."""
+    """In one run, among the scenarios in which control and twin control are both decided: the share in which both are
+    correct (NaN if there is none), and their number."""
     controls = items.loc[(items["side"] == "control") & items["correct_of"].eq(1)].set_index("scenario_id")
     own = controls.loc[controls["dataset"].isin(VISUAL), "correct"]
     twin = controls.loc[controls["dataset"] == TWIN, "correct"]
@@ -143,14 +143,14 @@ def _twins(items: pd.DataFrame) -> tuple[float, int]:
 
 
 def _missing(items: pd.DataFrame) -> int:
-    """Items, over runs, without a decision that their side needs."""
+    """The number of items, over runs, that lack a decision of their side."""
     control = items["side"] == "control"
     decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
     return int(len(items) - decided.sum())
 
 
 def _refusal(items: pd.DataFrame) -> str | None:
-    """Why pairs and arms make no gap: they were answered in different campaigns (docs/spec.md 9.2)."""
+    """Why there is no gap between pairs and arms: they were answered in different campaigns (docs/spec.md 9.2)."""
     of_arms = items["dataset"].isin(ARMS)
     pairs, arms = (joined_epochs(items.loc[chosen, "epoch"]) for chosen in (~of_arms, of_arms))
     if pairs == arms and "+" not in pairs:

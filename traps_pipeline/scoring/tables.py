@@ -28,7 +28,7 @@ class MetricsRow:
     run: shared.Run
     scope: Annotated[str, "all, category:.., sub_scenario:.. or label:.. (the control's answer)"]
     n_pairs: Annotated[int, "pairs in scope"]
-    n_missing: Annotated[int, "items (of 2 n_pairs, of n_pairs in an arm of one side) without an answer or a majority"]
+    n_missing: Annotated[int, "items (of 2 n_pairs; in an arm of one side of n_pairs) without an answer or a majority"]
     n_refused: Annotated[int, "items refused"]
     n_empty: Annotated[int, "items answered with no text"]
     n_errors: Annotated[int, "items whose call failed"]
@@ -38,13 +38,13 @@ class MetricsRow:
     false_abs: Annotated[float | None, "share of decided controls abstained on"]
     j: Annotated[float | None, "abs_rec - false_abs"]
     pecs: Annotated[float | None, "acc x max(0, j)"]
-    pecs_low: Annotated[float, "pecs if every missing decision were as bad for the model as can be, of all pairs"]
-    pecs_high: Annotated[float, "pecs if every missing decision were as good for the model as can be, of all pairs"]
+    pecs_low: Annotated[float, "pecs of all pairs if every missing decision were the worst for the model"]
+    pecs_high: Annotated[float, "pecs of all pairs if every missing decision were the best for the model"]
     naive: Annotated[float | None, "acc x abs_rec"]
-    n_acc: Annotated[int, "controls decided on correctness: what acc is a share of"]
+    n_acc: Annotated[int, "controls decided on correctness: the denominator of acc"]
     n_false_abs: Annotated[int, "controls decided on abstention"]
     n_abs_rec: Annotated[int, "voids decided on abstention"]
-    acc_low: Annotated[float | None, "95 % Wilson interval of this run alone, which takes its pairs for independent"]
+    acc_low: Annotated[float | None, "95 % Wilson interval of this run alone, as if its pairs were independent"]
     acc_high: shared.Wilson
     false_abs_low: shared.Wilson
     false_abs_high: shared.Wilson
@@ -80,7 +80,7 @@ class ContrastRow:
     ]
     p_holm: Annotated[
         float | None,
-        "corrected by Holm over the rows of the same kind, dataset and figure (and regime, of models)",
+        "corrected by Holm over the rows of the same kind, dataset and figure (for models, also the same regime)",
     ]
     separable: Annotated[bool, "whether p_holm is below 0.05"]
     refused: Refused
@@ -128,13 +128,13 @@ class LeaderboardRow:
     regime: shared.Regime
     dataset: DatasetOrOverall
     n_runs: Annotated[int, "runs averaged"]
-    n_pairs: Annotated[int, "pairs a run"]
+    n_pairs: Annotated[int, "pairs per run"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
     n_refused: Annotated[int, "items refused, over runs"]
     n_empty: Annotated[int, "items answered with no text, over runs"]
     n_errors: Annotated[int, "items whose call failed, over runs"]
     answered: Annotated[float, "share of items (2 a pair and run) answered with a text, whole or truncated"]
-    incomplete: Annotated[bool, "whether answered is below 0.99, on overall that of any of its datasets"]
+    incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]
     acc: Mean
     acc_std: Deviation
     abs_rec: Mean
@@ -155,17 +155,17 @@ class LeaderboardRow:
     j_ci_high: Bootstrap
     pecs_ci_low: Bootstrap
     pecs_ci_high: Bootstrap
-    rank: Annotated[int | None, "by PECS among the models of this regime and dataset, equal ones alike"]
+    rank: Annotated[int | None, "by PECS among the models of this regime and dataset; equal values share a rank"]
     rank_low: Annotated[
         int | None,
-        "1 + models whose PECS is higher, by a paired contrast that Holm's correction keeps",
+        "1 + the number of models whose PECS is higher by a paired contrast that is significant after correction",
     ]
     rank_high: Annotated[
         int | None,
-        "models less those whose PECS is lower by such a contrast: ranks in between are not separable",
+        "number of models minus those whose PECS is lower by such a contrast; ranks in between are not separable",
     ]
-    pecs_low: Annotated[float, "mean over runs: pecs if every missing decision were as bad for the model as can be"]
-    pecs_high: Annotated[float, "mean over runs: pecs if every missing decision were as good for the model as can be"]
+    pecs_low: Annotated[float, "mean over runs: pecs if every missing decision were the worst for the model"]
+    pecs_high: Annotated[float, "mean over runs: pecs if every missing decision were the best for the model"]
     naive: Annotated[float | None, "acc x abs_rec, mean over runs"]
     epoch: shared.AnswerEpochs
     benchmark_version: shared.BenchmarkVersion
@@ -176,13 +176,13 @@ LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model"
 
 @dataclass(frozen=True, kw_only=True)
 class RobustRow:
-    """A model under a regime once shortcuts are taken away: over the four datasets and the arms that it was asked."""
+    """A model under a regime when shortcuts are taken away: over the four datasets and the arms that it was asked."""
 
     model: shared.Model
     regime: shared.Regime
-    arms: Annotated[list[str], "arms behind the figures, of partitions.ARMS; entries over others are not compared"]
+    arms: Annotated[list[str], "arms (of partitions.ARMS) in the figures; entries with other arms are not compared"]
     n_runs: Annotated[int, "runs averaged: those that have all four datasets and these arms"]
-    n_items: Annotated[int, "items a run, of the four datasets and the arms"]
+    n_items: Annotated[int, "items per run, of the four datasets and the arms"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
     acc_r: Annotated[float | None, "mean over runs of Acc over answerable kinds, with equal weights"]
     acc_r_std: Deviation
@@ -202,13 +202,13 @@ class RobustRow:
     gap_ci_high: Bootstrap
     twin_accuracy: Annotated[
         float | None,
-        "share of scenarios of whose control and twin control both are answered correctly; null without that arm",
+        "share of scenarios in which both the control and the twin control are correct; null without that arm",
     ]
     twin_accuracy_std: Deviation
-    n_twins: Annotated[int, "scenarios of which both are decided, in the run that has most"]
+    n_twins: Annotated[int, "scenarios in which both are decided, in the run that has most"]
     epoch: shared.AnswerEpochs
     benchmark_version: shared.BenchmarkVersion
-    refused: Annotated[str | None, "why pairs and arms make no gap"]
+    refused: Annotated[str | None, "why there is no gap between pairs and arms"]
 
 
 ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
@@ -216,14 +216,14 @@ ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
 
 @dataclass(frozen=True, kw_only=True)
 class LeaveOneOutRow:
-    """A model under a regime on one dataset, or overall, as two of the three judges score it; 1-1 is undecided."""
+    """A model under a regime on one dataset, or overall, scored by two of the three judges; 1-1 is undecided."""
 
     model: shared.Model
     regime: shared.Regime
     dataset: Annotated[str, "one of four, or overall (equal-weight mean over the four)"]
     without: Annotated[str, "the judge left out"]
     n_runs: Annotated[int, "runs averaged"]
-    n_pairs: Annotated[int, "pairs a run"]
+    n_pairs: Annotated[int, "pairs per run"]
     n_missing: Annotated[int, "items without an answer or a majority of the two, over runs"]
     n_missing_panel: Annotated[int, "items without an answer or a majority of the three, over runs"]
     pecs: Annotated[float | None, "mean over runs of the per-run PECS of the two judges"]
@@ -231,11 +231,11 @@ class LeaveOneOutRow:
     difference: Annotated[float | None, "pecs - pecs_panel"]
     pecs_low: Annotated[
         float,
-        "mean over runs: pecs of the two if every missing decision were as bad for the model as can be",
+        "mean over runs: pecs of the two if every missing decision were the worst for the model",
     ]
     pecs_high: Annotated[
         float,
-        "mean over runs: pecs of the two if every missing decision were as good for the model as can be",
+        "mean over runs: pecs of the two if every missing decision were the best for the model",
     ]
     epoch: shared.AnswerEpochs
     benchmark_version: shared.BenchmarkVersion
@@ -249,7 +249,7 @@ class PrevalenceRow:
     """How often each axis applies to one model's sampled void failures; no row means not run."""
 
     model: shared.Model
-    evidence: Annotated[str, "trace_and_output or output: what went in; both joined by + where traces were missing"]
+    evidence: Annotated[str, "what the judge saw: trace_and_output or output; both joined by + if traces were missing"]
     judge: shared.Judge
     n_failures: Annotated[int, "void failures that the sample was drawn from"]
     n_sampled: Annotated[int, "failures put to the judge"]

@@ -1,1 +1,1 @@
-"""What a person does with a study: say what is asked, count it, see where it stands, have it answered elsewhere."""
+"""A person's work with a study: write an experiment, plan it, read its status, and import answers from elsewhere."""

@@ -1,4 +1,4 @@
-"""`traps doctor`: what this machine can do, and what to install where it cannot."""
+"""`traps doctor`: which steps of a study this machine can do, and what to install for the others."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MIN_FREE_GB = 1.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing examined."""
+    """The result of one examination."""
 
     ok: bool
     what: str
@@ -23,7 +23,7 @@ class Finding:
 
 
 def examine(workspace_root: Path) -> Iterator[Finding]:
-    """Everything that the demo needs, one finding each."""
+    """One finding for each requirement of the demo."""
     for what, look in (
         ("python", _python),
         ("checkout", _checkout),
@@ -37,7 +37,7 @@ def examine(workspace_root: Path) -> Iterator[Finding]:
 
 
 def examine_local() -> Iterator[Finding]:
-    """Everything that local models need, one finding each: the three families on tiny checkpoints, and what is here."""
+    """One finding for each requirement of local models: the three families on tiny checkpoints, devices and weights."""
     from traps_pipeline.models.local import selfcheck
     from traps_pipeline.models.local.tiny import FAMILIES
 
@@ -53,7 +53,7 @@ def examine_local() -> Iterator[Finding]:
 def _finding(what: str, look: Callable[[], str]) -> Finding:
     try:
         return Finding(True, what, look())
-    except Exception as error:  # noqa: BLE001 - a doctor reports whatever it meets
+    except Exception as error:  # noqa: BLE001 - every failure of an examination becomes a finding
         return Finding(False, what, f"{error}")
 
 
@@ -126,7 +126,7 @@ def _workspace(root: Path) -> str:
 
 
 def _keys() -> str:
-    """Which keys are not set, and who cannot be asked without them. None is needed for the demo."""
+    """The keys that are not set, and the models and judges that need them. The demo needs no key."""
     from traps_pipeline.models.judges import load_judges
     from traps_pipeline.models.registry import load_models, missing_keys
 

@@ -1,7 +1,7 @@
-"""Answers from elsewhere: a cluster, or a provider's batch mode, does the asking.
+"""Answers from elsewhere: from a cluster, or from a provider's batch mode.
 
-`export_requests` writes what is missing as JSON lines with its media by digest; `import_answers` takes answers back
-under the same keys, after the same checks. What is written is data: nothing in it is run or believed unchecked.
+`export_requests` writes the missing requests as JSON lines, with their media by digest; `import_answers` reads answers
+with the same keys and makes the same checks. Both files are data: nothing in them is executed or used unchecked.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from traps_pipeline.terminal import plain
 from traps_pipeline.yamlfile import explain, read_lines
 
 REQUESTS, MEDIA = "requests.jsonl", "media"
-SHOWN = 5  # bad lines named in an error
+SHOWN = 5  # number of wrong lines that an error names
 
 
 class Answer(BaseModel):
@@ -57,13 +57,14 @@ class Answer(BaseModel):
     @model_validator(mode="after")
     def _text_goes_with_outcome(self) -> Answer:
         if self.outcome in ("error", "malformed"):
-            raise ValueError("outcome: an error is no answer; leave the line out, the item stays missing")
+            raise ValueError("outcome: an error is no answer; remove the line, so that the item stays missing")
         if (self.outcome in JUDGED) != bool((self.text or "").strip()):
-            raise ValueError(f"text: outcome {self.outcome!r} {'needs one' if self.outcome in JUDGED else 'has none'}")
+            needs = "needs a text" if self.outcome in JUDGED else "must have no text"
+            raise ValueError(f"text: outcome {self.outcome!r} {needs}")
         return self
 
     def as_outcome(self, entry: ModelEntry) -> Outcome:
-        """What came of the request, priced by the registry."""
+        """The outcome of the request, with its price from the registry."""
         fields = self.model_dump(exclude={"key", "outcome", "latency_s"})
         cost = None
         if entry.prices and self.prompt_tokens is not None and self.completion_tokens is not None:
@@ -73,21 +74,22 @@ class Answer(BaseModel):
 
 @dataclass(frozen=True)
 class Imported:
-    """What became of a file's lines: new answers, and answers that the ledger held already."""
+    """The result of an import: the numbers of new answers, and of answers that the ledger had already."""
 
     new: int
     known: int
 
 
 def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> int:
-    """Write the experiment's missing requests to `out`: requests.jsonl, and media/<sha256>.<suffix>; how many.
+    """Write the experiment's missing requests to `out` (requests.jsonl, and media/<sha256>.<suffix>); returns their
+    number.
 
     A line holds key, model, provider_id, params, system, user, about (item, model, regime, run) and media: profile,
     file, sha256, n_frames, times_s (s), fps. A local model's media is the clip itself: decode the frames at times_s.
-    Raises TrapsError when items are missing or `out` holds an export already.
+    Raises TrapsError when items are missing or `out` already holds an export.
     """
     if (out / REQUESTS).exists():
-        raise TrapsError(f"{out / REQUESTS} is there already; give another folder, or delete it")
+        raise TrapsError(f"{out / REQUESTS} exists already; give another folder, or delete it")
     (out / MEDIA).mkdir(parents=True, exist_ok=True)
     prepare_media(workspace, _cells(workspace, experiment))
     count = 0
@@ -99,7 +101,8 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
 
 
 def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
-    """Cells of the datasets that the study has: of one taxonomy it has two of four. Raises TrapsError for none."""
+    """The experiment's cells whose datasets have items; a study of one taxonomy has two of four. Raises TrapsError if
+    there is none."""
     cells = [cell for cell in experiment.cells() if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
     if not cells:
         raise TrapsError(f"{workspace.root}: no items yet; materialize scene_specs, videos and items first")
@@ -139,10 +142,10 @@ def _line(request: Request, out: Path) -> dict[str, Any]:
 
 
 def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> Imported:
-    """Take answers (JSON lines, see `Answer`) into the ledger; `traps run` then makes tables of them.
+    """Import answers (JSON lines, see `Answer`) into the ledger; `traps run` then makes tables from them.
 
-    All lines are checked before any is written. Raises TrapsError naming lines that are not answers, whose key the
-    experiment does not want (another question, clip, parameter or run), or that give one key two different answers.
+    All lines are checked before any is written. Raises TrapsError naming lines that are not answers, that have a key
+    outside the experiment (another question, clip, parameter or run), or that answer a key a second time differently.
     """
     cells = _cells(workspace, experiment)
     prepare_media(workspace, cells)
@@ -158,7 +161,7 @@ def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> 
 
 
 def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answer]:
-    """The answers of a file by key. Raises TrapsError naming every line (up to five) that is not one that is wanted."""
+    """The answers of a file by key. Raises TrapsError naming the lines (up to five) that are wrong or not wanted."""
     answers: dict[str, Answer] = {}
     wrong: list[str] = []
     for number, line in read_lines(path):
@@ -173,7 +176,7 @@ def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answ
         if answer.key not in wanted:
             wrong.append(f"{path}:{number}: key {answer.key[:16]} is not wanted: question, clip or setting changed")
         elif answers.setdefault(answer.key, answer) != answer:
-            wrong.append(f"{path}:{number}: another answer to the key of an earlier line")
+            wrong.append(f"{path}:{number}: gives another answer to the key of an earlier line")
     if wrong:
         more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
         raise TrapsError("\n".join(wrong[:SHOWN]) + more + "\nnothing was imported")

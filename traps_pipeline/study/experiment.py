@@ -1,4 +1,4 @@
-"""An experiment: which models are asked what, as a YAML file under `assets/experiments` or anywhere else."""
+"""An experiment: models and the questions that they are asked, as a YAML file in `assets/experiments` or elsewhere."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ EXPERIMENTS = ASSETS / "experiments"
 
 
 class Experiment(BaseModel):
-    """What `traps plan` counts and `traps run` does. benchmark, scenarios, per_family and panel become the study's."""
+    """An experiment, which `traps plan` counts and `traps run` runs. Its benchmark, scenarios, per_family and panel
+    become the study's."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: str = Field(pattern=r"^[a-z0-9-]+$")
@@ -35,7 +36,7 @@ class Experiment(BaseModel):
     budget_usd: float | None = Field(default=None, ge=0.0)
     model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] | None = None
     allow_unknown_prices: bool | None = None
-    mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")
+    mechanism: MechanismSettings | None = Field(default=None, description="local models to read and steer")
 
     @field_validator("datasets")
     @classmethod
@@ -56,38 +57,39 @@ class Experiment(BaseModel):
 
     @model_validator(mode="after")
     def _study_holds_together(self) -> Experiment:
-        _ = self.study  # its own rules (one subset, an epoch's characters) are this file's errors
+        _ = self.study  # so that a study that would be invalid (two subsets, a wrong epoch) is an error of this file
         return self
 
     @property
     def study(self) -> Study:
-        """The study that a new workspace for this experiment holds."""
+        """The study in a new workspace for this experiment."""
         fields = ("benchmark", "scenarios", "per_family", "panel", "epoch", "budget_usd", "model_budgets_usd")
         fields += ("allow_unknown_prices", "mechanism")
-        given = {name: getattr(self, name) for name in fields}
-        return Study(**{name: value for name, value in given.items() if value is not None})
+        values = {name: getattr(self, name) for name in fields}
+        return Study(**{name: value for name, value in values.items() if value is not None})
 
     @property
     def asked(self) -> Asked:
-        """What it asks, as the study keeps it."""
-        given = {name: tuple(getattr(self, name)) for name in ("datasets", "models", "regimes", "runs")}
-        return Asked(**given, mechanism=self.mechanism is not None)
+        """The experiment's datasets, models, regimes and runs, in the form that the study keeps."""
+        values = {name: tuple(getattr(self, name)) for name in ("datasets", "models", "regimes", "runs")}
+        return Asked(**values, mechanism=self.mechanism is not None)
 
     def check_study(self, study: Study, path: Path) -> None:
-        """Raises TrapsError where an existing study has another panel or epoch than this experiment asks for, or asks
-        other things inside models."""
+        """Raises TrapsError if an existing study has another panel or epoch than this experiment asks for, or another
+        `mechanism` section."""
         for name in ("panel", "epoch"):
             old, new = getattr(study, name), getattr(self, name)
             if new is not None and new != old:
-                raise TrapsError(f"{path}: {name} is {old!r}, experiment {self.name} wants {new!r}; edit one of them")
+                raise TrapsError(f"{path}: {name} is {old!r}, experiment {self.name} has {new!r}; edit one of them")
         if self.mechanism is not None and study.mechanism not in (None, self.mechanism):
             raise TrapsError(
                 f"{path}: its `mechanism` differs from that of experiment {self.name}; edit one of them, or remove it "
-                "from study.yaml to take over the experiment's (states and steered answers that fit are kept)"
+                "from study.yaml to use the experiment's (states and steered answers that still apply are kept)"
             )
 
     def cells(self) -> list[Cell]:
-        """All cells asked for, model outermost; a model that has fewer runs has fewer cells. Raises TrapsError."""
+        """All cells of the experiment, ordered first by model; a model with fewer runs has fewer cells. Raises
+        TrapsError for an unknown model."""
         cells = []
         for model in self.models:
             available = get_model(model).runs
@@ -119,7 +121,7 @@ def load_experiment(name: str) -> Experiment:
     for model in experiment.mechanism.models if experiment.mechanism else ():
         if get_model(model).backend != LOCAL:
             raise TrapsError(
-                f"{path}: mechanism.models: {model} is asked through backend {get_model(model).backend}; only local "
-                f"models can be looked into: {', '.join(local_models())}"
+                f"{path}: mechanism.models: {model} is asked through backend {get_model(model).backend}, but only "
+                f"local models have states to read: {', '.join(local_models())}"
             )
     return experiment

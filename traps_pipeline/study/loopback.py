@@ -1,4 +1,4 @@
-"""A provider on this machine: an entry's backend asks it as it would ask its own, and the request is caught."""
+"""A fake provider on this machine: an entry's backend sends its requests there, and the requests are recorded."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class _Loopback(Account):
     """An account whose provider is this machine."""
 
     def secret(self) -> str | None:
-        """A key that opens nothing."""
+        """A placeholder for the key."""
         return PLACEHOLDER_KEY
 
 
 @dataclass
 class _Notes(Progress):
-    """Keeps what a backend would tell a person: why a client library refused to send."""
+    """Keeps the notes of a backend, such as the reason why a client library refused to send."""
 
     texts: list[str] = field(default_factory=list)
 
@@ -71,7 +71,7 @@ def _listening() -> Iterator[tuple[str, list[WireBody]]]:
 
 @contextmanager
 def _no_proxy(host: str) -> Iterator[None]:
-    """Clients ask a host directly, whatever proxy the environment names."""
+    """Let clients ask a host directly, even if the environment names a proxy."""
     names = ("no_proxy", "NO_PROXY")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update({name: ",".join(filter(None, (before[name], host))) for name in names})
@@ -98,7 +98,7 @@ async def _ask(
     entry: Entry, account: Account, request: Request, caught: list[WireBody], notes: _Notes
 ) -> WireBody | str:
     caught.clear()
-    backend = ApiBackend(entry, account)  # a new one each time: it tells a failure of a kind once
+    backend = ApiBackend(entry, account)  # a new one for each call, because it notes each kind of failure only once
     with suppress(TransientError):
         await backend.ask(request)
     return caught[0] if len(caught) == 1 else f"{len(caught)} requests were sent, not one ({notes.texts[-1:]})"

@@ -1,4 +1,4 @@
-"""`traps plan`: which calls an experiment would make, and what they would take."""
+"""`traps plan`: the calls that an experiment would make, with their tokens, dollars and minutes."""
 
 from __future__ import annotations
 
@@ -29,32 +29,32 @@ from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import Experiment
 
-LABEL_TOKENS = 2500  # prompt of a label: instructions, answer and, for half of the models, a trace; an estimate
+LABEL_TOKENS = 2500  # estimated prompt of a label: instructions, answer and, for half of the models, a trace
 
 
 @dataclass
 class Count:
-    """Calls: wanted and already in the ledger."""
+    """Numbers of calls: wanted, and of these already in the ledger (known)."""
 
     wanted: int = 0
     known: int = 0
 
     @property
     def new(self) -> int:
-        """Calls still to be made."""
+        """The number of calls still to be made."""
         return self.wanted - self.known
 
     def add(self, wanted: int, known: int) -> None:
-        """Sum in place."""
+        """Add to both counts in place."""
         self.wanted, self.known = self.wanted + wanted, self.known + known
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What an experiment will ask. calls: answers and votes by model. uncertain: datasets whose items are not current:
-    what those will be is not known yet, so all of their calls are counted as new, an upper bound. forecasts: what the
-    new calls over the network take, by model and judge. labels: calls to the confabulation judge; None where the
-    study's panel has none. steered: answers of steered models and votes on them, by model."""
+    """The calls of an experiment. calls: answers and votes by model. uncertain: datasets whose items are not current;
+    since their items may change, all of their calls are counted as new, which is an upper bound. forecasts: tokens,
+    dollars and minutes of the new calls over the network, by model and judge. labels: calls to the confabulation judge;
+    None if the study's panel has none. steered: answers of steered models and votes on them, by model."""
 
     calls: Mapping[str, tuple[Count, Count]]
     uncertain: Sequence[str]
@@ -64,7 +64,7 @@ class Plan:
 
 
 def make_plan(workspace: Workspace | None, experiment: Experiment) -> Plan:
-    """Count the calls of an experiment and say what they take; nothing is sent and nothing is made."""
+    """Count the calls of an experiment and forecast their cost; nothing is sent and nothing is made."""
     calls, uncertain = _count_calls(workspace, experiment)
     steered = _count_steered(workspace, experiment)
     votes = sum(count.new for _, count in [*calls.values(), *steered.values()])
@@ -85,7 +85,7 @@ def make_plan(workspace: Workspace | None, experiment: Experiment) -> Plan:
 
 
 def _count_steered(workspace: Workspace | None, experiment: Experiment) -> dict[str, tuple[Count, Count]]:
-    """Answers of steered models, and the panel's votes on whether they abstain."""
+    """Calls for the answers of steered models, and for the panel's votes on them, by model."""
     settings, counts = experiment.mechanism, dict[str, tuple[Count, Count]]()
     if settings is None or settings.steering is None:
         return counts
@@ -103,7 +103,8 @@ def _count_steered(workspace: Workspace | None, experiment: Experiment) -> dict[
 
 
 def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: JudgeEntry) -> Count:
-    """Calls to the confabulation judge about the experiment's models; one not judged yet counts with a full sample."""
+    """Calls to the confabulation judge about the experiment's models; a model that is not judged yet counts with a full
+    sample."""
     protocol, wanted = load_protocol(), {cell.key for cell in experiment.cells()}
     labels, known, lineage = Count(), _KnownKeys(), Lineage(workspace) if workspace else None
     for model in protocol.models:
@@ -120,7 +121,7 @@ def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: Ju
 
 
 def _judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
-    """Whether the verdicts of those cells whose dataset has items are there and current."""
+    """Whether the verdicts of all cells whose dataset has items exist and are current."""
     made = [cell for cell in cells if lineage.state("items", cell.dataset) is not None]
     return bool(made) and all(lineage.status("verdicts", cell.key).kind == "fresh" for cell in made)
 
@@ -162,7 +163,7 @@ def _items_current(lineage: Lineage, dataset: str) -> bool:
 
 
 class _KnownKeys:
-    """Keys that the ledgers answer, read once an evaluation."""
+    """The keys with an answer in the ledgers, which are read once per evaluation."""
 
     def __init__(self) -> None:
         self._keys: dict[tuple[str, Evaluation], set[str]] = {}
@@ -177,5 +178,5 @@ class _KnownKeys:
 def _answer_keys(workspace: Workspace, cell: Cell) -> set[str]:
     entry = get_model(cell.evaluation.model)
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}).to_dict("records")
-    sent = [item for item in items if is_prepared(workspace, entry, item)]  # what was never prepared was never asked
+    sent = [item for item in items if is_prepared(workspace, entry, item)]  # an item without media was never asked
     return {answer_request(workspace, entry, item, cell.evaluation).key for item in sent}

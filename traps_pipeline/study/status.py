@@ -1,4 +1,4 @@
-"""`traps status`: what of a study is there, what is missing, what is stale and why."""
+"""`traps status`: the fresh, stale and missing partitions of a study, with the reasons."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass(frozen=True)
 class StageStatus:
-    """How many partitions of a stage are fresh, which are stale and why, how many are missing."""
+    """The partitions of a stage: the number of fresh ones, the stale ones with reasons, the number of missing ones."""
 
     stage: str
     fresh: int
@@ -22,7 +22,7 @@ class StageStatus:
 
 
 def stage_statuses(workspace: Workspace, lineage: Lineage, experiment: str | None) -> Iterator[StageStatus]:
-    """The state of every stage, of what the study wants, or one experiment of it."""
+    """The status of every stage, over the partitions that the study wants, or that one of its experiments wants."""
     wanted = Wanted(workspace, experiment)
     for stage in lineage.graph.stages:
         statuses = {key or stage.name: lineage.status(stage.name, key) for key in stage.wanted(wanted)}

@@ -1,4 +1,4 @@
-"""`traps why`: whether an item's answers still stand, and what would be asked again."""
+"""`traps why`: which answers to an item are still valid, and which would be asked again."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def why(workspace: Workspace, item_id: str) -> Iterator[str]:
-    """For every evaluation that ever asked the item: whether its answer still stands, else which component of the key
+    """For every evaluation that has asked the item: whether its answer is still valid, or which component of the key
     changed. Raises TrapsError for an unknown item."""
     dataset = item_id.split(":")[0]
     current = _current_item(workspace, dataset, item_id)
-    asked = 0
+    n_asked = 0
     for model, entry in load_models().items():
         for regime in REGIMES:
             for run in range(1, entry.runs + 1):
@@ -27,15 +27,15 @@ def why(workspace: Workspace, item_id: str) -> Iterator[str]:
                 rows = [r for r in workspace.answers.read(evaluation.key).rows.values() if _about(r) == item_id]
                 if not rows:
                     continue
-                asked += 1
+                n_asked += 1
                 wanted = answer_request(workspace, entry, current, evaluation) if current else None
                 yield f"{evaluation.key}: {_explain(rows, wanted.components if wanted else None)}"
-    if current is None and not asked:
+    if current is None and not n_asked:
         raise TrapsError(
             f"item {item_id!r} is unknown; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void"
         )
-    if not asked:
-        yield "never asked of any model"
+    if not n_asked:
+        yield "no model has been asked this item"
 
 
 def _about(row: Mapping[str, Any]) -> Any:

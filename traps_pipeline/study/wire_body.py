@@ -1,4 +1,4 @@
-"""The bodies that providers' APIs get, read into one form, and the fields that each API has for a parameter."""
+"""The request bodies of providers' APIs, parsed into one form, and the fields of each API for each parameter."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ENDPOINTS: dict[str, Api] = {
     ":generateContent": "gemini",
     "/v1/messages": "anthropic",
 }
-# A parameter's name in the body, where it is another than in the entry.
+# A parameter's name in the body, where it differs from the name in the entry.
 _NAMES: dict[Api, dict[str, str]] = {
     "chat": {},
     "responses": {"max_tokens": "max_output_tokens", "max_completion_tokens": "max_output_tokens"},
@@ -29,7 +29,7 @@ SCHEMAS = ("response_format", "text.format", "generationConfig.responseJsonSchem
 
 @dataclass(frozen=True)
 class WireBody:
-    """One HTTP request as a provider would get it."""
+    """One HTTP request as a provider would receive it."""
 
     method: str
     path: str
@@ -43,16 +43,16 @@ class WireBody:
 
     @property
     def api(self) -> Api | None:
-        """Which API the path belongs to."""
+        """The API that the path belongs to; None for an unknown one."""
         return next((api for ending, api in ENDPOINTS.items() if self.path.endswith(ending)), None)
 
 
-# --- what a body says -------------------------------------------------------------------------------------------------
+# --- parsing a body ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class ClipPart:
-    """A video or an image in a body. fps: as the body says it."""
+    """A video or an image in a body. fps: the rate in the body, if it has one."""
 
     mime: str
     data: bytes
@@ -63,7 +63,7 @@ class ClipPart:
 class ParsedBody:
     """A body in one form for all APIs. turns: role and parts, each a text, a clip, or None for anything else.
 
-    fields: by dotted name, whatever is neither model nor turn; a schema is kept whole.
+    fields: all other fields, by dotted name; a schema is one field.
     """
 
     model: str
@@ -72,7 +72,7 @@ class ParsedBody:
 
 
 def read_body(wire: WireBody) -> ParsedBody:
-    """What a body says. Raises one of `UNKNOWN_FORM`."""
+    """The parsed body. Raises one of `UNKNOWN_FORM` if its form is unknown."""
     body = _camel(wire.body) if wire.api == "gemini" else dict(wire.body)
     model = body.pop("model", None) or wire.path.rsplit("/", 1)[-1].removesuffix(":generateContent")
     match wire.api:
@@ -93,7 +93,7 @@ def _turn(turn: Mapping[str, Any]) -> tuple[str, list[str | ClipPart | None]]:
 
 
 def _part(part: Mapping[str, Any]) -> str | ClipPart | None:
-    """A part of a turn, in the words of any of the APIs; None for what is none of ours."""
+    """A part of a turn, in the form of any of the APIs; None for an unknown kind of part."""
     match part:
         case {"text": str(text), **rest} if rest.keys() <= {"type"}:
             return text
@@ -114,7 +114,7 @@ def _clip(uri: str, fps: float | None = None) -> ClipPart:
 
 
 def _camel(value: Any) -> Any:
-    """Gemini's names in one spelling: it reads snake_case and camelCase alike, and litellm mixes them."""
+    """The value with Gemini's names in camelCase: Gemini accepts snake_case too, and litellm mixes both."""
     if isinstance(value, list):
         return [_camel(one) for one in value]
     if not isinstance(value, dict):
@@ -138,11 +138,11 @@ def flat(value: Any, name: str = "") -> dict[str, Any]:
     return leaves
 
 
-# --- what a body must have --------------------------------------------------------------------------------------------
+# --- the fields that a body must have ---------------------------------------------------------------------------------
 
 
 def declared_fields(api: Api, params: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields that a body of an API must have, and no others, by dotted name."""
+    """Exactly the fields that a body of an API must have, by dotted name."""
     fields: dict[str, Any] = {}
     for name, value in params.items():
         if name == "response_format":
@@ -158,7 +158,7 @@ def declared_fields(api: Api, params: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _schema_fields(api: Api, response_format: Mapping[str, Any]) -> dict[str, Any]:
-    """How an API is told a JSON schema."""
+    """The fields by which an API gets a JSON schema."""
     given = response_format["json_schema"]
     match api:
         case "chat":

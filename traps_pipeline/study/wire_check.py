@@ -1,8 +1,8 @@
-"""What an entry of the registry really sends, against what it declares: `traps models check`.
+"""`traps models check` compares the request that an entry of the registry sends with the request that it declares.
 
-Client libraries rename, add and leave out without a word. So each entry is asked one question through the backend that
-studies use, the request is caught on this machine, and everything in its body is accounted for: prompt, clip, question,
-declared parameters, and nothing else. No key is needed, and nothing leaves the machine.
+Client libraries rename, add and drop fields without a warning. So each entry is asked one question through the backend
+that studies use, the request is recorded on this machine, and its body must consist of prompt, clip, question, declared
+parameters, and nothing else. No key is needed, and nothing leaves the machine.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _PROTOCOL_FRAMES = 25  # 5 a second of the clip's 5 s, docs/spec.md 3.1
 
 @dataclass(frozen=True)
 class _Studio:
-    """A clip without a scene, and where what is sent of it is kept until this process ends."""
+    """A clip without a scene, in a folder that exists until this process ends."""
 
     folder: TemporaryDirectory[str]
     clip: Path
@@ -71,7 +71,7 @@ def _studio() -> _Studio:
 
 
 def _frames() -> list[np.ndarray]:
-    """A square that moves over a gradient."""
+    """Frames of a square that moves over a gradient."""
     width, height = _CLIP_SIZE
     ground = np.linspace(60, 200, width, dtype=np.uint8)[None, :, None].repeat(height, axis=0).repeat(3, axis=2)
     frames = []
@@ -83,8 +83,8 @@ def _frames() -> list[np.ndarray]:
 
 
 def requests_of(entry: Entry) -> dict[str, Request]:
-    """One request of every form that a study makes of an entry: a model's by regime, a judge's by task (and a label of
-    confabulation, where it gives those)."""
+    """One request of every form that a study sends to an entry: for a model by regime, for a judge by task (and a label
+    of confabulation, if the judge labels it)."""
     if isinstance(entry, ModelEntry):
         return {regime: _answer_request(entry, regime) for regime in REGIMES}
     assert isinstance(entry, JudgeEntry)
@@ -116,7 +116,7 @@ def _vote_request(entry: JudgeEntry, task: Literal["abstention", "correctness"])
     return vote_request(entry, task, cell, {"item_id": "none", "question": _QUESTION, "ground_truth": "yes"}, "Yes.")
 
 
-# --- what is sent against what is declared ----------------------------------------------------------------------------
+# --- comparing the sent with the declared request ---------------------------------------------------------------------
 
 
 def _field_problems(declared: Mapping[str, Any], sent: Mapping[str, Any]) -> Iterator[str]:
@@ -135,7 +135,8 @@ def _short(value: Any) -> str:
 
 
 def _turn_problems(turns: Sequence[tuple[str, list[str | ClipPart | None]]], request: Request) -> Iterator[str]:
-    """System prompt and question must arrive verbatim, and nothing else but the clip before the question."""
+    """The problems of the turns: system prompt and question must arrive verbatim, with the clip before the question and
+    nothing else."""
     roles = [role for role, _ in turns]
     if roles != ["system", "user"]:
         yield f"the turns are {roles}, not system and user"
@@ -162,35 +163,35 @@ def _clip_problems(clips: Sequence[ClipPart], media: Media) -> Iterator[str]:
         found.update(clip.data)
     if found.hexdigest() != media.sha256:
         yield "media: the bytes that arrive are not those that were prepared"
-    for name, seen, mine in (
+    for name, seen, declared in (
         ("type", {clip.mime for clip in clips}, _MIMES[media.profile]),
         ("fps", {clip.fps for clip in clips}, media.fps),
     ):
-        if seen != {mine}:
-            yield f"media.{name}: {mine} is declared, {', '.join(map(str, seen))} arrives"
+        if seen != {declared}:
+            yield f"media.{name}: {declared} is declared, {', '.join(map(str, seen))} arrives"
 
 
 def _wire_problems(entry: Entry, request: Request, wire: WireBody) -> Iterator[str]:
     if wire.api is None:
-        yield f"{wire.method} {wire.path} is of no API that can be checked ({', '.join(ENDPOINTS)})"
+        yield f"{wire.method} {wire.path} belongs to no API that can be checked ({', '.join(ENDPOINTS)})"
         return
     if PLACEHOLDER_KEY.encode() in wire.raw or PLACEHOLDER_KEY in wire.path:
         yield "the API key is in the body or the address"
     if not any(PLACEHOLDER_KEY in value for value in wire.headers.values()):
         yield "the API key is in no header"
     try:
-        said = read_body(wire)
+        body = read_body(wire)
     except UNKNOWN_FORM as error:
-        yield f"the body is of an unknown form ({type(error).__name__}: {error})"
+        yield f"the body has an unknown form ({type(error).__name__}: {error})"
         return
-    if said.model != model_name(entry):
-        yield f"model: {model_name(entry)} is declared, {said.model} is sent"
-    yield from _turn_problems(said.turns, request)
-    yield from _field_problems(declared_fields(wire.api, request.params), said.fields)
+    if body.model != model_name(entry):
+        yield f"model: {model_name(entry)} is declared, {body.model} is sent"
+    yield from _turn_problems(body.turns, request)
+    yield from _field_problems(declared_fields(wire.api, request.params), body.fields)
 
 
 def model_name(entry: Entry) -> str:
-    """The provider's own name of a model: litellm's without the route."""
+    """The provider's own name of a model: litellm's name without the route."""
     return str(entry.provider_id).split("/", 1)[1].removeprefix("responses/")
 
 
@@ -199,7 +200,7 @@ def model_name(entry: Entry) -> str:
 
 @dataclass(frozen=True)
 class Checked:
-    """An entry, what it sends, in a line, and what is wrong with that."""
+    """An entry, a line about its request, and the problems of the request."""
 
     entry: Entry
     line: str
@@ -207,7 +208,7 @@ class Checked:
 
 
 def examine(entry: Entry) -> Checked:
-    """Ask an entry on this machine and compare."""
+    """Send the requests of an entry to this machine and compare them."""
     if entry.backend == NETWORK:
         return _examine_network(entry)
     if isinstance(entry, ModelEntry) and entry.media is not None:
@@ -231,7 +232,7 @@ def _examine_network(entry: Entry) -> Checked:
 
 
 def _protocol_problems(entry: ModelEntry, requests: Mapping[str, Request]) -> Iterator[str]:
-    """What the protocol wants of every model, whatever an entry declares."""
+    """Departures from the protocol, which holds for every model in addition to its entry."""
     for regime, request in requests.items():
         if ("response_format" in request.params) != (entry.json_schema and regime == "json"):
             yield f"{regime}: structured output is for the JSON regime alone, where the entry has json_schema"
@@ -257,7 +258,7 @@ def _fields(fields: Mapping[str, Any]) -> str:
 
 
 def _examine_local(entry: ModelEntry, spec: MediaSpec) -> Checked:
-    """What a local model is shown: nothing is sent, but frames are picked and resized."""
+    """Check the frames that a local model is shown: nothing is sent, but frames are picked and resized."""
     shown = sample(_studio().clip, spec)
     count, (height, width) = len(shown.frames), shown.frames.shape[1:3]
     times = " ".join(f"{time:g}" for time in shown.times_s[:3])
@@ -287,7 +288,8 @@ def participants() -> dict[str, Entry]:
 
 
 def check_named(names: Sequence[str]) -> Iterator[Checked]:
-    """Check the entries of these ids; without any, all that send or show something. Raises TrapsError."""
+    """Check the entries with these ids; without any ids, all entries that send or show something. Raises TrapsError for
+    an unknown id."""
     known = participants()
     if unknown := [name for name in names if name not in known]:
         raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(known)}")

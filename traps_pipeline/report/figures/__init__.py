@@ -1,1 +1,1 @@
-"""The figures of docs/spec.md 10, from any `Results`; the same frames give the same bytes."""
+"""The figures of docs/spec.md 10, from any `Results`; equal frames give equal bytes."""

@@ -31,7 +31,8 @@ PERCENT = (0, 25, 50, 75, 100)
 
 
 def visual_textual(results: Results) -> Figure:
-    """AbsRec on visual (x) against textual voids (y), a point a model and taxonomy; beside it the means by family."""
+    """AbsRec on visual (x) against textual voids (y), one point per model and taxonomy; a second panel has the means by
+    family."""
     rates = results.rates
     if not len(rates):
         return not_run_figure("Visual against textual voids", results.why("rates"), PAGE_IN)
@@ -61,7 +62,8 @@ def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
 
 
 def _draw_families(axes: Axes, rates: pd.DataFrame) -> None:
-    """Means over a family's models of both rates, pooled over taxonomies; of a model without both, of what it has."""
+    """Draw both rates as means over a family's models, pooled over taxonomies; a model that was asked one taxonomy
+    enters with that one."""
     whole = rates.loc[rates["taxonomy"] == "pooled", "model"]
     used = rates.loc[(rates["taxonomy"] == "pooled") | ~rates["model"].isin(whole)]
     means = used.assign(family=used["model"].map(family_of)).groupby("family")[["visual", "textual"]].mean()
@@ -90,7 +92,8 @@ def _draw_models_key(figure: Figure, models: list[str]) -> None:
 
 
 def abs_rec_by_model(results: Results) -> Figure:
-    """AbsRec of every model under standard (hollow) and guided (filled), equal weight over datasets; ± over runs."""
+    """AbsRec of every model under standard (hollow) and guided (filled) with equal weights of datasets; bars are the
+    deviation over runs."""
     overall = results.overall
     rows = overall.loc[overall["regime"].isin(["standard", "guided"]) & overall["abs_rec"].notna()]
     if not len(rows):
@@ -134,8 +137,8 @@ def _abs_rec(sides: dict[tuple[str, str], Any], model: str, regime: str) -> floa
 
 
 def doubt(results: Results) -> Figure:
-    """Doubt of each pair's thinking member (x) against its AbsRec minus the other's (y): a dot a dataset, a large
-    marker for their mean. Both of one epoch; a pair of several is left out, with the reason in the title."""
+    """Doubt of each pair's thinking member (x) against its AbsRec minus the other's (y): a dot for each dataset, and a
+    large marker for the mean. Both figures must be of one epoch; other pairs are left out, and the title says why."""
     points, refused = doubt_points(results)
     if not len(points):
         return not_run_figure("Doubt and conversion", refused or _no_doubt(results))
@@ -166,7 +169,8 @@ def _no_doubt(results: Results) -> str:
 
 
 def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
-    """thinking, other, dataset, doubt, gain (fractions), a row a pair and dataset; and what was refused, in words.
+    """The columns thinking, other, dataset, doubt, gain (fractions), one row per pair and dataset; and the reasons why
+    pairs were refused.
 
     AbsRec is that of `results.rates` (standard), whose epoch must be that of the doubt labels (docs/spec.md 9.2).
     """

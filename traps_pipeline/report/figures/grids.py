@@ -25,8 +25,8 @@ MOST_MODELS = 12  # columns of a heatmap that stay legible on a page's width
 def sub_scenarios(results: Results) -> Figure:
     """AbsRec by sub-scenario (rows, by falling AbsRec under standard) and model (columns), standard beside guided.
 
-    Columns are the video-native models, all others where none of those was asked, 12 at most. The paper prints means
-    over models only: then the columns are its figures.
+    Columns are the models that take video, or all others if none of those was asked, 12 at most. The paper prints only
+    means over models, so for its numbers the columns are the figures that it prints.
     """
     rows = results.sub_scenarios
     rows = rows.loc[rows["abs_rec"].notna()]
@@ -71,7 +71,7 @@ def _means(rows: pd.DataFrame) -> list[tuple[str, list[str], np.ndarray]]:
 
 
 def _draw_grid(ax: Axes, title: str, columns: list[str], values: np.ndarray, names: list[str], first: int) -> AxesImage:
-    """One panel; a white line parts occlusion (the first rows) from chaotic, a dash is not run."""
+    """Draw one panel. A white line separates occlusion (the first rows) from chaotic; a dash means not run."""
     image = ax.imshow(values, cmap="cividis", vmin=0, vmax=100, aspect="auto")
     ax.set_facecolor("#f2f4f7")
     tilt: dict[str, Any] = {"rotation": 45, "ha": "right", "rotation_mode": "anchor"} if len(columns) > 4 else {}
@@ -90,7 +90,8 @@ def _draw_grid(ax: Axes, title: str, columns: list[str], values: np.ndarray, nam
 
 
 def confabulation(results: Results) -> Figure:
-    """How often each axis applies to a model's sampled void failures, with 95 % Wilson intervals where known."""
+    """How often each axis applies to a model's sampled void failures, with 95 % Wilson intervals if the table has
+    them."""
     rows = results.confabulation
     if not len(rows):
         why = "no judge of confabulation is configured for this study’s panel" if results.is_study else ""

@@ -1,4 +1,4 @@
-"""Names of points, placed so that they hit nothing."""
+"""Labels of points, placed so that they overlap nothing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SAME_POINT = 0.018  # distance, as a share of the axes, under which two models s
 
 @dataclass(frozen=True)
 class Label:
-    """The names of the models that end at one point of (Acc, J)."""
+    """The label of one point in (Acc, J), with the names of the models there."""
 
     x: float
     y: float
@@ -26,7 +26,7 @@ class Label:
 
 
 def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
-    """Labels of coinciding points joined, one name a line, in the order given; a shared label is neutral in colour."""
+    """The labels, with those of coinciding points joined: one name per line, in the given order, in neutral colour."""
     size = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
     merged: list[Label] = []
     for label in labels:
@@ -39,10 +39,10 @@ def merged_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
 
 
 def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:
-    """Put every label near its point where it hits no marker, no other label and, if that is not far, no line.
+    """Put every label near its point where it overlaps no marker, no other label and, if possible nearby, no line.
 
-    A leader line joins the two where they are apart. markers is (n, 2) in data coordinates. Greedy and without chance:
-    the outcome depends on the table alone.
+    A leader line connects label and point if they are apart. markers is (n, 2) in data coordinates. The algorithm is
+    greedy and deterministic: the result depends only on the table.
     """
     from matplotlib.patheffects import withStroke
 
@@ -77,14 +77,14 @@ def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> No
 
 
 def _offsets() -> np.ndarray:
-    """Candidate offsets (n, 2) in points of a label from its marker: rings, nearest first, sides before diagonals."""
+    """Candidate offsets (n, 2) in points of a label from its marker, nearest ring first, sides before diagonals."""
     angles = np.deg2rad([0, 180, 90, 270, 30, 330, 150, 210, 60, 120, 240, 300])
     rings = np.array([5, 9, 14, 20, 28, 38, 50, 64, 80])
     return np.round(rings[:, None, None] * np.column_stack([np.cos(angles), np.sin(angles)]), 3).reshape(-1, 2)
 
 
 def _side(offset: float, positive: str, negative: str) -> str:
-    """Alignment that lets text grow away from its marker."""
+    """The alignment by which a text extends away from its marker."""
     return "center" if offset == 0 else positive if offset > 0 else negative
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def landscape(results: Results) -> Figure:
-    """The PECS landscape of the overall figures; of the first dataset where no model has all four."""
+    """The PECS landscape of the overall figures, or of the first dataset if no model has all four."""
     overall, cells = results.overall, results.cells
     if len(overall):
         return landscape_figure(overall, TITLES["overall"])
@@ -43,10 +43,10 @@ def landscape(results: Results) -> Figure:
 def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     """Acc (x) against J (y) of every model with iso-PECS contours, one column wide.
 
-    points has the columns model, regime, acc, j, pecs, incomplete. Hollow is standard, filled is guided, an arrow joins
-    them, a dot is json; the dashed line is the frontier under guided, a ring marks each family's best PECS under
-    guided, ‡ an incomplete model. The reported PECS is averaged per run and dataset, so it can differ a little from
-    what the contours say. Models whose named points coincide (reference strategies) share one label.
+    points has the columns model, regime, acc, j, pecs, incomplete. A hollow marker is standard, a filled one guided, an
+    arrow connects them, and a dot is json. The dashed line is the frontier under guided, a ring marks each family's
+    best PECS under guided, and ‡ an incomplete model. The reported PECS is averaged per run and dataset, so it can
+    differ slightly from the contours. Models whose named points coincide (reference strategies) share one label.
     """
     points = points.loc[points["acc"].notna() & points["j"].notna()]
     with figure_style():
@@ -90,7 +90,7 @@ def reasoning(results: Results) -> Figure:
 
 
 def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
-    """Markers of every model; returns a label a model, at its guided point, else at the first it has."""
+    """Draw the markers of every model; returns one label per model, at its guided point or else at its first one."""
     labels, look = [], looks(points["model"])
     for model, rows in points.groupby("model", sort=True):
         colour, marker = look[str(model)]
@@ -116,7 +116,7 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
 
 
 def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
-    """Dashed steps around everything that some model under guided is as good as in both Acc and J."""
+    """Draw the frontier: dashed steps around the points that some model under guided equals or exceeds in Acc and J."""
     at = guided.sort_values(["acc", "j"], ascending=False)[["acc", "j"]].to_numpy(float)
     steps, best = [], 0.0
     for acc, j in at:
@@ -163,13 +163,13 @@ def _draw_chains(axes: Axes, points: pd.DataFrame, chains: list[list[str]]) -> l
     at = {row["model"]: (float(row["acc"]), float(row["j"])) for row in points.to_dict("records")}
     look, labels = looks(at), []
     for chain in chains:
-        there = [model for model in chain if model in at and np.isfinite(at[model]).all()]
-        for start, end in pairwise(there):
+        shown = [model for model in chain if model in at and np.isfinite(at[model]).all()]
+        for start, end in pairwise(shown):
             axes.plot(*np.array([at[start], at[end]]).T, linewidth=0, zorder=LINES)
             arrow(axes, at[start], at[end], look[end][0])
-        for k, model in enumerate(there):
+        for k, model in enumerate(shown):
             colour, marker = look[model]
-            face = colour if k == len(there) - 1 else "white"  # filled: thinks most
+            face = colour if k == len(shown) - 1 else "white"  # filled: thinks most
             axes.scatter(*at[model], s=20, marker=marker, facecolors=face, edgecolors=colour, linewidths=0.9, zorder=4)
             labels.append(Label(*at[model], short(model), colour))
     return labels

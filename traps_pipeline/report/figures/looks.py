@@ -1,4 +1,4 @@
-"""One look a model in every figure: its family's colour, its own marker. And what figures in (Acc, J) share."""
+"""The colour (of its family) and marker of each model in all figures, and shared parts of figures in (Acc, J)."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ OWN, REFERENCE = "own", "reference"
 
 
 def family_of(model: str) -> str:
-    """The registry's family of a model; `own` where it does not know the model."""
+    """The registry's family of a model; `own` if the model is not in the registry."""
     entry = load_models().get(model)
     return entry.groups.family if entry else OWN
 
 
 def families() -> list[str]:
-    """All families: those of the registry in its order, the paper's first, then `own`."""
+    """All families: first the paper's, then the others in the registry's order, then `own`."""
     known = [entry.groups for entry in load_models().values()]
     order = [g.family for g in known if g.group != "reference"] + [g.family for g in known if g.group == "reference"]
     return list(dict.fromkeys([*order, OWN]))
 
 
 def family_colour(family: str) -> str:
-    """The same colour for a family in every figure; grey is the reference strategies'."""
+    """The colour of a family in every figure; reference strategies are grey."""
     others = [name for name in families() if name != REFERENCE]
     return COLOURS[-1] if family == REFERENCE else COLOURS[others.index(family) % (len(COLOURS) - 1)]
 
 
 def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Colour and marker of each model: its family's colour, and within a colour no two markers alike (up to 13)."""
+    """Colour and marker of each model: its family's colour, and a different marker for up to 13 models of a family."""
     known = dict.fromkeys([*load_models(), *sorted(set(models))])
     colours = {model: family_colour(family_of(model)) for model in known}
     alike = {colour: [m for m in known if colours[m] == colour] for colour in COLOURS}
@@ -45,7 +45,7 @@ def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def frame_plane(axes: Axes, points: pd.DataFrame, xlabel: str) -> None:
-    """Limits around points (columns acc and j), never less than half of either axis, with contours of PECS."""
+    """Set the limits around points (columns acc and j), at least half of each axis, and draw contours of PECS."""
     left, right = _limits(points.loc[:, "acc"], 0.0, 0.0)
     low, high = _limits(points.loc[:, "j"], min([-0.08, *(points["j"] - 0.08)]), 0.3)
     axes.set(xlim=(left - 0.03, right + 0.03), ylim=(low, high + 0.04), xlabel=xlabel, ylabel="J = AbsRec − FalseAbs")
@@ -61,7 +61,7 @@ def frame_plane(axes: Axes, points: pd.DataFrame, xlabel: str) -> None:
 
 
 def _limits(values: pd.Series, low: float, least: float) -> tuple[float, float]:
-    """Ends of an axis of fractions: tenths around the values, at most [low, 1]; up to at least `least`."""
+    """Ends of an axis of fractions: tenths around the values, within [low, 1], the upper end at least `least`."""
     if not len(values):
         return low, 1.0
     bottom = low if least else max(low, float(np.floor(10 * values.min() - 0.8)) / 10)

@@ -11,7 +11,7 @@ from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.paths import PATH_SETS, TRANSFER_TYPES, path_name
 from traps_pipeline.partitions import DATASETS, SHORT, transfer_type
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.mechanism import NOT_LOOKED, best_layers
+from traps_pipeline.report.tables.mechanism import NO_MECHANISM, best_layers
 from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-# A source's colour and line, a target's marker: told apart without colour as well.
+# A source has a colour and a line style, a target a marker, so that they differ without colour as well.
 COLOUR: dict[str, str] = dict(zip(DATASETS, COLOURS, strict=False))
 LINE: dict[str, Any] = dict(zip(DATASETS, ("-", "--", "-.", ":"), strict=True))
 MARKER: dict[str, str] = dict(zip(DATASETS, ("o", "s", "^", "D"), strict=True))
@@ -29,7 +29,7 @@ SETS = {"transfer": "transfer", "within_domain": "within"}
 
 
 def _why(results: Results, frame: pd.DataFrame) -> str:
-    return NOT_LOOKED if results.is_study and not len(frame) else results.why("probes")
+    return NO_MECHANISM if results.is_study and not len(frame) else results.why("probes")
 
 
 def _legend(figure: Figure, *more: Line2D) -> None:
@@ -59,8 +59,9 @@ def _bar_key(label: str, width: float = 2.2, color: str = SOFT) -> Line2D:
 
 
 def probe_curves(results: Results) -> Figure:
-    """AUROC by layer of the twelve ordered pairs, a row a model, a column a kind of transfer; the band is what
-    label-shuffled probes within a dataset reach (mean ± 2 deviations over shuffles). Hollow: the source's own layer."""
+    """AUROC by layer of the twelve ordered pairs, with a row per model and a column per transfer type. The band shows
+    label-shuffled probes within a dataset (mean ± 2 deviations over shuffles); a hollow marker is the source's own
+    layer."""
     rows = results.probes
     curves = rows.loc[(rows["analysis"] == "transfer") & rows["value"].notna()]
     if not len(curves):
@@ -112,7 +113,7 @@ def _shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
 
 def confabulated_strip(results: Results) -> Figure:
     """AUROC of every ordered pair on all samples (hollow) and on confabulated voids with their controls (filled), both
-    at the all-sample best layer; a bar is the median of the filled ones."""
+    at the best layer of all samples; a bar is the median of the filled markers."""
     rows = best_layers(results.probes)
     if not len(rows) or rows.loc[:, "cf_value"].isna().all():
         why = "no dataset has confabulated voids" if len(rows) else _why(results, rows)
@@ -150,9 +151,9 @@ def _strip(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def dose_response(results: Results) -> Figure:
-    """Abstention against α, controls (+α) beside voids (−α), for each model and each path set that it has; under guided
-    directions and guided inference where both were run. Grey: the mean over the paths with its 95 % interval,
-    scenarios resampled."""
+    """Abstention against α on controls (+α) and voids (−α), for each model and each of its path sets, under guided
+    directions and guided inference if both were run. Grey is the mean over the paths with its 95 % interval from
+    resampled scenarios."""
     rows = effects.paths(results.effects)
     rows = rows.loc[rows["kind"] == "void"]
     panels = _panels(rows)
@@ -181,8 +182,8 @@ def dose_response(results: Results) -> Figure:
 
 def _of_panel(shares: pd.DataFrame, part: pd.DataFrame, path_set: str, side: str) -> pd.DataFrame:
     """The shares over a panel's paths along void directions, by alpha."""
-    mine = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
-    return mine.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
+    of_side = shares.loc[(shares["path_set"] == path_set) & (shares["side"] == side)]
+    return of_side.merge(part[[*effects.CELL, "kind"]].drop_duplicates()).sort_values("alpha")
 
 
 def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
@@ -192,7 +193,7 @@ def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
 
 
 def _panels(rows: pd.DataFrame) -> Mapping[tuple[str, str], pd.DataFrame]:
-    """Rows of each model and path set in which every path is there, of the most guided regimes that the model has."""
+    """Rows of each model and complete path set, under the most guided regimes of the model."""
     found: dict[tuple[str, str], pd.DataFrame] = {}
     for model, of in rows.groupby("model", sort=False):
         guided = (of["directions"] == "guided").astype(int) + 2 * (of["regime"] == "guided").astype(int)
@@ -217,7 +218,7 @@ def _doses(ax: Axes, part: pd.DataFrame, side: str) -> None:
 
 
 def cosine_heatmaps(results: Results) -> Figure:
-    """Cosines of the four void directions at the steered layer, a panel a model (and VQA prompt), on one scale."""
+    """Cosines of the four void directions at the steered layer, one panel per model (and VQA prompt), on one scale."""
     rows = results.cosines
     rows = rows.loc[rows["prompt"] == rows["other_prompt"]]
     if not len(rows):

@@ -1,4 +1,4 @@
-"""How well control and void can be told apart by one cue alone."""
+"""How well one cue alone separates control from void."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 def shortcut_figure(table: pd.DataFrame) -> Figure:
-    """How well side can be told from each cue alone, one column wide: a row of points a dataset, chance as a line.
+    """How well each cue alone predicts the side, one column wide: a row of points for each dataset, a line at chance.
 
-    table is what `benchmark.shortcuts` gives.
+    table is the result of `benchmark.shortcuts`.
     """
     datasets = [name for name in TITLES if name in set(table["dataset"])] or list(DATASETS)
     cues = list(dict.fromkeys(table["cue"]))
@@ -32,7 +32,7 @@ def shortcut_figure(table: pd.DataFrame) -> Figure:
                 rows["accuracy"], at, xerr=rows["half_width"], fmt=MARKERS[k], color=COLOURS[k], markersize=4,
                 linestyle="none", linewidth=0.8, label=cue, clip_on=False, zorder=3,
             )  # fmt: skip
-        axes.set(xlim=(0.38, 1.02), ylim=(len(datasets) - 0.5, -0.5), xlabel="control and void told apart, share")
+        axes.set(xlim=(0.38, 1.02), ylim=(len(datasets) - 0.5, -0.5), xlabel="share of sides predicted correctly")
         axes.set_yticks(range(len(datasets)), [TITLES[name] for name in datasets])
         if cues:
             columns = len(cues)

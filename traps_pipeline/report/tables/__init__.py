@@ -1,1 +1,1 @@
-"""The tables of docs/spec.md 10, from any `Results`: a study's or the paper's."""
+"""The tables of docs/spec.md 10, from the `Results` of a study or of the paper."""

@@ -65,9 +65,9 @@ def visual_textual(results: Results) -> list[PrintedTable]:
     notes = [
         epochs(rates.assign(dataset=rates["model"])),
         "AbsRec under standard; gap: textual over visual, ∞ where only the visual is 0",
-        "pooled: of the means of both taxonomies",
+        "pooled: means over both taxonomies, and their ratio",
         *marks(rates),
-        *([] if results.is_study else ["gaps as printed: from unrounded rates, many to whole numbers only"]),
+        *([] if results.is_study else ["gaps are as printed: from unrounded rates, many rounded to whole numbers"]),
         *results.refused.get("rates", []),
     ]
     return [
@@ -86,7 +86,7 @@ def _rate_trace(row: Mapping[str, Any], field: str) -> Behind:
 
 
 def uplift(results: Results) -> list[PrintedTable]:
-    """Guided over standard: AbsRec (equal weight over datasets) and their ratio, PECS of both."""
+    """AbsRec under guided and standard (equal weight over datasets), their ratio, and PECS of both."""
     rows, refused, both = [], [], ("standard", "guided")
     for model, means in marked(results.overall).groupby("model", sort=False):
         sides = {row["regime"]: row for row in means.to_dict("records") if row["regime"] in both}
@@ -126,7 +126,7 @@ def _regime_trace(row: Mapping[str, Any], field: str) -> Behind:
 
 
 def naive(results: Results) -> list[PrintedTable]:
-    """Cells under guided by how far Acc x AbsRec, which forgives false abstention, exceeds PECS."""
+    """Cells under guided, by the difference between Acc x AbsRec, which ignores false abstention, and PECS."""
     cells = results.cells.loc[results.cells["regime"] == "guided"]
     rows = marked(analyses.naive_gap(cells, -np.inf)).dropna(subset=["gap"])
     above = analyses.naive_gap(cells, NAIVE_THRESHOLD)
@@ -149,12 +149,12 @@ def naive(results: Results) -> list[PrintedTable]:
 
 
 def zero_boundary(results: Results) -> list[PrintedTable]:
-    """Cells whose PECS is 0: where a model does not tell void from control at all."""
+    """Cells with PECS 0, in which a model does not distinguish void from control or answers no control correctly."""
     rows = ordered(titled(marked(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
     columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
-    asked = results.cells.groupby("regime", sort=False).size()
-    zero = rows.groupby("regime").size().reindex(asked.index, fill_value=0)
-    notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in asked.items()), epochs(rows)]
+    n_cells = results.cells.groupby("regime", sort=False).size()
+    zero = rows.groupby("regime").size().reindex(n_cells.index, fill_value=0)
+    notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in n_cells.items()), epochs(rows)]
     notes += marks(rows)
     why = "no cell has PECS 0" if len(results.cells) else results.why("cells")
     table = PrintedTable("zero_boundary", "Cells with PECS 0", rows, columns, notes, why, cell_trace)
@@ -194,17 +194,17 @@ def reasoning(results: Results) -> list[PrintedTable]:
         *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARES),
         Column("pecs", "Δ PECS", "fraction", mark="mark"), *COUNTS,
     ]  # fmt: skip
-    notes = [epochs(results.cells), "thinking minus other; Δ of shares in points of percent; missing: of both"]
+    notes = [epochs(results.cells), "thinking minus other; Δ of shares in points; missing: items of both models"]
     notes += [*marks(table), *refused]
     trace: Trace = lambda row, field: Behind(  # noqa: E731
         row["dataset"] if row["dataset"] in DATASETS else "", row["thinking"], row["regime"], SIDE_OF.get(field, "")
     )
-    why = "no reasoning pair was evaluated whole"
+    why = "no reasoning pair has both members evaluated on one dataset"
     return [PrintedTable("reasoning_pairs", "Reasoning pairs", table, columns, notes, why, trace)]
 
 
 def contrasts(results: Results) -> list[PrintedTable]:
-    """Paired contrasts of PECS, overall: two models of one regime, two regimes of one model; Holm's correction."""
+    """Paired contrasts of overall PECS between models of one regime, or regimes of one model; Holm's correction."""
     rows = results.contrasts
     rows = rows.loc[(rows["dataset"] == "overall") & (rows["figure"] == "pecs")]
     rows = rows.assign(separable=rows["separable"].map({True: "yes", False: "no"}))
@@ -218,7 +218,7 @@ def contrasts(results: Results) -> list[PrintedTable]:
         *COUNTS, Column("refused", "Refused"),
     ]  # fmt: skip
     notes = ["left minus right; the other figures and datasets are in the workspace's table `contrasts`"]
-    notes += ["missing: of both", *marks(rows)] if len(rows) else []
+    notes += ["missing: items of both sides", *marks(rows)] if len(rows) else []
     trace: Trace = lambda row, field: Behind("", row["left_model"], row["left_regime"])  # noqa: E731
     why = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
     return [PrintedTable("contrasts", "Paired contrasts", rows, columns, notes, why, trace)]
@@ -261,13 +261,13 @@ def spreads(results: Results) -> list[PrintedTable]:
 
 
 def degenerate(results: Results) -> list[PrintedTable]:
-    """What strategies without discrimination score in expectation, and what they scored in this study."""
+    """The expected figures of strategies that do not discriminate, and their measured figures in this study."""
     rows = analyses.degenerate_strategies()
     columns = [
         Column("strategy", "Strategy"), *SHARES, Column("j", "J", "fraction"), Column("naive", "Naive", "fraction"),
         Column("pecs", "PECS", "fraction"),
     ]  # fmt: skip
-    notes = ["in expectation; Acc is open where the strategy does not fix it, PECS is 0 all the same"]
+    notes = ["in expectation; Acc is open where the strategy does not determine it, and PECS is still 0"]
     if results.is_study:
         measured = results.overall.loc[results.overall["regime"] == "standard"]
         names = {"model": "strategy", **{name: f"measured_{name}" for name in ("j", "j_std", "pecs", "pecs_std")}}

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def agreement(results: Results) -> list[PrintedTable]:
-    """The panel's agreement by dataset and task; with the lowest agreement of two of its judges."""
+    """The panel's agreement by dataset and task, and the lowest agreement of any two of its judges."""
     rows = results.agreement
     pairs = rows.loc[rows["judges"] != "panel"].groupby(["dataset", "task"])["agreement"].min().rename("lowest_pair")
     rows = rows.loc[rows["judges"] == "panel"].merge(pairs.reset_index(), on=["dataset", "task"], how="left")
@@ -52,7 +52,7 @@ def _undefined(rows: pd.DataFrame) -> list[str]:
 
 
 def judge_bias(results: Results) -> list[PrintedTable]:
-    """Every judge against the panel, and PECS without it."""
+    """The bias of every judge against the panel, and PECS without that judge."""
     bias = ordered(titled(results.bias), ["dataset", "task", "judge"])
     columns = [
         DATASET, Column("task", "Task"), Column("judge", "Judge"), Column("yes", "Yes %", "percent"),

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def overall(results: Results) -> list[PrintedTable]:
-    """The overall leaderboard: every model but the replication families, best PECS first."""
+    """The overall leaderboard: every model except the replication families, best PECS first."""
     return [_overall(results, "overall", "Overall leaderboard", replication=False)]
 
 
@@ -55,12 +55,12 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Prin
         shown = rows.to_dict("records")
         rows = rows.assign(ci=[interval(row) for row in shown], ranks=[ranks(row) for row in shown])
         columns[3:3] = [Column("ci", "95 % CI", "range"), Column("ranks", "Rank", "range")]
-        notes.append("rank by PECS within the regime; of 2–4, paired contrasts (Holm) leave these ranks open")
+        notes.append("rank by PECS within the regime; 2–4: paired contrasts (Holm) do not separate these ranks")
         printed = published_overall().loc[:, ["model", "regime", "pecs"]].rename(columns={"pecs": "published_pecs"})
         rows = rows.merge(printed, on=["model", "regime"], how="left")
         if rows["published_pecs"].notna().any():
             columns.append(Column("published_pecs", "published PECS", "fraction"))
-            notes.append("published PECS: as the paper prints it, of its own benchmark and epochs")
+            notes.append("published PECS: as printed in the paper, from its own benchmark and epochs")
     return PrintedTable(
         name, title, best_first(rows), [*columns, *COUNTS], notes, no_overall(results, replication), cell_trace
     )
@@ -108,19 +108,19 @@ def _by_dataset(results: Results, name: str, title: str, replication: bool) -> P
     rows = rows.merge(overall, on=index, how="left")
     columns.append(Column("mean", "Mean", "fraction", spread="mean_std", mark="mean_mark"))
     rows = rows.sort_values("mean", ascending=False, na_position="last", ignore_index=True, kind="stable")
-    notes = [epochs(cells), "mean: overall, of the runs that have all four datasets", *marks(cells)]
+    notes = [epochs(cells), "mean: overall, over the runs that have all four datasets", *marks(cells)]
     trace: Trace = lambda row, field: Behind(field if field in DATASETS else "", row["model"], row["regime"])  # noqa: E731
     return PrintedTable(name, title, rows, columns, notes, results.why("cells"), trace)
 
 
 def _n(title: str, part: pd.DataFrame, names: Mapping[str, str]) -> str:
-    """A heading with the number of pairs, where all rows have the same."""
+    """A heading with the number of pairs, if it is the same in all rows."""
     counts = part[names["n_pairs"]].dropna().unique()
     return f"{title} (n = {int(counts[0])})" if len(counts) == 1 else title
 
 
 def expanded(results: Results) -> list[PrintedTable]:
-    """Twelve tables, a dataset and regime each: Acc, AbsRec, FalseAbs and PECS of every model."""
+    """Twelve tables, one per dataset and regime: Acc, AbsRec, FalseAbs and PECS of every model."""
     cells = marked(results.cells)
     tables = []
     for dataset in DATASETS:

@@ -20,27 +20,27 @@ if TYPE_CHECKING:
 PATH, TYPE = Column("path", "Path"), Column("transfer_type", "Transfer")
 DIRECTIONS, INFERENCE = Column("directions", "Directions"), Column("regime", "Inference")
 KIND, SET = Column("kind", "Direction"), Column("path_set", "Path set")
-NOT_LOOKED = "no local model was looked into: the experiment has no `mechanism` section"
+NO_MECHANISM = "the experiment has no `mechanism` section, so no local model's states were read"
 SETS = {"transfer": "transfer", "within_domain": "within domain"}
 
 
 def _why(results: Results, frame: pd.DataFrame) -> str:
-    return NOT_LOOKED if results.is_study and not len(frame) else results.why("probes")
+    return NO_MECHANISM if results.is_study and not len(frame) else results.why("probes")
 
 
 # --- probes -----------------------------------------------------------------------------------------------------------
 
 
 def probes(results: Results) -> list[PrintedTable]:
-    """Probes from one dataset on another: best layer of each pair, means by transfer type, what goes with them."""
+    """Probes from one dataset on another: best layers, means by transfer type, and the probes' controls."""
     return [_transfer(results), _means(results), _within(results), _catch(results), _answerable(results)]
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row a model and ordered pair: the paper's best layer, the source's own choice, and Cf->Cf at both layers."""
+    """One row per model and ordered pair: the paper's best layer, the source's own layer, and Cf->Cf at both layers."""
     import pandas as pd
 
-    made: list[dict[str, Any]] = []
+    pair_rows: list[dict[str, Any]] = []
     for model, of in rows.groupby("model", sort=False):
         for source, target in TRANSFER_PAIRS:
             pair = of.loc[(of["source"] == source) & (of["target"] == target)]
@@ -50,7 +50,7 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
                 continue
             best, chosen = transfer.loc[transfer["own_best"]], transfer.loc[transfer["source_best"]]
             at_best, own = cf.loc[cf["all_sample_best"] & cf["value"].notna()], cf.loc[cf["own_best"]]
-            made.append(
+            pair_rows.append(
                 {
                     **{"model": model, "source": source, "target": target, "path": path_name(source, target)},
                     "transfer_type": transfer_type(source, target),
@@ -62,7 +62,7 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
                     "note": next(iter(cf["note"].dropna()), ""),
                 }
             )
-    return pd.DataFrame(made)
+    return pd.DataFrame(pair_rows)
 
 
 def _at(rows: pd.DataFrame, name: str, fields: tuple[str, ...]) -> dict[str, Any]:
@@ -81,9 +81,9 @@ def _transfer(results: Results) -> PrintedTable:
     ]  # fmt: skip
     notes = [
         "best layer: the highest AUROC on the target itself, as in the paper; the source’s layer is the highest of its "
-        "own grouped cross-validation, which sees the labels of no target",
+        "own grouped cross-validation, which uses no label of a target",
         *_shared_controls(results),
-        "from, to: 95 %, scenarios of the target resampled, the probe held fixed",
+        "from, to: 95 % interval from resampled scenarios of the target, with the probe held fixed",
         *([] if not len(rows) else sorted({note for note in rows["note"] if note})),
     ]
     return PrintedTable(
@@ -112,11 +112,11 @@ def _held_out(results: Results) -> list[Column]:
 
 
 def _shared_controls(results: Results) -> list[str]:
-    """What is to be known of cross-modality pairs."""
+    """Notes on cross-modality pairs, which share their controls."""
     notes = [
-        "cross-modality: the two datasets have the same control items, so half of the target’s rows are in the fit"
+        "cross-modality: both datasets have the same control items, so half of the target’s rows were used in the fit"
     ]
-    return notes + ["held out: at the best layer, fitted without the scenario that is scored"] * results.is_study
+    return notes + ["held out: at the best layer, fitted without the scored scenario"] * results.is_study
 
 
 def _within(results: Results) -> PrintedTable:
@@ -170,8 +170,8 @@ def _answerable(results: Results) -> PrintedTable:
         Column("answerable_control", "Answerable void against control", "fraction"),
     ]  # fmt: skip
     notes = [
-        "void clips of occlusion with a question that even they answer. First: the same clips, other question; 0.5 "
-        "where a probe sees that something hides, 1 where it sees that this cannot be known. Second: the reverse"
+        "answerable: void clips of occlusion with a question that they answer. First column: the same clips with both "
+        "questions; 0.5 if a probe detects a hidden object, 1 if it detects an unknowable answer. Second: the reverse"
     ]
     why = _why(results, wide) if results.is_study else "the paper has no such control"
     return PrintedTable("probe_answerable", "Hidden, or unknowable", wide, columns, notes, why)
@@ -181,7 +181,7 @@ def _answerable(results: Results) -> PrintedTable:
 
 
 def cosines(results: Results) -> list[PrintedTable]:
-    """Cosines of the four void directions at the steered layer, and of standard against guided ones."""
+    """Cosines of the four void directions at the steered layer, and of standard with guided directions."""
     import pandas as pd
 
     rows = results.cosines
@@ -223,7 +223,8 @@ def _place(values: pd.Series) -> pd.Series:
 
 
 def steering(results: Results) -> list[PrintedTable]:
-    """Abstention under steering: in all, by regimes and families, by domains, at the largest alpha, dose, layers."""
+    """Abstention under steering: over all paths, by regimes, families and domains, at the largest alpha, by alpha, by
+    layer."""
     return [
         _shares(results),
         _regimes(results, "steering_regimes", "Steering: direction regime against inference regime"),
@@ -253,8 +254,8 @@ def _shares(results: Results) -> PrintedTable:
             Column(f"{side}_n_answers", "Answers", "count"), Column(f"{side}_n_scenarios", "Scenarios", "count"),
         ]  # fmt: skip
     notes = [
-        "mean over all paths and regimes; answers: different ones, which may each stand in several paths",
-        "from, to: 95 %, scenarios resampled, not answers; where all scenarios say the same it has no width",
+        "mean over all paths and regimes; answers: distinct answers, each of which may belong to several paths",
+        "from, to: 95 % interval from resampled scenarios, not answers; its width is 0 where all scenarios agree",
     ]
     why = _why(results, wide) if results.is_study else "the paper prints no answers to resample"
     return PrintedTable("steering_shares", "Steering in all, with intervals by scenario", wide, columns, notes, why)
@@ -283,8 +284,8 @@ def _domains(results: Results) -> PrintedTable:
         Column("same", "Same domain, controls %", "percent", mark="mark"),
         Column("cross", "Cross domain, controls %", "percent"),
     ]  # fmt: skip
-    notes = ["well-posed targets: the source’s own taxonomy against the other"]
-    notes += ["* keyword judge"] if "*" in set(rows["mark"]) else []
+    notes = ["abstention on the well-posed dataset of the source’s own taxonomy (same) and of the other (cross)"]
+    notes += ["* by a keyword judge"] if "*" in set(rows["mark"]) else []
     return PrintedTable("steering_domains", "Same against cross domain", rows, columns, notes, _why(results, rows))
 
 
@@ -309,8 +310,8 @@ def _dose(results: Results) -> PrintedTable:
     counts = results.effects["n"].dropna()
     notes = [
         epochs(results.effects),
-        f"n = {counts.max():.0f} answers a cell at most, one a scenario" if len(counts) else "",
-        "from, to: 95 %, Wilson" if results.is_study else "",
+        f"n = {counts.max():.0f} answers per cell at most, one per scenario" if len(counts) else "",
+        "from, to: 95 % Wilson interval" if results.is_study else "",
     ]
     return PrintedTable(
         "steering_dose", "Dose and response", rows, columns, [n for n in notes if n], _why(results, rows)
@@ -324,7 +325,7 @@ def _layers(results: Results) -> PrintedTable:
         Column("control", "Controls abstained on %", "percent"), Column("n_splits", "Splits", "count"),
     ]  # fmt: skip
     notes = ["each dataset’s direction on its own controls, mean over the four splits"]
-    why = "one layer was steered" if len(results.effects) else _why(results, rows)
+    why = "only one layer was steered" if len(results.effects) else _why(results, rows)
     table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, why)
     return rightly_empty(table, results.is_study and bool(len(results.effects)))
 

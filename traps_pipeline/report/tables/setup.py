@@ -1,4 +1,4 @@
-"""What was run: models, what they are sent, the benchmark's composition (docs/spec.md 2 and 3)."""
+"""The setup of a study: models, their parameters, and the benchmark's composition (docs/spec.md 2 and 3)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from traps_pipeline.storage.media import MediaSpec
 
 
 def models(results: Results) -> list[PrintedTable]:
-    """The registry's entries of the models that were evaluated: who answers, how it is shown a clip, how often."""
+    """The evaluated models: provider, how a clip is shown, and the number of runs, from the registry."""
     rows = []
     for entry in _entries(results):
         rows.append(
@@ -44,7 +44,7 @@ def _shown(media: MediaSpec | None) -> str:
 
 
 def hyperparameters(results: Results) -> list[PrintedTable]:
-    """What models and judges are sent, and where that departs from the protocol."""
+    """The parameters that models and judges are sent, and where they depart from the protocol."""
     judges = [*load_judges().values()]
     if results.is_study:
         voted = set(results.bias["judge"])
@@ -90,8 +90,8 @@ def _flat(value: Any) -> str:
 
 def _entries(results: Results) -> Iterable[ModelEntry]:
     """Registry entries of the models with results, in the registry's order."""
-    there = set(results.cells["model"])
-    return [entry for entry in load_models().values() if entry.id in there]
+    evaluated = set(results.cells["model"])
+    return [entry for entry in load_models().values() if entry.id in evaluated]
 
 
 def composition(results: Results) -> list[PrintedTable]:

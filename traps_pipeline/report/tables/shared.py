@@ -37,7 +37,7 @@ COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
 
 def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
-    """Rows with model and regime, and a dataset where they are of one."""
+    """The items behind a number, by the row's model and regime, and by its dataset if it has one."""
     if field.startswith("published"):
         return None
     dataset = row.get("dataset")
@@ -46,19 +46,19 @@ def cell_trace(row: Mapping[str, Any], field: str) -> Behind | None:
 
 
 def marked(rows: pd.DataFrame) -> pd.DataFrame:
-    """With `mark`: ‡ on incomplete rows, † on others that miss some items."""
+    """The rows with `mark`: ‡ on incomplete rows, † on other rows with missing items."""
     incomplete = rows["incomplete"].eq(True).to_numpy(bool)
     missing = rows["n_missing"].fillna(0).to_numpy(float) > 0
     return rows.assign(mark=np.where(incomplete, INCOMPLETE_MARK, np.where(missing, MISSING_MARK, "")))
 
 
 def titled(rows: pd.DataFrame) -> pd.DataFrame:
-    """With `title`, the dataset's for people."""
+    """The rows with `title`, the printed name of the dataset."""
     return rows.assign(title=rows.loc[:, "dataset"].map(TITLES))
 
 
 def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """COUNTED of a comparison of entries: pairs and runs of the one that has fewest, what all of them miss."""
+    """COUNTED for a comparison of entries: the fewest pairs and runs of any entry, the missing items of all."""
     if not sides:
         return dict.fromkeys(COUNTED)
     counts = {name: min(side[name] for side in sides) for name in ("n_pairs", "n_runs")}
@@ -67,44 +67,44 @@ def together(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def counted(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Sequence[str]]) -> pd.DataFrame:
-    """Rows that compare entries, `marked` and with COUNTED. sides: the columns of rows that hold model, regime and
-    dataset of either side; entries: cells, and those of the dataset `overall`."""
+    """Rows that compare entries, `marked` and with COUNTED. sides: for each side, the columns of rows that hold its
+    model, regime and dataset; entries: cells, and those of the dataset `overall`."""
     import pandas as pd
 
-    known = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
+    by_key = {(e["model"], e["regime"], e["dataset"]): e for e in entries.to_dict("records")}
     keys = [[tuple(row[name] for name in side) for side in sides] for row in rows.to_dict("records")]
-    counts = [together([known[key] for key in of_row if key in known]) for of_row in keys]
+    counts = [together([by_key[key] for key in of_row if key in by_key]) for of_row in keys]
     return marked(rows.join(pd.DataFrame(counts, index=rows.index, columns=pd.Index(COUNTED))))
 
 
 def entries(results: Results) -> pd.DataFrame:
-    """The cells, and below them the overall rows as those of a dataset `overall`."""
+    """The cells, followed by the overall rows with the dataset `overall`."""
     import pandas as pd
 
     return pd.concat([results.cells, results.overall.assign(dataset="overall")], ignore_index=True)
 
 
 def marks(rows: pd.DataFrame) -> list[str]:
-    """What the marks in these rows mean."""
+    """The meanings of the marks in these rows."""
     return meanings(rows["mark"])
 
 
 def meanings(marks: Iterable[str]) -> list[str]:
-    """What these marks mean, each once."""
-    there = set(marks)
-    return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in there]
+    """The meaning of each of these marks, once."""
+    used = set(marks)
+    return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in used]
 
 
 def epochs(rows: pd.DataFrame) -> str:
-    """What a header says of epochs: the one there is, or that they are mixed, and how; empty without rows."""
+    """The note on epochs: it names the single epoch, or says how epochs are mixed; empty without rows."""
     known = rows.dropna(subset=["epoch"]) if "epoch" in rows else rows.iloc[:0]
     single = sorted({part for epoch in known["epoch"] for part in str(epoch).split("+")})
     if len(single) <= 1:
         return f"epoch {single[0]}" if single else ""
     groups: dict[str, list[str]] = {}
     for key, part in known.groupby("dataset", sort=False) if "dataset" in known else []:
-        there = " and ".join(sorted(set(part["epoch"].astype(str))))
-        groups.setdefault(there, []).append(SHORT.get(str(key), str(key)))
+        names = " and ".join(sorted(set(part["epoch"].astype(str))))
+        groups.setdefault(names, []).append(SHORT.get(str(key), str(key)))
     most = max(groups, key=lambda name: len(groups[name]), default="")
     parts = [f"{', '.join(keys)}: {epoch}" for epoch, keys in groups.items() if epoch != most]
     if not parts:
@@ -113,18 +113,18 @@ def epochs(rows: pd.DataFrame) -> str:
 
 
 def printed(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
-    """The columns that are shown: of the paper's numbers, those that it prints at all."""
+    """The columns to show: for a study all, for the paper's numbers those that the paper prints."""
     whole = results.is_study or not len(rows)
     return [c for c in columns if whole or c.field not in rows or not rows.loc[:, c.field].isna().all()]
 
 
 def best_first(rows: pd.DataFrame) -> pd.DataFrame:
-    """By falling PECS, nulls last."""
+    """The rows by falling PECS, nulls last."""
     return rows.sort_values("pecs", ascending=False, na_position="last", ignore_index=True, kind="stable")
 
 
 def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """Sorted with datasets and regimes in the benchmark's order, models in the registry's."""
+    """The rows sorted by these columns; datasets and regimes in the benchmark's order, models in the registry's."""
     orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
 
     def place(values: pd.Series) -> pd.Series:
@@ -135,13 +135,13 @@ def ordered(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
 
 
 def interval(row: Mapping[str, Any]) -> str:
-    """The interval of PECS as printed; empty where there is none."""
+    """The interval of PECS as printed; empty if there is none."""
     low, high = row["pecs_ci_low"], row["pecs_ci_high"]
     return "" if low != low or low is None else f"[{fraction(low)}, {fraction(high)}]"
 
 
 def ranks(row: Mapping[str, Any]) -> str:
-    """The ranks that contrasts leave open, as printed."""
+    """The range of ranks that contrasts do not separate, as printed."""
     import pandas as pd
 
     low, high = row["rank_low"], row["rank_high"]
@@ -149,14 +149,14 @@ def ranks(row: Mapping[str, Any]) -> str:
 
 
 def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
-    """Rows as a frame; one with these columns where there are none."""
+    """The rows as a frame; without rows, an empty frame with these columns."""
     import pandas as pd
 
     return pd.DataFrame(list(rows)) if rows else pd.DataFrame(columns=pd.Index(list(columns)))
 
 
 def rightly_empty(table: PrintedTable, run: bool) -> PrintedTable:
-    """A table that may rightly be empty says so, and not that it was not run."""
+    """The table; if it was run and has no rows, it prints its reason `why` instead of "not run"."""
     return replace(table, none=table.why) if run and not len(table.rows) else table
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def occlusion_sub_scenarios(results: Results) -> list[PrintedTable]:
-    """Means over models of every occlusion sub-scenario, and the hidden against the others."""
+    """Means over models of every occlusion sub-scenario, and the hidden ones compared with the others."""
     rows = _sub_rows(results, "occlusion")
     tables = [_sub_table(results, rows, "occlusion_sub_scenarios", "Occlusion sub-scenarios")]
     hidden = rows.iloc[:0]
