@@ -12,8 +12,8 @@ from traps_pipeline.scoring.analyses import (
     models_of,
     naive_gap,
     overall,
+    pair_differences,
     pareto_frontier,
-    reasoning_pairs,
     scoped_cells,
     spread,
     study_cells,
@@ -149,20 +149,20 @@ def test_reasoning_pairs_subtract_the_other_from_the_thinking_member():
         *(cell("qwen3-vl-think", d, abs_rec=0.6) for d in DATASETS),
         *(cell("qwen3-vl-instruct", d, abs_rec=r) for d, r in zip(DATASETS, (0.5, 0.6, 0.7, 0.8), strict=True)),
     )
-    change = reasoning_pairs(frame).set_index("dataset")["abs_rec"]
+    change = pair_differences(frame).set_index("dataset")["abs_rec"]
     assert change.to_dict() == pytest.approx(
-        {"occlusion": 0.1, "occlusion_ill_posed": 0.0, "chaotic": -0.1, "chaotic_ill_posed": -0.2, "overall": -0.05}
+        {"occlusion": 0.1, "occlusion_ill_posed": 0.0, "chaotic": -0.1, "chaotic_ill_posed": -0.2}
     )
 
 
-def test_a_dataset_without_a_figure_leaves_no_overall_difference():
+def test_a_figure_that_one_member_lacks_has_no_difference():
     frame = cells(
         *(cell(m, d, acc=np.nan if (m, d) == ("qwen3-vl-think", "chaotic") else 0.5)
           for m in ("qwen3-vl-think", "qwen3-vl-instruct") for d in DATASETS)
     )  # fmt: skip
-    change = reasoning_pairs(frame).set_index("dataset")
-    assert change["acc"].isna()[["chaotic", "overall"]].all()
-    assert change.loc["overall", "abs_rec"] == 0.0
+    change = pair_differences(frame).set_index("dataset")
+    assert change["acc"].isna().to_dict() == {dataset: dataset == "chaotic" for dataset in DATASETS}
+    assert change.loc["chaotic", "abs_rec"] == 0.0
 
 
 def test_a_single_run_has_no_deviation_rather_than_one_of_0():

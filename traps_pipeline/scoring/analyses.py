@@ -229,22 +229,9 @@ def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMI
     return table.iloc[rows][[*index, "visual", "textual", "gap"]].reset_index(drop=True)
 
 
-def reasoning_pairs(cells: pd.DataFrame) -> pd.DataFrame:
-    """The thinking member of each pair minus the other: columns thinking, other, regime, dataset (or `overall`), acc,
-    abs_rec, false_abs, pecs (differences of fractions).
-
-    `overall` is the mean over the datasets of `cells`, where both members have all of them.
-    """
-    import pandas as pd
-
-    cells = _checked(cells)
-    epochs = cells.groupby(["model", "regime"])["epoch"].agg(joined_epochs).reset_index()
-    means = overall(cells).merge(epochs, on=["model", "regime"]).assign(dataset="overall")
-    return pair_differences(pd.concat([cells, means], ignore_index=True))
-
-
 def pair_differences(cells: pd.DataFrame) -> pd.DataFrame:
-    """`reasoning_pairs` without the added overall rows; the cells may be of the dataset `overall` themselves."""
+    """The thinking member of each pair minus the other: columns thinking, other, regime, dataset, acc, abs_rec,
+    false_abs, pecs (differences of fractions). The cells may be of the dataset `overall` too."""
     import pandas as pd
 
     cells = _checked(cells, datasets=(*DATASETS, "overall"))
