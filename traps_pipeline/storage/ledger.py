@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, sync_folder
+from traps_pipeline.files import is_in_place, remedy, require_in_place, sync_folder
 from traps_pipeline.storage.lines import NOT_WHOLE, Line, append_whole, checked_line, read_checked
 from traps_pipeline.storage.rows import heal, is_cost
 
@@ -150,34 +150,36 @@ class Ledger:
     @asynccontextmanager
     async def lock(
         self, evaluation: str, waiting: Callable[[str], None], give_up: Callable[[], bool] = lambda: False
-    ) -> AsyncIterator[None]:
-        """Hold the evaluation's lock; while another process has it, wait and say once who holds it.
+    ) -> AsyncIterator[Callable[[], None]]:
+        """Hold the evaluation's lock; while another process has it, wait and say once who holds it. The value raises
+        TrapsError when it is called after the lock's file was removed.
 
         Raises LockGivenUp when `give_up` says so while waiting.
         """
-        path = self.root / "locks" / f"{self.kind}-{evaluation}.lock"
-        with _writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        told = False
-        try:
-            while True:
-                try:
-                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        path, told = self.root / "locks" / f"{self.kind}-{evaluation}.lock", False
+        while True:
+            with _writing(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if is_in_place(descriptor, path):
                     break
-                except BlockingIOError:
-                    if not told:
-                        waiting(
-                            f"{self.kind} of {evaluation} are being asked by {_holder(path)}; waiting for it to finish"
-                        )
-                        told = True
-                    if give_up():
-                        raise LockGivenUp(evaluation) from None
-                    await asyncio.sleep(LOCK_POLL_SECONDS)
+                os.close(descriptor)  # removed meanwhile: the next one is another file
+                continue
+            except BlockingIOError:
+                os.close(descriptor)
+            if not told:
+                waiting(f"{self.kind} of {evaluation} are being asked by {_holder(path)}; waiting for it to finish")
+                told = True
+            if give_up():
+                raise LockGivenUp(evaluation)
+            await asyncio.sleep(LOCK_POLL_SECONDS)
+        try:
             with _writing(path):
                 os.ftruncate(descriptor, 0)
                 os.pwrite(descriptor, json.dumps({"pid": os.getpid(), "since": time.strftime("%H:%M:%S")}).encode(), 0)
-            yield
+            yield lambda: require_in_place(descriptor, path)
         finally:
             os.close(descriptor)
 
