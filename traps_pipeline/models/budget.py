@@ -24,7 +24,7 @@ from traps_pipeline.files import is_in_place, remedy, require_in_place, write_by
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_models
 from traps_pipeline.models.request import Request
-from traps_pipeline.storage.ledger import Spent
+from traps_pipeline.storage.ledger import JOURNAL, Spent
 from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, read_checked
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -223,7 +223,7 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
         return
     path = workspace.locks / "budget.lock"
     with _locked(path) as held:
-        journal = Journal(workspace.answers.root / "in_flight.jsonl")
+        journal = Journal(workspace.answers.root / JOURNAL)
         try:
             yield _open_budget(workspace, journal, held)
         finally:

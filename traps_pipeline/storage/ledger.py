@@ -29,6 +29,7 @@ from traps_pipeline.storage.rows import heal, is_cost
 SYNC_ROWS, SYNC_SECONDS = 100, 0.5
 LOCK_POLL_SECONDS = 0.1
 FAILED = ("error", "malformed")  # outcomes that settle nothing
+JOURNAL = "in_flight.jsonl"  # beside the segments' folders: calls that no row tells of yet (`models.budget`)
 ASIDES = ("reasoning", "raw")  # texts kept beside a segment, each in a file of its own
 _KEY = b'{"key": "'  # how every row begins
 _CHECKED = "-v2.jsonl"  # how the names of segments end whose lines have checksums; earlier ones have none
@@ -266,6 +267,12 @@ def _writing(path: Path) -> Iterator[None]:
             f"{path}: could not be written ({error.strerror}); {remedy(error)} and run the same command again: "
             "everything answered before is kept, only what was in flight is asked again"
         ) from error
+
+
+def damaged_lines(path: Path) -> list[int]:
+    """Numbers of the lines of a segment, of what is kept beside it, or of the journal that are not what was written."""
+    lines = read_checked(path) if path.name == JOURNAL else _lines(path)
+    return [line.number for line in lines if not line.whole]
 
 
 def _lines(path: Path) -> Iterator[Line]:
