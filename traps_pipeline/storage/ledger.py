@@ -16,13 +16,13 @@ import re
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Container, Iterator, Mapping
-from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass, field
+from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import is_in_place, remedy, require_in_place, sync_folder
+from traps_pipeline.files import is_in_place, remedy, require_in_place, sync_folder, write_bytes
 from traps_pipeline.storage.lines import NOT_WHOLE, Line, append_whole, checked_line, read_checked
 from traps_pipeline.storage.rows import heal, is_cost
 
@@ -32,6 +32,7 @@ FAILED = ("error", "malformed")  # outcomes that settle nothing
 JOURNAL = "in_flight.jsonl"  # beside the segments' folders: calls that no row tells of yet (`models.budget`)
 ASIDES = ("reasoning", "raw")  # texts kept beside a segment, each in a file of its own
 _KEY = b'{"key": "'  # how every row begins
+_LONG = 2**18  # bytes of a segment whose sums are kept
 _CHECKED = "-v2.jsonl"  # how the names of segments end whose lines have checksums; earlier ones have none
 # Found without parsing the row, to leave most of them out. Inside a string the quote before the colon has a backslash
 # before it, so that no text of a model can look like this; what is counted is read from the parsed row.
@@ -84,6 +85,34 @@ class Spent:
             return
         self.dollars, self.dearest = self.dollars + cost, max(self.dearest, cost)
 
+    def join(self, other: Spent) -> None:
+        """Count what other rows of the participant say."""
+        self.dollars, self.dearest = self.dollars + other.dollars, max(self.dearest, other.dearest)
+        self.unknown += other.unknown
+
+
+def _spent_in(segment: Path) -> dict[str, Spent]:
+    """What the rows of a segment say, by participant. Of a long one it is kept beside it, and counted again where it is
+    not of this very file: a ledger of a million rows would else take seconds at the start of each run."""
+    found, kept = segment.stat(), segment.with_name(f".{segment.name}.spent")
+    stamp = f"{found.st_size} {found.st_mtime_ns}"
+    if found.st_size >= _LONG and kept.is_file():
+        (line, *_) = [*read_checked(kept)] or [None]
+        told = json.loads(line.content) if line is not None and line.whole else {}
+        if told.get("of") == stamp:
+            return {participant: Spent(*its) for participant, its in told["spent"].items()}
+    spent: dict[str, Spent] = {}
+    for line in _lines(segment):
+        if not line.torn:  # what a crash cut off stands in the journal
+            row = _parsed(line)
+            its = spent.setdefault(_participant(row, line.content), Spent())
+            for _ in range(1 if row else max(1, line.content.count(_KEY))):  # rows whose line ends are gone
+                its.add(row)
+    if found.st_size >= _LONG:
+        with suppress(TrapsError):  # a study that can only be read is counted again next time
+            write_bytes(kept, checked_line({"of": stamp, "spent": {name: astuple(its) for name, its in spent.items()}}))
+    return spent
+
 
 class Ledger:
     """Append-only rows by key, one folder an evaluation: `<root>/<kind>/<evaluation>/<segment>.jsonl`."""
@@ -122,12 +151,8 @@ class Ledger:
         """What was paid, by participant, over every row of every evaluation: repeated keys were paid for as well."""
         spent: dict[str, Spent] = {}
         for segment in sorted((self.root / self.kind).glob("*/*.jsonl")):
-            for line in _lines(segment):
-                if not line.torn:  # what a crash cut off stands in the journal
-                    row = _parsed(line)
-                    its = spent.setdefault(_participant(row, line.content), Spent())
-                    for _ in range(1 if row else max(1, line.content.count(_KEY))):  # rows whose line ends are gone
-                        its.add(row)
+            for participant, its in _spent_in(segment).items():
+                spent.setdefault(participant, Spent()).join(its)
         return spent
 
     def reasoning(self, evaluation: str, wanted: Container[str] | None = None) -> dict[str, str]:
