@@ -7,6 +7,7 @@ import json
 import shutil
 import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 from playwright.sync_api import sync_playwright
 
@@ -71,6 +72,11 @@ function socket(query) {
 def attack(port: int, queries: Sequence[str], cookies: Sequence[tuple[str, str]] = ()) -> list[str]:
     """What a page of another origin, and one under a name that is bound to this machine, get from a server here: of
     each try "refused", "opaque" or "read: ...". cookies: of the server, as a browser has them that uses it."""
+    with ThreadPoolExecutor(1) as thread:  # Playwright has one browser's loop a thread, and the test may have its own
+        return thread.submit(_attack, port, queries, cookies).result()
+
+
+def _attack(port: int, queries: Sequence[str], cookies: Sequence[tuple[str, str]]) -> list[str]:
     served: dict[str, str] = {}
 
     class Foreign(http.server.BaseHTTPRequestHandler):

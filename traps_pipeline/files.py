@@ -22,6 +22,7 @@ _REMEDIES = {
     errno.EMFILE: "let this shell open more files (`ulimit -n 4096`)",
     errno.ENFILE: "end programs that hold many files open",
     errno.ENOTDIR: "one of the folders of its path is a file: move that file away, or choose another folder",
+    errno.EEXIST: "a file lies where its folder must be: move that away",
     errno.EISDIR: "a folder lies in its place: move that away",
     errno.ENOENT: "its folder is gone: make it again, or name the right one",
     errno.EIO: "the disk fails: look at it, or choose a folder on another one",
@@ -76,6 +77,24 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def is_in_place(descriptor: int, path: Path) -> bool:
+    """Whether an open file is still what its name stands for: a lock on one that was removed keeps nobody out."""
+    try:
+        there, own = path.stat(), os.fstat(descriptor)
+    except FileNotFoundError:
+        return False
+    return (there.st_dev, there.st_ino) == (own.st_dev, own.st_ino)
+
+
+def require_in_place(descriptor: int, path: Path) -> None:
+    """Raises TrapsError where the file of a lock that this process holds was removed: another run may hold it too."""
+    if not is_in_place(descriptor, path):
+        raise TrapsError(
+            f"{path}: was removed while this run held it, so that another run may ask the same calls; nothing more is "
+            "sent. Leave lock files alone (they hold nothing when no run goes on), and run the same command again"
+        )
 
 
 def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:

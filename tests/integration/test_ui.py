@@ -225,7 +225,7 @@ def test_a_selection_of_stages_over_all_their_partitions_is_one_click(study: Che
     history = (sys.executable, "-W", "ignore", "-c", HISTORY)
     before_attack = study.run(*history).out
     port = int(server.rsplit(":", 1)[1])
-    seen = attack(port, _launch("items"))
+    seen = attack(port, _launch("items"), [(f"traps-ui-{port}", TOKEN)])
     assert seen and set(seen) <= {"refused", "opaque"}
     assert study.run(*history).out == before_attack and before_attack.endswith("False\n")
 

@@ -312,6 +312,19 @@ def test_stopping_does_not_wait_for_a_provider_that_asked_for_an_hour(tmp_path: 
     assert len(backend.calls) == 4
 
 
+def test_a_lock_that_is_removed_under_a_run_ends_its_calls_and_keeps_what_was_answered(tmp_path: Path) -> None:
+    lock = tmp_path / "locks" / f"answers-{CELL.evaluation.key}.lock"
+
+    async def removing(_: Request, call: int) -> Outcome:
+        lock.unlink(missing_ok=True)
+        return LEFT
+
+    backend = Answering(removing)
+    with pytest.raises(TrapsError, match=r"\.lock: was removed while this run held it"):
+        list(run_work(work(tmp_path, {"m": backend}, ten), [CELL]))
+    assert len(backend.calls) == len(Ledger(tmp_path, "answers").read(CELL.evaluation.key).rows) == 4  # at once
+
+
 INTERRUPTED = """
 import asyncio, sys
 from pathlib import Path

@@ -261,6 +261,18 @@ def test_two_runs_never_spend_from_one_budget_at_once(tmp_path: Path) -> None:
     assert events == ["free", "first ends", "second"]
 
 
+def test_a_lock_that_is_removed_under_a_run_ends_its_calls(tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path, Study(budget_usd=5))
+    with spending(workspace, [PRICED]) as budget:
+        asyncio.run(budget.reserve("m", 0.5))
+        (workspace.locks / "budget.lock").unlink()
+        with pytest.raises(TrapsError, match=r"budget\.lock: was removed while this run held it"):
+            asyncio.run(budget.reserve("m", 0.5))
+        (workspace.locks / "budget.lock").touch()  # of another run
+        with pytest.raises(TrapsError, match=r"budget\.lock: was removed while this run held it"):
+            asyncio.run(budget.reserve("m", 0.5))
+
+
 def test_calls_in_flight_at_a_kill_are_spent_for_good(tmp_path: Path) -> None:
     workspace = Workspace.create(tmp_path / "study", Study(budget_usd=5))
 

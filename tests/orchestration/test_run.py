@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import random
+import shutil
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
-from dagster import PartitionKeyRange
+from dagster import AssetObservation, PartitionKeyRange
 
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.orchestration.run import batches
+from traps_pipeline.orchestration.run import batches, dagster_history
 from traps_pipeline.orchestration.schemes import CELL, DATASET
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import DATASETS, Cell
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
 
 CELLS = [str(key) for key in the_graph().keys("responses")]
 
@@ -56,3 +61,29 @@ def test_neighbours_of_one_dimension_are_one_range_and_no_keys_are_no_run() -> N
         ("chaotic_ill_posed", "chaotic_ill_posed"),
     ]
     assert list(batches(None, [None])) == [(None, None)]
+
+
+@pytest.mark.parametrize("damage", ["gone", "no database"])
+def test_a_history_that_is_lost_begins_anew(
+    tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study())
+    monkeypatch.setenv("DAGSTER_HOME", str(workspace.dagster_home))
+    with dagster_history(workspace) as history:
+        history.report_runless_asset_event(AssetObservation("questions", tags={"dagster/data_version": "1"}))
+    if damage == "gone":
+        shutil.rmtree(workspace.dagster_home)
+    else:
+        (workspace.dagster_home / "history" / "runs" / "index.db").write_bytes(b"no database" * 500)
+    with dagster_history(workspace) as history:
+        assert history.all_asset_keys() == [] and history.get_runs_count() == 0
+    assert ("history was damaged; it lies in broken-" in capsys.readouterr().err) == (damage != "gone")
+
+
+def test_a_file_in_the_place_of_dagsters_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study())
+    monkeypatch.delenv("DAGSTER_HOME", raising=False)
+    workspace.dagster_home.rmdir()
+    workspace.dagster_home.touch()
+    with pytest.raises(TrapsError, match=r"a file.* move that"), dagster_history(workspace):
+        pass

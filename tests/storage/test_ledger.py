@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.ledger import Ledger, Spent
+from traps_pipeline.storage.lines import checked_line
 
 HOLD = """
 import asyncio, sys, time
@@ -144,6 +145,21 @@ def test_no_bit_of_a_segment_can_flip_unseen(ledger: Ledger) -> None:
         ):
             silent.append(place)
     assert silent == []
+
+
+def test_the_sums_of_a_long_segment_are_kept_and_counted_again_where_they_are_not_its_own(ledger: Ledger) -> None:
+    row = answer("a", "x" * 1000) | {"cost_usd": 0.25, "components": {"participant": "m"}}
+    write(ledger, *([row] * 300))
+    assert ledger.spent() == {"m": Spent(75.0, 0.25)}
+    (kept,) = ledger.folder("m").glob(".*.spent")
+    written = kept.read_bytes()
+    for damaged in (written.replace(b"75.0", b"15.0"), b"", b"no sums"):
+        kept.write_bytes(damaged)
+        assert ledger.spent() == {"m": Spent(75.0, 0.25)}
+    (segment,) = segments(ledger)
+    with segment.open("ab") as stream:
+        stream.write(checked_line(row))
+    assert ledger.spent() == {"m": Spent(75.25, 0.25)}
 
 
 def test_values_that_no_table_holds_are_unknown_and_told(ledger: Ledger) -> None:

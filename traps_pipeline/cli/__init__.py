@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import io
 import os
 import signal
 import sys
@@ -36,6 +37,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a subcommand; returns the exit code: 0 done, 1 something failed, 2 bad usage, 4 a budget is reached, 130
     interrupted."""
     gc.set_threshold(50_000, 20, 20)  # imported objects stay: searching them for garbage costs half a second
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a path or a word that this terminal cannot show
     arguments = build_parser().parse_args(argv)
     command: Run = arguments.command
     try:
@@ -49,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             # Nobody reads any more (`| head`); the interpreter's last flush must not complain of it either.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return FAILED
-        where = f"{error.filename}: " if error.filename else ""
+        where = f"{plain(error.filename)[:200]}: " if error.filename else ""
         print(f"traps: {where}{error.strerror}; {remedy(error)} and run the same command again", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:

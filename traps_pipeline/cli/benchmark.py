@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from traps_pipeline.cli.command import FAILED, OK, Commands
+from traps_pipeline.cli.command import FAILED, OK, Commands, number, whole
 from traps_pipeline.errors import TrapsError
 
 
@@ -16,22 +16,26 @@ def add(commands: Commands) -> None:
     parser = commands.add("certify", certify, text, workspace=False)
     parser.add_argument("--specs", type=Path, help="folder of a sampled benchmark (default: scene_specs)")
     parser.add_argument("--families", nargs="+", metavar="FAMILY", help="these only")
-    parser.add_argument("--workers", type=int, help="processes (default: one per core)")
+    parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
     parser.add_argument(
         "--fresh", action="store_true", help="certify all again, also scenarios that an earlier call has certified"
     )
 
     text = "sample a fresh benchmark, certified like the released one"
     parser = commands.add("sample", sample, text, workspace=False)
-    parser.add_argument("--seed", type=int, required=True, help="the same seed gives the same scenarios")
+    parser.add_argument(
+        "--seed", type=whole(0, 2**63 - 1), required=True, help="the same seed gives the same scenarios"
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder of the new benchmark")
     parser.add_argument("--name", help="its name (default: private-SEED)")
     parser.add_argument("--families", nargs="+", metavar="FAMILY", help="sample only these (default: all)")
     parser.add_argument(
-        "--scale", type=float, default=1.0, help="number of scenarios, relative to the released benchmark"
+        "--scale", type=number(0, 1000), default=1.0, help="number of scenarios, relative to the released benchmark"
     )
-    parser.add_argument("--count", type=int, help="number of scenarios of each family, instead of --scale")
-    parser.add_argument("--workers", type=int, help="processes (default: one per core)")
+    parser.add_argument(
+        "--count", type=whole(1, 1_000_000), help="number of scenarios of each family, instead of --scale"
+    )
+    parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
 
 
 def certify(arguments: argparse.Namespace) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,28 @@ if TYPE_CHECKING:
 OK, FAILED, OVER_BUDGET, INTERRUPTED = 0, 1, 4, 130
 
 Run = Callable[[argparse.Namespace], int]  # a command: it takes its parsed arguments and returns an exit code
+
+
+def whole(least: int, most: int) -> Callable[[str], int]:
+    """The type of an argument that is a whole number in these bounds, in plain digits."""
+
+    def parse(text: str) -> int:
+        if not re.fullmatch(r"-?[0-9]{1,18}", text) or not least <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text[:40]!r} is no whole number from {least} to {most}")
+        return int(text)
+
+    return parse
+
+
+def number(above: float, most: float) -> Callable[[str], float]:
+    """The type of an argument that is a number in these bounds (the lower one left out), in plain digits."""
+
+    def parse(text: str) -> float:
+        if not re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,9})?", text) or not above < float(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text[:40]!r} is no number above {above:g}, at most {most:g}")
+        return float(text)
+
+    return parse
 
 
 class Commands:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from traps_pipeline.cli.command import FAILED, OK, Commands, root_of
+from traps_pipeline.terminal import plain
 
 
 def add(commands: Commands) -> None:
@@ -13,12 +14,20 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--local", action="store_true", help="check local models instead: tiny checkpoints of each family, devices, NF4"
     )
+    parser.add_argument(
+        "--verify", action="store_true", help="read every table, ledger and clip of the study whole, and name damage"
+    )
 
 
 def doctor(arguments: argparse.Namespace) -> int:
     """See `traps doctor --help`."""
-    from traps_pipeline.study.doctor import examine, examine_local
+    from traps_pipeline.study.doctor import examine, examine_files, examine_local
 
+    if arguments.verify:
+        findings = [*examine_files(root_of(arguments))]
+        for finding in findings:
+            print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}", flush=True)
+        return OK if all(finding.ok for finding in findings) else FAILED
     who, needs = ("local models", "need") if arguments.local else ("the demo", "needs")
     problems = 0
     for finding in examine_local() if arguments.local else examine(root_of(arguments)):

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from traps_pipeline.cli.command import OK, Commands, Run
+from traps_pipeline.cli.command import OK, Commands, Run, whole
 
 if TYPE_CHECKING:
     from traps_pipeline.pocket.recipe import Recipe
@@ -28,7 +28,9 @@ def add(commands: Commands) -> None:
     parser = _add(noun, "evaluate", evaluate, text)
     _add_scenes(parser)
     _add_weights(parser)
-    parser.add_argument("--scenes", type=int, help="number of held-out scenes per family (default: all)")
+    parser.add_argument(
+        "--scenes", type=whole(1, 1_000_000), help="number of held-out scenes per family (default: all)"
+    )
     _add_counts(parser)
 
     text = "write the counts and the mechanistic figures into the model card"
@@ -54,11 +56,11 @@ def _add(noun: Commands, name: str, run: Run, text: str) -> argparse.ArgumentPar
 
 def _add_scenes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the rendered scenes")
-    parser.add_argument("--workers", type=int, help="processes that render (default: one per core)")
+    parser.add_argument("--workers", type=whole(1, 1024), help="processes that render (default: one per core)")
 
 
 def _add_weights(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seed", type=int, default=1, help="seed of weights and batches (default: 1)")
+    parser.add_argument("--seed", type=whole(0, 2**63 - 1), default=1, help="seed of weights and batches (default: 1)")
     parser.add_argument("--out", type=Path, required=True, help="folder for the weights of this seed")
 
 

@@ -5,21 +5,15 @@ from __future__ import annotations
 import argparse
 import os
 
-from traps_pipeline.cli.command import OK, Commands, open_workspace
+from traps_pipeline.cli.command import OK, Commands, open_workspace, whole
 
 
 def add(commands: Commands) -> None:
     """Add `traps ui`."""
     parser = commands.add("ui", ui, "Dagster's web server and daemon; prints the address to open, with its token")
-    parser.add_argument("--port", type=_port, default=3000, help="of the web server (default: 3000)")
+    parser.add_argument("--port", type=whole(1, 65535), default=3000, help="of the web server (default: 3000)")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine alone)")
     parser.add_argument("--token", help="of the address, instead of a fresh one (default: $TRAPS_UI_TOKEN)")
-
-
-def _port(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or not 1 <= int(text[:6]) <= 65535:
-        raise argparse.ArgumentTypeError(f"{text!r} is no port: a number from 1 to 65535")
-    return int(text)
 
 
 def ui(arguments: argparse.Namespace) -> int:

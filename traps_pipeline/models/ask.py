@@ -110,6 +110,7 @@ class _Asking:
 
     work: Work[Any, Any, Any]
     writer: SegmentWriter
+    held: Callable[[], None]  # raises when the evaluation's lock was removed
     missing: Sequence[Request]
     stop: asyncio.Event
     rows: dict[str, Row] = field(default_factory=dict)
@@ -126,6 +127,7 @@ class _Asking:
         """Ask and record one request of the queue; False when there is nothing more to do."""
         if not queue or self.halted():
             return False
+        self.held()
         request, name = queue.popleft(), participant.entry.id
         attempted = await attempt(participant, request, self.work.budget, self.stop, self.halted)
         if attempted is None:
@@ -172,6 +174,15 @@ class _Asking:
             raise self.problems[0]
 
 
+@dataclass(frozen=True)
+class _Evaluation:
+    """What the cells of an evaluation share: its segment, its lock, the places in its ledger that were told of."""
+
+    writer: SegmentWriter
+    held: Callable[[], None]
+    told: set[str]
+
+
 async def settle_evaluation(
     work: Work[AnyCell, AnyCall, Any], evaluation: Evaluation, cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[Settled[AnyCell, AnyCall]]:
@@ -181,10 +192,10 @@ async def settle_evaluation(
     cells share (a steered control stands in two datasets) is found by the second.
     """
     told: set[str] = set()
-    async with work.ledger.lock(evaluation.key, progress.current().note, stop.is_set):
+    async with work.ledger.lock(evaluation.key, progress.current().note, stop.is_set) as held:
         with work.ledger.writer(evaluation.key) as writer:
             for cell in cells:
-                settled = await _settle_cell(work, cell, writer, stop, told)
+                settled = await _settle_cell(work, cell, _Evaluation(writer, held, told), stop)
                 if settled is None:
                     return  # what was answered is in the ledger
                 yield settled
@@ -193,27 +204,27 @@ async def settle_evaluation(
 
 
 async def _settle_cell(
-    work: Work[AnyCell, AnyCall, Any], cell: AnyCell, writer: SegmentWriter, stop: asyncio.Event, told: set[str]
+    work: Work[AnyCell, AnyCall, Any], cell: AnyCell, its: _Evaluation, stop: asyncio.Event
 ) -> Settled[AnyCell, AnyCall] | None:
-    """Ask what is missing of a cell; None if that was stopped. told: lines that a person was told of."""
+    """Ask what is missing of a cell; None if that was stopped."""
     report = progress.current()
     calls = work.calls(cell)
     wanted = {call.request.key: call.request for call in calls}
     known = work.ledger.read(cell.evaluation.key, wanted)
-    for place in sorted({*known.notes} - told):
+    for place in sorted({*known.notes} - its.told):
         report.note(f"{place}: {known.notes[place]}")
-    told.update(known.notes)
+    its.told.update(known.notes)
     rows = known.settled
     missing = [request for key, request in wanted.items() if key not in rows]
     new = Counter(request.participant for request in missing)
     for name, count in Counter(request.participant for request in wanted.values()).items():
         report.asking(work.stage, name, new[name], count - new[name])
-    asking = _Asking(work, writer, missing, stop)
+    asking = _Asking(work, its.writer, its.held, missing, stop)
     await asking.run()
     rows |= asking.rows
     if stop.is_set() or len(rows) < len(wanted):
         return None
-    writer.sync()
+    its.writer.sync()
     errors = sum(not settles(row) for row in rows.values())
     tally = Tally(asked=len(missing), cached=len(wanted) - len(missing), errors=errors)
     return Settled(cell, calls, {key: rows[key] for key in wanted}, tally)

@@ -12,7 +12,7 @@ import json
 import os
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +20,11 @@ from typing import Any
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, write_bytes
+from traps_pipeline.files import is_in_place, remedy, require_in_place, write_bytes
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_models
 from traps_pipeline.models.request import Request
-from traps_pipeline.storage.ledger import Spent
+from traps_pipeline.storage.ledger import JOURNAL, Spent
 from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, read_checked
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -150,8 +150,9 @@ class Budget:
         caps_usd: Mapping[str, float],
         spent_usd: Mapping[str, float],
         journal: Journal | None = None,
+        held: Callable[[], None] = lambda: None,
     ) -> None:
-        self._journal = journal
+        self._journal, self._held = journal, held
         self._caps = {None: cap_usd, **caps_usd}
         self._spent = defaultdict(float, spent_usd) | {None: sum(spent_usd.values())}
         self._reserved: defaultdict[str | None, float] = defaultdict(float)
@@ -171,10 +172,12 @@ class Budget:
     async def reserve(self, participant: str, worst_usd: float) -> None:
         """Reserve a call's worst case; while calls in flight hold the room, wait for what they really cost.
 
-        Raises BudgetReached when there is no room and nothing in flight that could make some.
+        Raises BudgetReached when there is no room and nothing in flight that could make some, TrapsError when the lock
+        that keeps other runs from the same budget was removed.
         """
         if worst_usd <= 0:
             return
+        self._held()
         async with self._changed:
             while full := [slot for slot in self._slots(participant) if self._room(slot) < worst_usd - 1e-9]:
                 if hopeless := [slot for slot in full if self._reserved[slot] <= 1e-9]:
@@ -218,31 +221,44 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
     if not any(entry.prices for entry in participants):
         yield Budget(workspace.study.budget_usd, workspace.study.model_budgets_usd, {})
         return
-    workspace.locks.mkdir(parents=True, exist_ok=True)
-    with (workspace.locks / "budget.lock").open("w") as lock:
-        told = False
-        while True:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if not told:
-                    progress.current().note("another run spends from this study's budget; waiting for it to finish")
-                    told = True
-                time.sleep(0.2)
-        journal = Journal(workspace.answers.root / "in_flight.jsonl")
+    path = workspace.locks / "budget.lock"
+    with _locked(path) as held:
+        journal = Journal(workspace.answers.root / JOURNAL)
         try:
-            yield _open_budget(workspace, journal)
+            yield _open_budget(workspace, journal, held)
         finally:
             journal.close()
 
 
-def _open_budget(workspace: Workspace, journal: Journal) -> Budget:
+@contextmanager
+def _locked(path: Path) -> Iterator[Callable[[], None]]:
+    """Hold a lock file; the value raises TrapsError when it is called after the file was removed."""
+    told = False
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if is_in_place(descriptor, path):
+                break
+        except BlockingIOError:
+            if not told:
+                progress.current().note("another run spends from this study's budget; waiting for it to finish")
+                told = True
+            time.sleep(0.2)
+        os.close(descriptor)
+    try:
+        yield lambda: require_in_place(descriptor, path)
+    finally:
+        os.close(descriptor)
+
+
+def _open_budget(workspace: Workspace, journal: Journal, held: Callable[[], None]) -> Budget:
     study, spent = workspace.study, defaultdict(float, journal.lost_usd)
     for ledger in (workspace.answers, workspace.votes):
         for participant, its in ledger.spent().items():
             spent[participant] += its.dollars + its.unknown * _at_most_usd(workspace, participant, its)
-    return Budget(study.budget_usd, study.model_budgets_usd, spent, journal)
+    return Budget(study.budget_usd, study.model_budgets_usd, spent, journal, held)
 
 
 def _at_most_usd(workspace: Workspace, participant: str, its: Spent) -> float:

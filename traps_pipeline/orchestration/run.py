@@ -16,6 +16,7 @@ from typing import Any
 
 import dagster as dg
 
+from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import remedy
 from traps_pipeline.models.budget import BudgetReached
@@ -48,8 +49,9 @@ class WalkResult:
 def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
     """Dagster's history of this workspace, opened by one process at a time (a first opening by two corrupts it).
 
-    Runs whose process was killed are marked as failed: a queue would count them for ever. Raises TrapsError when the
-    history cannot be read or written.
+    Runs whose process was killed are marked as failed: a queue would count them for ever. A history that is gone begins
+    anew, and so does one that is no history any more, which is kept beside it: what counts stands in the tables.
+    Raises TrapsError when the history cannot be read or written.
     """
     from sqlalchemy.exc import DBAPIError
 
@@ -58,9 +60,7 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
         workspace.locks.mkdir(parents=True, exist_ok=True)
         with (workspace.locks / "dagster.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            if home == workspace.dagster_home:
-                workspace.copy_dagster_yaml()
-            instance = dg.DagsterInstance.from_config(str(home))
+            instance = _opened(workspace, home)
         with instance:
             for run in instance.get_runs(dg.RunsFilter(statuses=[dg.DagsterRunStatus.STARTED])):
                 here = run.tags.get(HOST_TAG) == this_host()
@@ -75,6 +75,31 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
             f"{home}: Dagster's history cannot be read or written ({' '.join(str(error).split())[:300]}); {what} and "
             "run the same command again: tables are whole, no answer is lost"
         ) from error
+
+
+def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
+    from sqlalchemy.exc import DatabaseError, OperationalError
+
+    for again in (False, True):
+        workspace.copy_dagster_yaml(home)
+        try:
+            instance = dg.DagsterInstance.from_config(str(home))
+            instance.get_runs_count()
+            instance.all_asset_keys()  # of the other file
+        except OperationalError:
+            raise  # a full disk or another's lock: it is whole
+        except DatabaseError as error:
+            if again or ("not a database" not in str(error) and "malformed" not in str(error)):
+                raise
+            kept = home / f"broken-{time.strftime('%Y%m%dT%H%M%S')}"
+            for name in ("history", "schedules", "storage"):
+                if (home / name).exists():
+                    kept.mkdir(exist_ok=True)
+                    (home / name).rename(kept / name)
+            progress.current().note(f"{home}: Dagster's history was damaged; it lies in {kept.name}, a new one begins")
+        else:
+            return instance
+    raise AssertionError("unreachable: the second try returns or raises")
 
 
 def this_host() -> str:

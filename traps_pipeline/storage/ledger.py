@@ -16,21 +16,23 @@ import re
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Container, Iterator, Mapping
-from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass, field
+from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, sync_folder
+from traps_pipeline.files import is_in_place, remedy, require_in_place, sync_folder, write_bytes
 from traps_pipeline.storage.lines import NOT_WHOLE, Line, append_whole, checked_line, read_checked
 from traps_pipeline.storage.rows import heal, is_cost
 
 SYNC_ROWS, SYNC_SECONDS = 100, 0.5
 LOCK_POLL_SECONDS = 0.1
 FAILED = ("error", "malformed")  # outcomes that settle nothing
+JOURNAL = "in_flight.jsonl"  # beside the segments' folders: calls that no row tells of yet (`models.budget`)
 ASIDES = ("reasoning", "raw")  # texts kept beside a segment, each in a file of its own
 _KEY = b'{"key": "'  # how every row begins
+_LONG = 2**18  # bytes of a segment whose sums are kept
 _CHECKED = "-v2.jsonl"  # how the names of segments end whose lines have checksums; earlier ones have none
 # Found without parsing the row, to leave most of them out. Inside a string the quote before the colon has a backslash
 # before it, so that no text of a model can look like this; what is counted is read from the parsed row.
@@ -83,6 +85,34 @@ class Spent:
             return
         self.dollars, self.dearest = self.dollars + cost, max(self.dearest, cost)
 
+    def join(self, other: Spent) -> None:
+        """Count what other rows of the participant say."""
+        self.dollars, self.dearest = self.dollars + other.dollars, max(self.dearest, other.dearest)
+        self.unknown += other.unknown
+
+
+def _spent_in(segment: Path) -> dict[str, Spent]:
+    """What the rows of a segment say, by participant. Of a long one it is kept beside it, and counted again where it is
+    not of this very file: a ledger of a million rows would else take seconds at the start of each run."""
+    found, kept = segment.stat(), segment.with_name(f".{segment.name}.spent")
+    stamp = f"{found.st_size} {found.st_mtime_ns}"
+    if found.st_size >= _LONG and kept.is_file():
+        (line, *_) = [*read_checked(kept)] or [None]
+        told = json.loads(line.content) if line is not None and line.whole else {}
+        if told.get("of") == stamp:
+            return {participant: Spent(*its) for participant, its in told["spent"].items()}
+    spent: dict[str, Spent] = {}
+    for line in _lines(segment):
+        if not line.torn:  # what a crash cut off stands in the journal
+            row = _parsed(line)
+            its = spent.setdefault(_participant(row, line.content), Spent())
+            for _ in range(1 if row else max(1, line.content.count(_KEY))):  # rows whose line ends are gone
+                its.add(row)
+    if found.st_size >= _LONG:
+        with suppress(TrapsError):  # a study that can only be read is counted again next time
+            write_bytes(kept, checked_line({"of": stamp, "spent": {name: astuple(its) for name, its in spent.items()}}))
+    return spent
+
 
 class Ledger:
     """Append-only rows by key, one folder an evaluation: `<root>/<kind>/<evaluation>/<segment>.jsonl`."""
@@ -121,12 +151,8 @@ class Ledger:
         """What was paid, by participant, over every row of every evaluation: repeated keys were paid for as well."""
         spent: dict[str, Spent] = {}
         for segment in sorted((self.root / self.kind).glob("*/*.jsonl")):
-            for line in _lines(segment):
-                if not line.torn:  # what a crash cut off stands in the journal
-                    row = _parsed(line)
-                    its = spent.setdefault(_participant(row, line.content), Spent())
-                    for _ in range(1 if row else max(1, line.content.count(_KEY))):  # rows whose line ends are gone
-                        its.add(row)
+            for participant, its in _spent_in(segment).items():
+                spent.setdefault(participant, Spent()).join(its)
         return spent
 
     def reasoning(self, evaluation: str, wanted: Container[str] | None = None) -> dict[str, str]:
@@ -150,34 +176,36 @@ class Ledger:
     @asynccontextmanager
     async def lock(
         self, evaluation: str, waiting: Callable[[str], None], give_up: Callable[[], bool] = lambda: False
-    ) -> AsyncIterator[None]:
-        """Hold the evaluation's lock; while another process has it, wait and say once who holds it.
+    ) -> AsyncIterator[Callable[[], None]]:
+        """Hold the evaluation's lock; while another process has it, wait and say once who holds it. The value raises
+        TrapsError when it is called after the lock's file was removed.
 
         Raises LockGivenUp when `give_up` says so while waiting.
         """
-        path = self.root / "locks" / f"{self.kind}-{evaluation}.lock"
-        with _writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        told = False
-        try:
-            while True:
-                try:
-                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        path, told = self.root / "locks" / f"{self.kind}-{evaluation}.lock", False
+        while True:
+            with _writing(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if is_in_place(descriptor, path):
                     break
-                except BlockingIOError:
-                    if not told:
-                        waiting(
-                            f"{self.kind} of {evaluation} are being asked by {_holder(path)}; waiting for it to finish"
-                        )
-                        told = True
-                    if give_up():
-                        raise LockGivenUp(evaluation) from None
-                    await asyncio.sleep(LOCK_POLL_SECONDS)
+                os.close(descriptor)  # removed meanwhile: the next one is another file
+                continue
+            except BlockingIOError:
+                os.close(descriptor)
+            if not told:
+                waiting(f"{self.kind} of {evaluation} are being asked by {_holder(path)}; waiting for it to finish")
+                told = True
+            if give_up():
+                raise LockGivenUp(evaluation)
+            await asyncio.sleep(LOCK_POLL_SECONDS)
+        try:
             with _writing(path):
                 os.ftruncate(descriptor, 0)
                 os.pwrite(descriptor, json.dumps({"pid": os.getpid(), "since": time.strftime("%H:%M:%S")}).encode(), 0)
-            yield
+            yield lambda: require_in_place(descriptor, path)
         finally:
             os.close(descriptor)
 
@@ -264,6 +292,12 @@ def _writing(path: Path) -> Iterator[None]:
             f"{path}: could not be written ({error.strerror}); {remedy(error)} and run the same command again: "
             "everything answered before is kept, only what was in flight is asked again"
         ) from error
+
+
+def damaged_lines(path: Path) -> list[int]:
+    """Numbers of the lines of a segment, of what is kept beside it, or of the journal that are not what was written."""
+    lines = read_checked(path) if path.name == JOURNAL else _lines(path)
+    return [line.number for line in lines if not line.whole]
 
 
 def _lines(path: Path) -> Iterator[Line]:

@@ -252,6 +252,15 @@ def _sound_bytes(path: Path) -> io.BytesIO:
     return io.BytesIO(content)
 
 
+def altered(path: Path) -> str:
+    """What is wrong with the bytes of a table's file, in words; empty where they are what was written."""
+    try:
+        _sound_bytes(path)
+    except (TrapsError, OSError) as error:
+        return str(error)
+    return ""
+
+
 def _stamp(found: os.stat_result) -> str:
     return f"{found.st_mtime_ns} {found.st_size} {found.st_ino}"
 

@@ -102,9 +102,10 @@ class Workspace:
             )
         return cls(root, parse_yaml_model(Study, data, path))
 
-    def copy_dagster_yaml(self) -> None:
-        """Give Dagster's folder the checkout's `dagster.yaml`, unless it has one of its own (another storage, say)."""
-        own = self.dagster_home / "dagster.yaml"
+    def copy_dagster_yaml(self, home: Path | None = None) -> None:
+        """Give Dagster's folder (default: the workspace's) the checkout's `dagster.yaml`, unless it has one of its own
+        (another storage, say)."""
+        own = (home or self.dagster_home) / "dagster.yaml"
         if own.is_symlink() or not own.exists():
             write_text(own, (CHECKOUT / "dagster.yaml").read_text(encoding="utf-8"))
 

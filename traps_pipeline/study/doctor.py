@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 MIN_FREE_GB = 1.0
+SHOWN = 5  # damaged files of a kind that are named
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,44 @@ def examine_local() -> Iterator[Finding]:
             yield _finding(family, partial(selfcheck.check_family, family, folder))
         yield _finding("nf4", lambda: selfcheck.check_nf4(folder))
         yield _finding("checkpoints", selfcheck.describe_checkpoints)
+
+
+def examine_files(workspace_root: Path) -> Iterator[Finding]:
+    """Every file of a study that says what it must hold, read whole: one finding for each kind."""
+    from traps_pipeline.storage.workspace import Workspace
+
+    workspace = Workspace.open(workspace_root)
+    for what, files, damage_of in (
+        ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), _damaged_table),
+        ("ledger", sorted((workspace.root / "ledger").rglob("*.jsonl*")), _damaged_lines),
+        ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
+    ):
+        damaged = [said for path in files if (said := damage_of(path))]
+        shown = "; ".join(damaged[:SHOWN]) + (f"; and {len(damaged) - SHOWN} more" if len(damaged) > SHOWN else "")
+        yield Finding(not damaged, what, shown or f"{len(files)} files are what was written")
+
+
+def _damaged_table(path: Path) -> str:
+    from traps_pipeline.storage.parquet import altered
+
+    return altered(path)
+
+
+def _damaged_lines(path: Path) -> str:
+    from traps_pipeline.storage.ledger import damaged_lines
+
+    lines = damaged_lines(path)
+    return f"{path}: line {', '.join(map(str, lines))}: not what was written, and not believed" if lines else ""
+
+
+def _damaged_clip(path: Path) -> str:
+    from traps_pipeline.scenes.clips import DamagedClip, read_clip
+
+    try:
+        read_clip(path)
+    except DamagedClip as error:
+        return str(error)
+    return ""
 
 
 def _finding(what: str, look: Callable[[], str]) -> Finding:

@@ -113,7 +113,8 @@ def load_experiment(name: str) -> Experiment:
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in EXPERIMENTS.glob("*.yaml")))
         raise TrapsError(
-            f"no experiment {name!r}: {path} is not there; known: {known}, or give the path of a YAML file"
+            f"no experiment {name[:80]!r}: {str(path)[:200]} is not there; known: {known}, or give the path of a YAML "
+            "file"
         )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
     for model in experiment.models:
