@@ -102,6 +102,10 @@ def without_flags(frames: np.ndarray) -> np.ndarray:
             if patch is None or patch[0] > left + width + 3:
                 continue
             x, y, wide, high = patch
+            box = np.s_[y : y + high, x : x + wide]
+            changes = np.abs(np.stack([frames[0][box], frames[-1][box]]).astype(int) - still[box])
+            if min(abs(y - top), abs(y + high - top)) > 6 or changes.mean() > 12:
+                continue  # neither flies at the end of the mast, or it moves
             above = max(0, min(top, y) - 4)
             beside = shown[:, above, max(0, left - 4)]
             shown[:, above + 2 : y + high + 3, left - 1 : x + wide + 3] = beside[:, None, None]
@@ -125,7 +129,7 @@ def _patch(still: np.ndarray, seed: tuple[int, int]) -> tuple[int, int, int, int
 def _masts(still: np.ndarray) -> list[tuple[int, int, int]]:
     """Upper ends (left, top, width) of thin, dark, colourless lines that stand upright, or nearly."""
     dark = ((still.max(axis=2) < 125) & (np.ptp(still, axis=2) < 30)).astype(np.uint8)
-    thin = dark & ~cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((1, 7), np.uint8))
+    thin = cv2.subtract(dark, cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((1, 7), np.uint8)))
     tall = cv2.morphologyEx(cv2.dilate(thin, np.ones((1, 3), np.uint8)), cv2.MORPH_OPEN, np.ones((6, 1), np.uint8))
     count, names = cv2.connectedComponents(tall, connectivity=8)
     found = []
