@@ -24,6 +24,12 @@ def lower_panel(record: Record) -> None:
     panel["half"][2] /= 2
 
 
+def raise_panel(record: Record) -> None:
+    panel = record["void"]["panel"]
+    panel["centre"][2] *= 1.5
+    panel["half"][2] *= 1.5
+
+
 def change_answer(record: Record) -> None:
     record["ground_truth"] = next(label for label in record["labels"] if label != record["ground_truth"])
 
@@ -41,11 +47,17 @@ def cut_later(record: Record) -> None:
     record["void"]["cut_frame"] += 8
 
 
+def start_the_twin_elsewhere(record: Record) -> None:
+    record["twin"]["rollout"] += 1
+
+
 ALTERED: dict[str, tuple[Callable[[Record], None], str]] = {
     "hidden_race-0001": (lower_panel, "hidden"),
     "domino_chain-0001": (close_the_gap, "physics"),
+    "chain-0001": (raise_panel, "referents: something that the question names has 0 pixels"),
     "head_on-0001": (change_answer, "outcome"),
     "plinko-0001": (cut_later, "open"),
+    "pachinko_waterfall-0001": (start_the_twin_elsewhere, "twin: the twin's trajectory begins"),
     "bounce-0001": (widen_margin, "outcome: margin_m is"),
 }
 UNTOUCHED = "slide-0001"
@@ -80,4 +92,4 @@ def test_an_altered_record_is_named_with_the_certificate_it_loses(finished: Fini
 
 def test_an_untouched_record_passes_beside_altered_ones(finished: Finished) -> None:
     assert f"traps: {UNTOUCHED}" not in finished.err
-    assert "1 of 6 scenarios certified" in finished.out
+    assert "1 of 8 scenarios certified" in finished.out

@@ -134,8 +134,10 @@ def test_a_record_without_evidence_loses_every_certificate_that_stores_some() ->
     assert lost == [
         ["outcome", "no evidence 'commit_s'"],
         ["legible", "no evidence 'least_visible_px'"],
+        ["order", "no evidence 'order_frames'"],
         ["hidden", "no evidence 'hidden_from_s'"],
         ["ablation", "no evidence 'ablation_px'"],
+        ["referents", "no evidence 'referents'"],
         ["twin", "no evidence 'twin_px'"],
     ]
 

@@ -12,6 +12,7 @@ import pytest
 
 from tests.conftest import EXPERIMENT, Checkout
 from tests.tables import TABLES
+from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.scoring.tables import METRICS
@@ -97,13 +98,14 @@ def test_a_corrected_ill_posed_question_asks_one_item_again(study: Checkout) -> 
     assert run.counts() == {"answers": EVALUATIONS, "votes": 3 * EVALUATIONS, "frames": 0}
     # Versions change where the correction reaches, and nowhere else.
     tables = Workspace.open(study.workspace).tables
+    release = load_release().version
     versions = tables.read_all(ITEMS).groupby("dataset")["benchmark_version"].unique()
     corrected = versions.pop("chaotic_ill_posed")
-    assert len(corrected) == 1 and corrected[0].startswith("0.1.0+")
-    assert {version for found in versions for version in found} == {"0.1.0"}
+    assert len(corrected) == 1 and corrected[0].startswith(f"{release}+")
+    assert {version for found in versions for version in found} == {release}
     specs = tables.read_all(SCENE_SPECS)
-    assert set(specs.query("category != 'plinko'")["benchmark_version"]) == {"0.1.0"}
-    assert set(tables.read_all(VIDEOS)["benchmark_version"]) == {"0.1.0"}  # a corrected question renders nothing
+    assert set(specs.query("category != 'plinko'")["benchmark_version"]) == {release}
+    assert set(tables.read_all(VIDEOS)["benchmark_version"]) == {release}  # a corrected question renders nothing
 
 
 def test_dagster_shows_exactly_the_touched_partitions_stale_stage_by_stage(study: Checkout) -> None:

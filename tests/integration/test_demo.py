@@ -8,6 +8,7 @@ import pytest
 
 from tests.conftest import Checkout
 from tests.tables import TABLES
+from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.benchmark.tables import ITEMS, VIDEOS
 from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS, VERDICTS
 from traps_pipeline.scoring.leaderboard import pooled_j
@@ -84,7 +85,7 @@ def test_every_table_knows_its_benchmark_version(workspace: Workspace) -> None:
     for table in TABLES.values():
         rows = workspace.tables.read_all(table)
         assert rows.empty == (table.name in {*NOT_RUN, *MECHANISM, *ON_REQUEST}), table.name
-        assert set(rows.get("benchmark_version", ())) <= {"0.1.0"}, table.name
+        assert set(rows.get("benchmark_version", ())) <= {load_release().version}, table.name
 
 
 def test_the_demo_ends_with_the_leaderboard_and_paths_that_exist(demo: Checkout, demo_output: str) -> None:

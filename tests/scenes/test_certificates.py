@@ -14,7 +14,16 @@ from tests.scenes import certificate_table
 from tests.scenes.released import Released, first_of_each, load
 from traps_pipeline.benchmark.evidence import unanswerable_controls
 from traps_pipeline.scenes import certificates
-from traps_pipeline.scenes.certificates import CERTIFICATES, OPEN, OUTCOME, pair_of, settled_outcome
+from traps_pipeline.scenes.certificates import (
+    CERTIFICATES,
+    LEGIBLE,
+    OPEN,
+    ORDER,
+    OUTCOME,
+    REFERENTS,
+    pair_of,
+    settled_outcome,
+)
 from traps_pipeline.scenes.certify import certify
 from traps_pipeline.scenes.evidence import Certificate, Claim, Evidence, Number
 from traps_pipeline.scenes.kit import Reading
@@ -59,6 +68,45 @@ def test_a_lowered_panel_hides_nothing_and_betrays_the_twin(race: Released) -> N
     assert "pixels" in found["hidden"]
 
 
+def test_a_panel_that_rises_over_the_flags_hides_what_the_question_names() -> None:
+    case = load("chain-0001")
+    panel = dict(case.spec.void["panel"])
+    x, y, z = panel["centre"]
+    across, thickness, up = panel["half"]
+    high = panel | {"centre": [x, y, 1.5 * z], "half": [across, thickness, 1.5 * up]}
+    spec = altered(case.spec, void=case.spec.void | {"panel": high})
+    measured, said = {}, {}
+    for name, record in (("released", case.spec), ("raised", spec)):
+        pair = pair_of(record, case.qpos, case.twin, frame_step=10)
+        measured[name] = REFERENTS.measured(pair)
+        said[name] = REFERENTS.failure(measured[name] | {"cause_moving_s": 0.5}, pair.claim)  # 10 frames are too few
+    assert said["released"] is None
+    assert measured["released"]["referents"] == case.spec.evidence["referents"]
+    assert measured["released"]["referents"]["ball"] == measured["released"]["referents"]["box"] == "marked"
+    assert "has 0 pixels in a void frame" in str(said["raised"])
+    assert measured["raised"]["panel_covers"] >= measured["released"]["panel_covers"] > 0
+
+
+def test_flags_are_the_same_in_both_worlds_and_change_no_trajectory() -> None:
+    for scenario_id in first_of_each("occluder"):
+        case = load(scenario_id)
+        worlds = [
+            pair_of(case.spec, case.qpos, case.twin).control,
+            pair_of(case.spec, case.qpos, case.twin).other_world,
+        ]
+        flags = []
+        for world in worlds:
+            model = world.model
+            found = [i for i, name in enumerate(world.geoms) if name.startswith(("flag ", "mast "))]
+            assert len(found) == 2 * len(world.scene.marks)
+            assert not model.geom_contype[found].any() and not model.geom_conaffinity[found].any()
+            assert not model.body_weldid[model.geom_bodyid[found]].any()
+            flags.append(
+                [model.geom_pos[found], model.geom_quat[found], model.geom_size[found], model.geom_rgba[found]]
+            )
+        assert all(np.array_equal(a, b) for a, b in zip(*flags, strict=True)), scenario_id
+
+
 def test_a_changed_answer_is_not_what_the_control_shows(race: Released) -> None:
     other = next(label for label in race.spec.labels if label != race.spec.ground_truth)
     found = failures(race, altered(race.spec, ground_truth=other))
@@ -83,6 +131,29 @@ def test_a_twin_that_differs_in_what_is_seen_is_no_twin(race: Released) -> None:
 def test_a_camera_that_looks_away_loses_the_scene(race: Released) -> None:
     camera = race.spec.camera | {"distance": race.spec.camera["distance"] / 2}
     assert "in_frame" in failures(race, altered(race.spec, camera=camera))
+
+
+def test_what_is_too_small_in_a_frame_that_any_model_is_shown_is_not_legible(race: Released) -> None:
+    far = race.spec.camera | {"distance": 4 * race.spec.camera["distance"]}
+    pair = pair_of(altered(race.spec, camera=far), race.qpos, race.twin)
+    assert "too small at the end" in str(LEGIBLE.failure(LEGIBLE.measured(pair), pair.claim))
+
+
+def test_an_order_that_two_frames_a_second_do_not_show_is_lost(race: Released) -> None:
+    pair = pair_of(race.spec, race.qpos, race.twin)
+
+    def seen(in_order: tuple[int, int] | None) -> Evidence:
+        control = replace(pair.control)
+        vars(control)["outcome"] = replace(pair.control.outcome, in_order=in_order)  # as if it were read so
+        return ORDER.measured(replace(pair, control=control))
+
+    frames = [seen(span)["order_frames"] for span in ((21, 25), (20, 25))]  # 2 FPS shows frames 20 and 25
+    assert frames == [0, 1]
+    assert "no sampled frame shows" in str(ORDER.failure(seen((21, 25)), pair.claim))
+    released = seen(pair.control.outcome.in_order)
+    assert released["order_frames"] >= 1
+    assert ORDER.contradiction(released, race.spec.evidence, exact=False) is None
+    assert ORDER.contradiction(seen(None), race.spec.evidence, exact=False) is not None
 
 
 def test_an_answerable_question_is_not_ill_posed(race: Released) -> None:
@@ -156,13 +227,28 @@ GOOD: dict[str, Any] = {
     "physics": {"same_physics": False, "simulated_answer": CLAIM.answer, "parted_m": 0.005},
     "in_frame": {"in_frame": True},
     "legible": {"too_small": [], "least_visible_px": 150.0},
+    "order": {"order_frames": 1},
     "hidden": {"past_panel_px": 0.0, "hidden_from_s": 2.2, "commit_s": 2.3},
     "ablation": {"ablation_px": 0},
+    "referents": {
+        "referents": {"ball": "seen moving", "tunnel": "in view"},
+        "referents_px": 80.0,
+        "referents_moving_s": 0.5,
+        "cause_moving_s": 0.5,
+        "panel_covers": 0.6,
+    },
     "twin behind panel": {"hidden_alone": True, "twin_answer": CLAIM.twin_answer, "twin_px": 0},
     "cut": {"last_shown_s": 1.0, "cut_s": 1.1, "commit_s": 1.1},
     "open": {"entropy_bits": 1.0, "top_share": 0.65, "accepted": 64},
-    "twin of cut": {"twin_answer": CHAOTIC.twin_answer, "twin_deviation_px": 0.5, "twin_largest_difference": 255},
-    "words": {"ill_posed_for": "mass", "question_refuted": None},
+    "twin of cut": {
+        "twin_answer": CHAOTIC.twin_answer,
+        "twin_deviation_px": 0.5,
+        "twin_largest_difference": 255,
+        "start_off": 2.5e-7,
+        "rebuilt": True,
+        "rebuilt_answer": CHAOTIC.twin_answer,
+    },
+    "words": {"ill_posed_for": "mass", "question_refuted": None, "premises": 1},
 }
 BAD: list[tuple[str, dict[str, Any], str]] = [
     ("outcome", {"label": None}, "the outcome is undecided"),
@@ -175,9 +261,14 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("in_frame", {"in_frame": False}, "leaves the frame"),
     ("legible", {"too_small": ["149 of 150 pixels of ball"]}, "too small at the end: 149 of 150 pixels of ball"),
     ("legible", {"least_visible_px": 149.75}, "too small at the end"),
+    ("order", {"order_frames": 0}, "no sampled frame shows the first of two events"),
     ("hidden", {"past_panel_px": 0.25}, "seen past it"),
     ("hidden", {"hidden_from_s": 2.3}, "does not hide the outcome before it is committed"),
     ("ablation", {"ablation_px": 1}, "changes 1 pixels"),
+    ("referents", {"referents": {}}, "names nothing that is in the scene"),
+    ("referents", {"referents_px": 79.75}, "has 80 pixels in a void frame"),
+    ("referents", {"referents_moving_s": 0.4}, "the question names is seen moving for 0.4 s"),
+    ("referents", {"cause_moving_s": 0.4}, "the cause is seen moving for 0.4 s"),
     ("twin behind panel", {"hidden_alone": False}, "in more, or in less, than the hidden element"),
     ("twin behind panel", {"twin_answer": CLAIM.answer}, "the twin ends in"),
     ("twin behind panel", {"twin_answer": None}, "the twin ends in None"),
@@ -189,8 +280,11 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("open", {"top_share": 0.651}, "65.1% of the futures end alike"),
     ("twin of cut", {"twin_answer": CHAOTIC.answer}, "the twin ends in"),
     ("twin of cut", {"twin_deviation_px": 0.51}, "0.51 pixels off before the cut"),
+    ("twin of cut", {"start_off": 2.6e-7}, "begins 2.6e-07 beside the start that the record names"),
+    ("twin of cut", {"rebuilt": False}, "its trajectory is of another start"),
     ("words", {"ill_posed_for": None}, "has no answer"),
     ("words", {"question_refuted": "mass"}, "reads as ill-posed: mass"),
+    ("words", {"premises": 2}, "presumes 2 things that are not so"),
 ]
 JUDGES = dict(zip(GOOD, CERTIFICATES, strict=True))
 
@@ -216,6 +310,24 @@ def test_three_answers_need_less_entropy_than_two() -> None:
     evidence = GOOD["open"] | {"entropy_bits": 0.9}
     assert OPEN.failure(evidence, replace(CHAOTIC, labels=3)) is None
     assert "1.0 wanted" in str(OPEN.failure(evidence, replace(CHAOTIC, labels=2)))
+
+
+def test_the_futures_of_another_machine_are_another_sample_and_are_judged_as_one() -> None:
+    elsewhere = GOOD["open"] | {"same_physics": False}
+    for narrow in ({"accepted": 48}, {"top_share": 0.80}, {"entropy_bits": 0.65}):
+        assert OPEN.failure(elsewhere | narrow, CHAOTIC) is None
+        assert OPEN.failure(elsewhere | narrow | {"same_physics": True}, CHAOTIC) is not None
+    assert "47 futures" in str(OPEN.failure(elsewhere | {"accepted": 47}, CHAOTIC))
+    assert "80.1% of the futures" in str(OPEN.failure(elsewhere | {"top_share": 0.801}, CHAOTIC))
+    assert "0.65 wanted" in str(OPEN.failure(elsewhere | {"entropy_bits": 0.64}, CHAOTIC))
+    assert OPEN.contradiction(elsewhere, {"perturbation": 1e-4}, exact=False) is None
+    assert "accepted" in str(OPEN.contradiction({"accepted": 64}, {"accepted": 65}, exact=True))
+
+
+def test_another_twin_start_that_leads_elsewhere_is_no_fault_of_a_record_on_another_machine() -> None:
+    moved = GOOD["twin of cut"] | {"rebuilt": False, "same_physics": False}
+    assert judged("twin of cut", moved) is None
+    assert judged("twin of cut", moved | {"same_physics": True}) is not None
 
 
 # --- adding one -------------------------------------------------------------------------------------------------------

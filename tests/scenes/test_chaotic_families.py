@@ -16,15 +16,17 @@ from traps_pipeline.scenes.certificates import (
     MIN_ACCEPTED,
     MIN_ENTROPY_BITS,
     TOP_SHARE,
+    TWIN_OF_CUT,
     earliest_cut,
     futures_of,
+    pair_of,
     settled_outcome,
 )
 from traps_pipeline.scenes.certify import certify
 from traps_pipeline.scenes.ensemble import Cut, Rollout, entropy_bits
-from traps_pipeline.scenes.evidence import Claim
+from traps_pipeline.scenes.evidence import Claim, Evidence
 from traps_pipeline.scenes.kit import Family, Motion, Physics
-from traps_pipeline.scenes.outcome import Outcome, compile_scene
+from traps_pipeline.scenes.outcome import Outcome, Rejected, compile_scene
 from traps_pipeline.scenes.registry import families, get_family
 from traps_pipeline.scenes.resolve import choose_cut, latest_open_cut
 from traps_pipeline.scenes.simulate import replay, simulate
@@ -110,11 +112,51 @@ def test_a_scenario_of_every_chaotic_family_is_certified(stored: Stored):
         assert verdict.measured["accepted"] == evidence["accepted"]
 
 
-def test_a_cut_after_commitment_is_named():  # one before it, but too late, test_certify_command.py alters
+def twin_certificate(case: Stored, *, rollout: int, twin: np.ndarray) -> tuple[Evidence, str | None]:
+    """What the certificate of a cut's twin measures if the record names this rollout and holds this trajectory."""
+    named = case.spec.twin.model_copy(update={"rollout": rollout})
+    pair = pair_of(case.spec.model_copy(update={"twin": named}), case.qpos, twin, frame_step=10)
+    measured = TWIN_OF_CUT.measured(pair)
+    return measured, TWIN_OF_CUT.failure(measured, pair.claim)
+
+
+def test_a_twin_is_rebuilt_from_the_start_that_the_record_names_and_from_no_other(stored: Stored):
+    path, number = RELEASED / "trajectories" / f"{stored.spec.scenario_id}.npz", stored.spec.twin.rollout
+    twin = load_trajectory(path, stored.spec.twin.trajectory_sha256, "twin")
+    assert number is not None
+    measured, failure = twin_certificate(stored, rollout=number, twin=twin)
+    assert failure is None
+    assert (measured["rebuilt"], measured["start_off"]) == (True, 0.0)
+    measured, failure = twin_certificate(stored, rollout=number + 1, twin=twin)
+    assert "beside the start that the record names" in str(failure)
+    assert not measured["rebuilt"]
+    with pytest.raises(Rejected, match="there is no start 128"):
+        twin_certificate(stored, rollout=128, twin=twin)
+
+
+def test_the_future_of_a_twins_start_that_was_rounded_is_not_the_twin(stored: Stored):
+    path, number = RELEASED / "trajectories" / f"{stored.spec.scenario_id}.npz", stored.spec.twin.rollout
+    assert number is not None
+    twin = load_trajectory(path, stored.spec.twin.trajectory_sha256, "twin")
+    model, scene = compile_scene(stored.family, stored.params, stored.physics)
+    model.qpos0[:] = twin[0]  # float32, as it is stored
+    rounded = simulate(model, scene, stored.physics)
+    measured, failure = twin_certificate(stored, rollout=number, twin=rounded)
+    assert (measured["rebuilt"], measured["start_off"]) == (False, 0.0)
+    assert "its trajectory is of another start" in str(failure) or "the twin ends in" in str(failure)
+
+
+@pytest.mark.slow  # simulates 128 futures
+def test_a_cut_that_is_too_late_is_named_on_any_machine():  # on this one test_certify_command.py alters such a cut
     plinko = load("plinko")
     twin = load_trajectory(
         RELEASED / "trajectories" / f"{plinko.spec.scenario_id}.npz", plinko.spec.twin.trajectory_sha256, "twin"
     )
+    late = plinko.spec.model_copy(update={"void": {"cut_frame": plinko.outcome.commit_frame}})
+    elsewhere = certify(late, plinko.qpos + np.float32(1e-7), twin, frame_step=10)
+    assert not elsewhere.same_physics  # the futures of such a machine are simulated all the same
+    assert "open" in elsewhere.failures
+    assert elsewhere.measured["accepted"] > 0
     beyond = plinko.spec.model_copy(update={"void": {"cut_frame": plinko.outcome.commit_frame + 1}})
     assert "after commitment" in certify(beyond, plinko.qpos, twin, frame_step=10).failures["cut"]
 
@@ -170,7 +212,7 @@ def test_the_last_frame_of_the_earliest_cut_is_at_one_second():
 
 def rollouts(parted: int, **counts: int) -> list[Rollout]:
     """Rollouts by label; `unresolved` ones have none."""
-    return [Rollout(parted, None if key == "unresolved" else key) for key, n in counts.items() for _ in range(n)]
+    return [Rollout(0, parted, None if key == "unresolved" else key) for key, n in counts.items() for _ in range(n)]
 
 
 def asking(labels: int) -> Claim:
@@ -199,7 +241,7 @@ def test_fewer_than_64_accepted_rollouts_make_no_cut():
 def test_an_outcome_above_65_percent_makes_no_cut_however_high_the_entropy():
     futures = rollouts(20, a=66, b=8, c=8, d=9, e=9)  # 1.51 bits, but 66 %
     assert latest_open_cut(futures, range(11, 31), asking(2)) is None
-    assert latest_open_cut([*futures[1:], Rollout(20, "b")], range(11, 31), asking(2)) is not None
+    assert latest_open_cut([*futures[1:], Rollout(0, 20, "b")], range(11, 31), asking(2)) is not None
 
 
 @pytest.mark.parametrize("name", CHAOTIC)

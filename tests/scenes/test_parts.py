@@ -7,6 +7,7 @@ from dataclasses import dataclass, make_dataclass
 import numpy as np
 import pytest
 
+from traps_pipeline.scenes import vision
 from traps_pipeline.scenes.kit import COLOURS, Motion, Physics
 from traps_pipeline.scenes.parts import observers, outcome, questions, vary
 from traps_pipeline.scenes.parts.ramp import Ramp, SteppedRamp
@@ -160,7 +161,7 @@ def test_the_first_past_a_line_needs_a_lead() -> None:
     motion = world(ball=[[0, 0, 0]] * 8)
     ahead = np.array([[-0.4, -0.5], [0.1, -0.4], [0.2, -0.2], [0.3, 0.1], *[[0.4, 0.2]] * 4])
     won = outcome.first_past(motion, ahead, ("red", "blue"), 0.15)
-    assert won == outcome.Reading([None, *["red"] * 7], 0.4)
+    assert won == outcome.Reading([None, *["red"] * 7], 0.4, in_order=(1, 3))
     assert set(outcome.first_past(motion, ahead, ("red", "blue"), 0.25).labels) == {None}
 
 
@@ -210,3 +211,17 @@ def test_a_finder_takes_what_has_the_size_and_shape_of_a_ball() -> None:
     assert observers.compact(frame, "red", shape=(0.3, 3.5), area=1200) is None
     assert observers.rounded(frame, "red", longer=3.1) is None  # it fills its box, as a panel does
     assert observers.rounded(frame, "red", longer=3.1, fill=1.1) is not None
+
+
+def test_an_observer_sees_no_flag_and_sees_what_is_no_flag() -> None:
+    frames = np.full((3, 360, 480, 3), 200, np.uint8)
+    frames[:, 100:160, 60:63] = 45  # a mast, and a red flag at its upper end, to the right
+    frames[:, 100:118, 63:90] = (220, 25, 30)
+    frames[:, 200:230, 300:330] = (220, 25, 30)  # a red block
+    seen = vision.without_flags(frames)
+    red = [blob.box for blob in vision.blobs(vision.colour_mask(seen[-1], "red"))]
+    assert red == [(300, 200, 30, 30)]
+    assert len(vision.blobs(vision.colour_mask(frames[-1], "red"))) == 2
+    bare = frames.copy()
+    bare[:, 100:160, 60:63] = 200  # without its mast it is a thing
+    assert np.array_equal(vision.without_flags(bare), bare)

@@ -141,11 +141,11 @@ def test_a_hidden_element_that_follows_what_is_seen_is_refused_before_anything_i
 ) -> None:
     # Long planks have their post beside them, most of the time.
     drawn = (
-        "drawn_by(lambda rng, so_far: uniform(rng, 0.3, 0.34) + 0.04 * (so_far['post_in_way'] or rng.random() < 0.2))"
+        "drawn_by(lambda rng, so_far: uniform(rng, 0.55, 0.59) + 0.04 * (so_far['post_in_way'] or rng.random() < 0.2))"
     )
     add(
         "plank_post",
-        seen=("seen_m: float = between(0.30, 0.40)", f"seen_m: float = {drawn}"),
+        seen=("seen_m: float = between(0.55, 0.65)", f"seen_m: float = {drawn}"),
         names=("import apart,", "import drawn_by, apart,"),
         kit=("import Motion, Physics, Scene", "import Motion, Physics, Scene, uniform"),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.registry import family_names, get_family
-from traps_pipeline.scenes.sample import answer_quota, sample_family
+from traps_pipeline.scenes.sample import answer_quota, load_tallies, sample_family, take_out
 from traps_pipeline.scenes.spec import load_trajectory
 
 
@@ -39,6 +40,24 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tally = sample_family("hidden_race", 2, 11, folder, workers=1)
     assert (tally.seed, tally.wanted, tally.draws >= 2) == (11, 2, True)
     return folder
+
+
+@pytest.mark.slow  # draws one scenario
+def test_the_place_of_a_record_that_is_taken_out_is_filled_by_a_later_draw(tmp_path: Path, whole: Path) -> None:
+    folder = shutil.copytree(whole, tmp_path / "again")
+    lines = (folder / "hidden_race.jsonl").read_text(encoding="utf-8").splitlines()
+    before = load_tallies(folder)["hidden_race"]
+    take_out(folder, {"hidden_race-0001": "looked odd"})
+    assert not (folder / "trajectories" / "hidden_race-0001.npz").exists()
+    tally = sample_family("hidden_race", 2, 11, folder, workers=1)
+    after = (folder / "hidden_race.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["scenario_id"] for line in after] == ["hidden_race-0001", "hidden_race-0002"]
+    assert after[1] == lines[1]
+    assert json.loads(after[0])["seed"] >= before.draws > json.loads(lines[0])["seed"]
+    assert tally.rejected["looked odd"] == 1
+    assert tally.draws == 2 + tally.rejected.total()  # each draw is a record or has a reason
+    with pytest.raises(KeyError):
+        take_out(folder, {"hidden_race-0009": "is not there"})
 
 
 def test_a_stopped_sampling_goes_on_and_gives_the_same_scenarios(tmp_path: Path, whole: Path) -> None:

@@ -12,8 +12,10 @@ from traps_pipeline.scenes.wording import (
     BEYOND_VIDEO,
     beyond_video,
     choices_in,
+    colour_distance,
     draw_ill_posed,
     false_premise,
+    false_premises,
 )
 
 SCENE = Inventory(
@@ -71,8 +73,22 @@ def test_drawn_questions_are_refuted_and_plenty(taxonomy: str) -> None:
             lambda text: texts[text] < most,
         )
         assert (beyond_video(question) if taxonomy == "occlusion" else false_premise(question, SCENE)) is not None
+        assert taxonomy == "occlusion" or len(false_premises(question, SCENE, near=True)) == 1, question
         texts[question] += 1
     assert max(texts.values()) <= most
+
+
+def test_a_colour_that_is_nearly_there_refutes_nothing() -> None:
+    # By hand in CIELAB: yellow (0.98, 0.82, 0.08) and gold (1.00, 0.84, 0.00) differ by a few units only.
+    assert colour_distance("gold", "yellow") < 10
+    assert colour_distance("black", "white") > 60
+    yellow = Inventory(colours=("yellow", "wood"), objects=("ball",))
+    assert false_premise("Where does the gold ball end up?", yellow) is None
+    assert false_premise("Where does the green ball end up?", yellow) == "nothing is green"
+    assert false_premises("Which way does the gold arrow point?", yellow) == ["there is no arrow"]
+    assert len(false_premises("Which way does the gold arrow point?", yellow, near=True)) == 2
+    both = false_premises("Which way does the green arrow point?", yellow)
+    assert both == ["there is no arrow", "nothing is green"]
 
 
 def test_a_scene_with_every_question_taken_is_refused() -> None:

@@ -23,7 +23,9 @@ from pydantic import ValidationError
 
 from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.registry import load_models
 from traps_pipeline.scenes.encode import DamagedClip, decode, decode_sampled, encode
+from traps_pipeline.scenes.policies import POLICIES, FramePolicy
 from traps_pipeline.storage import media
 from traps_pipeline.storage.media import (
     Media,
@@ -153,6 +155,12 @@ def test_sixteen_uniform_frames_include_first_and_last() -> None:
 def test_a_grid_of_two_a_second_has_ten_frames_in_five_seconds() -> None:
     assert at(50, 10, GRID) == list(range(0, 50, 5))
     assert at(1000, 10, GRID) == list(range(0, 160, 5))  # at most 32
+
+
+def test_what_is_certified_for_every_frame_policy_is_certified_for_those_of_all_registered_models() -> None:
+    shown = [entry.media for entry in load_models().values() if entry.media is not None and entry.id != "pocket"]
+    policies = {FramePolicy(each.fps, each.uniform, each.most) for each in shown}
+    assert policies == set(POLICIES)  # the pocket model sees two frames alone
 
 
 def test_of_two_frames_equally_near_the_earlier_is_shown() -> None:

@@ -126,7 +126,8 @@ def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
     if any(not v.same_physics for v in verdicts):
         lines.append(
             "other physics: simulating here does not give the frozen trajectory bit by bit (another CPU or version); "
-            "outcome, visibility and frames are certified on the trajectory as shipped, futures are not simulated"
+            "outcome, visibility and frames are certified on the trajectory as shipped; futures are those of this "
+            "machine, which are another sample, and a chaotic twin is held against its start alone"
         )
     return "\n".join(lines)
 

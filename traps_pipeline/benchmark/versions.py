@@ -17,7 +17,7 @@ from traps_pipeline.scenes.spec import SceneSpec
 
 
 def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:
-    """`0.1.0`, or `0.1.0+3f2a9c01` when the current content is not the released one."""
+    """`0.2.0`, or `0.2.0+3f2a9c01` when the current content is not the released one."""
     release = load_release().version
     now = sorted(digest(part) for part in current)
     return release if now == sorted(digest(part) for part in released) else f"{release}+{digest(now)[:8]}"

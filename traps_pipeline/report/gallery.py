@@ -100,6 +100,8 @@ _PHRASES = {
     "margin_m": "margin {} m",
     "least_visible_px": "at least {:.0f} pixels at the end",
     "ablation_px": "{} pixels change without what is hidden",
+    "cause_moving_s": "cause seen moving for {} s",
+    "panel_covers": "the panel covers {:.0%} of where things move",
     "twin_px": "{} pixels between void and twin's void",
     "entropy_bits": "futures disagree by {:.2f} bits",
     "top_share": "commonest future {:.0%}",

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel
 from traps_pipeline.scenes.render import Renderer
 
 SAMPLED_FPS = 5  # models are shown this rate (docs/spec.md 3.1)
@@ -46,6 +48,27 @@ def past_panel(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hi
     """What is seen past the panel of the geoms of decisive bodies and of the hidden element, by segmentation."""
     counts = renderer.visible_pixels(qpos, [*decisive, *hidden], panel=True)
     return PastPanel(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
+
+
+def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step_px: float) -> int:
+    """From how many frames to the next a body is seen to move: it has at least so many pixels in both and goes so far.
+
+    pixels (F,), places (F, 2) in pixels.
+    """
+    moves = np.abs(np.diff(places, axis=0)).max(axis=1) >= step_px
+    seen = pixels >= least_px
+    return int((moves & seen[1:] & seen[:-1]).sum())
+
+
+def swept_behind(camera: Camera, swept: Sequence[np.ndarray], panel: Panel) -> float:
+    """Share of the picture's pixels over which anything moves that the panel covers. swept: corners (8, 3) of every
+    moving geom's box in every frame."""
+    moving, board = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
+    for mask, solids in ((moving, swept), (board, [panel.corners()])):
+        for corners in solids:
+            outline = cv2.convexHull(camera.project(corners).round().astype(np.int32))
+            cv2.fillConvexPoly(mask, outline, 1)
+    return float((moving & board).sum() / max(1, moving.sum()))
 
 
 def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:

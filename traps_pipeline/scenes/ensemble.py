@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.scenes.camera import Camera
-from traps_pipeline.scenes.outcome import last_run
+from traps_pipeline.scenes.outcome import Rejected, last_run
 from traps_pipeline.scenes.simulate import initial_velocity, replay
 from traps_pipeline.scenes.world import World
 
@@ -53,11 +53,13 @@ class Cut:
 
 @dataclass(frozen=True)
 class Rollout:
-    """One perturbed future. parted: first frame that looks different from the control (n_frames if none does).
+    """One perturbed future. number: which of the starts. parted: first frame that looks different from the control
+    (n_frames if none does).
 
     qpos (F, nq) float32: its trajectory, None if it parted before the earliest cut or diverged.
     """
 
+    number: int
     parted: int
     label: str | None
     qpos: np.ndarray | None = None
@@ -98,12 +100,24 @@ class Futures:
         """All rollouts so far after each batch of `BATCHES`."""
         for tried in BATCHES:
             if len(self._rollouts) < tried:
-                self._rollouts += self._simulated(slice(len(self._rollouts), tried))
+                self._rollouts += self._simulated(range(len(self._rollouts), tried))
             yield self._rollouts[:tried]
 
-    def _simulated(self, which: slice) -> list[Rollout]:
+    def start(self, number: int) -> np.ndarray:
+        """One of the starts, (nq,) float64: it follows from the seed and the control's first row. Raises Rejected if
+        there is none of that number."""
+        if not 0 <= number < TRIED:
+            raise Rejected(f"there is no start {number}; there are {TRIED}")
+        return self._prepared.starts[number]
+
+    def rollout(self, number: int) -> Rollout:
+        """The future of one start, simulated here. Raises Rejected if there is none of that number."""
+        self.start(number)
+        return self._rollouts[number] if number < len(self._rollouts) else self._roll(number)
+
+    def _simulated(self, which: range) -> list[Rollout]:
         with ThreadPoolExecutor(THREADS) as pool:  # mj_step releases the GIL
-            return list(pool.map(self._roll, self._prepared.starts[which]))
+            return list(pool.map(self._roll, which))
 
     @cached_property
     def _prepared(self) -> _Prepared:
@@ -120,14 +134,14 @@ class Futures:
             shown=np.stack([silhouette.pixels(row) for row in control.qpos]),
         )
 
-    def _roll(self, start: np.ndarray) -> Rollout:
+    def _roll(self, number: int) -> Rollout:
         """Simulate one start to the end of the control; give up early if it parts before the earliest cut."""
         import mujoco
 
         control, prepared = self._control, self._prepared
         shown, outline = prepared.shown, prepared.silhouette
         data = mujoco.MjData(prepared.model)
-        data.qpos[:], data.qvel[:] = start, prepared.velocity
+        data.qpos[:], data.qvel[:] = prepared.starts[number], prepared.velocity
         frames = np.empty((len(shown), prepared.model.nq))
         parted = len(shown)
         for i in range(len(shown)):
@@ -135,14 +149,14 @@ class Futures:
             if parted == len(shown) and np.abs(outline.pixels(data.qpos) - shown[i]).max() > self._alike_px:
                 parted = i
                 if i < self.first:
-                    return Rollout(parted, None)
+                    return Rollout(number, parted, None)
             mujoco.mj_step(prepared.model, data, control.physics.substeps)
         if not np.isfinite(frames).all():
-            return Rollout(parted, None)
+            return Rollout(number, parted, None)
         motion = replay(prepared.model, frames, control.physics)
         labels = control.family.outcome(motion, control.params).labels
         settled = last_run(labels) <= len(labels) - 1 - self._held
-        return Rollout(parted, labels[-1] if settled else None, frames.astype(np.float32))
+        return Rollout(number, parted, labels[-1] if settled else None, frames.astype(np.float32))
 
 
 def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:

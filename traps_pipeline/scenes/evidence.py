@@ -58,7 +58,7 @@ class Pair:
     """A pair to be certified; a draw's has no void and no twin until they are found.
 
     futures: of perturbed starts of the control. void_frame: from which the void shows nothing decisive: the first
-    hidden frame, or the cut.
+    hidden frame, or the cut. rollout: which of the futures the twin is (chaotic).
     """
 
     control: World
@@ -66,6 +66,7 @@ class Pair:
     futures: Futures
     void_frame: int | None = None
     twin: World | None = None
+    rollout: int | None = None
 
     @property
     def void_from(self) -> int:
@@ -85,12 +86,14 @@ class Pair:
 @dataclass(frozen=True)
 class Number:
     """A piece of evidence. decimals: it is stored rounded to so many. kept: it is stored in the record.
-    compared: measured again it must be what is stored; not so what another OpenGL draws otherwise."""
+    compared: measured again it must be what is stored; not so what another OpenGL draws otherwise. of_futures: it
+    depends on the last bit of the arithmetic, so that it is compared only where that is the record's."""
 
     name: str
     decimals: int | None = None
     kept: bool = True
     compared: bool = True
+    of_futures: bool = False
 
     def stored(self, value: Any) -> Any:
         """The value as a record has it."""
@@ -108,9 +111,9 @@ class Certificate:
     """A promise about a pair.
 
     about: what must be there to measure it; words come last, after a draw has its place in its family.
-    measure(pair): all its `numbers`, or None where this machine cannot measure them. judge(evidence, claim): what is
-    wrong with the evidence, gravest first; a number that records do not keep may be missing, and is then not judged
-    (it was when the record was drawn, and is by `certify`).
+    measure(pair): all its `numbers`. judge(evidence, claim): what is wrong with the evidence, gravest first; a number
+    that records do not keep may be missing, and is then not judged (it was when the record was drawn, and is by
+    `certify`).
     promises, does_not_promise: for the table in `docs/scenes.md`. kinds: the kinds of void that it is for.
     """
 
@@ -119,15 +122,13 @@ class Certificate:
     promises: str
     does_not_promise: str
     numbers: tuple[Number, ...]
-    measure: Callable[[Pair], Evidence | None]
+    measure: Callable[[Pair], Evidence]
     judge: Callable[[Evidence, Claim], Judged]
     kinds: tuple[VoidKind, ...] = ("occluder", "truncation")
 
     def measured(self, pair: Pair) -> Evidence:
-        """The evidence, {} where this machine cannot measure it. Raises Rejected if there is none in this pair."""
+        """The evidence. Raises Rejected if there is none in this pair."""
         evidence = self.measure(pair)
-        if evidence is None:
-            return {}
         if list(evidence) != [number.name for number in self.numbers]:
             raise TypeError(f"certificate {self.name}: measures {list(evidence)}, not what its `numbers` say")
         return evidence
@@ -146,6 +147,8 @@ class Certificate:
         """
         for number in self.numbers:
             if not (number.kept and number.compared and number.name in evidence):
+                continue
+            if number.of_futures and not exact:
                 continue
             if number.name not in stored:
                 return f"the record has no evidence {number.name!r}"

@@ -121,6 +121,8 @@ class Scene:
     stage: boxes that must lie in frame besides everything that moves (the outcome zone above all).
     velocity: initial velocity of free bodies: linear (m/s, world) and angular (rad/s, body).
     inventory: what a viewer can name.
+    marks: phrases ('left bin') of which a flag stands over the panel; its geom is `flag_of(phrase)`.
+    shown_by: of a noun that no geom's name begins with: the nouns that stand for it.
     """
 
     spec: mujoco.MjSpec
@@ -131,6 +133,13 @@ class Scene:
     cover: Box | None = None
     velocity: Mapping[str, Sequence[float]] = field(default_factory=dict)
     inventory: Inventory = Inventory()
+    marks: tuple[str, ...] = ()
+    shown_by: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+
+def flag_of(phrase: str) -> str:
+    """Name of the geom of a flag."""
+    return f"flag {phrase}"
 
 
 @dataclass(frozen=True)
@@ -156,10 +165,12 @@ class Motion:
 @dataclass(frozen=True)
 class Reading:
     """What a run comes to. labels: for every frame the label that holds then, None while undecided. margin_m: distance
-    (m) of the end state from the nearest other outcome."""
+    (m) of the end state from the nearest other outcome. in_order: of a question after the order of two events, the
+    frames from which the first one and the second one have happened: in between, the order is seen."""
 
     labels: Sequence[str | None]
     margin_m: float
+    in_order: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)

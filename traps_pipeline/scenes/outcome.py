@@ -25,12 +25,14 @@ class Outcome:
     """What a run comes to, held against nothing yet.
 
     label: None if it is undecided at the end. commit_frame: first frame from which the label holds to the end (the
-    number of frames if it is undecided). margin_m: distance (m) of the end from the nearest other outcome.
+    number of frames if it is undecided). margin_m: distance (m) of the end from the nearest other outcome. in_order: as
+    in `kit.Reading`.
     """
 
     label: str | None
     commit_frame: int
     margin_m: float
+    in_order: tuple[int, int] | None = None
 
     @property
     def answer(self) -> str:
@@ -45,7 +47,8 @@ def read_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
     reading = family.outcome(motion, params)
     commit = last_run(reading.labels)
     label = reading.labels[-1]
-    return Outcome(label, len(reading.labels) if label is None else commit, float(reading.margin_m))
+    committed = len(reading.labels) if label is None else commit
+    return Outcome(label, committed, float(reading.margin_m), reading.in_order)
 
 
 def last_run(labels: Sequence[str | None]) -> int:

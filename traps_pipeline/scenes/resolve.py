@@ -90,6 +90,7 @@ def resolve(
         trajectory_sha256=trajectory_digest(control.qpos),
         twin=Twin(
             params=None if panel is None else _plain(params_to_dict(twin.params)),
+            rollout=pair.rollout,
             ground_truth=twin.outcome.answer,
             trajectory_sha256=trajectory_digest(twin.qpos),
         ),
@@ -175,7 +176,8 @@ def _cut_short(pair: Pair) -> list[Pair]:
         raise Rejected("no cut at 1.0 s or later leaves the outcome open")
     cut, twin = found
     assert twin.qpos is not None
-    return [_with_twin(pair, cut.frame, replace(pair.control, qpos=twin.qpos, simulated=None))]
+    other = _with_twin(pair, cut.frame, replace(pair.control, qpos=twin.qpos, simulated=None))
+    return [replace(other, rollout=twin.number)]
 
 
 def choose_cut(futures: Futures, claim: Claim, commit_frame: int) -> tuple[Cut, Rollout] | None:

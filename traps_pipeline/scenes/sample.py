@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -88,8 +88,9 @@ def sample_family(
 ) -> Tally:
     """Draw until `released` holds `count` scenarios of a family; the same seed gives the same ones on a machine type.
 
-    Goes on where a stopped call with the same seed and count was; anything else of the family is replaced. Raises
-    RuntimeError with the tally of rejections when 40 draws a scenario are not enough, TrapsError for an unfit family.
+    Goes on where a stopped call with the same seed and count was, and fills the places of records that were taken out
+    (`take_out`); anything else of the family is replaced. Raises RuntimeError with the tally of rejections when 40
+    draws a scenario are not enough, TrapsError for an unfit family.
     """
     family, records = fit_to_sample(name), Records(released, name)
     tally = load_tallies(released).get(name)
@@ -99,7 +100,9 @@ def sample_family(
     specs = records.read(tally)
     answers = Counter(spec.ground_truth for spec in specs)
     texts = Counter(spec.ill_posed_question for spec in specs)
-    if len(specs) == count:
+    taken = {int(spec.scenario_id.rpartition("-")[2]) for spec in specs}
+    places = [place for place in range(1, count + 1) if place not in taken]
+    if not places:
         return tally
 
     def jobs() -> Iterator[Draw]:
@@ -115,12 +118,13 @@ def sample_family(
             if isinstance(found, str):
                 tally.rejected[found.split(":")[0]] += 1
                 continue
-            named = _named(family, found, draw, answers.total() + 1, texts, count)
+            named = _named(family, found, draw, places.pop(0), texts, count)
             answers[named.spec.ground_truth] += 1
             texts[named.spec.ill_posed_question] += 1
             records.append(named, tally)
             report(f"{named.spec.scenario_id}: {named.spec.ground_truth} after {tally.draws} draws")
-            if answers.total() == count:
+            if not places:
+                records.sort()
                 return tally
     finally:
         results.close()  # type: ignore[attr-defined]
@@ -156,14 +160,39 @@ class Records:
         write_text(self._lines, "".join(_line(spec) for spec in kept))
         return kept
 
+    def sort(self) -> None:
+        """Put the records in the order of their ids: those that fill a place were added last."""
+        lines = self._lines.read_text(encoding="utf-8").splitlines()
+        lines.sort(key=lambda line: json.loads(line)["scenario_id"])
+        write_text(self._lines, "".join(f"{line}\n" for line in lines))
+
     def append(self, found: Resolved, tally: Tally) -> None:
         """Add a scenario and note how far the drawing is."""
         save_trajectory(self._released / "trajectories", found.spec.scenario_id, found.qpos, found.twin)
         with self._lines.open("a", encoding="utf-8") as lines:
             lines.write(_line(found.spec))
-        tallies = load_tallies(self._released) | {self._family: tally}
-        notes = {name: vars(each) | {"rejected": dict(each.rejected)} for name, each in tallies.items()}
-        write_text(self._released / DRAWS, json.dumps(notes, indent=1, sort_keys=True) + "\n")
+        _save_tallies(self._released, load_tallies(self._released) | {self._family: tally})
+
+
+def take_out(released: Path, reasons: Mapping[str, str]) -> None:
+    """Take records (id -> why, as it is counted in `draws.json`) out of their families, with their trajectories: the
+    next `sample_family` with the same seed and count fills their places with later draws. Raises KeyError for an id
+    that is not there."""
+    tallies = load_tallies(released)
+    for family in sorted({scenario_id.rpartition("-")[0] for scenario_id in reasons}):
+        lines = released / f"{family}.jsonl"
+        records = {r["scenario_id"]: line for line in lines.read_text("utf-8").splitlines() if (r := json.loads(line))}
+        for scenario_id in [id_ for id_ in reasons if id_.rpartition("-")[0] == family]:
+            del records[scenario_id]
+            tallies[family].rejected[reasons[scenario_id]] += 1
+            (released / "trajectories" / f"{scenario_id}.npz").unlink()
+        write_text(lines, "".join(f"{line}\n" for line in records.values()))
+    _save_tallies(released, tallies)
+
+
+def _save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
+    notes = {name: vars(each) | {"rejected": dict(each.rejected)} for name, each in tallies.items()}
+    write_text(released / DRAWS, json.dumps(notes, indent=1, sort_keys=True) + "\n")
 
 
 def _line(spec: SceneSpec) -> str:

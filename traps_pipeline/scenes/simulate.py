@@ -58,7 +58,7 @@ def replay(model: mujoco.MjModel, qpos: np.ndarray, physics: Physics) -> Motion:
 
 
 def swept_points(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """Corners of the bounding boxes of all moving geoms over a trajectory, shape (N, 3)."""
+    """Corners of the bounding boxes of all moving geoms over a trajectory, eight by eight, shape (N, 3)."""
     import mujoco
 
     data = mujoco.MjData(model)

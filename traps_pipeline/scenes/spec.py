@@ -26,12 +26,15 @@ class Answerable(BaseModel):
 class Twin(BaseModel):
     """Another world behind the same void: what is changed, its outcome, the digest of its trajectory.
 
-    params: the whole scene with another hidden element (occlusion), or none: the same scene from the start that is the
-    first row of the twin's trajectory (chaotic).
+    params: the whole scene with another hidden element (occlusion), or none: the same scene from another start
+    (chaotic). rollout: which of the perturbed starts that follow from the record's seed and from the first row of its
+    trajectory (`ensemble.Futures`); the first row of the twin's own trajectory is that start rounded to float32, which
+    has another future.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     params: dict[str, Any] | None
+    rollout: int | None = Field(default=None, ge=0)
     ground_truth: str
     trajectory_sha256: str
 
@@ -79,6 +82,9 @@ class SceneSpec(BaseModel):
             raise ValueError(
                 f"answerable_question: answer {self.answerable_question.answer!r} is not one of its labels"
             )
+        of_cut = self.void_kind == "truncation"
+        if (self.twin.params is None) != of_cut or (self.twin.rollout is not None) != of_cut:
+            raise ValueError("twin: an occluder's has `params` and no `rollout`, a truncation's has a `rollout` alone")
         return self
 
     @property

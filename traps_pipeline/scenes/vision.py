@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+FLAG_PX = (60, 50)  # a flag is no wider and no higher
 # Hue (degrees), least saturation and value (0-1) of the saturated colours. Shade lowers the value, not the hue.
 _HUES: Mapping[str, tuple[float, float, float, float]] = {
     "red": (346, 8, 0.62, 0.22),
@@ -85,6 +86,59 @@ def largest(frame: np.ndarray, colour: str, min_area: int = 12) -> Blob | None:
 def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int = 12) -> list[Blob | None]:
     """The largest region of a colour in every frame."""
     return [largest(frame, colour, min_area) for frame in frames]
+
+
+def without_flags(frames: np.ndarray) -> np.ndarray:
+    """The frames with every flag painted over by what is beside it: a flag stands for a thing and is none.
+
+    A flag is a small upright patch of one colour at the top of a thin dark mast, to its right; both stand still. Of a
+    black flag the mast is told apart only below.
+    """
+    still = np.median(frames, axis=0).astype(np.uint8)
+    shown = frames.copy()
+    for left, top, width in _masts(still):
+        for seed in ((left + width + 3, top + 5), (left + width + 3, top - 4)):
+            patch = _patch(still, seed)
+            if patch is None or patch[0] > left + width + 3:
+                continue
+            x, y, wide, high = patch
+            box = np.s_[y : y + high, x : x + wide]
+            changes = np.abs(np.stack([frames[0][box], frames[-1][box]]).astype(int) - still[box])
+            if min(abs(y - top), abs(y + high - top)) > 6 or changes.mean() > 12:
+                continue  # neither flies at the end of the mast, or it moves
+            above = max(0, min(top, y) - 4)
+            beside = shown[:, above, max(0, left - 4)]
+            shown[:, above + 2 : y + high + 3, left - 1 : x + wide + 3] = beside[:, None, None]
+            break
+    return shown
+
+
+def _patch(still: np.ndarray, seed: tuple[int, int]) -> tuple[int, int, int, int] | None:
+    """Box (x, y, width, height) of the patch of one colour around a pixel (x, y), if it may be a flag."""
+    height, width = still.shape[:2]
+    if not (0 <= seed[0] < width and 0 <= seed[1] < height):
+        return None
+    region = np.zeros((height + 2, width + 2), np.uint8)
+    flags = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)
+    _, _, _, (x, y, wide, high) = cv2.floodFill(still.copy(), region, seed, (0, 0, 0), (22,) * 3, (22,) * 3, flags)
+    filled = region[1:-1, 1:-1][y : y + high, x : x + wide].mean()
+    fits = 8 <= wide <= FLAG_PX[0] and 6 <= high <= FLAG_PX[1] and filled > 0.6
+    return (x, y, wide, high) if fits else None
+
+
+def _masts(still: np.ndarray) -> list[tuple[int, int, int]]:
+    """Upper ends (left, top, width) of thin, dark, colourless lines that stand upright, or nearly."""
+    dark = ((still.max(axis=2) < 125) & (np.ptp(still, axis=2) < 30)).astype(np.uint8)
+    thin = cv2.subtract(dark, cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((1, 7), np.uint8)))
+    tall = cv2.morphologyEx(cv2.dilate(thin, np.ones((1, 3), np.uint8)), cv2.MORPH_OPEN, np.ones((6, 1), np.uint8))
+    count, names = cv2.connectedComponents(tall, connectivity=8)
+    found = []
+    for name in range(1, count):
+        y, x = np.nonzero(names == name)
+        end = x[y < y.min() + 6]
+        if np.ptp(x) < 3 * np.ptp(y) and np.ptp(end) < 12:
+            found.append((int(end.min()), int(y.min()), int(np.ptp(end)) + 1))
+    return found
 
 
 def at_rest(path: Sequence[Blob | None], last: int = 3, tolerance_px: float = 1.5) -> bool:

@@ -106,7 +106,16 @@ def beyond_video(question: str) -> str | None:
 
 # --- ill-posed questions with a false premise (chaotic) ---------------------------------------------------------------
 
-ABSENT_COLOURS = ("pink", "magenta", "gold", "silver", "violet", "red", "green", "blue", "yellow", "orange", "purple")
+# sRGB of colours that nothing in a scene has by that name; the others are as they are drawn.
+_ELSEWHERE: Mapping[str, tuple[float, float, float]] = {
+    "pink": (1.00, 0.75, 0.80),
+    "magenta": (1.00, 0.00, 1.00),
+    "gold": (1.00, 0.84, 0.00),
+    "silver": (0.75, 0.75, 0.75),
+}
+ABSENT_COLOURS = (*_ELSEWHERE, "red", "green", "blue", "yellow", "orange", "purple")
+LIGHTS = (0.7, 1.0, 1.5)  # by which light and shade multiply a colour; the edges of dice glow
+FAR_COLOUR = 25.0  # CIELAB distance from which nobody takes one colour for the other
 ABSENT_OBJECTS = (
     "triangle",
     "spring",
@@ -144,8 +153,8 @@ _FALSE_PREMISES = (
     "Where does the {colour} {object} end up?",
     "How many times does the {colour} {object} turn over?",
     "What does the {colour} {object} hit first?",
-    "Which way does the {colour} arrow point?",
-    "How many {colour} stripes does the {object} have?",
+    "Which way does the {present} arrow point?",
+    "How many {present} stripes does the {object} have?",
     "What is the weight of the colour {present}?",
     "How loud is the colour {present}, in decibels?",
     "What is the temperature of the colour {present}?",
@@ -154,19 +163,50 @@ _FALSE_PREMISES = (
 _COLOUR_WORDS = frozenset(COLOURS) - {"wood"} | frozenset(ABSENT_COLOURS)
 
 
-def false_premise(question: str, inventory: Inventory) -> str | None:
-    """What the question presumes and the scene's inventory refutes; None if it presumes nothing of the kind."""
-    text = question.lower()
+def false_premises(question: str, inventory: Inventory, *, near: bool = False) -> list[str]:
+    """All that the question presumes and the scene's inventory refutes. near: and colours that it does not have, but
+    has others like them: a viewer may take these for a second false premise, though they refute nothing."""
+    text, found = question.lower(), []
     for thing in (*ABSENT_OBJECTS, "arrow", "stripe"):
         if re.search(rf"\b{thing}(s|es)?\b", text) and thing not in inventory.objects:
-            return f"there is no {thing}"
+            found.append(f"there is no {thing}")
     quality = re.search(NO_QUALITY_OF_A_COLOUR, text)
     if quality:
-        return f"a colour has no {quality.group(1)}"
+        found.append(f"a colour has no {quality.group(1)}")
     for colour in sorted(_COLOUR_WORDS):
         if re.search(rf"\b{colour}\b", text) and colour not in inventory.colours:
-            return f"nothing is {colour}"
-    return None
+            if not near and not is_far(colour, inventory.colours):
+                continue
+            found.append(f"nothing is {colour}")
+    return found
+
+
+def false_premise(question: str, inventory: Inventory) -> str | None:
+    """What the question presumes and the scene's inventory refutes; None if it presumes nothing of the kind."""
+    return next(iter(false_premises(question, inventory)), None)
+
+
+def is_far(colour: str, present: Sequence[str]) -> bool:
+    """Whether a colour is none of some others and is not easily taken for one of them: at least `FAR_COLOUR` away."""
+    return colour not in present and all(colour_distance(colour, other) >= FAR_COLOUR for other in present)
+
+
+@cache
+def colour_distance(one: str, other: str) -> float:
+    """Least Euclidean distance in CIELAB (D65) of a named colour from another one, in shade and in bright light too."""
+    known = {**COLOURS, **_ELSEWHERE}
+    seen = (tuple(min(1.0, light * part) for part in known[other]) for light in LIGHTS)
+    return min(float(np.linalg.norm(_lab(known[one]) - _lab(as_lit))) for as_lit in seen)
+
+
+def _lab(srgb: Sequence[float]) -> np.ndarray:
+    """CIELAB of an sRGB colour in [0, 1]."""
+    value = np.array(srgb)
+    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    t = to_xyz @ linear / np.array([0.9505, 1.0, 1.089])
+    f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
 
 
 def refutation(taxonomy: Taxonomy, question: str, inventory: Inventory) -> str | None:
@@ -181,7 +221,9 @@ def draw_ill_posed(
     questions = list(_beyond_video(inventory) if taxonomy == "occlusion" else _false_premises(inventory, rng))
     for i in rng.permutation(len(questions)):
         question = questions[i]
-        if free(question) and refutation(taxonomy, question, inventory) is not None:
+        if not free(question) or refutation(taxonomy, question, inventory) is None:
+            continue
+        if taxonomy == "occlusion" or len(false_premises(question, inventory, near=True)) == 1:
             return question
     raise ValueError("every ill-posed question about this scene is taken; name more things in its inventory")
 
@@ -195,13 +237,15 @@ def _beyond_video(inventory: Inventory) -> Iterator[str]:
 
 def _false_premises(inventory: Inventory, rng: np.random.Generator) -> Iterator[str]:
     absent = [thing for thing in ABSENT_OBJECTS if thing not in inventory.objects]
-    colours = [colour for colour in ABSENT_COLOURS if colour not in inventory.colours]
+    colours = [colour for colour in ABSENT_COLOURS if is_far(colour, inventory.colours)]
     present = [colour for colour in inventory.colours if colour in _COLOUR_WORDS]
     for template in _FALSE_PREMISES:
+        if "{colour}" in template and not colours:
+            continue
         for _ in range(6):
             yield template.format(
                 absent=rng.choice(absent),
-                colour=rng.choice(colours),
+                colour=rng.choice(colours) if colours else "",
                 present=rng.choice(present),
                 object=rng.choice(inventory.objects),
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.scenes.camera import Camera, Panel
-from traps_pipeline.scenes.checks import PastPanel, past_panel, void_frames
+from traps_pipeline.scenes.checks import PastPanel, void_frames
 from traps_pipeline.scenes.kit import Family, Inventory, Motion, Physics, Scene
 from traps_pipeline.scenes.outcome import Outcome, compile_scene, decisive_geoms, read_outcome, simulated
 from traps_pipeline.scenes.registry import get_family
@@ -109,11 +110,25 @@ class World:
         return (*decisive_geoms(self.model, self.scene.decisive), *self.scene.hidden)
 
     @cached_property
+    def geoms(self) -> tuple[str, ...]:
+        """Names of all geoms, in the order of the model."""
+        return tuple(self.model.geom(i).name for i in range(self.model.ngeom))
+
+    @cached_property
+    def void_pixels(self) -> np.ndarray:
+        """How many pixels each of the `geoms` has in each frame of the void, (F, G), by segmentation."""
+        with self.renderer() as renderer:
+            return renderer.visible_pixels(self.looked_at, self.geoms, panel=True)
+
+    def pixels_of(self, names: Sequence[str]) -> np.ndarray:
+        """How many pixels some geoms have together in each frame of the void, (F,)."""
+        return self.void_pixels[:, [self.geoms.index(name) for name in names]].sum(axis=1)
+
+    @cached_property
     def past_panel(self) -> PastPanel:
         """What is seen past the panel."""
-        with self.renderer() as renderer:
-            decisive = decisive_geoms(self.model, self.scene.decisive)
-            return past_panel(renderer, self.looked_at, decisive, self.scene.hidden)
+        decisive = decisive_geoms(self.model, self.scene.decisive)
+        return PastPanel(self.pixels_of(decisive), self.pixels_of(self.scene.hidden))
 
     @cached_property
     def void_frames(self) -> list[np.ndarray]:

@@ -29,6 +29,7 @@ from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import remedy, write_bytes, write_text
 from traps_pipeline.scenes.encode import ENCODER, DamagedClip, decode, encode
+from traps_pipeline.scenes.policies import FramePolicy
 
 Profile = Literal["video", "images", "frames"]
 MOST = 25  # frames an API model sees, docs/spec.md 3.1
@@ -108,20 +109,8 @@ class Media:
 
 
 def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
-    """Indices of the frames nearest to the wanted times, none twice; of two that are equally near the earlier one.
-
-    times: (F,) seconds, ascending. A grid starts at 0 and ends with the last frame; uniform includes first and last.
-    """
-    if spec.uniform is not None and len(times) <= spec.uniform:
-        return np.arange(len(times))
-    away = np.abs(times[:, None] - _wanted(times, spec)).round(9)  # s; rounded, or noise would decide between equals
-    return np.unique(away.argmin(axis=0))[: spec.uniform or spec.most]
-
-
-def _wanted(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
-    if spec.fps is None:
-        return np.linspace(times[0], times[-1], spec.uniform or 1)
-    return np.arange(int(times[-1] * spec.fps + 1e-6) + 1) / spec.fps
+    """Indices of the frames that a model is shown, of a clip whose frames have these times (F,), s."""
+    return FramePolicy(spec.fps, spec.uniform, spec.most).pick(times)
 
 
 def sample(clip: Path, spec: MediaSpec) -> Frames:

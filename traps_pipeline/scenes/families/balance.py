@@ -86,6 +86,7 @@ def build(p: Params, physics: Physics) -> Scene:
     _add_beam(stage, p)
     at = (start + 1.2 * r, 0, z + r)
     stage.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, density=BALL_DENSITY)
+    stage.mark("beam", "axle", p.beam_colour)
     return stage.scene(
         p,
         decisive=["beam"],

@@ -57,7 +57,7 @@ class Params:
     blocked: bool = hidden(False, True)  # whether the block lies across the lane
     speed_m_s: float = between(0.62, 0.78)
     radius_m: float = between(0.050, 0.058)
-    run_m: float = between(0.30, 0.38)  # open lane before the wall
+    run_m: float = between(0.48, 0.56)  # open lane before the wall
     height_m: float = between(0.28, 0.33)
     windows_m: tuple[float, ...] = drawn_by(_windows)  # middle of each window
     window_m: float = between(0.19, 0.22)  # width of a window

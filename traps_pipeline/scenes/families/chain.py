@@ -97,6 +97,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
     high = DECK_M + 2 * r
     across = (outer[0] - 0.02, outer[1] + 4 * PEG_M + SHADOW_BACK * high)
+    stage.mark("ball", "last")
+    stage.mark("box", "box_floor")
     return stage.scene(
         p,
         decisive=["last"],
@@ -106,6 +108,7 @@ def build(p: Params, physics: Physics) -> Scene:
         things=[f"{p.striker_colour} ball", f"{p.last_colour} ball", f"{p.box_colour} box", "ramp"],
         also=["row", "deck", "peg"],
         colours=["black"],
+        shown_by={"row": ["ball"]},
     )
 
 

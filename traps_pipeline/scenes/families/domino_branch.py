@@ -80,6 +80,8 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.slab("post", (0, -h * (junction + BALL + 0.03), h * (PLANK + 0.3)), (0.03 * h, 0.03 * h, 0.3 * h), "grey")
 
     back = -h * (junction - BALL - 0.2)
+    for side in SIDES:  # either one ends a branch, fallen or not
+        stage.mark(f"{side} domino", f"end_{side}")
     scene = stage.scene(
         p,
         decisive=[f"end_{side}" for side in SIDES],
@@ -89,6 +91,7 @@ def build(p: Params, physics: Physics) -> Scene:
         things=[f"{p.left_colour} domino", f"{p.right_colour} domino", f"{p.ball_colour} ball", "board"],
         also=["post", "row", "branch"],
         colours=["grey"],
+        shown_by={"row": ["domino"], "branch": ["domino"]},
     )
     speed = p.starter_speed_m_s  # towards the camera
     return replace(scene, velocity={"starter": (0, -speed, 0, speed / (BALL * h), 0, 0)})

@@ -82,6 +82,7 @@ def build(p: Params, physics: Physics) -> Scene:
         speed_m_s=p.starter_speed_m_s,
     )
     back = 1.5 * p.width + 0.20
+    stage.mark("domino", "last")
     return stage.scene(
         p,
         decisive=["last"],

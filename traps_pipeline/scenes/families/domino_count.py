@@ -91,6 +91,9 @@ def build(p: Params, physics: Physics) -> Scene:
         speed_m_s=p.starter_speed_m_s,
     )
     back = p.width / 2 + 0.65
+    row = len(p.second) * p.size.spacing  # the gap may be anywhere in it
+    middle = along[1] - p.height_m * (dominoes.RUN_OUT + row / 2)
+    stage.mark("domino", (middle, p.height_m * p.width / 2), p.second_colour)
     return stage.scene(
         p,
         decisive=p.second,
@@ -100,6 +103,7 @@ def build(p: Params, physics: Physics) -> Scene:
         things=[f"{p.first_colour} domino", f"{p.second_colour} domino", f"{p.ball_colour} ball", "plank"],
         also=["post", "row"],
         colours=["grey"],
+        shown_by={"row": ["domino"]},
     )
 
 

@@ -46,7 +46,7 @@ class Params:
     wedge_colour: str = PLAIN()
     back_colour: str = PLAIN()
     release_m: float = between(1.15, 1.35)  # height of the ball's centre in the first frame
-    toss_m_s: float = between(1.2, 2.0)  # how fast it still rises then
+    toss_m_s: float = between(2.0, 2.5)  # how fast it still rises then
     drift_m_s: float = between(-0.22, 0.22)
     ridge_m: float = between(0.34, 0.42)  # height of the ridge
     foot_m: float = between(0.20, 0.26)  # half of the ridge's width at its foot
@@ -89,6 +89,9 @@ def build(p: Params, physics: Physics) -> Scene:
 
     front = -DEPTH_M - WALL_M
     things = (f"{p.ball_colour} ball", f"{p.cube_colour} cube", "red bin", "blue bin")
+    for side in ("left", "right"):
+        stage.mark(f"{side} bin", f"{side}_floor")
+    stage.mark("ridge", (0.0, DEPTH_M), p.wedge_colour)
     scene = stage.scene(
         p,
         decisive=["ball"],
@@ -101,6 +104,7 @@ def build(p: Params, physics: Physics) -> Scene:
         things=things,
         also=["ridge", "wall", "side"],
         colours=["red", "blue"],
+        shown_by={"side": ["bin"]},
     )
     named = (*things, "ridge between the bins")  # which does not end in its noun
     return replace(scene, inventory=replace(scene.inventory, things=named))

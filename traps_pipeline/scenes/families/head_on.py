@@ -1,5 +1,5 @@
-"""Two balls roll down ramps at each other and collide on the deck between them; the question is which one is knocked
-back to its own side.
+"""Two balls roll down ramps at each other, collide on the deck between them and end on one half of it; the question is
+which of them came from that half.
 
 Control: the whole deck is in view. Void: the panel stands before it; both balls are seen to roll in behind it.
 Hidden element: a rough board on one half of the deck. The ball that crosses it arrives slowly and is knocked back. The
@@ -70,6 +70,7 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.sides("rim", (-half, half), side, WALL_M, (0, DECK_M + 0.2 * r), p.ramp_colour)
 
     across = (-side - WALL_M - 0.02, side + WALL_M + 0.5 * high)
+    stage.mark("line", "line")
     return stage.scene(
         p,
         decisive=[f"ball_{name}" for name in SIDES],
@@ -79,6 +80,7 @@ def build(p: Params, physics: Physics) -> Scene:
         things=[*(f"{colour} ball" for colour in p.colours), *(f"{name} ramp" for name in SIDES)],
         also=["deck", "line", "board", "side"],
         colours=[*p.colours, "wood", "black"],
+        shown_by={"side": ["line"], "deck": ["line"]},
     )
 
 
@@ -148,11 +150,11 @@ FAMILY = scene_family(
     build=build,
     outcome=outcome,
     question=which_colour(
-        "The two balls roll at each other: which one is knocked back to the side it came from, {choices}?",
-        "Which ball is driven back to its own side when the two collide: {choices}?",
-        "What colour is the ball that the other one pushes back to its own half of the deck: {choices}?",
+        "The two balls collide and end up on the same half of the deck: which one came from that side, {choices}?",
+        "Both balls come to rest on one side of the black line: which of them started on that side, {choices}?",
+        "What colour is the ball that started on the half of the deck where both balls end up: {choices}?",
         colours=lambda p: p.colours,
-        forms=["{} ball", "the {} one", "{} is knocked back", "the {} ball is knocked back"],
+        forms=["{} ball", "the {} one", "the {} ball", "the side of the {} ball"],
     ),
     asides=[_aside],
     observe=observe,

@@ -47,7 +47,7 @@ class Params:
     colours: tuple[str, ...] = PLAY(2)
     speeds_m_s: tuple[float, ...] = drawn_by(lambda rng, so_far: (uniform(rng, 0.80, 0.92), uniform(rng, 0.62, 0.70)))
     radius_m: float = between(0.055, 0.062)
-    run_m: float = between(0.26, 0.32)  # open track on either side
+    run_m: float = between(0.64, 0.70)  # open track on either side
     middle_m: float = between(1.00, 1.10)  # covered track
     switch_m: float = between(0.11, 0.15)  # where the switch begins, from the start of the covered track
     azimuth_deg: float = in_front(-18, 18)
@@ -75,6 +75,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
     high = DECK_M + 2 * r
     across = (outer[0] - 0.01, outer[1] + SHADOW_BACK * high)
+    for i, colour in enumerate(p.colours):
+        stage.mark(f"{colour} ball", f"ball_{i}")
     return stage.scene(
         p,
         decisive=["ball_0", "ball_1"],
@@ -84,6 +86,7 @@ def build(p: Params, physics: Physics) -> Scene:
         things=[*(f"{c} ball" for c in p.colours), "track", "front lane of the track", "back lane of the track"],
         also=["lane", "rail"],
         colours=p.colours,
+        shown_by={"track": ["deck"]},
     )
 
 

@@ -96,6 +96,8 @@ def build(p: Params, physics: Physics) -> Scene:
     half = (p.block_half_m, 0.6 * side, p.block_height_m / 2)
     stage.free_box("block", (p.block_at_m, 0, FLOOR_M + p.block_height_m / 2), half, p.block_colour, density=400)
     stage.ball("ball", (-p.run_m + 1.2 * r, 0, top + STEP_M + r), r, p.ball_colour, speed=p.speed_m_s)
+    stage.mark("bob", (p.pivot_at_m, side), p.bob_colour)
+    stage.mark("block", "block")
     return stage.scene(
         p,
         decisive=["block"],
@@ -105,6 +107,7 @@ def build(p: Params, physics: Physics) -> Scene:
         things=[f"{p.ball_colour} ball", f"{p.block_colour} block", f"{p.bob_colour} pendulum bob", "pendulum"],
         also=["lane", "board", "peg", "rod"],
         colours=["black", "yellow"],
+        shown_by={"pendulum": ["bob"]},
     )
 
 

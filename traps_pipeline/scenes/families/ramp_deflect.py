@@ -38,8 +38,8 @@ class Params:
     radius_m: float = between(0.047, 0.056)
     ramp_x_m: float = between(-0.06, 0.06)
     slope_deg: float = between(16, 22)
-    ramp_m: float = between(0.52, 0.62)  # length of the ramp's surface
-    start_m: float = between(0.06, 0.13)  # from the ramp's top to where the ball starts
+    ramp_m: float = between(0.60, 0.68)  # length of the ramp's surface
+    start_m: float = between(0.06, 0.09)  # from the ramp's top to where the ball starts
     table_m: float = between(0.09, 0.12)  # height of the table
     half_width_m: float = between(0.26, 0.32)  # of the table
     depth_m: float = between(0.35, 0.40)  # of the table
@@ -77,6 +77,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
     high, out = top + 2 * r + 0.01, wide + p.bin_m + WALL_M
     _, back, highest = ramp.at(p.ramp_m)
+    for name in ("left", "right"):
+        stage.mark(f"{name} bin", f"bin_{name}")
     return stage.scene(
         p,
         decisive=["ball"],

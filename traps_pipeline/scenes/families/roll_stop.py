@@ -42,8 +42,8 @@ class Params:
     wall_colour: str = PLAIN()
     radius_m: float = between(0.048, 0.058)
     rough: bool = hidden(False, True)
-    speed_m_s: float = between(0.55, 0.90)
-    run_m: float = between(0.34, 0.44)  # track before the panel
+    speed_m_s: float = between(0.55, 0.80)
+    run_m: float = between(0.56, 0.66)  # track before the panel
     lead_m: float = drawn_by(  # track behind the panel before the patch
         lambda rng, so_far: 2 * so_far["radius_m"] + uniform(rng, 0.04, 0.08)
     )
@@ -82,6 +82,7 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.ball("ball", (0.05, 0, TRACK_M + r), r, p.ball_colour, speed=p.speed_m_s)
 
     high, covered, across = TRACK_M + 2 * r + 0.01, (p.run_m, end + WALL_M), (outer[0] - 0.01, outer[1] + 0.03)
+    stage.mark("line", "line")
     return stage.scene(
         p,
         decisive=["ball"],

@@ -1,9 +1,9 @@
 """A ball runs down a tilted board of pegs towards a seesaw above two coloured bins; the question is where it ends up.
 
-The ball is thrown up the bare head of the board, curves back and meets the pegs after about a second. The seesaw tips
-under it and sheds it into the red bin on the left or the blue one on the right; a ball that misses them lies in a grey
-tray at the side. Control: the whole run. Void: the clip ends before that. Each peg magnifies a difference in the
-ball's path about tenfold, so that what no pixel shows at the cut decides the place.
+The ball is thrown up the bare head of the board, curves back and meets the pegs after about a second. Where it strikes
+the seesaw, this tips and sheds it into the red bin on the left or the blue one on the right; a ball that misses them
+lies in a grey tray at the side. Control: the whole run. Void: the clip ends before that. Each peg magnifies a
+difference in the ball's path about tenfold, so that what no pixel shows at the cut decides the place.
 """
 
 from __future__ import annotations
@@ -207,8 +207,8 @@ FAMILY = scene_family(
         "direction",
         (
             "Where does the {ball} ball end up: {choices}?",
-            "Once the seesaw has tipped, where does the {ball} ball come to rest: {choices}?",
-            "Which place does the {ball} ball finish in after the seesaw: {choices}?",
+            "At the bottom of the board, where does the {ball} ball come to rest: {choices}?",
+            "Which place does the {ball} ball finish in, past the pegs and the seesaw: {choices}?",
         ),
         _places,
     ),

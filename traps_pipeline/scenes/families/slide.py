@@ -50,7 +50,7 @@ class Params:
     )
     rough: bool = hidden(False, True)  # whether the board stands out of the deck
     slope_deg: float = between(19, 25)
-    incline_m: float = between(0.40, 0.48)  # length of the incline's surface
+    incline_m: float = between(0.48, 0.56)  # length of the incline's surface
     start_m: float = between(0.08, 0.14)  # from the incline's top to the middle of the block
     deck_friction: float = between(0.03, 0.06)
     rough_friction: float = between(0.75, 0.95)
@@ -103,6 +103,7 @@ def build(p: Params, physics: Physics) -> Scene:
     high, covered = p.deck_m + 2 * max(p.block_half_m) + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
     highest = ramp.at(p.incline_m)
+    stage.mark("tray", "tray_floor")
     return stage.scene(
         p,
         decisive=["block"],
@@ -111,6 +112,7 @@ def build(p: Params, physics: Physics) -> Scene:
         in_view=[stage.box(covered, outer, (0, p.deck_m)), stage.box((highest[0], 0), deep, (0, highest[2]))],
         things=[f"{p.block_colour} block", f"{p.tray_colour} tray", "incline", "deck"],
         also=["end"],
+        shown_by={"end": ["deck"]},
     )
 
 

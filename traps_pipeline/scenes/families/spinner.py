@@ -48,7 +48,7 @@ class Params:
     disc_m: float = between(0.30, 0.34)
     radius_m: float = between(0.042, 0.050)
     speed_m_s: float = between(0.95, 1.2)
-    run_m: float = between(0.30, 0.40)  # visible lane before the panel
+    run_m: float = between(0.74, 0.84)  # visible lane before the panel
     ball_colour: str = drawn_by(  # that no sector has
         lambda rng, so_far: str(rng.choice([colour for colour in BALLS if colour not in so_far["sectors"]]))
     )
@@ -89,6 +89,9 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
     seen = (-side, end + RIM_M)
+    stage.mark("pointer", (0.0, 0.0), POINTER_COLOUR)
+    for i, colour in enumerate(p.sectors):
+        stage.mark(f"{colour} sector", _place(p.disc_m, FIRST_DEG + (i + 0.5) * p.sector_deg), colour)
     return stage.scene(
         p,
         decisive=["pointer"],
@@ -98,6 +101,7 @@ def build(p: Params, physics: Physics) -> Scene:
         things=[f"{p.ball_colour} ball", "black pointer", "spinner", *(f"{c} sector" for c in p.sectors)],
         also=["table", "rim", "peg"],
         colours=[*p.sectors, POINTER_COLOUR],
+        shown_by={"spinner": ["pointer"]},
     )
 
 

@@ -55,7 +55,7 @@ class Params:
     tunnel_colour: str = PLUNGER()
     radius_m: float = between(0.054, 0.062)
     speed_m_s: float = between(0.95, 1.15)
-    run_m: float = between(0.50, 0.62)  # open deck before the panel
+    run_m: float = between(0.78, 0.88)  # open deck before the panel
     step_m: float = between(0.06, 0.08)  # height of the deck over the lane
     lane_m: float = between(0.50, 0.56)  # from the step to the plunger's head
     line_m: float = between(0.21, 0.24)  # from the plunger's head to the line
@@ -98,6 +98,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
     high, shading = max(deck + 2.2 * r, LANE_M + 2.4 * r), deck + 2 * r
     across = (outer[0], wide + SHADOW_BACK * shading)
+    stage.mark("line", "line")
+    stage.mark("spring", "housing")
     return stage.scene(
         p,
         decisive=["ball"],

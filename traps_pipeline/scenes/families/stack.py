@@ -43,7 +43,7 @@ class Params:
     block_height_m: float = between(0.054, 0.062)
     block_width_m: float = between(0.086, 0.104)
     speed_m_s: float = between(0.95, 1.15)
-    run_m: float = between(0.36, 0.46)  # visible ledge before the panel
+    run_m: float = between(0.72, 0.82)  # visible ledge before the panel
     tray_m: float = between(0.34, 0.40)
     ball_colour: str = one_of("orange", "cyan")
     azimuth_deg: float = facing(-14, 20)
@@ -100,6 +100,8 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.ball("ball", at, RADIUS_M, p.ball_colour, speed=p.speed_m_s, rolling=0.0002, density=7500)
 
     covered, top = (screened, end + 0.02), ledge + p.stack_m + 0.03
+    stage.mark("block", BLOCKS[-1])
+    stage.mark("stand", (0.0, 0.15), STAND_COLOUR)
     return stage.scene(
         p,
         decisive=BLOCKS,
@@ -109,6 +111,7 @@ def build(p: Params, physics: Physics) -> Scene:
         things=[f"{p.ball_colour} ball", "black stand", "ledge", *(f"{c} block" for c in p.block_colours)],
         also=["stack", "pusher", "wall"],
         colours=[*p.block_colours, STAND_COLOUR],
+        shown_by={"stack": ["block"]},
     )
 
 
@@ -162,7 +165,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
 
 
 def _count(frame: np.ndarray, stand_colour: str) -> int | None:
-    stand = largest(frame, stand_colour, 150)
+    stand = largest(frame, stand_colour, 600)  # a flag of the stand is smaller
     if stand is None:
         return None
     x, y, width, _ = stand.box

@@ -48,7 +48,7 @@ class Params:
     strike: float = between(0.60, 0.72)  # height at which the ball strikes
     radius_m: float = between(0.047, 0.056)
     speed_m_s: float = between(0.80, 1.0)
-    run_m: float = between(0.34, 0.44)  # visible ledge before the panel
+    run_m: float = between(0.64, 0.74)  # visible ledge before the panel
     azimuth_deg: float = facing(-14, 20)
     elevation_deg: float = between(-32, -21)
 
@@ -83,6 +83,7 @@ def build(p: Params, physics: Physics) -> Scene:
     covered, top = (screened, end + 0.02), p.pillar_m + 0.03
     across = (-deep - 0.02, max(deep + 0.05, 0.05 + SHADOW_BACK * p.pillar_m))
     props = [f"{p.prop_colour} block"] if has_prop else []
+    stage.mark("pillar", "pillar")
     scene = stage.scene(
         p,
         decisive=["pillar"],

@@ -49,7 +49,7 @@ class Params:
         lambda rng, so_far: so_far["blocks"] - uniform(rng, 0.45, 0.60)
     )
     speed_m_s: float = between(0.85, 1.05)
-    run_m: float = between(0.36, 0.46)  # visible ledge before the panel
+    run_m: float = between(0.66, 0.76)  # visible ledge before the panel
     tray_m: float = between(0.32, 0.38)
     azimuth_deg: float = facing(-14, 20)
     elevation_deg: float = between(-32, -21)
@@ -98,6 +98,7 @@ def build(p: Params, physics: Physics) -> Scene:
     seen = stage.box((screened, end + 0.02), (-0.165, 0.165), (0, p.tower_m))
     right = max(seen.high[0], SHADOW_RIGHT * p.tower_m + half_w) + stage.ahead(0.07) - seen.high[0]
     across = (-0.17, half_w + SHADOW_BACK * p.tower_m)
+    stage.mark("block", p.names[-1])
     return stage.scene(
         p,
         decisive=[p.names[-1]],
@@ -113,6 +114,7 @@ def build(p: Params, physics: Physics) -> Scene:
         ],
         also=["tray", "wall", "top"],
         colours=[*p.block_colours, "black"],
+        shown_by={"tower": ["block"], "top": ["block"]},
     )
 
 

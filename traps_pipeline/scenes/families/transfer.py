@@ -84,6 +84,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
     high = DECK_M + max(p.block_m, 2 * r)
     covered, across = (p.ramp_m - 0.04, end + WALL_M), (outer[0] - 0.02, outer[1] + SHADOW_BACK * high)
+    stage.mark("block", "block")
+    stage.mark("zone", "zone")
     return stage.scene(
         p,
         decisive=["block"],

@@ -31,6 +31,7 @@ FLAT_RAD = math.radians(8)  # a die that leans more lies on no face
 LEGIBLE_PIXELS = 200.0
 LEAD_S = 0.2  # a closer finish could fall between two sampled frames
 PLATE = 0.78  # of a face: the rest is its edge, by which a viewer tells the dice apart
+GLASS, GLASS_EDGE_M = (0.50, 0.72, 0.86, 1.0), 0.006
 DARK_WOOD = (0.50, 0.35, 0.22, 1.0)
 STILL = 0.1  # share of its size by which a lying die may move from one frame to the next
 
@@ -131,7 +132,8 @@ def build(p: Params, physics: Physics) -> Scene:
     panes |= {"top": ((-WALL_M, 0), (-side, side)), "end": ((end, end + WALL_M), (-side, side))}
     for name, (along, across) in panes.items():
         glass = stage.block(f"fence_{name}", along, across, (0, high + 1.0), "white")
-        glass.rgba = [1, 1, 1, 0]  # never drawn: nothing leaves the steps
+        glass.rgba = [1, 1, 1, 0]  # nothing leaves the steps; a drawn pane would tint the faces: its edges are drawn
+    _add_glass_edges(stage, (0, end), side, (TRAY_M, high + 1.0))
     for i in range(len(p.faces)):
         _add_die(stage, p, i)
     dice = [f"die_{i}" for i in range(len(p.faces))]
@@ -144,6 +146,15 @@ def build(p: Params, physics: Physics) -> Scene:
     )
     throws = [(p.direction * along, across, up) for along, across, up in p.speeds_m_s]
     return replace(scene, velocity={d: (*v, *w) for d, v, w in zip(dice, throws, p.spins_rad_s, strict=True)})
+
+
+def _add_glass_edges(stage: Stage, along: tuple[float, float], side: float, up: tuple[float, float]) -> None:
+    """The edges of the glass box that dice bounce off: four upright ones from floor to top, and the rails around it."""
+    bars = [((x, y, up[0]), (x, y, up[1])) for x in along for y in (-side, side)]
+    bars += [((along[0], y, up[1]), (along[1], y, up[1])) for y in (-side, side)]
+    bars += [((x, -side, up[1]), (x, side, up[1])) for x in along]
+    for i, (a, b) in enumerate(bars):
+        stage.rod(f"glass_{i}", a, b, GLASS_EDGE_M, "white", solid=False).rgba = GLASS
 
 
 def _add_die(stage: Stage, p: Params, i: int) -> None:
@@ -204,7 +215,14 @@ def outcome(motion: Motion, p: Params) -> Reading:
     lead = np.min(np.delete(np.maximum(*_short_of_tray(motion, p))[arrival], die))
     rise = 2 * p.half_m * math.sin(max(0.0, math.pi / 4 - lean[-1]))
     labels = [p.faces[die][face] if lying else None for face, lying in zip(top, lies, strict=True)]
-    return Reading(labels, float(min(lead, rise)))
+    return Reading(labels, float(min(lead, rise)), _in_order(motion, p, die))
+
+
+def _in_order(motion: Motion, p: Params, die: int) -> tuple[int, int]:
+    """The frames from which the first die and another one are past the steps: in between, one sees which is first."""
+    past = _short_of_tray(motion, p)[0] <= 0
+    others: np.ndarray = np.delete(past, die, axis=1).max(axis=1)
+    return int(past[:, die].argmax()), int(others.argmax()) if others.any() else len(past)
 
 
 def legible(motion: Motion, p: Params) -> list[tuple[tuple[str, ...], float]]:

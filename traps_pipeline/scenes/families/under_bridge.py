@@ -91,6 +91,7 @@ def build(p: Params, physics: Physics) -> Scene:
             "railing of the bridge",
         ],
         also=["railing", "kerb"],
+        shown_by={"bridge": ["plank", "handrail", "leg"]},
     )
 
 

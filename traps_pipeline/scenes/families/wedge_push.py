@@ -44,7 +44,7 @@ class Params:
     wedge_height_m: float = between(0.09, 0.11)
     radius_m: float = between(0.046, 0.054)
     speed_m_s: float = between(1.0, 1.25)
-    run_m: float = between(0.34, 0.44)  # visible track before the panel
+    run_m: float = between(0.76, 0.86)  # visible track before the panel
     mat_m: float = drawn_by(lambda rng, so_far: so_far["wedge_length_m"] + uniform(rng, 0.10, 0.14))
     track_colour: str = one_of("wood", "grey", "white")
     azimuth_deg: float = facing(-16, 20)
@@ -82,6 +82,8 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.ball("ball", at, r, p.ball_colour, speed=p.speed_m_s, rolling=1e-4, sliding=0.1, density=2500)
 
     seen, top, back = (screened, end + 0.015), TRACK_M + p.wedge_height_m + 0.02, HALF_TRACK_M + 0.11
+    stage.mark("wedge", "base", p.wedge_colour)
+    stage.mark("mat", "mat")
     return stage.scene(
         p,
         decisive=["wedge"],

@@ -11,6 +11,7 @@ from traps_pipeline.scenes.kit import Family, Motion, Physics, Reading, Scene
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
+from traps_pipeline.scenes.vision import without_flags
 
 USUAL_PHYSICS = Physics()
 
@@ -43,7 +44,7 @@ def scene_family(
 
     def seen(frames: np.ndarray, text: str) -> str | None:
         named = question.named_in(text)
-        return None if named is None else observe(frames, named)
+        return None if named is None else observe(frames if twins is None else without_flags(frames), named)
 
     return Family(
         name=name,

@@ -101,8 +101,9 @@ def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead
     first, second = np.sort(arrivals)[:2]
     if not past[-1].all() or second - first < min_lead_s:
         return Reading(undecided(motion), margin)
-    winner = names[int(arrivals.argmin())]
-    return Reading([winner if t >= first else None for t in motion.times], margin)
+    winner, frames = names[int(arrivals.argmin())], np.sort(past.argmax(axis=0))
+    labels = [winner if t >= first else None for t in motion.times]
+    return Reading(labels, margin, (int(frames[0]), int(frames[1])))
 
 
 def top_m(motion: Motion, body: str, height_m: float, floor_m: float = 0.0) -> np.ndarray:

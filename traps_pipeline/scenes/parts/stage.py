@@ -7,9 +7,10 @@ Everything is added in the order of the calls, which is the order of the compile
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from traps_pipeline.scenes.kit import (
     View,
     add_ball,
     add_box,
+    flag_of,
     new_spec,
     rgba,
 )
@@ -36,6 +38,9 @@ Point = tuple[float, float]  # along, up (m)
 # The key light falls to the right and to the back: a thing so high throws a shadow of so many times its height.
 SHADOW_RIGHT = 0.35
 SHADOW_BACK = 0.55
+FLAG, FLAG_SHAPE = 0.065, 0.75  # width of a flag, as a share of what the camera shows; its height, of its width
+FLAG_CLEAR_M = 0.045  # over the line of sight past the panel, which itself stands out by a margin
+MAST = (0.20, 0.20, 0.21, 1.0)  # neither black nor grey to an observer
 
 
 # --- surfaces ---------------------------------------------------------------------------------------------------------
@@ -88,6 +93,7 @@ class Stage:
         self.direction = direction
         self.surface = surface
         self._velocity: dict[str, tuple[float, ...]] = {}
+        self._marks: dict[str, tuple[Vec3, Sequence[float]]] = {}  # phrase -> foot in the world, colour
 
     def towards(self, direction: int) -> Stage:
         """The same world with its way to a side: what stands on both sides of a middle is written once."""
@@ -317,6 +323,73 @@ class Stage:
             joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, list(range_deg)
         return body
 
+    # --- what stands for hidden things ---
+
+    def mark(self, phrase: str, at: str | tuple[float, float], colour: str | None = None) -> None:
+        """A flag over the panel for what a question names and the panel hides. It is drawn only, and is the same
+        whatever the hidden element is: so it may stand only where something is in every world, or begins.
+
+        at: the geom, or the body at its start, behind which it stands, or a place (along, across). colour: None takes
+        that geom's.
+        """
+        if isinstance(at, tuple):
+            assert colour is not None, f"the flag of {phrase} needs a colour"
+            self._marks[phrase] = ((self.direction * at[0], at[1], 0.0), rgba(colour))
+            return
+        geom, body = self.spec.geom(at), self.spec.body(at)
+        geom = geom if body is None else body.first_geom()
+        assert np.isnan(geom.fromto[0]), f"{at} has two ends; give a place"
+        x, y, _ = (float(v) for v in (geom.pos if body is None else np.add(body.pos, geom.pos)))
+        back = y + float(geom.size[1] or geom.size[0])
+        self._marks[phrase] = ((x, back, 0.0), list(geom.rgba) if colour is None else rgba(colour))
+
+    def _raise_flags(self, p: Any, cover: Box, in_view: Sequence[Box]) -> list[Box]:
+        """Draw the flags of all marks; returns what the camera must see of them.
+
+        A line of sight over the panel falls as it goes back: it meets the upper edges of `cover`, and the flag flies
+        where it passes over the mark. Flags side by side fly at different heights.
+        """
+        azimuth, down = np.radians(p.azimuth_deg), np.radians(-p.elevation_deg)
+        ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+        seen = np.concatenate([box.corners() for box in (*in_view, cover)])
+        upright = np.array([0.0, 0.0, np.cos(down)]) + ahead * np.sin(down)
+        scale = max(np.ptp(seen @ across), np.ptp(seen @ upright) * 4 / 3)
+        wide, high = FLAG * scale, FLAG_SHAPE * FLAG * scale / float(np.cos(down))
+        corners, flown, boxes = cover.corners(), [], []
+        for phrase, (foot, colour) in sorted(self._marks.items(), key=lambda item: float(np.dot(item[1][0], across))):
+            place = np.array(foot)
+            over = float((corners[:, 2] + (corners - place) @ ahead * np.tan(down)).max()) + FLAG_CLEAR_M + high / 2
+            at = float(place @ across)
+            over += high * 1.2 * max((n + 1 for n, other in flown if abs(at - other) < 1.15 * wide), default=0)
+            flown.append((int(any(abs(at - other) < 1.15 * wide for _, other in flown)), at))
+            centre = place + across * wide / 2 + np.array([0, 0, over - place[2]])
+            boxes.append(self._add_flag(phrase, place, centre, (wide, high), p.azimuth_deg, colour))
+        return boxes
+
+    def _add_flag(
+        self,
+        phrase: str,
+        foot: np.ndarray,
+        centre: np.ndarray,
+        size: tuple[float, float],
+        azimuth_deg: float,
+        colour: Sequence[float],
+    ) -> Box:
+        """A mast and its flag, which touch nothing and weigh nothing. Returns the box around the flag."""
+        import mujoco
+
+        top, half = float(centre[2] + size[1] / 2), np.radians(azimuth_deg - 90) / 2
+        mast = self.spec.worldbody.add_geom(name=f"mast {phrase}", type=mujoco.mjtGeom.mjGEOM_CYLINDER)
+        mast.pos, mast.size = [foot[0], foot[1], (foot[2] + top) / 2], [0.05 * size[0], (top - foot[2]) / 2, 0]
+        flag = self.spec.worldbody.add_geom(name=flag_of(phrase), type=mujoco.mjtGeom.mjGEOM_BOX)
+        flag.pos, flag.size = centre.tolist(), [size[0] / 2, 0.02 * size[0], size[1] / 2]
+        flag.quat = [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))]
+        for geom, paint in ((mast, MAST), (flag, colour)):
+            geom.rgba, geom.contype, geom.conaffinity, geom.mass = list(paint), 0, 0, 0
+        (x, y, z), reach, half_high = (float(value) for value in centre), size[0] / 2, size[1] / 2
+        return Box((x - reach, y - reach, z - half_high), (x + reach, y + reach, z + half_high))
+
     # --- what panel and camera must reach ---
 
     def box(self, along: Span, across: Span, up: Span, *, left: float = 0.0, right: float = 0.0) -> Box:
@@ -347,13 +420,15 @@ class Stage:
         things: Sequence[str] = (),
         also: Sequence[str] = (),
         colours: Sequence[str] = (),
+        shown_by: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> Scene:
         """The built scene.
 
         decisive, hidden, cover, in_view: `kit.Scene` (there, in_view is `stage`). things: phrases that single out one
         thing in view, each ends in its noun ('red ball'). also: further nouns in view. colours: those in view that no
-        field `<part>_colour` of the parameters has.
+        field `<part>_colour` of the parameters has. shown_by: as in `kit.Scene`.
         """
+        flags = [] if cover is None else self._raise_flags(p, cover, in_view)
         nouns = [thing.split()[-1] for thing in things]
         return Scene(
             spec=self.spec,
@@ -361,7 +436,9 @@ class Stage:
             decisive=tuple(decisive),
             hidden=tuple(hidden),
             cover=cover,
-            stage=tuple(in_view),
+            stage=(*in_view, *flags),
+            marks=tuple(self._marks),
+            shown_by=dict(shown_by),
             velocity=self._velocity,
             inventory=Inventory(
                 tuple(dict.fromkeys([*coloured(p).values(), *colours])),

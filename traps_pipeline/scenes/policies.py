@@ -1,0 +1,55 @@
+"""Which frames of a clip a model is shown: a grid of so many a second, or so many evenly spaced ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class FramePolicy:
+    """A grid of `fps` frames a second of which the first `most` are shown, or `uniform` evenly spaced frames."""
+
+    fps: float | None = None
+    uniform: int | None = None
+    most: int = 25
+
+    def __str__(self) -> str:
+        return f"{self.uniform} evenly spaced" if self.fps is None else f"{self.fps:g} a second"
+
+    def pick(self, times: np.ndarray) -> np.ndarray:
+        """Indices of the frames nearest to the wanted times, none twice; of two that are equally near the earlier one.
+
+        times: (F,) seconds, ascending. A grid starts at 0; uniform includes the first frame and the last one.
+        """
+        if self.uniform is not None and len(times) <= self.uniform:
+            return np.arange(len(times))
+        away = np.abs(times[:, None] - self._wanted(times)).round(9)  # s; rounded, or noise would decide between equals
+        return np.unique(away.argmin(axis=0))[: self.uniform or self.most]
+
+    def _wanted(self, times: np.ndarray) -> np.ndarray:
+        if self.fps is None:
+            return np.linspace(times[0], times[-1], self.uniform or 1)
+        return np.arange(int(times[-1] * self.fps + 1e-6) + 1) / self.fps
+
+
+# Those of the registered models (docs/spec.md 3.1): what is certified to be seen must be seen under each of them.
+POLICIES = (FramePolicy(fps=5), FramePolicy(uniform=16), FramePolicy(fps=2, most=32))
+
+
+def shown_at_end(n_frames: int, fps: int, last_s: float) -> list[int]:
+    """Frames within the last so many seconds of a clip that some policy shows; at least the last one of each policy."""
+    times = np.arange(n_frames) / fps
+    found: set[int] = set()
+    for policy in POLICIES:
+        shown = policy.pick(times)
+        late = shown[times[shown] >= times[-1] - last_s - 1e-6]
+        found |= {int(i) for i in (late if late.size else shown[-1:])}
+    return sorted(found)
+
+
+def fewest_within(n_frames: int, fps: int, span: tuple[int, int]) -> int:
+    """How many frames from the first of a span up to its end the policy that shows fewest of them shows."""
+    times = np.arange(n_frames) / fps
+    return min(sum(span[0] <= int(i) < span[1] for i in policy.pick(times)) for policy in POLICIES)
