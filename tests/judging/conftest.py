@@ -101,8 +101,8 @@ def _response(workspace: Workspace, cell: Cell, number: int, side: str, text: st
     item = item_row(cell.dataset, number, side)
     trace, _, answer = text.rpartition("<think>")
     request = answer_request(workspace, get_model("oracle"), item, cell.evaluation)
-    row, reasoning = ledger_row(request, Outcome("answer", answer, reasoning=trace or None), 1, 0.1, "e1")
-    return response_row(cell, item, row, reasoning)
+    row, beside = ledger_row(request, Outcome("answer", answer, reasoning=trace or None), 1, 0.1, "e1")
+    return response_row(cell, item, row, beside.get("reasoning"))
 
 
 @pytest.fixture
