@@ -156,7 +156,7 @@ def test_a_cut_that_is_too_late_is_named_on_any_machine():  # on this one test_c
     elsewhere = certify(late, plinko.qpos + np.float32(1e-7), twin, frame_step=10)
     assert not elsewhere.same_physics  # the futures of such a machine are simulated all the same
     assert "open" in elsewhere.failures
-    assert elsewhere.measured["accepted"] > 0
+    assert elsewhere.measured["tried"] == 128
     beyond = plinko.spec.model_copy(update={"void": {"cut_frame": plinko.outcome.commit_frame + 1}})
     assert "after commitment" in certify(beyond, plinko.qpos, twin, frame_step=10).failures["cut"]
 
