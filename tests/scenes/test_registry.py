@@ -87,7 +87,7 @@ def test_the_family_of_the_page_is_drawn_certified_rendered_and_observed(add: Ad
         inventory = family.build(family.params_from(found.spec.params), family.physics).inventory
         ill_posed = draw_ill_posed("occlusion", inventory, np.random.default_rng(0))
         spec = found.spec.model_copy(update={"ill_posed_question": ill_posed})
-        assert certify(spec, found.qpos, found.twin, frame_step=10).failures == {}
+        assert certify(spec, found.qpos, found.twin, frame_step=2).failures == {}
         shown = Released(spec, found.qpos, found.twin)
         assert family.observe is not None
         assert family.observe(shown.control_frames, spec.question) == answer
