@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel
@@ -63,6 +62,8 @@ def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step
 def swept_behind(camera: Camera, swept: Sequence[np.ndarray], panel: Panel) -> float:
     """Share of the picture's pixels over which anything moves that the panel covers. swept: corners (8, 3) of every
     moving geom's box in every frame."""
+    import cv2
+
     moving, board = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
     for mask, solids in ((moving, swept), (board, [panel.corners()])):
         for corners in solids:
