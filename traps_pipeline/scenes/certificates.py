@@ -473,7 +473,8 @@ REFERENTS = Certificate(
     f"flag where it stands or begins in every world, or is seen moving for {MOVING_S} s before it is hidden (the "
     f"record says which); some body is seen moving for {MOVING_S} s; of the pixels over which anything moves, the "
     "panel covers the stated share",
-    does_not_promise="that a person takes the flag for the thing",
+    does_not_promise=f"that a person takes the flag for the thing; anything of {', '.join(sorted(UNMARKED))}: their "
+    "records have no flags yet, so that it is measured and not judged",
     numbers=(
         Number("referents"),
         *(Number(name, compared=False) for name in ("referents_px", "referents_moving_s", "cause_moving_s")),
