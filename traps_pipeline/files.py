@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import secrets
 from collections.abc import Iterator
@@ -86,6 +87,24 @@ def is_in_place(descriptor: int, path: Path) -> bool:
     except FileNotFoundError:
         return False
     return (there.st_dev, there.st_ino) == (own.st_dev, own.st_ino)
+
+
+def try_lock(path: Path) -> int | None:
+    """The descriptor of a lock file that this process now holds alone, until it is closed or the process ends; None
+    while another one holds it. Missing folders are made. Raises OSError."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(descriptor)
+            if isinstance(error, BlockingIOError):
+                return None
+            raise
+        if is_in_place(descriptor, path):
+            return descriptor
+        os.close(descriptor)  # removed meanwhile: the next one is another file
 
 
 def require_in_place(descriptor: int, path: Path) -> None:

@@ -7,22 +7,22 @@ small journal, so that calls in flight when a process is killed count as their w
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import json
 import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import is_in_place, remedy, require_in_place, write_bytes
+from traps_pipeline.files import remedy, require_in_place, try_lock, write_bytes
+from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.judges import load_judges
-from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_models
+from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_accounts, load_models
 from traps_pipeline.models.request import Request
 from traps_pipeline.storage.ledger import JOURNAL, Spent
 from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, read_checked
@@ -142,7 +142,8 @@ def _early(line: bytes) -> Mapping[str, Any] | None:
 
 
 class Budget:
-    """What may still be spent, in all and by each participant that has a cap of its own."""
+    """What may still be spent, in all and by each participant that has a cap of its own. shared: by participant, the
+    budget of its account where that spans several studies."""
 
     def __init__(
         self,
@@ -151,8 +152,9 @@ class Budget:
         spent_usd: Mapping[str, float],
         journal: Journal | None = None,
         held: Callable[[], None] = lambda: None,
+        shared: Mapping[str, AccountBudget] | None = None,
     ) -> None:
-        self._journal, self._held = journal, held
+        self._journal, self._held, self._shared = journal, held, shared or {}
         self._caps = {None: cap_usd, **caps_usd}
         self._spent = defaultdict(float, spent_usd) | {None: sum(spent_usd.values())}
         self._reserved: defaultdict[str | None, float] = defaultdict(float)
@@ -178,10 +180,16 @@ class Budget:
         if worst_usd <= 0:
             return
         self._held()
+        shared = self._shared.get(participant)
         async with self._changed:
-            while full := [slot for slot in self._slots(participant) if self._room(slot) < worst_usd - 1e-9]:
+            while True:
+                full = [slot for slot in self._slots(participant) if self._room(slot) < worst_usd - 1e-9]
                 if hopeless := [slot for slot in full if self._reserved[slot] <= 1e-9]:
                     raise BudgetReached(self._explain(hopeless[0], worst_usd))
+                if not full and (shared is None or shared.reserve(worst_usd)):
+                    break
+                if not full and shared is not None and not self._in_flight_through(shared):
+                    raise BudgetReached(shared.explain(worst_usd))
                 await self._changed.wait()
             for slot in (None, participant):
                 self._reserved[slot] += worst_usd
@@ -191,11 +199,17 @@ class Budget:
         """Put a call's cost in the place of its worst case; an unknown cost counts as the worst."""
         cost = worst_usd if cost_usd is None else cost_usd
         self._note(participant, cost - worst_usd)
+        if shared := self._shared.get(participant):
+            shared.correct(cost - worst_usd)
         async with self._changed:
             for slot in (None, participant):
                 self._reserved[slot] = max(0.0, self._reserved[slot] - worst_usd)
                 self._spent[slot] = self._spent[slot] + cost
             self._changed.notify_all()
+
+    def _in_flight_through(self, shared: AccountBudget) -> bool:
+        """Whether calls of this process are out whose settling may make room in an account's budget."""
+        return any(self._reserved[name] > 1e-9 for name, its in self._shared.items() if its is shared)
 
     def booked(self, participant: str, cost_usd: float) -> None:
         """What a call and its attempts cost stands in the ledger."""
@@ -222,43 +236,51 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
         yield Budget(workspace.study.budget_usd, workspace.study.model_budgets_usd, {})
         return
     path = workspace.locks / "budget.lock"
-    with _locked(path) as held:
+    with _locked(path) as held, ExitStack() as opened:
         journal = Journal(workspace.answers.root / JOURNAL)
-        try:
-            yield _open_budget(workspace, journal, held)
-        finally:
-            journal.close()
+        opened.callback(journal.close)
+        spent = _spent_usd(workspace, journal)
+        shared = _shared_budgets(workspace, spent)
+        for account in shared.values():
+            opened.callback(account.close)
+        caps = workspace.study.budget_usd, workspace.study.model_budgets_usd
+        yield Budget(*caps, spent, journal, held, shared)
 
 
 @contextmanager
 def _locked(path: Path) -> Iterator[Callable[[], None]]:
     """Hold a lock file; the value raises TrapsError when it is called after the file was removed."""
     told = False
-    while True:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if is_in_place(descriptor, path):
-                break
-        except BlockingIOError:
-            if not told:
-                progress.current().note("another run spends from this study's budget; waiting for it to finish")
-                told = True
-            time.sleep(0.2)
-        os.close(descriptor)
+    while (descriptor := try_lock(path)) is None:
+        if not told:
+            progress.current().note("another run spends from this study's budget; waiting for it to finish")
+            told = True
+        time.sleep(0.2)
     try:
         yield lambda: require_in_place(descriptor, path)
     finally:
         os.close(descriptor)
 
 
-def _open_budget(workspace: Workspace, journal: Journal, held: Callable[[], None]) -> Budget:
-    study, spent = workspace.study, defaultdict(float, journal.lost_usd)
+def _spent_usd(workspace: Workspace, journal: Journal) -> Mapping[str, float]:
+    """Dollars by participant: what the ledgers hold, and calls that were in flight when a process died."""
+    spent = defaultdict[str, float](float, journal.lost_usd)
     for ledger in (workspace.answers, workspace.votes):
         for participant, its in ledger.spent().items():
             spent[participant] += its.dollars + its.unknown * _at_most_usd(workspace, participant, its)
-    return Budget(study.budget_usd, study.model_budgets_usd, spent, journal, held)
+    return spent
+
+
+def _shared_budgets(workspace: Workspace, spent_usd: Mapping[str, float]) -> dict[str, AccountBudget]:
+    """By participant, the budget of its account where `study.yaml` names a folder for it. Raises TrapsError."""
+    study, shared = workspace.study, dict[str, AccountBudget]()
+    entries: list[Entry] = [*load_models().values(), *load_judges().values()]
+    for account, folder in study.account_budgets.items():
+        through = [entry.id for entry in entries if entry.account == account]
+        budget = AccountBudget(account, workspace.root / folder, study.name)
+        budget.begin(sum(spent_usd.get(name, 0.0) for name in through))
+        shared |= dict.fromkeys(through, budget)
+    return shared
 
 
 def _at_most_usd(workspace: Workspace, participant: str, its: Spent) -> float:
@@ -277,6 +299,11 @@ def _at_most_usd(workspace: Workspace, participant: str, its: Spent) -> float:
 
 def _check_names(workspace: Workspace) -> None:
     """A cap for nobody caps nothing. Raises TrapsError."""
+    if unknown := workspace.study.account_budgets.keys() - load_accounts().keys():
+        raise TrapsError(
+            f"{workspace.root / 'study.yaml'}: account_budgets names {', '.join(sorted(unknown))}, no account of "
+            "assets/models.yaml; correct the name, or remove its line"
+        )
     if unknown := workspace.study.model_budgets_usd.keys() - load_models().keys() - load_judges().keys():
         raise TrapsError(
             f"{workspace.root / 'study.yaml'}: model_budgets_usd names {', '.join(sorted(unknown))}, neither a model "

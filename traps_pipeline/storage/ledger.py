@@ -9,7 +9,6 @@ runs from asking the same key at the same time; the kernel frees it when its hol
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import json
 import os
 import re
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import is_in_place, remedy, require_in_place, sync_folder, write_bytes
+from traps_pipeline.files import remedy, require_in_place, sync_folder, try_lock, write_bytes
 from traps_pipeline.storage.lines import NOT_WHOLE, Line, append_whole, checked_line, read_checked
 from traps_pipeline.storage.rows import heal, is_cost
 
@@ -185,16 +184,9 @@ class Ledger:
         path, told = self.root / "locks" / f"{self.kind}-{evaluation}.lock", False
         while True:
             with _writing(path):
-                path.parent.mkdir(parents=True, exist_ok=True)
-                descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if is_in_place(descriptor, path):
-                    break
-                os.close(descriptor)  # removed meanwhile: the next one is another file
-                continue
-            except BlockingIOError:
-                os.close(descriptor)
+                descriptor = try_lock(path)
+            if descriptor is not None:
+                break
             if not told:
                 waiting(f"{self.kind} of {evaluation} are being asked by {_holder(path)}; waiting for it to finish")
                 told = True

@@ -114,6 +114,9 @@ class Study(BaseModel):
     model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] = Field(
         default={}, description="by model or judge, besides"
     )
+    account_budgets: dict[str, str] = Field(
+        default={}, description="by account, the folder of a budget that several studies share (docs/models.md)"
+    )
     allow_unknown_prices: bool = Field(default=False, description="ask models without a price: no budget bounds them")
     mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")
     experiments: dict[str, Asked] = Field(

@@ -1,0 +1,152 @@
+"""A cap of one account over all studies that are asked through it, on one machine or a shared disk.
+
+A study's own budget knows what its own ledger holds. Two studies that use one key could spend twice; so each may name
+a folder for an account. The folder's `budget.yaml` gives the cap; `spent.jsonl` has one line a change, which every
+process appends under a lock that it holds for that moment only: several runs go on at once and share what is left.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import is_in_place, remedy, write_bytes
+from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, is_whole
+from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
+
+CAP, SPENT = "budget.yaml", "spent.jsonl"
+_COMPACTED = 2**20  # bytes of lines from which on they are summed up when a run begins
+
+
+class Cap(BaseModel):
+    """`budget.yaml` of an account's folder. usd: dollars for all studies together, ever."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    usd: float = Field(ge=0, allow_inf_nan=False)
+
+
+class AccountBudget:
+    """What all studies may still spend through an account. `study` is the name that this one's lines carry.
+
+    A line is added before a call is sent, with its worst case, and another with the difference when its cost is known.
+    A process that is killed leaves the worst case of its calls in flight there for good.
+    """
+
+    def __init__(self, account: str, folder: Path, study: str) -> None:
+        self.account, self.folder, self.study = account, folder, study
+        path = folder / CAP
+        if not path.is_file():
+            raise TrapsError(
+                f"{path}: no such file; write `usd: 100` (dollars that all studies together may spend through the "
+                f"account {account}) into it, or remove {account} from account_budgets in study.yaml"
+            )
+        self.cap_usd = parse_yaml_model(Cap, read_yaml(path), path).usd
+        self._spent: defaultdict[str, float] = defaultdict(float)
+        self._descriptor, self._read = -1, 0
+        with self._held():
+            if self._read > _COMPACTED:
+                content = b"".join(checked_line({"study": name, "usd": usd}) for name, usd in self._spent.items())
+                write_bytes(self._path, content, durable=True)  # other processes see another file and read that
+
+    @property
+    def _path(self) -> Path:
+        return self.folder / SPENT
+
+    @property
+    def spent_usd(self) -> Mapping[str, float]:
+        """Dollars spent or on their way, by study."""
+        with self._held():
+            return dict(self._spent)
+
+    def begin(self, known_usd: float) -> None:
+        """Add what this study has spent through the account and the folder does not know: before it named the folder,
+        or because the file was lost. known_usd: dollars by the study's own ledgers and journal."""
+        with self._held():
+            if (missing := known_usd - self._spent[self.study]) > 1e-6:
+                self._append(missing)
+
+    def reserve(self, dollars: float) -> bool:
+        """Take the worst case of a call, if it fits under the cap beside what every study has taken."""
+        with self._held():
+            if sum(self._spent.values()) + dollars > self.cap_usd + 1e-9:
+                return False
+            self._append(dollars)
+            return True
+
+    def correct(self, dollars: float) -> None:
+        """Put a call's cost in the place of its worst case: the difference, negative as a rule."""
+        if dollars:
+            with self._held():
+                self._append(dollars)
+
+    def explain(self, worst_usd: float) -> str:
+        """Why there is no room for a call."""
+        spent = self.spent_usd
+        return (
+            f"the budget of the account {self.account} is reached: {len(spent)} studies have spent "
+            f"${sum(spent.values()):.2f} of ${self.cap_usd:.2f} (calls in flight count as their worst case), the next "
+            f"call may cost ${worst_usd:.4f}. Raise `usd` in {self.folder / CAP} and run the same command to go on"
+        )
+
+    def close(self) -> None:
+        """Close the file; it stays."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    @contextmanager
+    def _held(self) -> Iterator[None]:
+        """Hold the file's lock for a moment, with all that others wrote meanwhile read."""
+        try:
+            while True:
+                if self._descriptor < 0:
+                    self._descriptor, self._read = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644), 0
+                    self._spent.clear()
+                fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+                if is_in_place(self._descriptor, self._path):
+                    break
+                self.close()  # another process has summed the lines up into a new file
+            try:
+                self._catch_up()
+                yield
+            finally:
+                fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+        except OSError as error:
+            raise TrapsError(
+                f"{self._path}: cannot be read or written ({error.strerror}); {remedy(error)} and run the same command "
+                "again: nothing is sent through an account whose budget cannot be kept"
+            ) from error
+
+    def _catch_up(self) -> None:
+        size = os.fstat(self._descriptor).st_size
+        if size < self._read:
+            self._read = 0
+            self._spent.clear()
+        content = os.pread(self._descriptor, size - self._read, self._read)
+        if torn := len(content) - (content.rfind(b"\n") + 1):  # of a process that died: its call was never sent
+            size, content = size - torn, content[:-torn]
+            os.ftruncate(self._descriptor, size)
+        for line in content.splitlines(keepends=True):
+            if not is_whole(line):
+                raise TrapsError(
+                    f"{self._path}: a line is {NOT_WHOLE}, so that nobody can tell what was spent; compare the "
+                    "provider's bill, then remove the file: every study that names it adds its own spending again when "
+                    "it next runs"
+                )
+            change = json.loads(line)
+            self._spent[change["study"]] += change["usd"]
+        self._read = size
+
+    def _append(self, dollars: float) -> None:
+        line = checked_line({"study": self.study, "usd": dollars})
+        append_whole(self._descriptor, line)
+        self._spent[self.study] += dollars
+        self._read += len(line)
