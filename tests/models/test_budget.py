@@ -32,7 +32,7 @@ from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.storage.ledger import Ledger, Spent
+from traps_pipeline.storage.ledger import Ledger, Totals
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -124,7 +124,7 @@ def test_spend_is_what_the_ledger_holds_repeated_answers_too(tmp_path: Path) -> 
             about = {"participant": name.split("__")[0]}
             writer.append({"key": "k", "text": trap, "cost_usd": cost, "components": about})
             writer.append({"key": "l", "text": None, "cost_usd": None, "components": about})
-    assert ledger.spent() == {"m": Spent(0.75, 0.5), "n": Spent(1e-05, 1e-05)}
+    assert ledger.totals() == {"m": Totals(0.75, 0.5), "n": Totals(1e-05, 1e-05)}
 
 
 def test_costs_that_cannot_be_count_as_the_dearest_call_and_are_told(
@@ -239,7 +239,7 @@ def test_a_call_that_may_be_billed_counts_as_its_worst_case(
     row = row_after(kind, times, cap_usd, tmp_path)
     assert (row and row["outcome"]) == outcome
     assert (row and row["cost_usd"]) == (None if cost_usd is None else pytest.approx(cost_usd))
-    assert sum(its.dollars for its in Ledger(tmp_path, "answers").spent().values()) <= cap_usd
+    assert sum(its.dollars for its in Ledger(tmp_path, "answers").totals().values()) <= cap_usd
 
 
 def test_two_runs_never_spend_from_one_budget_at_once(tmp_path: Path) -> None:

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from traps_pipeline.models.forecast import Experience, experiences, forecast
+from traps_pipeline.models.forecast import Experience, experience, forecast
 from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.storage.ledger import Totals
 
 
 def model(**changes: Any) -> ModelEntry:
@@ -37,11 +38,14 @@ def test_experience_comes_before_estimates() -> None:
         {"outcome": "answer", "prompt_tokens": None, "completion_tokens": None, "latency_s": 6.0},
         {"outcome": "error", "prompt_tokens": None, "completion_tokens": None, "latency_s": 600.0},
     ]
-    rows = [row | {"components": {"participant": "m"}} for row in rows]
-    rows.append(rows[0] | {"components": {"participant": "n"}})
-    known = experiences(rows)
-    assert known == {"m": Experience(2000, 200, 4.0), "n": Experience(1000, 100, 2.0)}
-    seen = forecast(model(), 60, known["m"])
+    one, other = Totals(), Totals()
+    for row in rows[:2]:
+        one.add(row)
+    for row in rows[2:]:
+        other.add(row)
+    known = experience([one, other])
+    assert known == Experience(2000, 200, 4.0)
+    seen = forecast(model(), 60, known)
     assert (seen.prompt_tokens, seen.completion_tokens) == (60 * 2000, 60 * 200)
     assert seen.minutes == pytest.approx(60 * 4 / 24 / 60)
 

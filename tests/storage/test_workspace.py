@@ -28,6 +28,7 @@ def test_a_created_workspace_opens_with_its_study(tmp_path: Path) -> None:
     assert yaml.safe_load((tmp_path / "w" / "study.yaml").read_text()) == {
         "name": opened.name,
         "experiments": {},
+        "account_budgets": {},
         "format": FORMAT,
         "benchmark": "released",
         "per_family": 2,

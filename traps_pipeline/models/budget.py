@@ -24,7 +24,7 @@ from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_accounts, load_models
 from traps_pipeline.models.request import Request
-from traps_pipeline.storage.ledger import JOURNAL, Spent
+from traps_pipeline.storage.ledger import JOURNAL, Totals
 from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, read_checked
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -266,7 +266,7 @@ def _spent_usd(workspace: Workspace, journal: Journal) -> Mapping[str, float]:
     """Dollars by participant: what the ledgers hold, and calls that were in flight when a process died."""
     spent = defaultdict[str, float](float, journal.lost_usd)
     for ledger in (workspace.answers, workspace.votes):
-        for participant, its in ledger.spent().items():
+        for participant, its in ledger.totals().items():
             spent[participant] += its.dollars + its.unknown * _at_most_usd(workspace, participant, its)
     return spent
 
@@ -283,7 +283,7 @@ def _shared_budgets(workspace: Workspace, spent_usd: Mapping[str, float]) -> dic
     return shared
 
 
-def _at_most_usd(workspace: Workspace, participant: str, its: Spent) -> float:
+def _at_most_usd(workspace: Workspace, participant: str, its: Totals) -> float:
     """What a call whose row is damaged, or tells a cost that cannot be, is counted as: the dearest call of the same
     participant that is known, or all the tokens that its answer may take."""
     entry = load_models().get(participant) or load_judges().get(participant)

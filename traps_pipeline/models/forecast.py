@@ -5,14 +5,12 @@ Experience comes first: means over what the ledger holds of a participant. Witho
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 from traps_pipeline.models.budget import BYTES_A_TOKEN, OVERHEAD_TOKENS
 from traps_pipeline.models.registry import Entry, ModelEntry, load_accounts
-from traps_pipeline.storage.ledger import settles
+from traps_pipeline.storage.ledger import AVERAGED, Totals
 
 TYPICAL_TEXT_BYTES = 1500  # system prompt, question and, for a judge, the answer
 TYPICAL_LATENCY_S = 10.0
@@ -41,22 +39,12 @@ class Forecast:
     minutes: float
 
 
-def experiences(rows: Iterable[Mapping[str, Any]]) -> dict[str, Experience]:
-    """What ledger rows tell, by participant; the rows are gone through once and not kept."""
-    columns = ("prompt_tokens", "completion_tokens", "latency_s")
-    sums, counts, seen = Counter[tuple[str, str]](), Counter[tuple[str, str]](), dict[str, None]()
-    for row in rows:
-        participant = row["components"]["participant"]
-        seen[participant] = None
-        for column in columns:
-            if settles(row) and row.get(column) is not None:
-                sums[participant, column] += row[column]
-                counts[participant, column] += 1
-
-    def mean(slot: tuple[str, str]) -> float | None:
-        return sums[slot] / counts[slot] if counts[slot] else None
-
-    return {name: Experience(*(mean((name, column)) for column in columns)) for name in seen}
+def experience(totals: Iterable[Totals]) -> Experience:
+    """What the ledgers' rows of one participant say."""
+    joined = Totals()
+    for part in totals:
+        joined.join(part)
+    return Experience(*(joined.mean(column) for column in AVERAGED))
 
 
 def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:

@@ -16,14 +16,14 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Container, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager, suppress
-from dataclasses import astuple, dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import remedy, require_in_place, sync_folder, try_lock, write_bytes
 from traps_pipeline.storage.lines import NOT_WHOLE, Line, append_whole, checked_line, read_checked
-from traps_pipeline.storage.rows import heal, is_cost
+from traps_pipeline.storage.rows import heal, is_cost, is_count, is_seconds
 
 SYNC_ROWS, SYNC_SECONDS = 100, 0.5
 LOCK_POLL_SECONDS = 0.1
@@ -31,7 +31,9 @@ FAILED = ("error", "malformed")  # outcomes that settle nothing
 JOURNAL = "in_flight.jsonl"  # beside the segments' folders: calls that no row tells of yet (`models.budget`)
 ASIDES = ("reasoning", "raw")  # texts kept beside a segment, each in a file of its own
 _KEY = b'{"key": "'  # how every row begins
-_LONG = 2**18  # bytes of a segment whose sums are kept
+_LONG = 2**18  # bytes of a segment whose totals are kept
+# Columns whose means forecast what a call takes, and what is a possible value of each.
+AVERAGED = {"prompt_tokens": is_count, "completion_tokens": is_count, "latency_s": is_seconds}
 _CHECKED = "-v2.jsonl"  # how the names of segments end whose lines have checksums; earlier ones have none
 # Found without parsing the row, to leave most of them out. Inside a string the quote before the colon has a backslash
 # before it, so that no text of a model can look like this; what is counted is read from the parsed row.
@@ -68,13 +70,14 @@ class Known:
 
 
 @dataclass
-class Spent:
-    """What rows of one participant say that was paid. dearest: one of them; unknown: rows that do not tell it in a way
-    that can be believed."""
+class Totals:
+    """What rows of one participant add up to. dollars: paid; dearest: by one row; unknown: rows that do not tell it so
+    that it can be believed; means: of the settled rows, sum and number of the values of each column of `AVERAGED`."""
 
     dollars: float = 0.0
     dearest: float = 0.0
     unknown: int = 0
+    means: dict[str, tuple[float, int]] = field(default_factory=dict)
 
     def add(self, row: Mapping[str, Any] | None) -> None:
         """Count a row; None: a damaged one."""
@@ -83,34 +86,54 @@ class Spent:
             self.unknown += 1
             return
         self.dollars, self.dearest = self.dollars + cost, max(self.dearest, cost)
+        if row.get("outcome") not in FAILED:
+            for column, is_possible in AVERAGED.items():
+                if is_possible(row.get(column)):
+                    self._add_to_mean(column, row[column], 1)
 
-    def join(self, other: Spent) -> None:
-        """Count what other rows of the participant say."""
+    def join(self, other: Totals) -> None:
+        """Count what other rows of the participant add up to."""
         self.dollars, self.dearest = self.dollars + other.dollars, max(self.dearest, other.dearest)
         self.unknown += other.unknown
+        for column, (total, count) in other.means.items():
+            self._add_to_mean(column, total, count)
+
+    def mean(self, column: str) -> float | None:
+        """The mean of a column; None where no row has a value."""
+        total, count = self.means.get(column, (0.0, 0))
+        return total / count if count else None
+
+    def _add_to_mean(self, column: str, total: float, count: int) -> None:
+        before = self.means.get(column, (0.0, 0))
+        self.means[column] = (before[0] + total, before[1] + count)
 
 
-def _spent_in(segment: Path) -> dict[str, Spent]:
-    """What the rows of a segment say, by participant. Of a long one it is kept beside it, and counted again where it is
-    not of this very file: a ledger of a million rows would else take seconds at the start of each run."""
-    found, kept = segment.stat(), segment.with_name(f".{segment.name}.spent")
+def _totals_of(segment: Path) -> dict[str, Totals]:
+    """What the rows of a segment add up to, by participant. Of a long one it is kept beside it, and counted again where
+    it is not of this very file: a ledger of a million rows would else take seconds at the start of each run."""
+    found, kept = segment.stat(), segment.with_name(f".{segment.name}.totals")
     stamp = f"{found.st_size} {found.st_mtime_ns}"
     if found.st_size >= _LONG and kept.is_file():
         (line, *_) = [*read_checked(kept)] or [None]
         told = json.loads(line.content) if line is not None and line.whole else {}
         if told.get("of") == stamp:
-            return {participant: Spent(*its) for participant, its in told["spent"].items()}
-    spent: dict[str, Spent] = {}
+            return {participant: _as_totals(its) for participant, its in told["totals"].items()}
+    totals: dict[str, Totals] = {}
     for line in _lines(segment):
         if not line.torn:  # what a crash cut off stands in the journal
             row = _parsed(line)
-            its = spent.setdefault(_participant(row, line.content), Spent())
+            its = totals.setdefault(_participant(row, line.content), Totals())
             for _ in range(1 if row else max(1, line.content.count(_KEY))):  # rows whose line ends are gone
                 its.add(row)
     if found.st_size >= _LONG:
         with suppress(TrapsError):  # a study that can only be read is counted again next time
-            write_bytes(kept, checked_line({"of": stamp, "spent": {name: astuple(its) for name, its in spent.items()}}))
-    return spent
+            told = {"of": stamp, "totals": {name: asdict(its) for name, its in totals.items()}}
+            write_bytes(kept, checked_line(told))
+    return totals
+
+
+def _as_totals(kept: Mapping[str, Any]) -> Totals:
+    return Totals(**{**kept, "means": {column: tuple(mean) for column, mean in kept["means"].items()}})
 
 
 class Ledger:
@@ -138,21 +161,13 @@ class Ledger:
                     known.add(row)
         return known
 
-    def rows_of(self, participants: Container[str]) -> Iterator[dict[str, Any]]:
-        """Rows of some participants, of every evaluation; lines that are not whole are left out."""
+    def totals(self) -> dict[str, Totals]:
+        """What every row of every evaluation adds up to, by participant: repeated keys were paid for as well."""
+        totals: dict[str, Totals] = {}
         for segment in sorted((self.root / self.kind).glob("*/*.jsonl")):
-            for line in _lines(segment):
-                about = _PARTICIPANT.search(line.content)
-                if line.whole and about and about[1].decode() in participants:
-                    yield _row(line.content)[0]
-
-    def spent(self) -> dict[str, Spent]:
-        """What was paid, by participant, over every row of every evaluation: repeated keys were paid for as well."""
-        spent: dict[str, Spent] = {}
-        for segment in sorted((self.root / self.kind).glob("*/*.jsonl")):
-            for participant, its in _spent_in(segment).items():
-                spent.setdefault(participant, Spent()).join(its)
-        return spent
+            for participant, its in _totals_of(segment).items():
+                totals.setdefault(participant, Totals()).join(its)
+        return totals
 
     def reasoning(self, evaluation: str, wanted: Container[str] | None = None) -> dict[str, str]:
         """Reasoning traces by key (of the wanted keys), in sibling segments so that reading answers stays quick."""

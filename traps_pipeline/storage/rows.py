@@ -16,6 +16,11 @@ def is_cost(value: Any) -> bool:
     return type(value) in (int, float) and math.isfinite(value) and 0 <= value <= MOST_USD
 
 
+def is_seconds(value: Any) -> bool:
+    """Whether a call can have taken so long."""
+    return type(value) in (int, float) and 0 <= value < math.inf
+
+
 def _is_text(value: Any) -> bool:
     if not isinstance(value, str):
         return False
@@ -26,14 +31,15 @@ def _is_text(value: Any) -> bool:
     return True
 
 
-def _is_count(value: Any) -> bool:
+def is_count(value: Any) -> bool:
+    """Whether a call can have taken so many tokens."""
     return type(value) is int and 0 <= value <= MOST_TOKENS
 
 
 # What a provider says; anything else is unknown.
 _SAID: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("text", "finish_reason", "error", "served_model"), _is_text),
-    **dict.fromkeys(("prompt_tokens", "completion_tokens", "reasoning_tokens"), _is_count),
+    **dict.fromkeys(("prompt_tokens", "completion_tokens", "reasoning_tokens"), is_count),
     "cost_usd": is_cost,
 }
 

@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from traps_pipeline.benchmark.corrections import load_scenarios
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.confabulation import load_protocol, sample_failures
 from traps_pipeline.judging.panel import tasks_for, wanted_ballots
+from traps_pipeline.judging.tables import VOTES
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answers import answer_request, is_prepared
-from traps_pipeline.models.forecast import Experience, Forecast, experiences, forecast
+from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast
 from traps_pipeline.models.judges import PANEL_SIZE, JudgeEntry, load_panel
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import (
     ARMS,
@@ -26,6 +29,7 @@ from traps_pipeline.partitions import (
     sides_of,
 )
 from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import Experiment
 
@@ -73,9 +77,11 @@ def make_plan(workspace: Workspace | None, experiment: Experiment) -> Plan:
     new: list[tuple[Entry, int]] = [(get_model(model), answers.new) for model, (answers, _) in calls.items()]
     new += [(judge, votes // PANEL_SIZE) for judge in panel]
     new = [(entry, count) for entry, count in new if entry.backend == NETWORK]
-    names, ledgers = {entry.id for entry, _ in new}, (workspace.answers, workspace.votes) if workspace else ()
-    seen = experiences(row for ledger in ledgers for row in ledger.rows_of(names))
-    forecasts = [forecast(entry, count, seen.get(entry.id, Experience())) for entry, count in new]
+    ledgers = [ledger.totals() for ledger in (workspace.answers, workspace.votes)] if workspace else []
+    forecasts = [
+        forecast(entry, count, experience(totals[entry.id] for totals in ledgers if entry.id in totals))
+        for entry, count in new
+    ]
     judge = load_protocol().judge(study.panel)
     if judge is None:
         return Plan(calls, uncertain, forecasts, None, steered)
@@ -143,15 +149,28 @@ def _count_calls(
             answers.add(items, 0)
             votes.add(votes_asked, 0)
             continue
-        keys = _answer_keys(workspace, cell)
-        wanted = len(keys) if cell.dataset in ARMS else items  # not every scenario admits every arm
-        answers.add(wanted, len(keys & known.of(workspace.answers, cell.evaluation)))
-        if lineage.status("responses", cell.key).kind != "fresh":
+        # A fresh cell has every answer that it wants: its keys need not be made again, nor its ledger be read.
+        answered = _fresh_rows(workspace, lineage, RESPONSES, cell)
+        if answered is not None:
+            answers.add(answered, answered)
+        else:
+            keys = _answer_keys(workspace, cell)
+            wanted = len(keys) if cell.dataset in ARMS else items  # not every scenario admits every arm
+            answers.add(wanted, len(keys & known.of(workspace.answers, cell.evaluation)))
+        if answered is None:
             votes.add(votes_asked, 0)
-            continue
-        ballots = {ballot.request.key for ballot in wanted_ballots(workspace, load_panel(study.panel), cell)}
-        votes.add(len(ballots), len(ballots & known.of(workspace.votes, cell.evaluation)))
+        elif (cast := _fresh_rows(workspace, lineage, VOTES, cell)) is not None:
+            votes.add(cast, cast)
+        else:
+            ballots = {ballot.request.key for ballot in wanted_ballots(workspace, load_panel(study.panel), cell)}
+            votes.add(len(ballots), len(ballots & known.of(workspace.votes, cell.evaluation)))
     return plan, sorted(uncertain)
+
+
+def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
+    """The number of rows of a cell's table; None unless it is fresh."""
+    state = workspace.tables.state(table, cell.partition)
+    return state.rows if state and lineage.status(table.name, cell.key).kind == "fresh" else None
 
 
 def _items_current(lineage: Lineage, dataset: str) -> bool:
