@@ -226,9 +226,13 @@ class Family:
     min_margin_m: float = 0.005
     twins: Callable[[Any], Sequence[Any]] | None = None
     perturbation: float = 1e-4  # chaotic: standard deviation of an initial-state perturbation (m, rad)
+    check: Callable[[Any], None] = lambda params: (
+        None
+    )  # raises ValueError where parameters from a file are not plausible
 
     def params_from(self, values: Mapping[str, Any]) -> Any:
-        """Parameters from a stored mapping (lists become tuples). Raises ValueError naming unknown or missing ones."""
+        """Parameters from a stored mapping (lists become tuples). Raises ValueError naming the first that is unknown,
+        missing, of another type or not plausible."""
         known = {f.name for f in fields(self.params)}
         unknown, missing = sorted(set(values) - known), sorted(known - set(values))
         if unknown or missing:
@@ -236,7 +240,9 @@ class Family:
                 f"family {self.name}: unknown parameters {unknown}, missing parameters {missing}; "
                 f"known: {sorted(known)}"
             )
-        return self.params(**{name: _as_tuple(value) for name, value in values.items()})
+        params = self.params(**{name: _as_tuple(value) for name, value in values.items()})
+        self.check(params)
+        return params
 
 
 def params_to_dict(params: Any) -> dict[str, Any]:

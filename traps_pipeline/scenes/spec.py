@@ -4,14 +4,65 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from traps_pipeline.digests import digest
 
 Slug = r"^[a-z0-9_]+-[a-z0-9]+$"
+
+
+class _Strict(BaseModel):
+    """Values of exactly these names and types, no number infinite."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+Length = Annotated[float, Field(ge=-100, le=100)]  # metres; a scene is a few metres wide
+Angle = Annotated[float, Field(ge=-720, le=720)]  # degrees
+
+
+class _Physics(_Strict):
+    """`kit.Physics` in a record."""
+
+    timestep_s: float = Field(ge=1e-5, le=0.02)
+    duration_s: float = Field(ge=1, le=60)
+    fps: int = Field(ge=1, le=60)
+    gravity_m_s2: float = Field(ge=0, le=30)
+    iterations: int = Field(ge=1, le=10_000)
+    tolerance: float = Field(ge=0, le=1e-2)
+    impratio: float = Field(ge=0.01, le=1000)
+
+
+class _Camera(_Strict):
+    """`camera.Camera` in a record."""
+
+    lookat: list[Length] = Field(min_length=3, max_length=3)
+    distance: float = Field(gt=0, le=100)
+    azimuth_deg: Angle
+    elevation_deg: float = Field(ge=-90, le=90)
+    fovy_deg: float = Field(gt=0, lt=180)
+    extent: float = Field(gt=0, le=100)
+    centre: list[Length] = Field(min_length=3, max_length=3)
+
+
+class _Panel(_Strict):
+    """`camera.Panel` in a record."""
+
+    centre: list[Length] = Field(min_length=3, max_length=3)
+    half: list[Length] = Field(min_length=3, max_length=3)
+    yaw_deg: Angle
+
+
+class _Occluder(_Strict):
+    panel: _Panel
+    hidden_from_frame: int = Field(ge=0)
+
+
+class _Truncation(_Strict):
+    cut_frame: int = Field(ge=1)
 
 
 class Answerable(BaseModel):
@@ -87,6 +138,16 @@ class SceneSpec(BaseModel):
             raise ValueError("twin: an occluder's has `params` and no `rollout`, a truncation's has a `rollout` alone")
         return self
 
+    @model_validator(mode="after")
+    def _what_decides_the_pixels_is_plausible(self) -> SceneSpec:
+        physics = _checked(_Physics, "physics", self.physics)
+        _checked(_Camera, "camera", self.camera)
+        void = _checked(_Truncation if self.void_kind == "truncation" else _Occluder, "void", self.void)
+        frame = void.cut_frame if isinstance(void, _Truncation) else void.hidden_from_frame
+        if frame >= physics.duration_s * physics.fps:
+            raise ValueError(f"void: frame {frame} is not in a clip of {physics.duration_s} s at {physics.fps} FPS")
+        return self
+
     @property
     def scene_hash(self) -> str:
         """Digest of what the clips show; a corrected question leaves it alone."""
@@ -98,6 +159,18 @@ class SceneSpec(BaseModel):
     def spec_hash(self) -> str:
         """Digest of the whole record."""
         return digest(self.model_dump(mode="json"))
+
+
+_Part = TypeVar("_Part", bound=_Strict)
+
+
+def _checked(kind: type[_Part], name: str, values: dict[str, Any]) -> _Part:
+    """A part of a record. Raises ValueError naming the field."""
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{'.'.join(map(str, (name, *first['loc'])))}: {first['msg']}") from None
 
 
 def trajectory_digest(qpos: np.ndarray) -> str:

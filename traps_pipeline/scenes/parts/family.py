@@ -64,4 +64,5 @@ def scene_family(
         min_margin_m=min_margin_m,
         twins=twins,
         perturbation=perturbation,
+        check=vary.check,
     )

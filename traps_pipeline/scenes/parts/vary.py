@@ -18,9 +18,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, replace
-from typing import Any, TypeVar
+from functools import cache
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from traps_pipeline.scenes.kit import distinct_colours, uniform
 
@@ -30,33 +32,36 @@ Count = int | str | Callable[[Mapping[str, Any]], int]
 Params = TypeVar("Params")
 
 _HOW, _COUNT, _HIDDEN = "how", "count", "hidden"  # keys of a field's metadata
+_RANGE, _VALUES = "range", "values"  # what is drawn: bounds of a number, or all values
 
 
 # --- one field --------------------------------------------------------------------------------------------------------
 
 
-def drawn_by(draw: Draw) -> Any:
+def drawn_by(draw: Draw, **what: Any) -> Any:
     """A field that `draw(rng, so_far)` draws, for what no other function here says.
 
     `so_far` holds the fields above by name. `draw` may put further values into it for fields below: those are not
-    stored with the parameters.
+    stored with the parameters. what: for `check`, the bounds (`range`) or the possible values (`values`).
     """
-    return field(metadata={_HOW: draw})
+    return field(metadata={_HOW: draw, **what})
 
 
 def between(low: float, high: float) -> Any:
     """A float between two bounds, rounded to 0.0001."""
-    return drawn_by(lambda rng, so_far: uniform(rng, low, high))
+    return drawn_by(lambda rng, so_far: uniform(rng, low, high), range=(low, high))
 
 
 def several_between(count: Count, low: float, high: float) -> Any:
     """A tuple of floats between two bounds. count: how many, or the name of the drawn value that says how many."""
-    return drawn_by(lambda rng, so_far: tuple(uniform(rng, low, high) for _ in range(_number(count, so_far))))
+    return drawn_by(
+        lambda rng, so_far: tuple(uniform(rng, low, high) for _ in range(_number(count, so_far))), range=(low, high)
+    )
 
 
 def one_of(*values: Any) -> Any:
     """One of these values, each as often. Names of colours, -1 and 1, counts: `one_of(4, 5, 6)`."""
-    return drawn_by(lambda rng, so_far: values[int(rng.integers(len(values)))])
+    return drawn_by(lambda rng, so_far: values[int(rng.integers(len(values)))], values=values)
 
 
 def chance(share: float) -> Any:
@@ -86,11 +91,12 @@ class Group:
     """
 
     draw: Callable[[np.random.Generator, Drawn, int], Sequence[Any]]
+    values: tuple[Any, ...] | None = None  # all that it draws from, where that can be said
 
     def __call__(self, count: Count | None = None) -> Any:
         """A field with one value of the group, or with a tuple of `count` of them: a number, the name of the drawn
         value that says how many, or a function of the fields above."""
-        return field(metadata={_HOW: self, _COUNT: count})
+        return field(metadata={_HOW: self, _COUNT: count, _VALUES: self.values})
 
 
 def apart(*pool: str, fits: Callable[..., bool] | None = None) -> Group:
@@ -102,7 +108,7 @@ def apart(*pool: str, fits: Callable[..., bool] | None = None) -> Group:
             if fits is None or fits(*colours):
                 return colours
 
-    return Group(draw)
+    return Group(draw, pool)
 
 
 def shuffled(*values: Any, without: str | None = None) -> Group:
@@ -112,7 +118,7 @@ def shuffled(*values: Any, without: str | None = None) -> Group:
         left = [value for value in values if without is None or value != so_far[without]]
         return [left[int(i)] for i in rng.permutation(len(left))[:count]]
 
-    return Group(draw)
+    return Group(draw, values)
 
 
 def together(draw: Callable[[np.random.Generator, Drawn], Sequence[Any]]) -> Group:
@@ -156,6 +162,51 @@ def twins(p: Any) -> list[Any]:
         raise TypeError(f"{type(p).__module__}: no field of Params is `hidden(...)`, so there are no twins")
     values = {each.name: each for each in fields(p)}[name].metadata[_HIDDEN](vars(p))
     return [replace(p, **{name: value}) for value in values if value != getattr(p, name)]
+
+
+# --- values from a file -----------------------------------------------------------------------------------------------
+
+
+def check(p: Any) -> None:
+    """Raises ValueError naming the first parameter whose value is not of its type or is far from all that is drawn. A
+    number may lie outside of its range by the width of the range: a correction may move what a draw would not."""
+    types = _types(type(p))
+    for each in fields(p):
+        value = getattr(p, each.name)
+        try:
+            types[each.name].validate_python(value, strict=True)
+        except ValidationError as error:
+            raise ValueError(f"parameter {each.name} is {_shown(value)}: {error.errors()[0]['msg']}") from None
+        for one in _members(value):
+            if isinstance(one, float) and not np.isfinite(one):
+                raise ValueError(f"parameter {each.name} is {_shown(value)}; it must be finite")
+            _check_member(p, each, one)
+
+
+@cache
+def _types(params: type) -> Mapping[str, TypeAdapter[Any]]:
+    return {name: TypeAdapter(kind) for name, kind in get_type_hints(params).items()}
+
+
+def _check_member(p: Any, each: Field[Any], value: Any) -> None:
+    if bounds := each.metadata.get(_RANGE):
+        low, high = bounds
+        if not low - (high - low) <= value <= high + (high - low):
+            raise ValueError(f"parameter {each.name} is {_shown(value)}; it is drawn from {low} to {high}")
+    hides = each.metadata.get(_HIDDEN)
+    values = tuple(hides(vars(p))) if hides else each.metadata.get(_VALUES)
+    if values is not None and value not in values:
+        raise ValueError(f"parameter {each.name} is {_shown(value)}; it is one of {', '.join(map(str, values))}")
+
+
+def _members(value: Any) -> list[Any]:
+    """The values in a tuple of tuples, or the value itself."""
+    return [one for each in value for one in _members(each)] if isinstance(value, tuple) else [value]
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:60]}..."
 
 
 # --- all fields -------------------------------------------------------------------------------------------------------
