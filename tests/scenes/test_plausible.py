@@ -44,7 +44,7 @@ def test_every_number_of_several_is_looked_at() -> None:
     scenario = next(id_ for id_ in load_released() if id_.startswith("tumbling_dice"))
     params = record(scenario)["params"]
     turns = [[1.0, 0.0, 0.0, float("inf")], *params["turns"][1:]]
-    with pytest.raises(ValueError, match="parameter turns is .*; it must be finite"):
+    with pytest.raises(ValueError, match=r"parameter turns is .*; it must be finite"):
         get_family("tumbling_dice").params_from(params | {"turns": turns})
 
 
