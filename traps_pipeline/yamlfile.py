@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Hashable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -93,6 +94,23 @@ def read_yaml(path: Path) -> Any:
         return value
     except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
         raise TrapsError(f"{path}: not valid YAML ({_said(error)}); correct the file") from error
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Parsed YAML that is a mapping. Raises TrapsError."""
+    data = read_yaml(path)
+    if not isinstance(data, dict):
+        raise TrapsError(f"{path}: must be a mapping of names, not {data!r:.60}; correct the file")
+    return data
+
+
+@contextmanager
+def within(path: Path) -> Iterator[None]:
+    """Name the file in which the block found what it complains of."""
+    try:
+        yield
+    except TrapsError as error:
+        raise TrapsError(f"{path}: {error}") from error
 
 
 def _said(error: Exception) -> str:

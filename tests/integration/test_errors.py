@@ -127,7 +127,7 @@ def test_unknown_names_are_answered_with_the_known_ones(study: Checkout, tmp_pat
     )
     experiment = tmp_path / "typo.yaml"
     experiment.write_text("name: typo\nmodels: [orakel]\n")
-    assert_refused(study.traps("plan", experiment), "unknown model 'orakel'", "oracle, always-abstain")
+    assert_refused(study.traps("plan", experiment), "unknown model 'orakel'", "oracle")
     experiment.write_text("name: typo\nmodels: [oracle]\nregimes: [polite]\n")
     assert_refused(study.traps("plan", experiment), str(experiment), "regimes", "choose from standard, guided, json")
     mistyped = study.traps("run", EXPERIMENT, "--until", "leaderbord")

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import datetime
+import os
+import subprocess
+import sys
+from ast import literal_eval
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.conftest import KEY, SECRET
+from tests.conftest import KEY, ROOT, SECRET
 from tests.providers.server import Provider, answer_to
 from traps_pipeline import progress
 from traps_pipeline.models.api import ApiBackend
@@ -119,3 +124,28 @@ def test_a_refusal_in_words_is_no_answer(provider: Provider) -> None:
         assert (outcome.kind, outcome.text) == ("refused", None)
     provider.configure(faults={"content_filter_error": 1.0})
     assert ask(provider, "openai/m").kind == "refused"
+
+
+@pytest.mark.slow  # litellm is imported anew
+def test_a_env_file_above_the_checkout_sets_no_proxy_and_no_key(tmp_path: Path) -> None:
+    """litellm takes variables from such a file by itself, so that anybody who can write one could read the calls."""
+    (tmp_path / ".env").write_text("HTTPS_PROXY=http://127.0.0.1:9\nOPENAI_API_KEY=sk-foreign\nTRAPS_PLANTED=yes\n")
+    folder = tmp_path / "projects" / "mine"
+    folder.mkdir(parents=True)
+    (folder / ".env").write_text("ANTHROPIC_API_KEY=sk-foreign\n")
+    script = """
+import os
+before = {**os.environ}
+from traps_pipeline.models.api import load_litellm
+load_litellm()
+print(sorted(name for name in os.environ.keys() - before.keys() if not name.startswith("LITELLM_")))
+import dotenv
+print(dotenv.find_dotenv(usecwd=True))  # the file is one that such a library finds
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "LITELLM_MODE"}
+    environment["PYTHONPATH"] = str(ROOT)
+    command = [sys.executable, "-c", script]
+    ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, check=True, text=True)
+    set_here, found = ran.stdout.splitlines()
+    assert found == str(folder / ".env")
+    assert not {"HTTPS_PROXY", "OPENAI_API_KEY", "TRAPS_PLANTED", "ANTHROPIC_API_KEY"} & {*literal_eval(set_here)}

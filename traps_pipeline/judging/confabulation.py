@@ -34,7 +34,7 @@ from traps_pipeline.paths import ASSETS
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
+from traps_pipeline.yamlfile import parse_yaml_model, read_yaml, within
 
 PROTOCOL_FILE = ASSETS / "confabulation.yaml"
 TASK = "confabulation"
@@ -87,9 +87,11 @@ class Protocol(BaseModel):
 def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
     """The protocol. Raises TrapsError naming the file and the field, model or judge that is wrong."""
     protocol = parse_yaml_model(Protocol, read_yaml(path), path)
-    for model in protocol.models:
-        if protocol.run > get_model(model).runs:
-            raise TrapsError(f"{path}: run is {protocol.run}, but {model} has only {get_model(model).runs} runs")
+    with within(path):
+        runs = {model: get_model(model).runs for model in protocol.models}
+    for model, most in runs.items():
+        if protocol.run > most:
+            raise TrapsError(f"{path}: run is {protocol.run}, but {model} has only {most} runs")
     strangers = [model for model in protocol.validation.models if model not in protocol.models]
     if strangers:
         raise TrapsError(f"{path}: validation.models: {', '.join(strangers)} must be among `models`")

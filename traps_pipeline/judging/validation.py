@@ -119,14 +119,14 @@ def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
         annotator, sample = row["annotator"], row["sample_id"]
         problems = [f"{name} is empty" for name in ("annotator", "sample_id") if not row[name]]
         if sample and sample not in known:
-            problems.append(f"sample_id {sample!r} is not a failure that the judge has labelled")
+            problems.append(f"sample_id {sample!r:.40} is not a failure that the judge has labelled")
         problems += [
-            f"{axis} is {row[axis]!r}; write 1 or 0, true or false, yes or no"
+            f"{axis} is {row[axis]!r:.40}; write 1 or 0, true or false, yes or no"
             for axis in AXES
             if row[axis].lower() not in (*YES_WORDS, *NO_WORDS)
         ]
         if (annotator, sample) in found:
-            problems.append(f"{annotator} has already labelled {sample} on line {found[annotator, sample][0]}")
+            problems.append(f"{annotator:.40} has already labelled {sample:.40} on line {found[annotator, sample][0]}")
         wrong += [f"{path}:{line}: {problem}" for problem in problems]
         found.setdefault((annotator, sample), (line, [row[axis].lower() in YES_WORDS for axis in AXES]))
     _refuse(wrong)
@@ -151,11 +151,13 @@ def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
 def _paired(path: Path, found: Mapping[tuple[str, str], tuple[int, list[bool]]]) -> HumanLabels:
     names = sorted({annotator for annotator, _ in found})
     if len(names) != 2:
-        raise TrapsError(f"{path}: has {len(names)} annotators ({', '.join(names) or 'none'}); it needs exactly two")
+        raise TrapsError(
+            f"{path}: has {len(names)} annotators ({', '.join(names)[:80] or 'none'}); it needs exactly two"
+        )
     one, other = names
     samples = sorted({sample for _, sample in found})
     alone = [(a, s, line) for (a, s), (line, _) in found.items() if (other if a == one else one, s) not in found]
-    _refuse([f"{path}:{line}: only {a} has labelled {s}; both annotators must" for a, s, line in alone])
+    _refuse([f"{path}:{line}: only {a:.40} has labelled {s:.40}; both annotators must" for a, s, line in alone])
     labels = np.array([[found[name, sample][1] for sample in samples] for name in names], bool)
     return HumanLabels((one, other), tuple(samples), labels)
 

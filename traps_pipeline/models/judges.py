@@ -13,7 +13,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import JUDGE_PROTOCOL, Entry, Limits, Protocol, read_entries, structured
 from traps_pipeline.paths import ASSETS
-from traps_pipeline.yamlfile import read_yaml
+from traps_pipeline.yamlfile import read_mapping
 
 JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZE = 3
@@ -57,7 +57,7 @@ def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     """The three judges of a panel. Raises TrapsError naming the file and what is wrong."""
-    panels, judges = read_yaml(path).get("panels"), load_judges(path)
+    panels, judges = read_mapping(path).get("panels"), load_judges(path)
     if not isinstance(panels, dict) or name not in panels:
         raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels or ())}")
     seats = panels[name]

@@ -4,6 +4,7 @@ entry, no code. Judges (`assets/judges.yaml`) are entries of the same form."""
 from __future__ import annotations
 
 import datetime
+import difflib
 import os
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -308,10 +309,13 @@ def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:
 
 
 def get_model(model_id: str) -> ModelEntry:
-    """The entry of that id. Raises TrapsError with the known ids."""
+    """The entry of that id. Raises TrapsError with ids that are like it."""
     models = load_models()
     if model_id not in models:
-        raise TrapsError(f"unknown model {model_id!r}; {MODELS_FILE} has {', '.join(models)}")
+        alike = difflib.get_close_matches(model_id, models, n=3, cutoff=0.4) or [*models][:3]
+        raise TrapsError(
+            f"unknown model {model_id!r:.60}; {MODELS_FILE} has {len(models)}, {', '.join(alike)} among them"
+        )
     return models[model_id]
 
 

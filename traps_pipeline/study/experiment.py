@@ -12,7 +12,7 @@ from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.study import Asked, MechanismSettings, Study
-from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
+from traps_pipeline.yamlfile import parse_yaml_model, read_yaml, within
 
 EXPERIMENTS = ASSETS / "experiments"
 
@@ -117,12 +117,13 @@ def load_experiment(name: str) -> Experiment:
             "file"
         )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
-    for model in experiment.models:
-        get_model(model)
-    for model in experiment.mechanism.models if experiment.mechanism else ():
-        if get_model(model).backend != LOCAL:
-            raise TrapsError(
-                f"{path}: mechanism.models: {model} is asked through backend {get_model(model).backend}, but only "
-                f"local models have states to read: {', '.join(local_models())}"
-            )
+    with within(path):
+        for model in experiment.models:
+            get_model(model)
+        for model in experiment.mechanism.models if experiment.mechanism else ():
+            if get_model(model).backend != LOCAL:
+                raise TrapsError(
+                    f"mechanism.models: {model} is asked through backend {get_model(model).backend}, but only local "
+                    f"models have states to read: {', '.join(local_models())}"
+                )
     return experiment
