@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from traps_pipeline.cli import main
-from traps_pipeline.scoring.audit import _same_words, audit
+from traps_pipeline.scoring.audit import _same_words, audit, counts_text
 from traps_pipeline.scoring.claims import CLAIMS
 from traps_pipeline.scoring.published import published
 
@@ -16,10 +16,14 @@ def findings():
 
 
 def test_the_counts_are_the_documented_ones(findings):
-    assert findings["verdict"].value_counts().to_dict() == {"agrees": 431, "within rounding": 69, "differs": 16}
-    documented = (Path(__file__).parents[2] / "docs" / "scoring.md").read_text()
-    assert "prints 516 statements" in documented
-    assert "500 agree" in documented
+    assert findings["verdict"].value_counts().to_dict() == {
+        "agrees": 468,
+        "within rounding": 69,
+        "differs": 37,
+        "declared": 2,
+    }
+    documented = " ".join((Path(__file__).parents[2] / "docs" / "scoring.md").read_text().split())
+    assert counts_text(findings) in documented
 
 
 def test_a_statement_agrees_only_with_the_same_numbers_and_the_same_names():
@@ -29,19 +33,45 @@ def test_a_statement_agrees_only_with_the_same_numbers_and_the_same_names():
     assert not _same_words("gpt-5-pro", "gpt-5-pro; gpt-5-mini")
 
 
-def test_the_shift_of_confabulated_items_is_held_against_the_model_that_it_is_stated_of(findings):
-    shifts = findings[findings["group"] == "probe means"]
-    assert len(shifts) == 3
-    assert shifts["statement"].str.contains("qwen3-vl-8b").all()
-    assert (shifts["verdict"] == "agrees").all()
+def test_every_printed_probe_mean_follows_from_its_four_pairs(findings):
+    means = findings[findings["group"] == "probe means"]
+    assert len(means) == 3 * 3 * 2
+    assert (means["verdict"] == "agrees").all()
+    # (.913 + .860 + .645 + .760) / 4 = .7945, which the paper prints as .795
+    (row,) = means[means["statement"] == "four-path mean AUROC, all items, qwen3-vl-8b, Cross-both"].to_dict("records")
+    assert (row["published"], row["recomputed"]) == ("0.795", "0.7945")
+
+
+def test_a_defect_is_counted_once_and_a_declared_difference_is_not_a_defect(findings):
+    assert findings["statement"].is_unique
+    about = findings[findings["statement"].str.contains("alpha 0")]
+    assert list(about.loc[about["verdict"] == "differs", "statement"].str.partition(":")[0]) == [
+        "steer-control", "steer-alpha0-families", "steer-alpha0-gemma", "sweep-alpha0",
+    ]  # fmt: skip
+    declared = findings[findings["verdict"] == "declared"]
+    assert declared["published"].tolist() == ["25", "39"]
+    # The verification run lies below the original one, but not here: 71.25 for 70.
+    (above,) = findings[findings["statement"].str.startswith("gemma-4-e4b: mean void abstention at alpha 10")].to_dict(
+        "records"
+    )
+    assert (above["verdict"], above["published"], above["recomputed"]) == ("differs", "70", "71.25")
+
+
+def test_every_statement_has_the_line_that_it_comes_from(findings):
+    assert findings["line"].str.fullmatch(r"\d+( and \d+)?").all()
 
 
 def test_every_published_claim_is_decided(findings):
     claims = findings[findings["group"] == "claims"]
     assert set(published("claims")["id"]) == set(CLAIMS)
-    assert len(claims) == 33
+    assert len(claims) == 73
     differing = claims.loc[claims["verdict"] == "differs", "statement"].str.partition(":")[0]
-    assert set(differing) == {"spread-video-native", "spread-gpt5", "steer-control", "steer-void", "steer-family"}
+    assert set(differing) == {
+        "spread-video-native", "spread-gpt5", "steer-control", "steer-void", "gap-families", "nine-contour",
+        "json-between", "gpt5-chaotic", "same-agreement", "guided-near-zero", "probe-replication-shift",
+        "probe-across-domains", "steer-chaotic-control", "steer-chaotic-void", "steer-single-paths", "steer-same-paths",
+        "steer-alpha0-families", "steer-alpha0-gemma", "sweep-alpha0", "sweep-chaotic", "validated-set",
+    }  # fmt: skip
 
 
 def test_the_overall_table_follows_from_the_cells_but_for_one(findings):
@@ -67,7 +97,8 @@ def test_two_printed_transfer_types_contradict_the_definitions(findings):
 def test_the_command_prints_claims_and_discrepancies_and_writes_all_findings(tmp_path, capsys):
     assert main(["audit", "--csv", str(tmp_path / "audit.csv")]) == 0
     printed = capsys.readouterr().out
-    assert "differs         steer-family" in printed
+    assert "agrees          steer-family" in printed
+    assert "differs         nine-contour" in printed and "(line 1907)" in printed
     assert "1 differs" in printed
     assert "overall acc of gemini-2.5-pro" not in printed
     assert "overall acc of gemini-2.5-pro" in (tmp_path / "audit.csv").read_text()

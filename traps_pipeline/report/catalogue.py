@@ -11,6 +11,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from traps_pipeline.report.figures import abstention, grids, landscape, mechanism
+from traps_pipeline.report.printed import mechanism as printed_mechanism
+from traps_pipeline.report.printed import scores as printed_scores
+from traps_pipeline.report.printed import setup as printed_setup
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables import comparisons, judges, leaderboards, setup, sub_scenarios
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
@@ -21,17 +24,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAPER = "published"  # folder below tables/ and figures/
+RECOMPUTED = "recomputed"  # folder below tables/, of what follows from the paper's tables
 
 
 @dataclass(frozen=True)
 class TableReport:
-    """A table (or several that belong together). reads: the stages whose tables it is made from; published: whether the
-    paper prints such a table."""
+    """A table (or several that belong together). reads: the stages whose tables it is made from; paper: the paper's
+    tables of the kind, as it prints them; recomputed: the names of those of its tables that `make` computes from the
+    paper's tables too, since their figures do not stand there."""
 
     name: str
     make: Callable[[Results], list[PrintedTable]]
     reads: tuple[str, ...]
-    published: bool = True
+    paper: Callable[[], list[PrintedTable]] | None = None
+    recomputed: tuple[str, ...] = ()
     title: str = ""  # of several tables together; by default the title of the first one
 
     @property
@@ -39,14 +45,29 @@ class TableReport:
         """What it shows."""
         return _first_paragraph(self.make)
 
+    @property
+    def published(self) -> bool:
+        """Whether there is anything of the paper's to show."""
+        return self.paper is not None or bool(self.recomputed)
+
     def tables(self, results: Results) -> list[PrintedTable]:
-        """The tables; those of the paper's numbers without the columns that the paper does not print."""
-        return [replace(t, columns=printed(results, t.rows, t.columns)) for t in self.make(results)]
+        """The tables; of the paper, those recomputed from its numbers, without columns that have no figure."""
+        made = [replace(t, columns=printed(results, t.rows, t.columns)) for t in self.make(results)]
+        return [table for table in made if results.is_study or table.name in self.recomputed]
+
+    def as_printed(self) -> list[PrintedTable]:
+        """The paper's own tables."""
+        return self.paper() if self.paper else []
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Files by path: `tables/name.csv` and so on, for the paper's numbers in `tables/published`."""
-        made = [file for table in self.tables(results) for file in table_files(table).items()]
-        return {f"{folder('tables', results)}/{name}": content for name, content in made}
+        """Files by path: `tables/name.csv` and so on; for the paper, its tables as printed in `tables/published` and
+        what follows from them in `tables/recomputed`."""
+        if results.is_study:
+            parts = {"tables": self.tables(results)}
+        else:
+            parts = {f"tables/{PAPER}": self.as_printed(), f"tables/{RECOMPUTED}": self.tables(results)}
+        made = [(folder, file) for folder, tables in parts.items() for t in tables for file in table_files(t).items()]
+        return {f"{folder}/{name}": content for folder, (name, content) in made}
 
 
 @dataclass(frozen=True)
@@ -81,33 +102,91 @@ class FigureReport:
 Report = TableReport | FigureReport
 
 TABLES: tuple[TableReport, ...] = (
-    TableReport("overall", leaderboards.overall, ("leaderboard",)),
-    TableReport("replication_overall", leaderboards.replication_overall, ("leaderboard",)),
-    TableReport("per_dataset", leaderboards.per_dataset, ("leaderboard",)),
-    TableReport("expanded", leaderboards.expanded, ("leaderboard",), title="By dataset and regime"),
-    TableReport("replication_per_dataset", leaderboards.replication_per_dataset, ("leaderboard",)),
-    TableReport("guided_uplift", comparisons.uplift, ("leaderboard", "contrasts")),
-    TableReport("visual_textual", comparisons.visual_textual, ("leaderboard",)),
-    TableReport("reasoning_pairs", comparisons.reasoning, ("leaderboard", "contrasts")),
-    TableReport("frontier", comparisons.frontier, ("leaderboard",)),
-    TableReport("pecs_naive", comparisons.naive, ("leaderboard",)),
-    TableReport("zero_boundary", comparisons.zero_boundary, ("leaderboard",)),
-    TableReport("contrasts", comparisons.contrasts, ("leaderboard", "contrasts"), published=False),
-    TableReport("regime_tests", comparisons.regime_tests, ("regime_tests",), published=False),
-    TableReport("run_spread", comparisons.spreads, ("leaderboard",)),
-    TableReport("degenerate_strategies", comparisons.degenerate, ("leaderboard",), published=False),
-    TableReport("occlusion_sub_scenarios", sub_scenarios.occlusion_sub_scenarios, ("metrics", "items")),
-    TableReport("chaotic_sub_scenarios", sub_scenarios.chaotic_sub_scenarios, ("metrics", "items")),
-    TableReport("judge_agreement", judges.agreement, ("agreement",)),
-    TableReport("judge_bias", judges.judge_bias, ("judge_bias", "leave_one_out"), published=False),
-    TableReport("confabulation", judges.confabulation, ("confabulation_prevalence",)),
-    TableReport("judge_validation", judges.validation, ("judge_validation",)),
-    TableReport("probes", tables_of_mechanism.probes, ("probes",), title="Probes"),
-    TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), title="Void directions"),
-    TableReport("steering", tables_of_mechanism.steering, ("steering_effects", "steering_shares"), title="Steering"),
-    TableReport("composition", setup.composition, ("items",)),
-    TableReport("models", setup.models, ("leaderboard",)),
-    TableReport("hyperparameters", setup.hyperparameters, ("leaderboard", "judge_bias")),
+    TableReport("overall", leaderboards.overall, ("leaderboard",), printed_scores.overall, recomputed=("overall",)),
+    TableReport(
+        "replication_overall",
+        leaderboards.replication_overall,
+        ("leaderboard",),
+        printed_scores.replication_overall,
+        recomputed=("replication_overall",),
+    ),
+    TableReport("per_dataset", leaderboards.per_dataset, ("leaderboard",), printed_scores.per_dataset),
+    TableReport(
+        "expanded", leaderboards.expanded, ("leaderboard",), printed_scores.expanded, title="By dataset and regime"
+    ),
+    TableReport(
+        "replication_per_dataset",
+        leaderboards.replication_per_dataset,
+        ("leaderboard",),
+        printed_scores.replication_per_dataset,
+    ),
+    TableReport(
+        "guided_uplift",
+        comparisons.uplift,
+        ("leaderboard", "contrasts"),
+        printed_scores.guided_uplift,
+        recomputed=("guided_uplift",),
+    ),
+    TableReport(
+        "visual_textual",
+        comparisons.visual_textual,
+        ("leaderboard",),
+        printed_scores.visual_textual,
+        recomputed=("visual_textual",),
+    ),
+    TableReport(
+        "reasoning_pairs", comparisons.reasoning, ("leaderboard", "contrasts"), recomputed=("reasoning_pairs",)
+    ),
+    TableReport("frontier", comparisons.frontier, ("leaderboard",), recomputed=("frontier",)),
+    TableReport("pecs_naive", comparisons.naive, ("leaderboard",), printed_scores.naive, recomputed=("pecs_naive",)),
+    TableReport(
+        "zero_boundary",
+        comparisons.zero_boundary,
+        ("leaderboard",),
+        printed_scores.zero_boundary,
+        recomputed=("zero_boundary",),
+    ),
+    TableReport("contrasts", comparisons.contrasts, ("leaderboard", "contrasts")),
+    TableReport("regime_tests", comparisons.regime_tests, ("regime_tests",)),
+    TableReport(
+        "run_spread", comparisons.spreads, ("leaderboard",), printed_scores.run_spread, recomputed=("run_spread",)
+    ),
+    TableReport("degenerate_strategies", comparisons.degenerate, ("leaderboard",), printed_scores.degenerate),
+    TableReport(
+        "occlusion_sub_scenarios",
+        sub_scenarios.occlusion_sub_scenarios,
+        ("metrics", "items"),
+        printed_scores.occlusion_sub_scenarios,
+        recomputed=("occlusion_sub_scenarios", "hidden_sub_scenarios"),
+    ),
+    TableReport(
+        "chaotic_sub_scenarios",
+        sub_scenarios.chaotic_sub_scenarios,
+        ("metrics", "items"),
+        printed_scores.chaotic_sub_scenarios,
+        recomputed=("chaotic_sub_scenarios",),
+    ),
+    TableReport("judge_agreement", judges.agreement, ("agreement",), printed_setup.agreement),
+    TableReport("judge_bias", judges.judge_bias, ("judge_bias", "leave_one_out")),
+    TableReport("confabulation", judges.confabulation, ("confabulation_prevalence",), printed_setup.confabulation),
+    TableReport("judge_validation", judges.validation, ("judge_validation",), printed_setup.validation),
+    TableReport(
+        "probes", tables_of_mechanism.probes, ("probes",), printed_mechanism.probes, ("probe_means",), "Probes"
+    ),
+    TableReport(
+        "cosines", tables_of_mechanism.cosines, ("cosines",), printed_mechanism.cosines, title="Void directions"
+    ),
+    TableReport(
+        "steering",
+        tables_of_mechanism.steering,
+        ("steering_effects", "steering_shares"),
+        printed_mechanism.steering,
+        recomputed=("steering_regimes",),
+        title="Steering",
+    ),
+    TableReport("composition", setup.composition, ("items",), printed_setup.composition),
+    TableReport("models", setup.models, ("leaderboard",), printed_setup.models),
+    TableReport("hyperparameters", setup.hyperparameters, ("leaderboard", "judge_bias"), printed_setup.hyperparameters),
 )
 FIGURES: tuple[FigureReport, ...] = (
     FigureReport("pecs_landscape", "PECS landscape", landscape.landscape, ("leaderboard",)),

@@ -8,7 +8,7 @@ from pathlib import Path
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.files import write_bytes
 from traps_pipeline.partitions import DATASETS, Cell
-from traps_pipeline.report.catalogue import FIGURES, TABLES
+from traps_pipeline.report.catalogue import FIGURES, RECOMPUTED, TABLES
 from traps_pipeline.report.contact_sheet import PAGE as SIX_PAIRS
 from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
 from traps_pipeline.report.items import FOLDER, addresses, write_item_pages
@@ -23,7 +23,8 @@ from traps_pipeline.report.page import (
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.study_results import StudyResults
-from traps_pipeline.report.writing import Behind, environment, figure_files
+from traps_pipeline.report.tables.audited import audit_table
+from traps_pipeline.report.writing import Behind, environment, figure_files, table_files
 from traps_pipeline.storage.workspace import Workspace
 
 PAGE, MARKDOWN, INDEX = "report.html", "leaderboard.md", "index.html"
@@ -33,6 +34,7 @@ SHEETS = {
     "arms_occlusion.png": "Arms of a scenario with a panel",
     "arms_chaotic.png": "Arms of a scenario with a cut",
 }
+FROM_PAPER = "recomputed from the published tables"  # the heading of what the paper does not print
 FULL = ("contact_sheet.png", "arms_occlusion.png", "arms_chaotic.png")  # shown as wide as the screen allows
 Pictures = Mapping[str, bytes]  # PNG by path below the reports folder
 
@@ -60,9 +62,10 @@ def _chapters(
     for report in TABLES:
         own = report.tables(study)
         blocks: list[Block] = [table_block(study.source, own, address)]
-        if report.published:
-            blocks.append(table_block(paper.source, report.tables(paper), None))
+        blocks += [table_block(paper.source, report.as_printed(), None)] if report.paper else []
+        blocks += [table_block(FROM_PAPER, report.tables(paper), None)] if report.recomputed else []
         tables.append(Card(f"table-{report.name}", report.title or own[0].title, blocks))
+    tables.append(Card("table-audit", "Audit of the paper", [table_block(FROM_PAPER, [audit_table()], None)]))
     sheets = [
         Card(name.removesuffix(".png"), title, [picture_block(study.source, pictures[name], name in FULL)])
         for name, title in SHEETS.items()
@@ -87,6 +90,9 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
             written += files
             pictures |= {path: content for path, content in files.items() if path.endswith(".png")}
             say(f"{source.source}: {report.name}")
+    for name, content in table_files(audit_table()).items():
+        write_bytes(target / "tables" / RECOMPUTED / name, content)
+        written.append(f"tables/{RECOMPUTED}/{name}")
     for path, content in _sheets(workspace):
         write_bytes(target / path, content)
         written.append(path)

@@ -7,15 +7,10 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.judging.tables import AGREEMENT
-from traps_pipeline.mechanism import effects
 from traps_pipeline.report.mechanism import (
     published_cosines,
-    published_domains,
     published_effects,
-    published_layers,
     published_probes,
-    published_regimes,
 )
 from traps_pipeline.report.results import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Makers, Results, joined
 from traps_pipeline.scoring import analyses
@@ -43,27 +38,24 @@ def _overall(results: Results) -> pd.DataFrame:
 
 
 def _rates(results: Results) -> pd.DataFrame:
-    """Gaps as printed (computed from unrounded rates); the pooled gaps are computed from the printed rates."""
+    """Printed rates, their means over taxonomies, and the gaps of both."""
     rows = published("visual_vs_textual")
     parts = []
     for taxonomy in analyses.TAXONOMIES:
-        names = {f"{taxonomy}_{kind}_pct": kind for kind in ("visual", "textual")} | {f"{taxonomy}_gap": "gap"}
-        part = rows.loc[:, ["model", *names]].rename(columns=names).assign(taxonomy=taxonomy)
+        names = {f"{taxonomy}_{kind}_pct": kind for kind in ("visual", "textual")}
+        part = rows.loc[:, ["model", "epoch", *names]].rename(columns=names).assign(taxonomy=taxonomy)
         part[["visual", "textual"]] /= 100
         parts.append(part)
     means = {kind: (kind, "mean") for kind in ("visual", "textual")}
-    pooled = joined(parts).groupby("model", sort=False).agg(**means).reset_index()
-    pooled["gap"] = analyses.ratio(pooled["textual"], pooled["visual"])
+    pooled = joined(parts).groupby(["model", "epoch"], sort=False).agg(**means).reset_index()
     table = joined([*parts, pooled.assign(taxonomy="pooled")])
-    table["gap"] = table["gap"].astype(float)
-    replication = table["model"].isin(analyses.models_of(group="replication"))
-    table["epoch"] = np.where(replication, "verification", "original")
+    table["gap"] = analyses.ratio(table["textual"], table["visual"])
     return table.reindex(columns=pd.Index(RATE_COLUMNS))
 
 
-def _sub_cells(results: Results) -> pd.DataFrame:
-    """A frame without rows, since the paper prints none."""
-    return pd.DataFrame(columns=pd.Index(["model", "dataset", "regime", "scope", "abs_rec", "n_pairs"]))
+def _none(*columns: str) -> pd.DataFrame:
+    """A frame without rows, where nothing follows from the paper's tables beyond what they print."""
+    return pd.DataFrame(columns=pd.Index(columns))
 
 
 def _sub_scenarios(results: Results) -> pd.DataFrame:
@@ -73,22 +65,10 @@ def _sub_scenarios(results: Results) -> pd.DataFrame:
     for name in [name for name in table if str(name).endswith("_pct")]:
         table[str(name).removesuffix("_pct")] = table[name] / 100
     table["abs_rec_uplift"] = table["guided_abs_rec"] - table["abs_rec"]
+    table["guided_pecs"] = np.nan
+    table["false_abs_uplift"] = table["guided_false_abs"] - table["false_abs"]
     table["textual_over_visual"] = analyses.ratio(table["abs_rec_ill_posed"], table["abs_rec"])
     return table.assign(epoch="original").reindex(columns=pd.Index(SUB_COLUMNS))
-
-
-def _labels(results: Results) -> pd.DataFrame:
-    """Values from the text of the paper, some of them approximate."""
-    rows = published("other")
-    rows = rows.loc[rows["id"].str.match("acc-(seesaw|dice)-")]
-    labels = rows["id"].str.rsplit("-", n=1).str[1]
-    return pd.DataFrame({"dataset": "chaotic", "label": labels, "acc": rows["value"].astype(float) / 100})
-
-
-def _agreement(results: Results) -> pd.DataFrame:
-    rows = published("judge_agreement")
-    table = rows[["dataset", "task", "fleiss_kappa"]].assign(judges="panel", agreement=rows["unanimous_pct"] / 100)
-    return table.reindex(columns=pd.Index(AGREEMENT.names)).assign(epoch="not stated")
 
 
 def _confabulation(results: Results) -> pd.DataFrame:
@@ -97,56 +77,23 @@ def _confabulation(results: Results) -> pd.DataFrame:
     return rows[["model", "n"]].assign(**shares, epoch="original")
 
 
-def _validation(results: Results) -> pd.DataFrame:
-    """100 failures, two annotators (docs/spec.md 6.3)."""
-    rows = published("judge_validation").rename(columns={"category": "axis", "acc": "accuracy"})
-    rows["human_agreement"] = rows["human_agree_pct"] / 100
-    return rows.assign(n_failures=100, n_labels=200, epoch="original")
-
-
-def _composition(results: Results) -> pd.DataFrame:
-    """The ill-posed datasets reuse the same scenarios (`other.csv`)."""
-    rows = published("composition").rename(columns={"void_source": "void"})
-    return rows[["taxonomy", "category", "void", "n"]].assign(n_ill_posed=rows["n"])
-
-
-def _steering_regimes(results: Results) -> pd.DataFrame:
-    """The printed table."""
-    rows = published_regimes()
-    return rows.loc[rows["family"] == "all"].reset_index(drop=True)
-
-
-def _steering_families(results: Results) -> pd.DataFrame:
-    """The printed table."""
-    rows = published_regimes()
-    return rows.loc[rows["family"] != "all"].reset_index(drop=True)
-
-
-def _steering_domains(results: Results) -> pd.DataFrame:
-    """The printed figures, two of which are only in the paper's text."""
-    return published_domains(effects.domains(results.effects))
-
-
 class PublishedResults(Results):
-    """The paper's numbers, as shipped in `assets/published`; a frame that the paper does not print has no rows."""
+    """The paper's numbers, as shipped in `assets/published`, from which figures are drawn and further tables computed.
+
+    The tables that the paper prints are shown by `report.printed`. A frame from which neither is made has no rows.
+    """
 
     source = "published"
     makers: ClassVar[Makers] = {
         "cells": _cells,
         "overall": _overall,
         "rates": _rates,
-        "sub_cells": _sub_cells,
+        "sub_cells": lambda results: _none("model", "dataset", "regime", "scope", "abs_rec", "n_pairs"),
         "sub_scenarios": _sub_scenarios,
-        "labels": _labels,
-        "agreement": _agreement,
+        "labels": lambda results: _none("dataset", "sub_scenario", "label", "acc"),
         "confabulation": _confabulation,
-        "validation": _validation,
-        "composition": _composition,
+        "composition": lambda results: _none("taxonomy", "category", "void", "n", "n_ill_posed"),
         "probes": lambda results: published_probes(),
         "cosines": lambda results: published_cosines(),
         "effects": lambda results: published_effects(),
-        "steering_regimes": _steering_regimes,
-        "steering_families": _steering_families,
-        "steering_domains": _steering_domains,
-        "steering_layers": lambda results: published_layers(),
     }

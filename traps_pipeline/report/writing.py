@@ -137,8 +137,8 @@ class PrintedTable:
     """A table for people: a frame, its printed columns, and notes (epoch, n, missing items).
 
     A table without rows says that it was not run, and `why`; if it was run and is empty for a good reason, it prints
-    `none` instead. `trace` returns the items behind a number, or None; `dash` is the meaning of a dash; `lead` is a
-    sentence after the title.
+    `none` instead. `trace` returns the items behind a number, or None; `dash` and `deviation` are the meanings of a
+    dash and of ±; `lead` is a sentence after the title.
     """
 
     name: str
@@ -151,6 +151,7 @@ class PrintedTable:
     none: str = ""
     dash: str = f"{NOT_RUN}, or undefined because no item is decided"
     lead: str = ""
+    deviation: str = "± population standard deviation over runs"
 
     @property
     def cells(self) -> list[list[str]]:
@@ -178,7 +179,7 @@ class PrintedTable:
         """The notes, also with the meaning of ± and of a dash if the table has them."""
         shown = [c for row in self.records for c in (column.text(row) for column in self.columns if column.is_number)]
         dashes = [f"{NONE} {self.dash}"] if any(cell.startswith(NONE) for cell in shown) else []
-        spreads = ["± population standard deviation over runs"] if any("±" in cell for cell in shown) else []
+        spreads = [self.deviation] if any("±" in cell for cell in shown) else []
         return [*(note for note in self.notes if note), *spreads, *dashes]
 
     @property
@@ -302,7 +303,7 @@ _LATEX = str.maketrans(
         "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': "''",
         "−": "$-$", "±": r"$\pm$", "×": r"$\times$", "∞": r"$\infty$", "≤": r"$\le$", "≥": r"$\ge$", "→": r"$\to$",
         "–": "--", "†": r"\dag{}", "‡": r"\ddag{}", "’": "'", "…": r"\ldots{}", "κ": r"$\kappa$", "α": r"$\alpha$",
-        "Δ": r"$\Delta$",
+        "Δ": r"$\Delta$", "≈": r"$\approx$", "∩": r"$\cap$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
     }
 )  # fmt: skip
 

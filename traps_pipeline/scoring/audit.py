@@ -1,8 +1,8 @@
 """Published values that follow from other published values, recomputed and compared (`traps audit`).
 
 Every statement gets a verdict: `agrees` (equal at the printed digits), `within rounding` (the printed result is
-possible if each printed input may be rounded in its last digit) or `differs`, with the arithmetic. No rule or threshold
-was chosen to make statements agree.
+possible if each printed input may be rounded in its last digit), `declared` (different, and the paper says why) or
+`differs`, with the arithmetic. No rule or threshold was chosen to make statements agree. Every defect is counted once.
 """
 
 from __future__ import annotations
@@ -10,25 +10,28 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from statistics import fmean
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
 from traps_pipeline.partitions import LONG, transfer_type
-from traps_pipeline.scoring.analyses import SHARES, overall
-from traps_pipeline.scoring.claims import CLAIMS, DOSE_AGAINST_REGIME
-from traps_pipeline.scoring.published import published, published_cells, published_overall
+from traps_pipeline.scoring.analyses import SHARES, models_of, overall
+from traps_pipeline.scoring.claims import CLAIMS
+from traps_pipeline.scoring.published import published, published_cells, published_overall, published_rows
 
-AGREES, ROUNDING, DIFFERS = "agrees", "within rounding", "differs"
-Verdict = Literal["agrees", "within rounding", "differs"]
+AGREES, ROUNDING, DECLARED, DIFFERS = "agrees", "within rounding", "declared", "differs"
+Verdict = Literal["agrees", "within rounding", "declared", "differs"]
 _NUMBER = re.compile(r"(?<![\w.-])\d+(?:\.\d+)?(?![\w-]*[a-z])")
 _SLACK = 1e-9
+_AGREEING = (AGREES, ROUNDING)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One published statement, and the value that the published tables give for it."""
+    """One published statement, the value that the published tables give for it, and the line of the paper's source
+    that it comes from."""
 
     group: str
     statement: str
@@ -36,10 +39,11 @@ class Finding:
     recomputed: str
     verdict: Verdict
     reason: str = ""
+    line: str = ""
 
 
 def audit() -> pd.DataFrame:
-    """Every finding: columns group, statement, published, recomputed, verdict, reason."""
+    """Every finding: columns group, statement, published, recomputed, verdict, reason, line."""
     groups: Sequence[Callable[[], Iterator[Finding]]] = (
         claims,
         overall_means,
@@ -51,6 +55,7 @@ def audit() -> pd.DataFrame:
         steering_families,
         validation_scores,
         composition_sums,
+        contradictions,
     )
     return pd.DataFrame([asdict(finding) for check in groups for finding in check()])
 
@@ -61,14 +66,24 @@ def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
         lines.append(f"{group}: {len(rows)} statements: {counts}")
-        shown = rows if everything or group == "claims" else rows.loc[rows["verdict"] == DIFFERS]
+        shown = rows if everything or group == "claims" else rows.loc[rows["verdict"].isin([DIFFERS, DECLARED])]
         for row in shown.to_dict("records"):
-            lines.append(f"  {row['verdict']:<15} {row['statement']}")
+            where = f" (line {row['line']})" if row["line"] else ""
+            lines.append(f"  {row['verdict']:<15} {row['statement']}{where}")
             lines.append(f"  {'':<15} published {row['published']}; recomputed {row['recomputed']}")
             lines += [f"  {'':<15} {row['reason']}"] if row["reason"] else []
-    differing = np.count_nonzero(findings["verdict"] == DIFFERS)
-    lines.append(f"{len(findings)} statements, {differing} differ from what the published tables give")
+    lines.append(counts_text(findings))
     return "\n".join(lines)
+
+
+def counts_text(findings: pd.DataFrame) -> str:
+    """How many statements agree, differ with a declaration, and disagree, as a sentence."""
+    count = {verdict: np.count_nonzero(findings["verdict"] == verdict) for verdict in (*_AGREEING, DECLARED, DIFFERS)}
+    agreeing = sum(count[verdict] for verdict in _AGREEING)
+    return (
+        f"{len(findings)} statements: {agreeing} agree ({count[ROUNDING]} of them within rounding), {count[DECLARED]} "
+        f"differ as the paper declares, {count[DIFFERS]} disagree"
+    )
 
 
 # --- claims.csv -------------------------------------------------------------------------------------------------------
@@ -78,11 +93,13 @@ def claims() -> Iterator[Finding]:
     """Every statement of `claims.csv`. Raises KeyError for a statement whose arithmetic is not in `claims`."""
     for claim in published("claims").to_dict("records"):
         printed, found = str(claim["published"]), CLAIMS[str(claim["id"])]()
-        verdict = AGREES if _same_words(printed, found.words) else DIFFERS
+        same = _same_words(printed, found.words) if found.agrees is None else found.agrees
+        verdict: Verdict = AGREES if same else DIFFERS
         reason = found.reason if verdict == DIFFERS else ""
-        if verdict == DIFFERS:
+        if verdict == DIFFERS and found.agrees is None:
             reason = f"{_differences(printed, found.words)}{'; ' + reason if reason else ''}"
-        yield Finding("claims", f"{claim['id']}: {claim['statement']}", printed, _shown(found.words), verdict, reason)
+        statement, line = f"{claim['id']}: {claim['statement']}", str(claim["line"])
+        yield Finding("claims", statement, printed, _shown(found.words), verdict, reason, line)
 
 
 def _same_words(printed: str, recomputed: str) -> bool:
@@ -120,6 +137,12 @@ def _shown(words: str) -> str:
     return re.sub(r"(\d\.\d*?[1-9])0+(?!\d)|(\d+)\.0+(?!\d)", r"\1\2", words) if re.search(r"\.\d{4}", words) else words
 
 
+def _line(table: str) -> str:
+    """The line of a table in the paper's source."""
+    (place,) = published_rows("tables", name=table)
+    return str(place["line"])
+
+
 # --- tables against each other ----------------------------------------------------------------------------------------
 
 
@@ -139,7 +162,11 @@ def overall_means() -> Iterator[Finding]:
             sums = " + ".join(f"{part:.{3 if share == 'pecs' else 1}f}" for part in parts)
             reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - theirs:+.2g}"
             name = f"overall {share} of {model}, {regime}"
-            yield Finding("overall", name, f"{theirs:.{digits}f}", f"{value:.{digits + 2}f}", verdict, reason)
+            shown = f"{theirs:.{digits}f}", f"{value:.{digits + 2}f}"
+            yield Finding("overall", name, *shown, verdict, reason, _line("overall"))
+
+
+_REPLICATION = models_of(group="replication")
 
 
 def pecs_factors() -> Iterator[Finding]:
@@ -161,7 +188,8 @@ def pecs_factors() -> Iterator[Finding]:
         )
         name = f"PECS of {cell['model']}, {cell['dataset']}, {cell['regime']}"
         shown = f"{shares['pecs']:.3f}", f"{naive:.4f}"
-        yield Finding("pecs factors", name, *shown, verdict, "" if verdict == AGREES else reason)
+        group = "replication_per_dataset" if cell["model"] in _REPLICATION else "per_dataset"
+        yield Finding("pecs factors", name, *shown, verdict, "" if verdict == AGREES else reason, _line(group))
 
 
 def _pecs_range(cell: Mapping[Hashable, Any], shares: Mapping[str, float]) -> tuple[float, float]:
@@ -196,64 +224,61 @@ def gaps() -> Iterator[Finding]:
                 "" if agrees else f"{textual:g} / {visual:g} = {ours:.2f}; rounding allows {lowest:.2f}-{highest:.2f}"
             )
             name = f"textual over visual, {taxonomy}, {row['model']}"
-            yield Finding("gaps", name, f"{printed:g}", f"{ours:.2f}", verdict, reason)
+            yield Finding("gaps", name, f"{printed:g}", f"{ours:.2f}", verdict, reason, _line("visual_textual"))
 
 
 def probe_means() -> Iterator[Finding]:
-    """The shift of mean AUROC from all items to confabulated items, by transfer type, against the largest shift that
-    the paper states, which it does for qwen3-vl-8b alone."""
-    stated = float(published("claims").set_index("id").loc["probe-cf-shift", "published"])
-    rows = published("probe_transfer").query("model == 'qwen3-vl-8b'")
-    means = pd.DataFrame(rows.groupby("transfer_type")[["auroc", "auroc_confabulated"]].mean())
-    for kind, row in means.to_dict("index").items():
-        shift = float(row["auroc"] - row["auroc_confabulated"])
-        verdict: Verdict = AGREES if shift <= stated + 0.005 + _SLACK else DIFFERS
-        name = f"four-path mean AUROC, all minus confabulated only, qwen3-vl-8b, {kind}"
-        yield Finding("probe means", name, f"at most {stated:g}", f"{shift:.3f}", verdict)
+    """The printed four-path means against the means of the printed pairs, each rounded in its last digit."""
+    columns = {"auroc": "all items", "auroc_confabulated": "confabulated items"}
+    for row in published_rows("probe_means"):
+        pairs = published_rows("probe_transfer", model=row["model"], transfer_type=row["transfer_type"])
+        for column, items in columns.items():
+            mean = fmean(pair[column] for pair in pairs)
+            off = abs(mean - row[column])
+            verdict: Verdict = AGREES if off <= 0.0005 + _SLACK else ROUNDING if off <= 0.001 + _SLACK else DIFFERS
+            name = f"four-path mean AUROC, {items}, {row['model']}, {row['transfer_type']}"
+            shown = f"{row[column]:.3f}", f"{mean:.5g}"
+            yield Finding("probe means", name, *shown, verdict, line=_line("probe_means"))
 
 
 def transfer_types() -> Iterator[Finding]:
     """Printed transfer types against the definitions."""
-    for name in ("probe_transfer", "steering_alpha10_qwen"):
+    for name, table in (("probe_transfer", "probe_transfer"), ("steering_alpha10_qwen", "steering_top")):
         for row in published(name).to_dict("records"):
             ours, printed = transfer_type(LONG[row["source"]], LONG[row["target"]]), str(row["transfer_type"])
             where = f"{name}: type of {row['source']} to {row['target']}" + (
                 f", {row['model']}" if "model" in row else ""
             )
             reason = "" if ours == printed else f"{row['source']} and {row['target']} share the taxonomy"
-            yield Finding("transfer types", where, printed, ours, AGREES if ours == printed else DIFFERS, reason)
+            verdict: Verdict = AGREES if ours == printed else DIFFERS
+            yield Finding("transfer types", where, printed, ours, verdict, reason, _line(table))
 
 
 def steering_means() -> Iterator[Finding]:
-    """The regime table against the means of the dose tables of the same model, direction and inference regime."""
-    regimes = published("steering_regime")
-    # The dose tables do not name their direction regime; the claims use standard directions and guided inference.
-    for name, model in (("steering_dose_qwen", "qwen3-vl-8b"), ("steering_dose_gemma", "gemma-4-e4b")):
-        printed = regimes.query(
-            "model == @model and direction_family == 'all' and direction_regime == 'standard' "
-            "and inference_regime == 'guided'"
-        ).iloc[0]
-        sides = ["control_abstention_pct", "void_abstention_pct"]
-        dose = pd.DataFrame(published(name).groupby("alpha")[sides].mean()).to_dict("index")
-        for side in ("control", "void"):
-            for alpha in (0, 10):
-                ours, theirs = float(dose[alpha][f"{side}_abstention_pct"]), float(printed[f"{side}_alpha{alpha}"])
-                verdict: Verdict = AGREES if abs(ours - theirs) <= 0.5 + _SLACK else DIFFERS
-                reason = "" if verdict == AGREES else f"differs by {ours - theirs:+.3g} points: {_DOSE_REASONS[name]}"
-                statement = f"{model}: mean {side} abstention at alpha {alpha} over the eight paths"
-                yield Finding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason)
-
-
-_DOSE_REASONS = {
-    "steering_dose_qwen": DOSE_AGAINST_REGIME,
-    "steering_dose_gemma": "the dose table is a verification run with a reduced generation budget; the regime table is "
-    "authoritative",
-}
+    """The regime table of gemma-4-e4b against the means of its dose table, which the paper calls a verification run
+    with a smaller budget whose rates lie below. (Of qwen3-vl-8b the claims make the same comparison.)"""
+    prompts = {"direction_family": "all", "direction_regime": "standard", "inference_regime": "guided"}
+    (printed,) = published_rows("steering_regime", model="gemma-4-e4b", **prompts)
+    for side in ("control", "void"):
+        for alpha in (0, 10):
+            theirs = printed[f"{side}_alpha{alpha}"]
+            ours = fmean(row[f"{side}_abstention_pct"] for row in published_rows("steering_dose_gemma", alpha=alpha))
+            same, below = abs(ours - theirs) <= 0.5 + _SLACK, ours < theirs
+            verdict: Verdict = AGREES if same else DECLARED if below else DIFFERS
+            where = (
+                "as the paper declares of the verification run" if below else "though the paper says that it lies below"
+            )
+            reason = "" if same else f"lies {abs(ours - theirs):.3g} points {'below' if below else 'above'}, {where}"
+            statement = f"gemma-4-e4b: mean {side} abstention at alpha {alpha} over the eight paths"
+            yield Finding("steering", statement, f"{theirs:g}", f"{ours:g}", verdict, reason, "1418")
 
 
 def steering_families() -> Iterator[Finding]:
-    """The regime table's figures over all paths against the means of its two source families, of four paths each."""
-    rows = published("steering_regime").query("direction_regime == 'guided' and inference_regime == 'guided'")
+    """The regime table's figures over all paths against the means of its two source families, of four paths each.
+
+    The table does not say under which prompt the families' directions were read; the guided ones are assumed.
+    """
+    rows = published("steering_regime").query("inference_regime == 'guided' and direction_regime != 'standard'")
     for model, group in rows.groupby("model", sort=False):
         by_family = group.set_index("direction_family")
         for side in ("control", "void"):
@@ -265,7 +290,7 @@ def steering_families() -> Iterator[Finding]:
             sums = f"({families[0]:g} + {families[1]:g}) / 2 = {ours:g}"
             reason = "" if verdict == AGREES else f"{sums}: the families are not halves of the paths averaged in `all`"
             statement = f"{model}: {side} abstention at alpha 10, all paths, guided directions and inference"
-            yield Finding("steering", statement, f"{stated:g}", f"{ours:g}", verdict, reason)
+            yield Finding("steering", statement, f"{stated:g}", f"{ours:g}", verdict, reason, _line("steering_regimes"))
 
 
 def validation_scores() -> Iterator[Finding]:
@@ -278,7 +303,8 @@ def validation_scores() -> Iterator[Finding]:
         reachable = lowest - 0.005 <= printed <= highest + 0.005
         verdict: Verdict = AGREES if agrees else ROUNDING if reachable else DIFFERS
         reason = "" if agrees else f"rounding of precision and recall allows {lowest:.3f} to {highest:.3f}"
-        yield Finding("validation", f"F1, {row['category']}", f"{printed:.2f}", f"{ours:.3f}", verdict, reason)
+        shown = f"{printed:.2f}", f"{ours:.3f}"
+        yield Finding("validation", f"F1, {row['category']}", *shown, verdict, reason, _line("judge_validation"))
 
 
 def _f1(precision: float, recall: float) -> float:
@@ -287,8 +313,21 @@ def _f1(precision: float, recall: float) -> float:
 
 def composition_sums() -> Iterator[Finding]:
     """Category counts against the totals that the paper states: 202 occlusion and 500 chaotic pairs."""
-    counts = pd.Series(published("composition").groupby("taxonomy")["n"].sum()).to_dict()
-    for taxonomy, row in (("occlusion", "ill-posed-occlusion"), ("chaotic", "ill-posed-chaotic")):
-        stated, ours = int(float(published("other").set_index("id").loc[row, "value"])), int(counts[taxonomy])
+    counts: dict[str, int] = {}
+    for row in published_rows("composition"):
+        counts[row["dataset"]] = counts.get(row["dataset"], 0) + row["n"]
+    for taxonomy in ("occlusion", "chaotic"):
+        stated, ours = counts[f"{taxonomy}_ill_posed"], counts[taxonomy]
         verdict: Verdict = AGREES if ours == stated else DIFFERS
-        yield Finding("composition", f"pairs of {taxonomy}", str(stated), str(ours), verdict)
+        shown = str(stated), str(ours)
+        yield Finding("composition", f"pairs of {taxonomy}", *shown, verdict, line=_line("composition"))
+
+
+# --- the text against itself ------------------------------------------------------------------------------------------
+
+
+def contradictions() -> Iterator[Finding]:
+    """Statements of the paper's text that another of its places contradicts, which no arithmetic decides."""
+    for row in published_rows("contradictions"):
+        lines = f"{row['line']} and {row['other_line']}"
+        yield Finding("contradictions", row["id"], row["statement"], row["against"], DIFFERS, line=lines)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from statistics import fmean, median
+from typing import Any
 
 import pandas as pd
 
+from traps_pipeline.models.registry import load_models
+from traps_pipeline.partitions import REGIMES
 from traps_pipeline.scoring.analyses import (
     hidden_against_others,
     models_of,
@@ -16,20 +19,8 @@ from traps_pipeline.scoring.analyses import (
     uplift,
     zero_boundary,
 )
-from traps_pipeline.scoring.published import published, published_cells, published_overall
-
-DOSE_AGAINST_REGIME = (
-    "the eight rows of the dose table repeat one alpha 0 cell a target (control 18 on ch and ch_ip, 0 on oc and oc_ip; "
-    "void 76, 90, 46, 100); only with another ch target in place of ch to oc_ip would alpha 0 be 11.25 and 66.5"
-)
-
-
-@dataclass(frozen=True)
-class Recomputed:
-    """A statement as recomputed, in the published wording, and the reason why it may differ."""
-
-    words: str
-    reason: str = ""
+from traps_pipeline.scoring.claims_mechanism import MECHANISM, Recomputed, text_figure
+from traps_pipeline.scoring.published import published, published_cells, published_overall, published_rows
 
 
 def _best(regime: str) -> Recomputed:
@@ -111,38 +102,6 @@ def _think_qwen() -> Recomputed:
     return Recomputed(f"{rates['qwen3-vl-instruct']:.1f} and {rates['qwen3-vl-think']:.1f}")
 
 
-def _probe_best() -> Recomputed:
-    rows = published("probe_transfer").query("model == 'qwen3-vl-8b'")
-    best = rows.loc[rows["auroc"].idxmax()]
-    return Recomputed(f"{best['auroc']:.3f} ({best['source']} to {best['target']})")
-
-
-def _probe_shift() -> Recomputed:
-    rows = published("probe_transfer").query("model == 'qwen3-vl-8b'")
-    means = pd.DataFrame(rows.groupby("transfer_type")[["auroc", "auroc_confabulated"]].mean())
-    return Recomputed(f"{(means['auroc'] - means['auroc_confabulated']).max():.4f}")
-
-
-def _probe_medians() -> Recomputed:
-    medians = pd.Series(published("probe_transfer").groupby("model")["auroc_confabulated"].median())
-    return Recomputed(f"{medians.min():.4f} to {medians.max():.4f}")
-
-
-def _steering(side: str) -> Recomputed:
-    means = pd.Series(published("steering_dose_qwen").groupby("alpha")[f"{side}_abstention_pct"].mean())
-    return Recomputed(f"{means[0]:g} and {means[10]:g}", DOSE_AGAINST_REGIME)
-
-
-def _steering_families() -> Recomputed:
-    rows = published("steering_alpha10_qwen")
-    families = pd.Series(rows.groupby(rows["source"].str.removesuffix("_ip"))["control_abstention_pct"].mean())
-    return Recomputed(
-        f"{families['oc']:g} and {families['ch']:g}",
-        "means of the four rows of each family in the alpha 10 table, whose directions are standard; the printed "
-        "figures stand in the regime table for guided directions, the paths of which are not published",
-    )
-
-
 def _range(name: str, column: str, decimals: int, models: Sequence[str] | None = None) -> Recomputed:
     rows = published(name)
     values = rows[column] if models is None else rows.set_index("model").loc[list(models), column]
@@ -165,6 +124,164 @@ def _flash_thinking() -> Recomputed:
     return Recomputed(f"{float(change.min()):.2f} to {float(change.max()):.2f}")
 
 
+def _pooled(row: dict[str, Any], kind: str) -> float:
+    return (row[f"occlusion_{kind}_pct"] + row[f"chaotic_{kind}_pct"]) / 2
+
+
+def _gap_median() -> Recomputed:
+    gaps = [_pooled(row, "textual") / _pooled(row, "visual") for row in published_rows("visual_vs_textual")]
+    return Recomputed(f"{median(gaps):.4f}")
+
+
+def _family_gaps() -> Recomputed:
+    rows = {row["model"]: row for row in published_rows("visual_vs_textual")}
+    families: dict[str, list[dict[str, Any]]] = {}
+    for entry in load_models().values():
+        if entry.id in rows:
+            families.setdefault(entry.groups.family, []).append(rows[entry.id])
+    gaps = {
+        family: sum(_pooled(row, "textual") for row in of) / sum(_pooled(row, "visual") for row in of)
+        for family, of in families.items()
+    }
+    listed = ", ".join(f"{family} {value:.1f}" for family, value in gaps.items())
+    return Recomputed(f"{min(gaps.values()):.1f} to {max(gaps.values()):.1f}", listed)
+
+
+def _by_regime(figure: str, models: Sequence[str]) -> dict[tuple[str, str], dict[str, float]]:
+    """The printed figure by (model, dataset) and regime."""
+    found: dict[tuple[str, str], dict[str, float]] = {}
+    for row in published_rows("behavioral_per_dataset"):
+        if row["model"] in models:
+            found.setdefault((row["model"], row["dataset"]), {})[row["regime"]] = row[figure]
+    return found
+
+
+def _means(cells: dict[tuple[str, str], dict[str, float]]) -> dict[str, dict[str, float]]:
+    """The equal-weight means over datasets by model and regime."""
+    models = dict.fromkeys(model for model, _ in cells)
+    of = {model: [cell for (name, _), cell in cells.items() if name == model] for model in models}
+    return {model: {regime: fmean(cell[regime] for cell in parts) for regime in REGIMES} for model, parts in of.items()}
+
+
+def _ties() -> Recomputed:
+    cells = _by_regime("abs_rec_pct", models_of("main"))
+    ties = [" ".join(key) for key, cell in cells.items() if cell["guided"] <= cell["standard"]]
+    return Recomputed(f"{len(ties)} ({'; '.join(ties)})")
+
+
+def _accuracy_kept() -> Recomputed:
+    cells = _by_regime("acc_pct", _video_native())
+    means = _means(cells)
+    kept = [
+        sum(abs(row["guided"] - row["standard"]) <= 2 + 1e-9 for row in rows)
+        for rows in (means.values(), cells.values())
+    ]
+    words = f"{kept[0]} of {len(means)} overall, {kept[1]} of {len(cells)} cells"
+    return Recomputed(words, agrees=2 * kept[0] > len(means) and 2 * kept[1] > len(cells))
+
+
+def _reported_above() -> Recomputed:
+    return Recomputed(f"{sum(row['pecs'] >= 0.4 for row in published_rows('overall', regime='guided'))}")
+
+
+def _above_contour() -> Recomputed:
+    models = [*models_of("main"), *models_of("replication")]
+    acc, abs_rec, false_abs = (_means(_by_regime(f"{name}_pct", models)) for name in ("acc", "abs_rec", "false_abs"))
+    products = {m: acc[m]["guided"] * (abs_rec[m]["guided"] - false_abs[m]["guided"]) / 1e4 for m in models}
+    reason = f"gpt-5-high is at {products['gpt-5-high']:.3f} there; its reported PECS is .400"
+    return Recomputed(f"{sum(value >= 0.4 for value in products.values())}", reason)
+
+
+def _json_between() -> Recomputed:
+    overall: dict[str, dict[str, float]] = {}
+    for row in published_rows("overall"):
+        overall.setdefault(row["model"], {})[row["regime"]] = row["pecs"]
+    cells = _by_regime("pecs", [*overall])
+    counts = [
+        sum(row["standard"] < row["json"] < row["guided"] for row in rows)
+        for rows in (overall.values(), cells.values())
+    ]
+    words = f"{counts[0]} of {len(overall)} models overall, {counts[1]} of {len(cells)} cells"
+    agrees = 2 * counts[0] > len(overall) and 2 * counts[1] > len(cells)
+    return Recomputed(words, "most models overall, but fewer than half of the cells", agrees=agrees)
+
+
+def _gpt5_chaotic() -> Recomputed:
+    rows = published_rows("behavioral_per_dataset", dataset="chaotic", regime="standard")
+    rates = [row["abs_rec_pct"] for row in rows if row["model"] in models_of(family="gpt-5")]
+    reason = "the original evaluation has 0.0 to 1.3 in the table of visual and textual voids"
+    return Recomputed(f"{min(rates):.1f} to {max(rates):.1f}", reason, agrees=max(rates) < 5)
+
+
+def _same_agreement() -> Recomputed:
+    figures = [
+        [(row["unanimous_pct"], row["fleiss_kappa"]) for row in rows if row["task"] != "void_abstention"]
+        for rows in (published_rows("judge_agreement", dataset=name) for name in ("chaotic", "chaotic_ill_posed"))
+    ]
+    listed = "; ".join(f"{share:g} % and {kappa:.3f}" for share, kappa in figures[0])
+    reason = f"both have {listed}, though the items, Acc and FalseAbs differ; the epoch is not stated"
+    return Recomputed("different" if figures[0] != figures[1] else "equal to three digits", reason)
+
+
+def _guided_near_zero() -> Recomputed:
+    rates = {row["sub_scenario"]: row["guided_abs_rec_pct"] for row in published_rows("occlusion_subscenarios")}
+    words = ", ".join(f"{name} {rates[name]:g}" for name in ("slide", "spring", "stack"))
+    return Recomputed(words, f"topple has {rates['topple']:g}", agrees=max(rates["spring"], rates["stack"]) < 5)
+
+
+def _change(table: str, sub_scenario: str, share: str) -> Recomputed:
+    (row,) = published_rows(table, sub_scenario=sub_scenario)
+    return Recomputed(f"{row[f'guided_{share}_pct'] - row[f'{share}_pct']:.4f}")
+
+
+def _textual_ratio(sub_scenario: str) -> Recomputed:
+    (row,) = published_rows("chaotic_subscenarios", sub_scenario=sub_scenario)
+    visual, textual = row["abs_rec_pct"], row["abs_rec_ill_posed_pct"]
+    low, high = (textual - 0.05) / (visual + 0.05), (textual + 0.05) / (visual - 0.05)
+    (printed,) = published_rows("other", id=f"{sub_scenario}-ratio")
+    half = 0.05 if "." in printed["value"] else 0.5
+    agrees = low - half <= float(printed["value"]) <= high + half
+    return Recomputed(f"{textual / visual:.2f}", f"rounding of the rates allows {low:.1f} to {high:.1f}", agrees=agrees)
+
+
+def _validated() -> Recomputed:
+    validated = ("gemini-2.5-flash", "gemini-2.5-flash-nt", "qwen3-vl-think", "qwen3-vl-instruct")
+    sizes = [row["n"] for row in published_rows("confabulation_taxonomy") if row["model"] in validated]
+    return Recomputed(f"{sum(sizes)}", " + ".join(map(str, sizes)))
+
+
+def _es_scores() -> Recomputed:
+    positives, missed, labels, agreeing = 13, 8, 100, 92
+    recall, accuracy = (positives - missed) / positives, 1 - missed / labels
+    chance = (positives**2 + (labels - positives) ** 2) / labels**2
+    f1, kappa = 2 * recall / (1 + recall), (agreeing / labels - chance) / (1 - chance)
+    return Recomputed(f"{accuracy:.4f} and {recall:.4f} and {f1:.4f} and {kappa:.4f}")
+
+
+def _reviewed() -> Recomputed:
+    kept, corrected, discarded = (text_figure(f"review-{kind}") for kind in ("kept", "corrected", "discarded"))
+    return Recomputed(f"{kept + corrected + discarded:g}")
+
+
+def _evaluated() -> Recomputed:
+    rows = published_rows("behavioral_per_dataset", model="gpt-5-pro", regime="standard")
+    return Recomputed(f"{sum(row['n_pairs'] for row in rows)}")
+
+
+def _sum(name: str, column: str) -> Recomputed:
+    return Recomputed(f"{sum(row[column] for row in published_rows(name)):g}")
+
+
+def _pairs() -> int:
+    return sum(row["n"] for row in published_rows("composition"))
+
+
+def _calls() -> Recomputed:
+    runs = (len(models_of("main")) + len(models_of("replication")) - 1) * 3 + 1  # one model has a single run
+    calls = 2 * 3 * runs * _pairs()
+    return Recomputed(f"{calls}", agrees=calls > text_figure("vlm-calls"))
+
+
 CLAIMS: dict[str, Callable[[], Recomputed]] = {
     "best-standard": lambda: _best("standard"),
     "best-guided": lambda: _best("guided"),
@@ -185,11 +302,6 @@ CLAIMS: dict[str, Callable[[], Recomputed]] = {
     "gap-chaotic-range": _chaotic_gaps,
     "gap-all-above": _textual_above,
     "think-qwen": _think_qwen,
-    "probe-best-qwen": _probe_best,
-    "probe-cf-shift": _probe_shift,
-    "probe-cf-medians": _probe_medians,
-    "steer-control": lambda: _steering("control"),
-    "steer-void": lambda: _steering("void"),
     "agreement-unanimous": lambda: _range("judge_agreement", "unanimous_pct", 1),
     "agreement-kappa": lambda: _range("judge_agreement", "fleiss_kappa", 3),
     "confab-hp": lambda: _range("confabulation_taxonomy", "hp_pct", 0),
@@ -200,7 +312,32 @@ CLAIMS: dict[str, Callable[[], Recomputed]] = {
     "judge-accuracy": lambda: _mean("judge_validation", "acc", 100),
     "hidden-vs-observable": lambda: _hidden("abs_rec_pct"),
     "hidden-vs-observable-guided": lambda: _hidden("guided_abs_rec_pct"),
-    "steer-family": _steering_families,
     "flash-thinking": _flash_thinking,
     "human-agreement": lambda: _mean("judge_validation", "human_agree_pct", 1),
+    "gap-median": _gap_median,
+    "gap-families": _family_gaps,
+    "one-tie": _ties,
+    "accuracy-kept": _accuracy_kept,
+    "nine-reported": _reported_above,
+    "nine-contour": _above_contour,
+    "json-between": _json_between,
+    "gpt5-chaotic": _gpt5_chaotic,
+    "same-agreement": _same_agreement,
+    "guided-near-zero": _guided_near_zero,
+    "uplift-dice-ar": lambda: _change("chaotic_subscenarios", "tumbling_dice", "abs_rec"),
+    "uplift-dice-fa": lambda: _change("chaotic_subscenarios", "tumbling_dice", "false_abs"),
+    "uplift-seesaw-ar": lambda: _change("chaotic_subscenarios", "seesaw", "abs_rec"),
+    "uplift-seesaw-fa": lambda: _change("chaotic_subscenarios", "seesaw", "false_abs"),
+    "uplift-pachinko-ar": lambda: _change("chaotic_subscenarios", "pachinko", "abs_rec"),
+    "uplift-launch": lambda: _change("occlusion_subscenarios", "launch", "abs_rec"),
+    "pachinko-ratio": lambda: _textual_ratio("pachinko"),
+    "seesaw-ratio": lambda: _textual_ratio("seesaw"),
+    "validated-set": _validated,
+    "human-count": lambda: _sum("judge_validation", "human_agree_pct"),
+    "es-scores": _es_scores,
+    "review-sum": _reviewed,
+    "evaluated-pairs": _evaluated,
+    "judged-pairs": lambda: Recomputed(f"{_pairs() * 3 * 3}"),
+    "calls": _calls,
+    **MECHANISM,
 }

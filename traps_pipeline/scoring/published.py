@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
@@ -17,11 +17,25 @@ _RENAMED = {"acc": "acc_pct", "abs_rec": "abs_rec_pct", "false_abs": "false_abs_
 
 
 def published(name: str) -> pd.DataFrame:
-    """One published file as printed: percentages are percent, PECS and AUROC fractions (`assets/published/README.md`).
+    """One published file as numbers: percentages are percent, PECS and AUROC fractions (`assets/published/README.md`).
 
     name is the file's stem, e.g. `probe_transfer`. Raises TrapsError that lists the files for another name.
     """
     return _read(name).copy()
+
+
+def as_printed(name: str) -> pd.DataFrame:
+    """One published file as texts, with the digits that the paper prints; an empty cell is an empty text.
+
+    Raises TrapsError that lists the files for another name.
+    """
+    return _read(name, texts=True).copy()
+
+
+def published_rows(name: str, /, **where: object) -> list[dict[str, Any]]:
+    """The rows of one published file as numbers and texts; where: values that the wanted rows have in these columns."""
+    rows: list[dict[str, Any]] = _read(name).to_dict("records")  # pyright: ignore[reportAssignmentType]
+    return [row for row in rows if all(row[column] == value for column, value in where.items())]
 
 
 def published_digest() -> str:
@@ -53,11 +67,11 @@ def published_overall() -> pd.DataFrame:
 
 
 @cache
-def _read(name: str) -> pd.DataFrame:
+def _read(name: str, texts: bool = False) -> pd.DataFrame:
     import pandas as pd
 
     path = PUBLISHED / f"{name}.csv"
     if not path.is_file():
         known = ", ".join(sorted(file.stem for file in PUBLISHED.glob("*.csv")))
         raise TrapsError(f"no published table {name!r}; known: {known}")
-    return pd.read_csv(path)
+    return pd.read_csv(path, dtype=str, keep_default_na=False) if texts else pd.read_csv(path)

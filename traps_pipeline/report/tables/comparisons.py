@@ -67,7 +67,7 @@ def visual_textual(results: Results) -> list[PrintedTable]:
         "AbsRec under standard; gap: textual over visual, ∞ where only the visual is 0",
         "pooled: means over both taxonomies, and their ratio",
         *marks(rates),
-        *([] if results.is_study else ["gaps are as printed: from unrounded rates, many rounded to whole numbers"]),
+        *([] if results.is_study else ["gaps of the printed, rounded rates"]),
         *results.refused.get("rates", []),
     ]
     return [
