@@ -8,6 +8,7 @@ import dagster as dg
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
+from traps_pipeline.mechanism.control_tables import PROBE_BASELINES, STEERING_NULLS, STEERING_PECS
 from traps_pipeline.mechanism.tables import (
     COSINES,
     DIRECTIONS,
@@ -50,6 +51,7 @@ from traps_pipeline.partitions import (
     ANSWERABLE,
     DATASETS,
     OCCLUSION_CATEGORIES,
+    TIME_SWAPPED,
     Cell,
     Evaluation,
     Extraction,
@@ -93,14 +95,18 @@ _ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in
 _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if key in OCCLUSION_CATEGORIES else [])
 
 
+def _probed_from(dataset: str) -> list[str]:
+    return [dataset, TIME_SWAPPED] if dataset == "chaotic" else [dataset]
+
+
 def _steers(wanted: Wanted, key: str | None) -> bool:
     return wanted.steers
 
 
 def _make_probe_items(workspace: Workspace, dataset: str) -> Made:
-    """Clips and questions for which hidden states are extracted: a dataset's items, or occlusion's void clips with a
-    question that they answer."""
-    from traps_pipeline.mechanism.stages import probe_items as rows_of
+    """Clips and questions for which hidden states are extracted: a dataset's items, occlusion's void clips with a
+    question that they answer, and chaotic's clips with the frame times of the other side."""
+    from traps_pipeline.mechanism.probe_items import probe_items as rows_of
 
     return Made(rows_of(workspace, dataset))
 
@@ -110,7 +116,7 @@ probe_items = stage(
     _make_probe_items,
     group=GROUP,
     deps=[
-        dg.AssetDep(items, partition_mapping=to_keys(DATASET, PROBED, lambda key: [key])),
+        dg.AssetDep(items, partition_mapping=to_keys(DATASET, PROBED, _probed_from)),
         dg.AssetDep(scene_specs, partition_mapping=_OCCLUSION),
         dg.AssetDep(videos, partition_mapping=_OCCLUSION),
     ],
@@ -181,8 +187,35 @@ probes = stage(
 )
 
 
+def _make_baselines(workspace: Workspace, key: str) -> Made:
+    """The probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
+    from traps_pipeline.mechanism.baselines import baseline_rows
+    from traps_pipeline.mechanism.stages import examined_model
+    from traps_pipeline.mechanism.stored import StoredStates
+
+    extraction = Extraction.parse(key)
+    entry = examined_model(workspace, extraction.model)
+    return Made(baseline_rows(workspace, entry, StoredStates.of(workspace, extraction)))
+
+
+probe_baselines = stage(
+    PROBE_BASELINES,
+    _make_baselines,
+    group=GROUP,
+    deps=[
+        dg.AssetDep(hidden_states, partition_mapping=by_extraction),
+        dg.AssetDep(probe_items, partition_mapping=dg.AllPartitionMapping()),
+        probing_settings,
+    ],
+    scheme=EXTRACTION,
+    needs={"hidden_states": "some"},
+    kinds=["parquet", "scikitlearn"],
+    wants=lambda wanted, key: Extraction.parse(key).prompt == PROBE_PROMPT,
+)
+
+
 def _make_directions(workspace: Workspace, key: str) -> Made:
-    """The void direction of every dataset at every layer, with its random and label-shuffled controls, as files."""
+    """The void direction of every dataset at every layer, with draws of its nulls, as files."""
     from traps_pipeline.mechanism.stages import direction_rows
 
     return Made(direction_rows(workspace, Extraction.parse(key)))
@@ -245,7 +278,7 @@ steering = stage(
 
 
 def _collect_steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
-    """The votes of the study's panel on whether each steered answer abstains."""
+    """The votes of the study's panel on whether each steered answer abstains, and whether a control's is correct."""
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
     for done, made in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
@@ -292,4 +325,28 @@ def _make_shares(workspace: Workspace, _: None) -> Made:
 _SOME: dict[str, Need] = {"steering": "some", "steering_votes": "some"}
 _ABOVE = [steering, steering_votes]
 steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, deps=_ABOVE, needs=_SOME, wants=_steers)
+
+
+def _make_nulls(workspace: Workspace, _: None) -> Made:
+    """The effect of every void direction on its own dataset, ranked among nulls that are orthogonal to it."""
+    import pandas as pd
+
+    from traps_pipeline.mechanism.nulls import null_rows
+
+    table = pd.DataFrame(null_rows(workspace.tables.read(STEERING_EFFECTS, {})), columns=pd.Index(STEERING_NULLS.names))
+    return Made(table, shown={"nulls": rows_shown(table)})
+
+
+def _make_steering_pecs(workspace: Workspace, _: None) -> Made:
+    """PECS of the steered model under each sign policy, with the share of degenerate answers."""
+    import pandas as pd
+
+    from traps_pipeline.mechanism.nulls import pecs_rows
+
+    table = pd.DataFrame(pecs_rows(workspace.tables.read(STEERING_EFFECTS, {})), columns=pd.Index(STEERING_PECS.names))
+    return Made(table, shown={"pecs": rows_shown(table)})
+
+
 steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, deps=_ABOVE, needs=_SOME, wants=_steers)
+steering_nulls = stage(STEERING_NULLS, _make_nulls, group=GROUP, deps=[steering_effects], wants=_steers)
+steering_pecs = stage(STEERING_PECS, _make_steering_pecs, group=GROUP, deps=[steering_effects], wants=_steers)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from traps_pipeline.mechanism.directions import KINDS
 from traps_pipeline.mechanism.paths import FAMILIES, PATH_SETS
 from traps_pipeline.partitions import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 
@@ -120,7 +121,7 @@ def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
     """The rows with sources and targets in the benchmark's order."""
     order = {name: place for place, name in enumerate(DATASETS)}
     by = [name for name in (*CELL, "kind", "source", "target", "alpha") if name in rows]
-    kinds = {"void": 0, "shuffled": 1, "random": 2}
+    kinds = {kind: place for place, kind in enumerate(KINDS)}
 
     def place(values: Any) -> Any:
         if values.name in ("source", "target"):

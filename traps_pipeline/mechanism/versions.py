@@ -64,7 +64,9 @@ def probing_version(workspace: Workspace, extraction: Extraction) -> str:
     if settings is None or extraction.model not in settings.models:
         return "none"
     steering = settings.steering
-    pairs = [steering.well_posed_pairs, steering.ill_posed_pairs, steering.pairs] if steering else []
+    pairs: list[Any] = [steering.well_posed_pairs, steering.ill_posed_pairs, steering.pairs] if steering else []
+    if steering and steering.nulls:
+        pairs.append(steering.nulls.model_dump(mode="json"))
     layers = settings.models[extraction.model]
     return digest([settings.probes.model_dump(mode="json"), layers.centroid, pairs, settings.seed, CURVES])[:16]
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.report.figures import abstention, grids, landscape, mechanism
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables import comparisons, judges, leaderboards, setup, sub_scenarios
+from traps_pipeline.report.tables import comparisons, inside, judges, leaderboards, setup, sub_scenarios
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
 from traps_pipeline.report.tables.shared import printed
 from traps_pipeline.report.writing import PrintedTable, figure_bytes, figure_files, table_files
@@ -103,8 +103,22 @@ TABLES: tuple[TableReport, ...] = (
     TableReport("confabulation", judges.confabulation, ("confabulation_prevalence",)),
     TableReport("judge_validation", judges.validation, ("judge_validation",)),
     TableReport("probes", tables_of_mechanism.probes, ("probes",), title="Probes"),
+    TableReport(
+        "probe_baselines",
+        inside.probe_baselines,
+        ("probes", "probe_baselines"),
+        published=False,
+        title="Probes and their baselines",
+    ),
     TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), title="Void directions"),
     TableReport("steering", tables_of_mechanism.steering, ("steering_effects", "steering_shares"), title="Steering"),
+    TableReport(
+        "steering_controls",
+        inside.steering_nulls,
+        ("steering_nulls", "steering_pecs"),
+        published=False,
+        title="Steering among its controls",
+    ),
     TableReport("composition", setup.composition, ("items",)),
     TableReport("models", setup.models, ("leaderboard",)),
     TableReport("hyperparameters", setup.hyperparameters, ("leaderboard", "judge_bias")),

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.mechanism import effects
-from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_SHARES
+from traps_pipeline.mechanism.control_tables import PROBE_BASELINES, STEERING_NULLS, STEERING_PECS
+from traps_pipeline.mechanism.tables import PROBES, STEERING_SHARES
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.tables import (
     CONFABULATION_PREVALENCE,
@@ -103,7 +104,10 @@ class Results:
     composition = Made("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
     probes = Made("PROBES rows; the paper has only transfer, confabulated, shuffled, centroid_void.", table=PROBES)
     cosines = Made("COSINES rows at the steered layer of each model.")
-    effects = Made(table=STEERING_EFFECTS)
+    effects = Made("STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label.")
+    baselines = Made(table=PROBE_BASELINES)
+    nulls = Made(table=STEERING_NULLS)
+    steering_pecs = Made(table=STEERING_PECS)
     shares = Made(table=STEERING_SHARES)
     steering_regimes = Made(
         "Rows of `mechanism.effects.regime_matrix`.", derive=lambda results: effects.regime_matrix(results.effects)
