@@ -8,7 +8,6 @@ import dagster as dg
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.mechanism.control_tables import PROBE_BASELINES, STEERING_NULLS, STEERING_PECS
 from traps_pipeline.mechanism.tables import (
     COSINES,
     DIRECTIONS,
@@ -99,7 +98,8 @@ def _probed_from(dataset: str) -> list[str]:
     return [dataset, TIME_SWAPPED] if dataset == "chaotic" else [dataset]
 
 
-def _steers(wanted: Wanted, key: str | None) -> bool:
+def steers(wanted: Wanted, key: str | None) -> bool:
+    """Whether the study steers models."""
     return wanted.steers
 
 
@@ -187,33 +187,6 @@ probes = stage(
 )
 
 
-def _make_baselines(workspace: Workspace, key: str) -> Made:
-    """The probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
-    from traps_pipeline.mechanism.baselines import baseline_rows
-    from traps_pipeline.mechanism.stages import examined_model
-    from traps_pipeline.mechanism.stored import StoredStates
-
-    extraction = Extraction.parse(key)
-    entry = examined_model(workspace, extraction.model)
-    return Made(baseline_rows(workspace, entry, StoredStates.of(workspace, extraction)))
-
-
-probe_baselines = stage(
-    PROBE_BASELINES,
-    _make_baselines,
-    group=GROUP,
-    deps=[
-        dg.AssetDep(hidden_states, partition_mapping=by_extraction),
-        dg.AssetDep(probe_items, partition_mapping=dg.AllPartitionMapping()),
-        probing_settings,
-    ],
-    scheme=EXTRACTION,
-    needs={"hidden_states": "some"},
-    kinds=["parquet", "scikitlearn"],
-    wants=lambda wanted, key: Extraction.parse(key).prompt == PROBE_PROMPT,
-)
-
-
 def _make_directions(workspace: Workspace, key: str) -> Made:
     """The void direction of every dataset at every layer, with draws of its nulls, as files."""
     from traps_pipeline.mechanism.stages import direction_rows
@@ -228,7 +201,7 @@ directions = stage(
     deps=[dg.AssetDep(hidden_states, partition_mapping=by_extraction), probing_settings],
     scheme=EXTRACTION,
     needs={"hidden_states": "some"},
-    wants=_steers,
+    wants=steers,
     lost=lambda workspace, key: (
         [] if directions_are_there(workspace, Extraction.parse(key)) else ["its directions are gone"]
     ),
@@ -245,7 +218,7 @@ def _make_cosines(workspace: Workspace, _: None) -> Made:
     return Made(table, shown={"cosines": rows_shown(table)})
 
 
-cosines = stage(COSINES, _make_cosines, group=GROUP, deps=[directions], needs={"directions": "some"}, wants=_steers)
+cosines = stage(COSINES, _make_cosines, group=GROUP, deps=[directions], needs={"directions": "some"}, wants=steers)
 
 
 def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
@@ -324,29 +297,7 @@ def _make_shares(workspace: Workspace, _: None) -> Made:
 
 _SOME: dict[str, Need] = {"steering": "some", "steering_votes": "some"}
 _ABOVE = [steering, steering_votes]
-steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, deps=_ABOVE, needs=_SOME, wants=_steers)
+steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, deps=_ABOVE, needs=_SOME, wants=steers)
 
 
-def _make_nulls(workspace: Workspace, _: None) -> Made:
-    """The effect of every void direction on its own dataset, ranked among nulls that are orthogonal to it."""
-    import pandas as pd
-
-    from traps_pipeline.mechanism.nulls import null_rows
-
-    table = pd.DataFrame(null_rows(workspace.tables.read(STEERING_EFFECTS, {})), columns=pd.Index(STEERING_NULLS.names))
-    return Made(table, shown={"nulls": rows_shown(table)})
-
-
-def _make_steering_pecs(workspace: Workspace, _: None) -> Made:
-    """PECS of the steered model under each sign policy, with the share of degenerate answers."""
-    import pandas as pd
-
-    from traps_pipeline.mechanism.nulls import pecs_rows
-
-    table = pd.DataFrame(pecs_rows(workspace.tables.read(STEERING_EFFECTS, {})), columns=pd.Index(STEERING_PECS.names))
-    return Made(table, shown={"pecs": rows_shown(table)})
-
-
-steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, deps=_ABOVE, needs=_SOME, wants=_steers)
-steering_nulls = stage(STEERING_NULLS, _make_nulls, group=GROUP, deps=[steering_effects], wants=_steers)
-steering_pecs = stage(STEERING_PECS, _make_steering_pecs, group=GROUP, deps=[steering_effects], wants=_steers)
+steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, deps=_ABOVE, needs=_SOME, wants=steers)

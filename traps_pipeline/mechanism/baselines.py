@@ -37,7 +37,7 @@ Features = Mapping[str, np.ndarray]  # dataset -> (n, columns), rows in the orde
 def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ProbeBaselineRow]:
     """Rows of PROBE_BASELINES for the items of an extraction. Raises TrapsError for a damaged clip."""
     settings = workspace.mechanism
-    items = {name: _in_order(workspace, states, name) for name in dict.fromkeys(states.items["dataset"])}
+    items = {name: probed_items(workspace, states, name) for name in dict.fromkeys(states.items["dataset"])}
     assert entry.media is not None, "local entries have media"
     found: list[ProbeBaselineRow] = []
 
@@ -57,7 +57,7 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
         add(name, scored(run, features))
     try:
         add(MARGIN, scored(run, output_margins(entry, states, [*items])))
-    except _NoMargin as error:
+    except NoMargin as error:
         add(MARGIN, [_without_figure()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
     return found
@@ -71,7 +71,7 @@ def scored(run: ProbeRun, features: Features) -> list[Row]:
 # --- features ---------------------------------------------------------------------------------------------------------
 
 
-def _in_order(workspace: Workspace, states: StoredStates, dataset: str) -> pd.DataFrame:
+def probed_items(workspace: Workspace, states: StoredStates, dataset: str) -> pd.DataFrame:
     """The PROBE_ITEMS rows of a dataset in the order of its states."""
     rows = workspace.tables.read(PROBE_ITEMS, {"dataset": dataset}).set_index("item_id")
     wanted = states.dataset(dataset)["item_id"]
@@ -132,7 +132,7 @@ def _seen(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
     return np.stack(small) / 255, shown.times_s, float(shown.times_s[-1])
 
 
-class _NoMargin(TrapsError):
+class NoMargin(TrapsError):
     """The output margin of these states cannot be read."""
 
 
@@ -144,12 +144,12 @@ def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[s
     from traps_pipeline.models.local.adapter import load_local_model
 
     if set(states.items["pooling"]) != {"last"}:
-        raise _NoMargin("states are means over tokens; set `pooling: last` to read the output margin")
+        raise NoMargin("states are means over tokens; set `pooling: last` to read the output margin")
     model = load_local_model(entry, inside=True)
     try:
         tokens = abstention_tokens(model)
     except TrapsError as error:
-        raise _NoMargin(str(error)) from error
+        raise NoMargin(str(error)) from error
     return {
         name: first_token_margins(model, states.read(name, "normed"), tokens).double().numpy()[:, None]
         for name in datasets

@@ -103,3 +103,107 @@ PROBE_BASELINES = Table(
     partition_by=("model", "prompt"),
     key=("features", "analysis", "source", "target"),
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateRow:
+    """A model's figures on a target before and after a gate: one regime, one kind of features, one source, one
+    threshold."""
+
+    model: shared.Model
+    prompt: Prompt
+    regime: Annotated[str, "system prompt of the answers that are gated"]
+    features: Annotated[
+        str, "states, or a control: a raw input, output margin, shuffled labels (of states) or untrained model"
+    ]
+    source: Annotated[str, "one:DATASET, other datasets (all but the target) or other families"]
+    threshold: Annotated[str, "mid, J or conformal"]
+    target: Annotated[
+        str, "dataset; all: mean over the four; or items without a pair, of which false_abs alone is known"
+    ]
+    layer: Annotated[int, "of the states, chosen by the sources' own cross-validation; -1 for other features"]
+    auroc: Annotated[float | None, "of the gate's scores on the target"]
+    acc: Share
+    false_abs: Share
+    abs_rec: Share
+    pecs: Share
+    pecs_low: Annotated[float | None, "95 % percentile interval from resampled scenarios, the gate held fixed"]
+    pecs_high: Annotated[float | None, "95 % percentile interval from resampled scenarios, the gate held fixed"]
+    plain_acc: Annotated[float | None, "without the gate"]
+    plain_false_abs: Annotated[float | None, "without the gate"]
+    plain_abs_rec: Annotated[float | None, "without the gate"]
+    plain_pecs: Annotated[float | None, "without the gate"]
+    expected_false_abs: Annotated[float | None, "share of the source's unseen controls above the threshold"]
+    n_controls: Annotated[int, "control items of the target"]
+    n_voids: Annotated[int, "void items of the target"]
+
+
+GATE = Table(
+    "gate",
+    GateRow,
+    partition_by=("model", "prompt"),
+    key=("regime", "features", "source", "threshold", "target"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RiskCoverageRow:
+    """A point of the curve along which a gate gives up answers, from the riskiest on, over the four datasets."""
+
+    model: shared.Model
+    prompt: Prompt
+    regime: Annotated[str, "system prompt of the answers"]
+    features: Annotated[str, "as in gate; no gate: answers given up in no order, the risk of all"]
+    coverage: Annotated[float, "share of items that are answered"]
+    risk: Annotated[float, "share of these answers that are wrong; every answer to a void is"]
+    n: Annotated[int, "answers"]
+
+
+RISK_COVERAGE = Table(
+    "risk_coverage",
+    RiskCoverageRow,
+    partition_by=("model", "prompt"),
+    key=("regime", "features", "coverage"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchingRow:
+    """The indirect effect of a group of positions at one site and layer, over the pairs of a dataset."""
+
+    model: shared.Model
+    prompt: Prompt
+    dataset: shared.Dataset
+    into: Annotated[str, "side whose pass is changed: control (towards its void) or void (towards its control)"]
+    source: Annotated[
+        str,
+        "where the patch comes from: pair (the other side), or a null: other scenario (another scenario's other side), "
+        "same side (another scenario's same side) or other times (the item's own frames with the other side's times)",
+    ]
+    site: Annotated[str, "residual (as it leaves the block), attention or mlp (their outputs)"]
+    layer: Annotated[int, "counted as in hidden_states"]
+    group: Annotated[
+        str,
+        "system, stamps, changed (visual tokens whose pixels differ between the sides), unchanged, question, last, "
+        "or all",
+    ]
+    effect: Annotated[
+        float | None, "sum of changes of the outcome over the sum of the differences between the sides; 1: all of it"
+    ]
+    low: Annotated[float | None, "95 % percentile interval from resampled scenarios"]
+    high: Annotated[float | None, "95 % percentile interval from resampled scenarios"]
+    flips: Annotated[
+        float | None, "share of pairs whose sides differ in the sign of the outcome in which the patch changes the sign"
+    ]
+    n_flippable: Annotated[int, "such pairs"]
+    n: Annotated[int, "pairs"]
+    n_left_out: Annotated[int, "pairs whose prompts have another form, or no such source"]
+    tokens: Annotated[float, "tokens of the group, mean over pairs"]
+
+
+PATCHING = Table(
+    "patching",
+    PatchingRow,
+    partition_by=("model", "prompt"),
+    key=("dataset", "into", "source", "site", "layer", "group"),
+)

@@ -52,8 +52,8 @@ def _ranked(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
         for null in NULLS:
             draws = group.loc[group["kind"] == null].groupby("draw")
             here = void.loc[void["target"].isin(set(group.loc[group["kind"] == null, "target"]))]
-            values = draws["moved"].mean().to_numpy(float)
-            if not len(values) or here.empty or not np.isfinite([*values, here["moved"].mean()]).all():
+            values = draws["moved"].mean().dropna().to_numpy(float)  # without draws on which no answer was decided
+            if not len(values) or here["moved"].isna().any() or here.empty:
                 continue
             effect = float(here["moved"].mean())
             # Shares of few answers tie often, so ties count against the direction; rounding must not break a tie.

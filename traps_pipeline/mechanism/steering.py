@@ -11,6 +11,7 @@ none in another. Nulls are steered at the largest dose, along the direction of t
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -155,9 +156,9 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
 
 def count_answers(
     settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
-) -> dict[str, int]:
-    """The number of answers that steering a model needs, by inference regime; an answer that cells share counts once.
-    scenarios: their number by taxonomy."""
+) -> dict[str, Counter[str]]:
+    """The number of answers that steering a model needs, by inference regime and side; an answer that cells share
+    counts once. scenarios: their number by taxonomy."""
     steering = settings.steering
     if steering is None:
         return {}
@@ -169,7 +170,9 @@ def count_answers(
             if side in row.sides:
                 along = (owner, side, row.source, row.kind, row.draw, row.layer, sign_of(row.signs, side))
                 cells |= {(*along, *rest) for rest in product(steering.direction_regimes, row.doses)}
-    answers = sum(min(steering.pairs, scenarios.get(taxonomy_of(str(cell[0])), 0)) for cell in cells)
+    answers = Counter[str]()
+    for cell in cells:
+        answers[cell[1]] += min(steering.pairs, scenarios.get(taxonomy_of(str(cell[0])), 0))
     return dict.fromkeys(steering.inference_regimes, answers)
 
 

@@ -122,6 +122,11 @@ class Wanted:
         return self._inside is not None and (self._inside[1] is None or self._inside[1].steering is not None)
 
     @cached_property
+    def patches(self) -> bool:
+        """Whether activations are patched."""
+        return self._inside is not None and (self._inside[1] is None or self._inside[1].patching is not None)
+
+    @cached_property
     def probed(self) -> list[str]:
         """Datasets whose hidden states are extracted."""
         datasets = self._inside[0] if self._inside else []

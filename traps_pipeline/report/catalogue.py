@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from traps_pipeline.report.figures import abstention, grids, landscape, mechanism
+from traps_pipeline.report.figures import inside as figures_of_inside
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables import comparisons, inside, judges, leaderboards, setup, sub_scenarios
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
@@ -110,6 +111,8 @@ TABLES: tuple[TableReport, ...] = (
         published=False,
         title="Probes and their baselines",
     ),
+    TableReport("gate", inside.gate, ("gate",), published=False, title="Probe-gated abstention"),
+    TableReport("patching", inside.patching, ("patching",), published=False),
     TableReport("cosines", tables_of_mechanism.cosines, ("cosines",), title="Void directions"),
     TableReport("steering", tables_of_mechanism.steering, ("steering_effects", "steering_shares"), title="Steering"),
     TableReport(
@@ -133,6 +136,28 @@ FIGURES: tuple[FigureReport, ...] = (
     ),
     FigureReport("sub_scenarios", "AbsRec by sub-scenario", grids.sub_scenarios, ("metrics", "items")),
     FigureReport("confabulation", "Prevalence of confabulation", grids.confabulation, ("confabulation_prevalence",)),
+    FigureReport(
+        "probe_baselines",
+        "Probes against their baselines",
+        figures_of_inside.probe_baselines,
+        ("probes", "probe_baselines"),
+        published=False,
+    ),
+    FigureReport(
+        "gate_arrows",
+        "Probe-gated abstention",
+        figures_of_inside.gate_arrows,
+        ("gate", "risk_coverage"),
+        published=False,
+    ),
+    FigureReport("patching", "Activation patching", figures_of_inside.patching, ("patching",), published=False),
+    FigureReport(
+        "doses_among_nulls",
+        "Doses among nulls",
+        figures_of_inside.doses_among_nulls,
+        ("steering_effects",),
+        published=False,
+    ),
     FigureReport("probe_curves", "Probe transfer by layer", mechanism.probe_curves, ("probes",), published=False),
     FigureReport("confabulated_strip", "Probes on confabulated voids", mechanism.confabulated_strip, ("probes",)),
     FigureReport(

@@ -70,6 +70,26 @@ class SteeringSettings(BaseModel):
         return values
 
 
+class GateSettings(BaseModel):
+    """Probe-gated abstention (docs/mechanism.md)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    false_abs: float = Field(default=0.05, gt=0, lt=1, description="of source controls, that conformal gates promise")
+    untrained: bool = Field(
+        default=False, description="also a gate on states of the same network with random weights, loaded beside it"
+    )
+
+
+class PatchingSettings(BaseModel):
+    """Activation patching between matched controls and voids (docs/mechanism.md)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    pairs: int = Field(default=50, ge=1, description="pairs of each well-posed dataset, the first of a seeded order")
+    sites: tuple[Literal["residual", "attention", "mlp"], ...] = Field(
+        default=("residual", "attention", "mlp"), min_length=1
+    )
+
+
 class MechanismSettings(BaseModel):
     """`mechanism:` of an experiment and of `study.yaml`. models: the local models, and their layers."""
 
@@ -77,6 +97,8 @@ class MechanismSettings(BaseModel):
     models: dict[str, Layers] = Field(min_length=1)
     prompts: tuple[Regime, ...] = Field(default=VQA_PROMPTS, min_length=1, description="VQA prompts extracted")
     probes: ProbeSettings = ProbeSettings()
+    gate: GateSettings = GateSettings()
+    patching: PatchingSettings | None = Field(default=None, description="null: nothing is patched")
     pooling: Literal["last", "mean"] = Field(default="last", description="of tokens; the paper does not say which")
     steering: SteeringSettings | None = SteeringSettings()
     seed: int = 20260101

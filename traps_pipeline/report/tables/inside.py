@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.mechanism.paths import path_name
+from traps_pipeline.mechanism.paths import path_name, probed_taxonomy
 from traps_pipeline.partitions import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.mechanism import DIRECTIONS, INFERENCE, NO_MECHANISM
@@ -65,10 +65,8 @@ def beside(results: Results) -> pd.DataFrame:
 def look_alikes(results: Results) -> pd.DataFrame:
     """As `beside`, on the items that only look like voids, by probes of the datasets of their taxonomy."""
     probe = results.probes.loc[results.probes["source_best"].eq(True) & results.probes["target"].isin([*WHAT])]
-    own = ["chaotic" if t.startswith(("chaotic", "length")) else "occlusion" for t in probe["target"]]
-    return _with_baselines(
-        results, probe.loc[[s in (o, f"{o}_ill_posed") for s, o in zip(probe["source"], own, strict=True)]]
-    )
+    own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
+    return _with_baselines(results, probe.loc[own])
 
 
 def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
@@ -203,3 +201,114 @@ def _pecs(results: Results) -> PrintedTable:
     ]
     absent = why(results, rows) if results.is_study else "the paper prints no correctness of steered answers"
     return PrintedTable("steering_pecs", "PECS of the steered model", named, columns, notes, absent)
+
+
+# --- the gate and patching --------------------------------------------------------------------------------------------
+
+DEFAULT_GATE = {"source": "other datasets", "threshold": "mid"}
+SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
+
+
+def gate(results: Results) -> list[PrintedTable]:
+    """Probe-gated abstention: PECS before and after the gate, by its sources and thresholds; beside gates on other
+    features; and what it does to items that must be answered."""
+    return [_gate_sources(results), _gate_controls(results), _gate_answerable(results)]
+
+
+_GATED = (
+    Column("plain_pecs", "PECS, plain", "fraction"), Column("pecs", "PECS, gated", "fraction", mark="mark"),
+    Column("pecs_low", "from", "fraction"), Column("pecs_high", "to", "fraction"),
+    Column("acc", "Acc %", "percent"), Column("abs_rec", "AbsRec %", "percent"),
+    Column("false_abs", "FalseAbs %", "percent"), Column("expected_false_abs", "expected %", "percent"),
+)  # fmt: skip
+_GATE_NOTES = (
+    "a gated answer becomes an abstention and every other answer keeps its verdict; no gate has seen the scenario that "
+    "it decides about",
+    "expected: share of the sources’ own unseen controls above the threshold; the difference from FalseAbs of answers "
+    "that do not abstain by themselves is the shift of calibration",
+)
+
+
+def _gates(results: Results) -> pd.DataFrame:
+    rows = results.gate
+    return rows.assign(
+        mark=few(rows, "n_controls", "n_voids"),
+        dataset=[SHORT.get(name, name) for name in rows["target"]],
+        sources=[SOURCE_NAMES.get(name, name) for name in rows["source"]],
+    )
+
+
+def _gate_sources(results: Results) -> PrintedTable:
+    rows = _gates(results)
+    rows = rows.loc[(rows["features"] == "states") & rows["target"].isin([*SHORT, "all"])]
+    columns = [
+        MODEL, Column("regime", "Answers"), Column("sources", "Gate from"), Column("threshold", "Threshold"),
+        Column("dataset", "Target"), LAYER, *_GATED,
+    ]  # fmt: skip
+    notes = [
+        *_GATE_NOTES,
+        "mid: half-way between the means of the sides; J: the cut with the largest J on unseen source items; "
+        "conformal: at most 5 % of new source controls in expectation, or as the experiment says",
+        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+    ]
+    absent = why(results, rows) if results.is_study else "the paper gates nothing"
+    return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, absent)
+
+
+def _gate_controls(results: Results) -> PrintedTable:
+    rows = _gates(results)
+    for name, value in (DEFAULT_GATE | {"target": "all"}).items():
+        rows = rows.loc[rows[name] == value]
+    columns = [MODEL, Column("regime", "Answers"), Column("features", "Features"), *_GATED]
+    notes = [
+        "gates from other datasets at the mid threshold, mean over the four datasets",
+        "a gate on states shows what states add only as far as it is above gates on raw inputs, on the output margin "
+        "and on an untrained model’s states",
+    ]
+    absent = why(results, rows) if results.is_study else "the paper gates nothing"
+    return PrintedTable("gate_controls", "The gate beside its controls", rows, columns, notes, absent)
+
+
+def _gate_answerable(results: Results) -> PrintedTable:
+    rows = _gates(results)
+    rows = rows.loc[~rows["target"].isin([*SHORT, "all"]) & (rows["source"] == DEFAULT_GATE["source"])]
+    rows = rows.loc[rows["target"].isin([*WHAT]) & (rows["target"] != "chaotic_time_swapped")]
+    rows = rows.drop_duplicates(["model", "features", "threshold", "target"])  # gates know no regime here
+    rows = rows.assign(what=[WHAT[name] for name in rows["target"]])
+    columns = [
+        MODEL, Column("features", "Features"), Column("threshold", "Threshold"), Column("what", "Items"),
+        Column("false_abs", "Abstained on %", "percent"), Column("expected_false_abs", "expected %", "percent"),
+        Column("n_controls", "n", "count"),
+    ]  # fmt: skip
+    notes = ["all of these items can be answered, so that every abstention of a gate is a false one"]
+    absent = why(results, rows) if results.is_study else "the paper gates nothing"
+    return PrintedTable("gate_answerable", "The gate on items that can be answered", rows, columns, notes, absent)
+
+
+def patching(results: Results) -> list[PrintedTable]:
+    """Indirect effects of activation patching between matched controls and voids, by group of positions, beside
+    nulls."""
+    rows = results.patching
+    own = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual")]
+    keys = ["model", "dataset", "into", "layer", "group"]
+    nulls = rows.loc[(rows["source"] != "pair") & (rows["site"] == "residual")]
+    wide = nulls.pivot_table(index=keys, columns="source", values="effect", observed=True)
+    names = ["other scenario", "same side", "other times"]
+    table = own.merge(wide.reindex(columns=names).reset_index(), on=keys, how="left")
+    table = table.assign(name=[SHORT.get(name, name) for name in table["dataset"]], mark=few(table, "n"))
+    columns = [
+        MODEL, Column("name", "Dataset"), Column("into", "Into"), LAYER, Column("group", "Positions"),
+        Column("tokens", "Tokens", "ratio"), Column("effect", "Indirect effect", "fraction", mark="mark"),
+        Column("low", "from", "fraction"), Column("high", "to", "fraction"), Column("flips", "Flipped %", "percent"),
+        Column("n_flippable", "of", "count"), *(Column(name, name.capitalize(), "fraction") for name in names),
+        Column("n", "Pairs", "count"), Column("n_left_out", "Left out", "count"),
+    ]  # fmt: skip
+    notes = [
+        "share of the way from the patched side’s log-odds of abstention to the other side’s, residual stream; 1 for "
+        "all positions by construction; effects of groups need not add up",
+        "changed: visual tokens whose pixels differ between the sides; the last columns are patches from another "
+        "scenario’s other side, another scenario’s same side, and the item’s own frames with the other side’s times",
+        *([FEW_NOTE.replace("controls or voids", "pairs")] if "†" in set(table["mark"]) else []),
+    ]
+    absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
+    return [PrintedTable("patching", "Activation patching", table, columns, notes, absent)]
