@@ -36,7 +36,9 @@ _ONE_TAXONOMY = {
 }
 REGIMES = ("standard", "guided", "json")
 ANSWERABLE = "occlusion_answerable"  # of the mechanistic stages alone: occlusion's voids, with a question they answer
-PROBED_DATASETS = (*DATASETS, ANSWERABLE)
+TIME_SWAPPED = "chaotic_time_swapped"  # of the mechanistic stages alone: each side's frames with the other's times
+PROBED_ARMS = ("decoy", "length_matched")  # arms that probes are applied to where an experiment asks them
+PROBED_DATASETS = (*DATASETS, ANSWERABLE, TIME_SWAPPED, *PROBED_ARMS)
 VQA_PROMPTS = ("standard", "guided")
 SIDES = ("control", "void")
 

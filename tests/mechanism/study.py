@@ -29,7 +29,8 @@ SETTINGS = {
     "probes": {"folds": 2, "resamples": 100},
     "steering": {
         **{"alphas": [2, 8], "pairs": 2, "well_posed_pairs": 3, "ill_posed_pairs": 2, "max_new_tokens": 4},
-        **{"direction_regimes": ["standard"], "inference_regimes": ["guided"], "controls": ["random"]},
+        **{"direction_regimes": ["standard"], "inference_regimes": ["guided"], "signs": ["plus"], "gaps": [0.5]},
+        "nulls": {"kinds": ["covariance"], "draws": 2},
     },
 }
 

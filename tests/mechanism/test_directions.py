@@ -11,6 +11,7 @@ import pytest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.directions import (
     KINDS,
+    NULLS,
     Origin,
     cosine_matrix,
     direction_scenarios,
@@ -40,39 +41,55 @@ def test_the_void_direction_is_the_unit_mean_difference() -> None:
     control[0] = [[1, 0], [3, 0]]
     void = control + np.array([[[6, 4], [0, 4]]], np.float32)
     made = extract_directions(void, control, [1])
-    assert made.vectors["void"].tolist() == [pytest.approx([0.6, 0.8])]  # mean difference (3, 4)
-    assert made.norms["void"].tolist() == [5.0]
+    assert made.void.tolist() == [pytest.approx([0.6, 0.8])]  # mean difference (3, 4)
+    assert made.gaps.tolist() == [5.0]
     assert made.residual_norms.tolist() == [2.0]  # control states of length 1 and 3
 
 
-def test_random_and_shuffled_directions_have_the_norm_of_the_void_direction() -> None:
-    made = extract_directions(*pair_states(), [1])
-    for kind in KINDS:
-        assert np.allclose(np.linalg.norm(made.vectors[kind], axis=1), 1, atol=1e-6)
+def test_nulls_are_unit_vectors_orthogonal_to_the_void_direction() -> None:
+    made = extract_directions(*pair_states(), [1], draws=20)
+    for null in NULLS:
+        assert made.vectors[null].shape == (20, 3, 8)
+        assert np.allclose(np.linalg.norm(made.vectors[null], axis=2), 1, atol=1e-6)
+        assert np.abs((made.vectors[null] * made.void).sum(axis=2)).max() < 1e-6
     again, other = (extract_directions(*pair_states(), [seed]) for seed in (1, 2))
-    assert all((made.vectors[k] == again.vectors[k]).all() for k in KINDS)
-    assert (made.vectors["void"] == other.vectors["void"]).all()
-    assert all((made.vectors[k] != other.vectors[k]).any() for k in ("random", "shuffled"))
+    more = extract_directions(
+        *pair_states(), [1], NULLS[1:], draws=1
+    )  # a kind does not depend on which others there are
+    for null in NULLS:
+        assert (again.vectors[null][0] != other.vectors[null][0]).any()
+    assert all((again.vectors[null] == more.vectors[null]).all() for null in NULLS[1:]) and NULLS[0] not in more.vectors
+    assert (again.void == other.void).all()
 
 
-def test_shuffled_labels_lose_a_direction_that_all_pairs_share() -> None:
-    void, control = pair_states(pairs=30)
-    shift = np.zeros(8, np.float32)
-    shift[2] = 5
-    made = extract_directions(void + shift, control, [3])
-    assert made.vectors["void"][:, 2].min() > 0.999
-    # Half of the pairs are swapped, so what they share cancels and the rest is the mean of 30 differences of 0.1.
-    assert made.norms["shuffled"].max() < 0.15
-    for seed in range(20):  # with few pairs too: no shuffle is the true labelling or its reverse
-        few = extract_directions(void[:, :4] + shift, control[:, :4], [seed])
-        assert np.abs((few.vectors["void"] * few.vectors["shuffled"]).sum(axis=1)).max() < 0.9
+def test_a_shuffled_null_has_none_of_what_all_pairs_share() -> None:
+    """With four pairs that differ by (5, +-1) the swapped mean differences have parts along the void direction; what is
+    left is the second axis alone."""
+    control = np.zeros((1, 4, 2), np.float32)
+    void = np.array([[[5, 1], [5, -1], [5, 1], [5, -1]]], np.float32)
+    made = extract_directions(void, control, [3], draws=10)
+    assert made.void.tolist() == [[1, 0]] and made.gaps.tolist() == [5]
+    lengths = np.linalg.norm(made.vectors["shuffled"], axis=2)[:, 0]
+    assert set(np.round(lengths, 6)) <= {0.0, 1.0} and 1.0 in lengths  # zero where the swaps cancel the second axis too
+    assert np.abs(made.vectors["shuffled"][..., 0]).max() == 0
+
+
+def test_covariance_nulls_lie_where_states_vary() -> None:
+    rng = np.random.default_rng(0)
+    control = rng.normal(size=(1, 50, 8)).astype(np.float32) * np.array([1, 9, 1, 1, 1, 1, 1, 1], np.float32)
+    void = rng.normal(size=(1, 50, 8)).astype(np.float32) * np.array([1, 9, 1, 1, 1, 1, 1, 1], np.float32)
+    void[..., 0] += 20
+    made = extract_directions(void, control, [1], draws=50)
+    along = {null: np.mean(made.vectors[null][:, 0, 1] ** 2) for null in NULLS}
+    assert along["covariance"] > 0.6 and along["isotropic"] < 0.3  # 81 / 87 of the variance, against 1 / 7
 
 
 def test_a_layer_where_the_sides_are_equal_has_no_direction() -> None:
     void, control = pair_states()
     void[0] = control[0]
     made = extract_directions(void, control, [1])
-    assert not made.vectors["void"][0].any() and made.norms["void"][0] == 0
+    assert not made.void[0].any() and made.gaps[0] == 0
+    assert not any(made.vectors[null][:, 0].any() for null in NULLS)  # nothing to be orthogonal to
     with pytest.raises(TrapsError, match="needs two pairs at least"):
         extract_directions(void[:, :1], control[:, :1], [1])
 
@@ -98,7 +115,7 @@ def test_directions_come_back_as_they_were_saved_and_damage_is_told(tmp_path: Pa
     save_directions(path, made, origin())
     back, said = load_directions(path)
     assert all((back.vectors[k] == made.vectors[k]).all() for k in KINDS)
-    assert (back.residual_norms == made.residual_norms).all() and back.n_layers == 3
+    assert (back.residual_norms == made.residual_norms).all() and (back.gaps == made.gaps).all() and back.n_layers == 3
     assert said == json.loads(path.with_suffix(".json").read_text())
     assert (said["dataset"], said["n_pairs"], said["pooling"]) == ("chaotic", 2, "last")
     content = bytearray(path.read_bytes())

@@ -24,7 +24,7 @@ from traps_pipeline.mechanism.probes import (
     within_split,
 )
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
-from traps_pipeline.partitions import ANSWERABLE, DATASETS, LONG, transfer_type
+from traps_pipeline.partitions import ANSWERABLE, DATASETS, LONG, TIME_SWAPPED, transfer_type
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.scoring.published import published
 from traps_pipeline.storage.study import ProbeSettings
@@ -97,6 +97,15 @@ def test_an_interval_resamples_scenarios_as_a_loop_over_resamples_does() -> None
     weights = scenario_weights(12, 300, 5)
     drawn = [roc_auc_score(np.repeat(void, w), np.repeat(scores, w)) for w in weights[:, scenario].astype(int)]
     assert auroc_interval(void, scores, scenario, weights) == pytest.approx(tuple(np.quantile(drawn, [0.025, 0.975])))
+
+
+def test_an_interval_of_a_perfect_probe_is_as_wide_as_its_scenarios_are_few() -> None:
+    """16 pairs that are all told apart: a share of failures up to 1 - .025^(1/16) = .206 cannot be excluded."""
+    scenario, void = np.repeat(np.arange(16), 2), np.tile([True, False], 16)
+    weights = scenario_weights(16, 200, 5)
+    assert auroc_interval(void, void.astype(float), scenario, weights) == pytest.approx((0.025 ** (1 / 16), 1.0))
+    assert pytest.approx(0.794, abs=5e-4) == 0.025 ** (1 / 16)
+    assert auroc_interval(void, -void.astype(float), scenario, weights) == pytest.approx((0.0, 1 - 0.025 ** (1 / 16)))
 
 
 def test_a_constant_column_is_not_blown_up_by_rounding() -> None:
@@ -248,7 +257,8 @@ def test_shared_controls_flatter_pairs_of_one_taxonomy_unless_their_scenario_is_
     found = pd.DataFrame(run.layer_rows(0))
     value = {name: rows.set_index(["source", "target"])["value"] for name, rows in found.groupby("analysis")}
     pairs = [(s, t) for s, t in TRANSFER_PAIRS if s.split("_")[0] == t.split("_")[0]]
-    assert sorted(value["held_out"].index) == sorted(pairs) and len(pairs) == 4
+    itself = [(name, name) for name in DATASETS]
+    assert sorted(value["held_out"].index) == sorted([*pairs, *itself]) and len(pairs) == 4
     assert value["transfer"][pairs].min() > 0.9
     assert abs(value["held_out"].mean() - 0.5) < 0.15  # four pairs of 30 items
     across = [pair for pair in TRANSFER_PAIRS if pair not in pairs]
@@ -260,6 +270,23 @@ def test_answerable_questions_tell_what_hides_from_what_cannot_be_known(rows: pd
     for source in DATASETS:  # the planted signal is of voids, and the answerable items do not have it
         assert at["answerable_void", source] > 0.97
         assert 0.1 < at["answerable_control", source] < 0.9
+
+
+def test_swapped_times_tell_a_probe_of_stamps_from_one_of_frames() -> None:
+    """Column 0 is written by the frames, column 1 by the stamps; swapping the stamps alone turns column 1 around."""
+    items, states = study(pairs=10)
+    chaotic = items.loc[items["dataset"] == "chaotic"]
+    items = pd.concat([items, chaotic.assign(dataset=TIME_SWAPPED)], ignore_index=True)
+    void, rng = (chaotic["side"] == "void").to_numpy(), np.random.default_rng(1)
+    for layer, column in ((0, 0), (1, 1)):  # layer 0 holds frames, layer 1 stamps
+        for dataset in ("chaotic", TIME_SWAPPED):
+            states[dataset, layer] = rng.normal(size=(20, WIDTH))
+            shown = void ^ (dataset == TIME_SWAPPED and layer == 1)
+            states[dataset, layer][:, column] = 8.0 * shown
+    run = ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, ProbeSettings(folds=3, resamples=100), 7)
+    for layer, expected in ((0, 1.0), (1, 0.0)):
+        rows = [r for r in run.comparable(layer) if r["analysis"] == "time_swapped" and r["source"] == "chaotic"]
+        assert [row["value"] for row in rows] == [pytest.approx(expected, abs=0.02)]
 
 
 def test_catch_rates_are_shares_of_a_sub_scenarios_voids(rows: pd.DataFrame) -> None:

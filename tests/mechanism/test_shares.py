@@ -29,7 +29,8 @@ def study(scenarios: tuple[str, ...] = ("s0", "s1")) -> tuple[pd.DataFrame, pd.D
                     | {"abstained": side == "void" and scenario.endswith(ABSTAINS)}
                 )
     frame = pd.DataFrame(rows).assign(model="m", directions="guided", regime="guided", epoch="e", alpha_relative=0.1)
-    votes = frame.assign(task="abstention", valid=True, benchmark_version="v1")
+    frame = frame.assign(draw=0, unit="alpha", dose=frame["alpha"], signs="label", degenerate=None)
+    votes = frame.assign(task="abstention", valid=True, benchmark_version="v1", correct=None)
     return frame.drop(columns="abstained"), votes.merge(pd.DataFrame({"judge": ["a", "b", "c"]}), how="cross")
 
 

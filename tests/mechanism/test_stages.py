@@ -14,10 +14,13 @@ import pytest
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_items, write_verdicts
 from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.mechanism import probing, stages
 from traps_pipeline.mechanism.directions import vector_digest
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.mechanism.shares import effect_rows
+from traps_pipeline.mechanism.nulls import null_rows, pecs_rows
+from traps_pipeline.mechanism.probe_items import probe_items
+from traps_pipeline.mechanism.shares import effect_rows, of_paper
 from traps_pipeline.mechanism.steering import (
     UNSTEERED,
     collect_steered,
@@ -25,11 +28,12 @@ from traps_pipeline.mechanism.steering import (
     count_answers,
     strengths,
 )
+from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES, STEERING, STEERING_VOTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.orchestration.lineage import Lineage
-from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, Extraction, StatesCell, SteeringCell
+from traps_pipeline.partitions import ANSWERABLE, DATASETS, TIME_SWAPPED, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import MechanismSettings
 from traps_pipeline.storage.tables import Table
@@ -55,8 +59,8 @@ def entry(patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -
 
 def extract_all(workspace: Workspace) -> int:
     made = 0
-    for dataset in PROBED_DATASETS:
-        workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, stages.probe_items(workspace, dataset), {})
+    for dataset in (*DATASETS, ANSWERABLE, TIME_SWAPPED):
+        workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
         cell = StatesCell(dataset, STANDARD)
         rows, new = stages.extract_states(workspace, cell)
         workspace.tables.write(HIDDEN_STATES, cell.partition, rows, {})
@@ -68,7 +72,7 @@ def extract_all(workspace: Workspace) -> int:
 def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     """Extracted, with directions."""
     workspace = make_study(tmp_path_factory.mktemp("study"))
-    assert extract_all(workspace) == 4 * 2 * PAIRS + PAIRS
+    assert extract_all(workspace) == 4 * 2 * PAIRS + PAIRS + 2 * PAIRS
     workspace.tables.write(DIRECTIONS, STANDARD.partition, stages.direction_rows(workspace, STANDARD), {})
     return workspace
 
@@ -96,14 +100,15 @@ def test_a_second_extraction_computes_nothing_and_a_corrected_item_alone_is_extr
     before = own.tables.read(HIDDEN_STATES, StatesCell("chaotic", STANDARD).partition).set_index("item_id")
     names = sorted(set(items["scenario_id"]))
     write_items(own, "chaotic", names, clips, **{names[0]: "Which side does the ball end on?"})
-    assert extract_all(own) == 2  # control and void of one scenario of one dataset
+    # control and void of one scenario of chaotic, and the same with swapped times
+    assert extract_all(own) == 4
     after = own.tables.read(HIDDEN_STATES, StatesCell("chaotic", STANDARD).partition).set_index("item_id")
     changed = before.index[(before["states_key"] != after["states_key"]).to_numpy()]
     assert sorted(changed) == [f"chaotic:{names[0]}:control", f"chaotic:{names[0]}:void"]
 
 
 def test_states_stand_in_the_order_of_their_table(study: Workspace) -> None:
-    states = stages.StoredStates.of(study, STANDARD)
+    states = StoredStates.of(study, STANDARD)
     ill_posed = states.dataset("chaotic_ill_posed")
     controls = [states.read(d, 3)[(states.dataset(d)["side"] == "control").to_numpy()] for d in DATASETS[2:]]
     assert np.allclose(*controls, atol=1e-5)  # the same clip and question
@@ -117,7 +122,7 @@ def test_two_items_with_the_same_clip_and_question_have_the_same_states(own: Wor
     twin |= {name: first[name] for name in ("clip", "media_digest", "question")}
     own.tables.write(ITEMS, {"dataset": "chaotic"}, [ItemRow(**item) for item in items], {})
     extract_all(own)
-    states = stages.StoredStates.of(own, STANDARD)
+    states = StoredStates.of(own, STANDARD)
     at = dict(zip(states.dataset("chaotic")["item_id"], states.read("chaotic", 3), strict=True))
     assert (at[first["item_id"]] == at[twin["item_id"]]).all()
     assert (at[first["item_id"]] != at["chaotic:plinko-2:void"]).any()
@@ -136,12 +141,12 @@ def test_states_that_are_gone_are_told(own: Workspace) -> None:
 def test_lost_states_are_stale_and_made_again_as_they_were(own: Workspace, lost: str) -> None:
     cell = StatesCell("chaotic", STANDARD)
     assert states_of(own, cell) == ()
-    before = stages.StoredStates.of(own, STANDARD).read("chaotic", 3)
+    before = StoredStates.of(own, STANDARD).read("chaotic", 3)
     (own.root / "states" / "tiny" / "standard" / "chaotic" / lost).unlink()
     assert "its states are gone" in states_of(own, cell)
     stages.extract_states(own, cell)
     assert states_of(own, cell) == ()
-    assert (stages.StoredStates.of(own, STANDARD).read("chaotic", 3) == before).all()
+    assert (StoredStates.of(own, STANDARD).read("chaotic", 3) == before).all()
 
 
 def states_of(workspace: Workspace, cell: StatesCell) -> tuple[str, ...]:
@@ -154,7 +159,7 @@ def test_a_damaged_index_of_states_is_written_again(own: Workspace) -> None:
     cell = StatesCell("chaotic", STANDARD)
     (own.root / "states" / "tiny" / "standard" / "chaotic" / "ids.parquet").write_bytes(b"torn")
     with pytest.raises(TrapsError, match="the next `traps run` writes it again"):
-        stages.StoredStates.of(own, STANDARD).read("chaotic", 3)
+        StoredStates.of(own, STANDARD).read("chaotic", 3)
     assert "its states are gone" in states_of(own, cell)
     assert stages.extract_states(own, cell)[1] == 0
     assert states_of(own, cell) == ()
@@ -181,17 +186,17 @@ def test_lost_or_damaged_directions_are_made_again_as_they_were(own: Workspace, 
 
 def test_directions_are_what_the_states_say(study: Workspace) -> None:
     table = study.tables.read(DIRECTIONS, STANDARD.partition)
-    assert len(table) == 4 * 3 * 5
+    assert len(table) == 4 * (1 + 2) * 5  # the void direction and two draws of a null, at five layers
     row = table.query("dataset == 'occlusion' and kind == 'void' and layer == 2").iloc[0]
     said = json.loads(study.resolve(row["path"]).with_suffix(".json").read_text())
     states, items = (
-        stages.StoredStates.of(study, STANDARD),
-        stages.StoredStates.of(study, STANDARD).dataset("occlusion"),
+        StoredStates.of(study, STANDARD),
+        StoredStates.of(study, STANDARD).dataset("occlusion"),
     )
     chosen, at = items["scenario_id"].isin(said["scenarios"]).to_numpy(), states.read("occlusion", 2).astype(float)
     void = (items["side"] == "void").to_numpy()
     difference = at[chosen & void].mean(axis=0) - at[chosen & ~void].mean(axis=0)
-    saved = stages.saved_directions(study, STANDARD)["occlusion"].vectors["void"][2]
+    saved = stages.saved_directions(study, STANDARD)["occlusion"].void[2]
     assert np.allclose(saved, difference / np.linalg.norm(difference), atol=1e-6)
     assert row["direction_digest"] == vector_digest(saved) and row["n_pairs"] == 3 and row["n_steered"] == 1
     assert row["norm"] == pytest.approx(np.linalg.norm(difference), rel=1e-5)
@@ -262,23 +267,27 @@ def steered(study: Workspace, entry: ModelEntry) -> Workspace:
     cells = [SteeringCell.make(dataset, "tiny", "standard", "guided") for dataset in DATASETS]
     along = {"standard": stages.saved_directions(study, STANDARD)}
     done = written(study, STEERING, collect_steered(study, entry, cells, along))
-    # chaotic: 4 sources x (void, random) x 2 alphas x 4 rows, the sweep's 2 x 2 controls, 4 rows as they are
+    # chaotic: 4 sources x 3 doses x 4 rows; + on both sides 3 x 4, of which the controls are asked already; 2 nulls x 4
+    # rows at the largest dose; the sweep's 2 x 2 controls; 4 rows as they are
     rows = {cell.dataset: (len(made.rows(STEERING)), made.tally.asked) for cell, made in done}
-    assert rows["chaotic"] == rows["occlusion"] == (72, 72)
-    # ill-posed: 3 sources, whose controls the well-posed cell has asked: its voids are new, and its sweep's controls
-    assert rows["chaotic_ill_posed"] == rows["occlusion_ill_posed"] == (56, 3 * 2 * 2 * 2 + 2 + 2 * 2)
+    assert rows["chaotic"] == rows["occlusion"] == (76, 70)
+    # ill-posed: 3 sources, whose controls the well-posed cell has asked: its voids are new, its nulls, and its sweep
+    assert rows["chaotic_ill_posed"] == rows["occlusion_ill_posed"] == (64, 3 * 3 * 2 + 3 * 2 + 2 * 4 + 2 * 2 + 2)
     planned = count_answers(study.mechanism, "tiny", DATASETS, {"occlusion": PAIRS, "chaotic": PAIRS})
-    assert planned == {"guided": sum(asked for _, asked in rows.values())}
+    assert planned["guided"].total() == sum(asked for _, asked in rows.values()) and set(planned) == {"guided"}
     votes = written(study, STEERING_VOTES, collect_steering_votes(study, cells))
     judged = [[row for row in made.rows(STEERING) if row.outcome in JUDGED] for _, made in done]
-    assert [len(made.rows(STEERING_VOTES)) for _, made in votes] == [3 * len(rows) for rows in judged]
+    tasks = [
+        sum(len(tasks_for(row.side)) for row in rows) for rows in judged
+    ]  # controls are judged for correctness too
+    assert [len(made.rows(STEERING_VOTES)) for _, made in votes] == [3 * n for n in tasks]
     return study
 
 
 def test_what_two_cells_share_is_one_answer(steered: Workspace, entry: ModelEntry) -> None:
     answers = steered.tables.read_all(STEERING)
     controls = answers.query("side == 'control' and source == 'chaotic' and layer == 2")
-    assert controls.groupby(["scenario_id", "kind", "alpha"])["request_key"].nunique().max() == 1
+    assert controls.groupby(["scenario_id", "kind", "draw", "alpha"])["request_key"].nunique().max() == 1
     plain = answers.query(f"kind == '{UNSTEERED}'")
     assert plain.groupby(["dataset", "item_id"]).size().max() == 1 and set(plain["alpha"]) == {0}
     ledger = steered.answers.read("tiny__guided__steered").rows
@@ -295,7 +304,7 @@ def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, e
 
     model, items = load_local_model(entry), steered.tables.read(ITEMS, {"dataset": "chaotic"}).set_index("item_id")
     answers = steered.tables.read_all(STEERING, dataset="chaotic")
-    vector = stages.saved_directions(steered, STANDARD)["occlusion"].vectors["void"][2]
+    vector = stages.saved_directions(steered, STANDARD)["occlusion"].void[2]
     assert entry.media is not None
     for side, sign in (("control", 1), ("void", -1)):
         row = answers.query(f"source == 'occlusion' and kind == 'void' and alpha == 8 and side == '{side}'").iloc[0]
@@ -311,25 +320,41 @@ def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, e
 
 def test_the_panel_judges_every_answer_with_a_text(steered: Workspace) -> None:
     answers, votes = steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES)
-    keys = ["dataset", "source", "kind", "layer", "alpha", "item_id"]
+    keys = ["dataset", "source", "kind", "draw", "layer", "unit", "dose", "signs", "item_id"]
     texts = answers.loc[answers["outcome"].isin(JUDGED), keys]
+    correctness = votes.query("task == 'correctness'")
+    assert set(correctness["side"]) == {"control"} and correctness["correct"].notna().all()
+    votes = votes.query("task == 'abstention'")
     of_answer = votes.groupby(keys)
     assert set(of_answer.groups) == set(texts.itertuples(index=False, name=None)) != set()
     assert set(of_answer["judge"].nunique()) == set(of_answer.size()) == {3}
-    assert set(votes["task"]) == {"abstention"} and votes["valid"].all() and votes["abstained"].notna().all()
+    assert votes["valid"].all() and votes["abstained"].notna().all()
     ledger = steered.votes.read("tiny__guided__steered").rows
-    assert set(votes["vote_key"]) == set(ledger)
+    assert {*votes["vote_key"], *correctness["vote_key"]} == set(ledger)
 
 
 def test_effects_put_the_model_as_it_is_into_every_path(steered: Workspace) -> None:
     effects = pd.DataFrame(effect_rows(steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES)))
-    main = effects.query("kind == 'void' and layer == 2")
+    main = of_paper(effects).query("layer == 2")
     assert len(main.groupby(["source", "target"])) == 14
     assert set(main["alpha"]) == {0, 2, 8} and (main["n"] + main["n_missing"] == 2).all()
     plain = main.query("alpha == 0 and target == 'chaotic'")
     assert plain.groupby("side")["abstained"].nunique().max() == 1
     assert set(effects.query("layer == 1")["side"]) == {"control"}  # the sweep
     assert (effects["low"].dropna() <= effects["abstention"].dropna()).all()
+
+
+def test_nulls_and_policies_stand_beside_every_own_direction(steered: Workspace) -> None:
+    effects = pd.DataFrame(effect_rows(steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES)))
+    nulls, pecs = pd.DataFrame(null_rows(effects)), pd.DataFrame(pecs_rows(effects))
+    assert set(nulls["target"]) == {*DATASETS, "all"} and set(nulls["null"]) == {"covariance"}
+    assert set(nulls["draws"]) == {2} and set(nulls["unit"]) == {"gap"} and set(nulls["dose"]) == {0.5}
+    gaps = {name: of.gaps[2] for name, of in stages.saved_directions(steered, STANDARD).items()}
+    doses = effects.query("unit == 'gap' and dose == 0.5 and layer == 2")
+    assert np.allclose(doses["alpha"], 0.5 * doses["source"].map(gaps).astype(float))
+    assert set(pecs.query("signs == 'plus'")["source"]) == set(DATASETS)
+    label, plus = (pecs.query(f"signs == '{s}' and source == target").reset_index(drop=True) for s in ("label", "plus"))
+    assert (label["acc"].dropna() == plus["acc"].dropna()).all()  # controls are the same under both policies
 
 
 def test_steering_refuses_layers_and_sources_that_are_not_there(study: Workspace) -> None:

@@ -31,7 +31,7 @@ MECHANISM = {
     "probes": {"folds": 2, "resamples": 100},
     "steering": {
         **{"alphas": [5], "pairs": 2, "well_posed_pairs": 4, "ill_posed_pairs": 4, "max_new_tokens": 4},
-        **{"direction_regimes": ["standard"], "inference_regimes": ["guided"], "controls": []},
+        **{"direction_regimes": ["standard"], "inference_regimes": ["guided"], "gaps": [], "signs": []},
     },
 }
 

@@ -50,6 +50,7 @@ from traps_pipeline.partitions import (
     ANSWERABLE,
     DATASETS,
     OCCLUSION_CATEGORIES,
+    TIME_SWAPPED,
     Cell,
     Evaluation,
     Extraction,
@@ -93,14 +94,19 @@ _ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in
 _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if key in OCCLUSION_CATEGORIES else [])
 
 
-def _steers(wanted: Wanted, key: str | None) -> bool:
+def _probed_from(dataset: str) -> list[str]:
+    return [dataset, TIME_SWAPPED] if dataset == "chaotic" else [dataset]
+
+
+def steers(wanted: Wanted, key: str | None) -> bool:
+    """Whether the study steers models."""
     return wanted.steers
 
 
 def _make_probe_items(workspace: Workspace, dataset: str) -> Made:
-    """Clips and questions for which hidden states are extracted: a dataset's items, or occlusion's void clips with a
-    question that they answer."""
-    from traps_pipeline.mechanism.stages import probe_items as rows_of
+    """Clips and questions for which hidden states are extracted: a dataset's items, occlusion's void clips with a
+    question that they answer, and chaotic's clips with the frame times of the other side."""
+    from traps_pipeline.mechanism.probe_items import probe_items as rows_of
 
     return Made(rows_of(workspace, dataset))
 
@@ -110,7 +116,7 @@ probe_items = stage(
     _make_probe_items,
     group=GROUP,
     deps=[
-        dg.AssetDep(items, partition_mapping=to_keys(DATASET, PROBED, lambda key: [key])),
+        dg.AssetDep(items, partition_mapping=to_keys(DATASET, PROBED, _probed_from)),
         dg.AssetDep(scene_specs, partition_mapping=_OCCLUSION),
         dg.AssetDep(videos, partition_mapping=_OCCLUSION),
     ],
@@ -182,7 +188,7 @@ probes = stage(
 
 
 def _make_directions(workspace: Workspace, key: str) -> Made:
-    """The void direction of every dataset at every layer, with its random and label-shuffled controls, as files."""
+    """The void direction of every dataset at every layer, with draws of its nulls, as files."""
     from traps_pipeline.mechanism.stages import direction_rows
 
     return Made(direction_rows(workspace, Extraction.parse(key)))
@@ -195,7 +201,7 @@ directions = stage(
     deps=[dg.AssetDep(hidden_states, partition_mapping=by_extraction), probing_settings],
     scheme=EXTRACTION,
     needs={"hidden_states": "some"},
-    wants=_steers,
+    wants=steers,
     lost=lambda workspace, key: (
         [] if directions_are_there(workspace, Extraction.parse(key)) else ["its directions are gone"]
     ),
@@ -212,7 +218,7 @@ def _make_cosines(workspace: Workspace, _: None) -> Made:
     return Made(table, shown={"cosines": rows_shown(table)})
 
 
-cosines = stage(COSINES, _make_cosines, group=GROUP, deps=[directions], needs={"directions": "some"}, wants=_steers)
+cosines = stage(COSINES, _make_cosines, group=GROUP, deps=[directions], needs={"directions": "some"}, wants=steers)
 
 
 def _collect_steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
@@ -245,7 +251,7 @@ steering = stage(
 
 
 def _collect_steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, Made]]:
-    """The votes of the study's panel on whether each steered answer abstains."""
+    """The votes of the study's panel on whether each steered answer abstains, and whether a control's is correct."""
     from traps_pipeline.mechanism.steering import collect_steering_votes
 
     for done, made in collect_steering_votes(workspace, [SteeringCell.parse(key) for key in keys]):
@@ -291,5 +297,7 @@ def _make_shares(workspace: Workspace, _: None) -> Made:
 
 _SOME: dict[str, Need] = {"steering": "some", "steering_votes": "some"}
 _ABOVE = [steering, steering_votes]
-steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, deps=_ABOVE, needs=_SOME, wants=_steers)
-steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, deps=_ABOVE, needs=_SOME, wants=_steers)
+steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, deps=_ABOVE, needs=_SOME, wants=steers)
+
+
+steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, deps=_ABOVE, needs=_SOME, wants=steers)

@@ -1,7 +1,12 @@
 """Void directions: the mean difference between voids and controls, as a value that is saved (docs/spec.md 8.1).
 
-A direction is the unit vector of mean(h_void) - mean(h_control) at one layer. It has two controls of the same norm: a
-random direction, and one from shuffled labels, for which the sides of half of the pairs, drawn at random, are swapped.
+A direction is the unit vector of mean(h_void) - mean(h_control) at one layer. Its nulls are unit vectors too, drawn
+from three distributions and made orthogonal to it, so that no null contains a part of what it is compared with:
+
+- `isotropic`: every direction is equally likely;
+- `covariance`: drawn from the covariance of the states within a side, so that a null lies where states vary;
+- `shuffled`: the mean difference after the sides of half of the pairs, chosen at random, were swapped. Without the
+  projection it would lie along the direction or its reverse: with ten pairs its cosine often exceeds 0.7.
 """
 
 from __future__ import annotations
@@ -19,7 +24,11 @@ from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_bytes, write_text
 
-KINDS = ("void", "random", "shuffled")
+VOID = "void"
+NULLS = ("isotropic", "covariance", "shuffled")
+KINDS = (VOID, *NULLS)
+_LENGTHS = ("gaps", "residual_norms")
+_NOTHING_LEFT = 1e-5  # share of a null's length below which what the projection leaves is rounding
 SITE = "output of the block, before the next one (residual stream); layer 0: embeddings"
 
 
@@ -65,12 +74,18 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """Directions of one dataset at every layer. vectors: kind -> (layers, d) float32 unit vectors. norms: kind ->
-    (layers,), lengths before normalisation. residual_norms: (layers,), mean length of the control states."""
+    """Directions of one dataset at every layer. vectors: kind -> (draws, layers, d) float32 unit vectors, with one draw
+    of kind void. gaps: (layers,), length of mean(h_void) - mean(h_control), the class gap. residual_norms: (layers,),
+    mean length of the control states."""
 
     vectors: Mapping[str, np.ndarray]
-    norms: Mapping[str, np.ndarray]
+    gaps: np.ndarray
     residual_norms: np.ndarray
+
+    @property
+    def void(self) -> np.ndarray:
+        """The void direction at every layer, (layers, d)."""
+        return self.vectors[VOID][0]
 
     @property
     def n_layers(self) -> int:
@@ -78,28 +93,54 @@ class Directions:
         return len(self.residual_norms)
 
 
-def extract_directions(void: np.ndarray, control: np.ndarray, seed: Sequence[int]) -> Directions:
-    """Directions from states (layers, pairs, d) of the two sides, with the pairs in the same order.
+def extract_directions(
+    void: np.ndarray, control: np.ndarray, seed: Sequence[int], nulls: Sequence[str] = NULLS, draws: int = 1
+) -> Directions:
+    """Directions from states (layers, pairs, d) of the two sides, with the pairs in the same order, and so many draws
+    of each kind of null.
 
     A layer at which the sides do not differ at all (the embeddings of a last token that is the same everywhere) has a
-    zero vector, not a direction that consists of rounding errors. Raises TrapsError with fewer than two pairs.
+    zero vector, not a direction that consists of rounding errors; so has a null of which the projection leaves nothing.
+    Raises TrapsError with fewer than two pairs.
     """
     if void.shape != control.shape or void.ndim != 3 or void.shape[1] < 2:
         raise TrapsError(
             f"a direction needs two pairs at least, but states are {void.shape} and {control.shape} (layers, pairs, "
             "width); take more scenarios"
         )
-    rng = np.random.default_rng(list(seed))
     difference = void.astype(np.float64) - control
-    swaps = rng.permutation(np.resize([-1.0, 1.0], difference.shape[1]))
-    raw = {
-        "void": difference.mean(axis=1),
-        "shuffled": (difference * swaps[None, :, None]).mean(axis=1),
-        "random": rng.standard_normal((difference.shape[0], difference.shape[2])),
-    }
-    norms = {kind: np.linalg.norm(vectors, axis=1) for kind, vectors in raw.items()}
-    units = {kind: (raw[kind] / np.where(norms[kind] > 0, norms[kind], 1)[:, None]).astype(np.float32) for kind in raw}
-    return Directions(units, norms | {"random": np.ones(len(void))}, np.linalg.norm(control, axis=2).mean(axis=1))
+    raw = difference.mean(axis=1)
+    gaps = np.linalg.norm(raw, axis=1)
+    unit = raw / np.where(gaps > 0, gaps, 1)[:, None]
+    vectors = {VOID: unit[None]}
+    for number, kind in enumerate(NULLS):
+        if kind in nulls:
+            drawn = _null_draws(kind, void, control, np.random.default_rng([*seed, number]), draws)
+            vectors[kind] = _orthogonal(drawn, unit)
+    found = {kind: of.astype(np.float32) for kind, of in vectors.items()}
+    return Directions(found, gaps, np.linalg.norm(control, axis=2).mean(axis=1))
+
+
+def _null_draws(kind: str, void: np.ndarray, control: np.ndarray, rng: np.random.Generator, draws: int) -> np.ndarray:
+    """Draws of a kind of null before the projection, (draws, layers, d)."""
+    layers, pairs, width = void.shape
+    if kind == "isotropic":
+        return rng.standard_normal((draws, layers, width))
+    if kind == "shuffled":
+        swaps = np.stack([rng.permutation(np.resize([-1.0, 1.0], pairs)) for _ in range(draws)])
+        return np.einsum("kn,lnd->kld", swaps, void.astype(np.float64) - control) / pairs
+    centred = [side - side.mean(axis=1, keepdims=True) for side in (void.astype(np.float64), control)]
+    return np.einsum("kn,lnd->kld", rng.standard_normal((draws, 2 * pairs)), np.concatenate(centred, axis=1))
+
+
+def _orthogonal(drawn: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """The unit vectors of what is left of draws (draws, layers, d) without their part along `unit` (layers, d); zero
+    where hardly anything is left, and where `unit` itself is zero."""
+    left = drawn - (drawn * unit).sum(axis=2, keepdims=True) * unit
+    left -= (left * unit).sum(axis=2, keepdims=True) * unit  # again, since the first projection rounds
+    before, after = (np.linalg.norm(of, axis=2, keepdims=True) for of in (drawn, left))
+    kept = (after > _NOTHING_LEFT * before) & unit.any(axis=1)[None, :, None]
+    return np.where(kept, left / np.where(kept, after, 1), 0.0)
 
 
 def vector_digest(vector: np.ndarray) -> str:
@@ -108,13 +149,12 @@ def vector_digest(vector: np.ndarray) -> str:
 
 
 def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
-    """Write `path` (safetensors: kind -> (layers, d), norms.kind and residual_norms -> (layers,)), and a JSON file of
+    """Write `path` (safetensors: kind -> (draws, layers, d), gaps and residual_norms -> (layers,)), and a JSON file of
     the same name that says what it holds. Raises TrapsError when the disk is full."""
     from safetensors.numpy import save
 
     tensors = {kind: np.ascontiguousarray(vectors) for kind, vectors in directions.vectors.items()}
-    tensors |= {f"norms.{kind}": np.asarray(norms, np.float64) for kind, norms in directions.norms.items()}
-    tensors["residual_norms"] = np.asarray(directions.residual_norms, np.float64)
+    tensors |= {name: np.asarray(getattr(directions, name), np.float64) for name in _LENGTHS}
     write_bytes(path, save(tensors))
     description = asdict(origin) | {"n_pairs": len(origin.scenarios), "tensors_sha256": file_digest(path)}
     write_text(path.with_suffix(".json"), json.dumps(description, indent=1, sort_keys=True))
@@ -135,9 +175,11 @@ def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
         raise TrapsError(f"{path}: it or its JSON file is missing; `traps run` makes both from the states") from None
     except (OSError, ValueError, KeyError, SafetensorError) as error:
         raise TrapsError(f"{path}: damaged ({error}); delete it, then `traps run` makes it again") from error
-    vectors = {kind: tensors[kind] for kind in KINDS}
-    norms = {kind: tensors[f"norms.{kind}"] for kind in KINDS}
-    return Directions(vectors, norms, tensors["residual_norms"]), description
+    if not {VOID, *_LENGTHS} <= set(tensors):
+        raise TrapsError(f"{path}: was written by an earlier version; delete it, then `traps run` makes it again")
+    return Directions(
+        {kind: tensors[kind] for kind in KINDS if kind in tensors}, **{n: tensors[n] for n in _LENGTHS}
+    ), description
 
 
 def cosine_matrix(vectors: np.ndarray) -> np.ndarray:

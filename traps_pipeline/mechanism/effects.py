@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from traps_pipeline.mechanism.directions import KINDS
 from traps_pipeline.mechanism.paths import FAMILIES, PATH_SETS
 from traps_pipeline.partitions import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 
@@ -116,11 +117,24 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
     return table.loc[several].reset_index(drop=True)
 
 
+def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
+    """The effects of every dataset along its own direction and its nulls, signs by label, at the layer that has both
+    sides; with `gaps`, the dose in units of the class gap. Without a dose in that unit there are no rows."""
+    own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
+    both = own.loc[own["side"] == "void", ["model", "layer"]].drop_duplicates()
+    own = own.merge(both, on=["model", "layer"])
+    keys = ["model", "directions", "target", "layer"]
+    length = own.loc[(own["unit"] == "gap") & (own["dose"] > 0) & (own["kind"] == "void")]
+    length = length.assign(length=length["alpha"] / length["dose"])[[*keys, "length"]].drop_duplicates(keys)
+    joined = own.merge(length, on=keys)
+    return joined.assign(gaps=joined["alpha"] / joined["length"])
+
+
 def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
     """The rows with sources and targets in the benchmark's order."""
     order = {name: place for place, name in enumerate(DATASETS)}
     by = [name for name in (*CELL, "kind", "source", "target", "alpha") if name in rows]
-    kinds = {"void": 0, "shuffled": 1, "random": 2}
+    kinds = {kind: place for place, kind in enumerate(KINDS)}
 
     def place(values: Any) -> Any:
         if values.name in ("source", "target"):

@@ -31,7 +31,7 @@ from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import remedy, replacing, write_bytes
 from traps_pipeline.models.local.capture import Pooling
-from traps_pipeline.storage.media import MediaSpec, profile_digest, sample
+from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,18 +72,34 @@ _Made = tuple[Item, str, "States"]  # an item, its key, its states
 _Place = tuple[str, int, str]  # shard, row and device of an item's states
 
 
-def clip_item(model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], clip: Path, system: str) -> Item:
+def clip_item(
+    model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], clip: Path, system: str, times: Path | None = None
+) -> Item:
     """The item that asks a question about a clip under a system prompt.
 
-    row: a row of the items table (item_id, side, question, media_digest). spec: how the model is shown a clip.
+    row: a row of the items table (item_id, side, question, media_digest; times_digest where there is `times`). spec:
+    how the model is shown a clip. times: another clip, whose frame times are shown in the place of the clip's own.
     """
 
     def prompt() -> Prompt:
         shown = sample(clip, spec)
-        return model.prompt(system, row["question"], shown.frames, shown.times_s)
+        return model.prompt(system, row["question"], shown.frames, shown_times(shown, clip, spec, times))
 
     about = {"question": row["question"], "clip": row["media_digest"], "media": profile_digest(spec), "system": system}
+    if times is not None:
+        about["times"] = row["times_digest"]
     return Item(row["item_id"], row["side"], about, prompt)
+
+
+def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
+    """The times (N,) in seconds that stand beside a clip's shown frames: its own, or those of another clip, spread over
+    as many frames if the other one has more or fewer."""
+    if times is None or times == clip:
+        return shown.times_s
+    other = sample(times, spec).times_s
+    if len(other) == len(shown.times_s):
+        return other
+    return np.interp(np.linspace(0, 1, len(shown.times_s)), np.linspace(0, 1, len(other)), other)
 
 
 def states_key(model: LocalModel, item: Item, pooling: Pooling) -> str:

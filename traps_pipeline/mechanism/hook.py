@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 class Steering:
     """A direction at a layer, and its strength for each row of a batch.
 
-    direction: (d_model,) float32, used without scaling (void directions are unit vectors). layer: counted as in
-    hidden_states, 1 to n_layers. alphas: one per row, signed.
+    direction: (d_model,) float32 for all rows, or (rows, d_model) with one of its own for each; used without scaling
+    (void directions are unit vectors). layer: counted as in hidden_states, 1 to n_layers. alphas: one per row, signed.
     """
 
     direction: np.ndarray
@@ -34,7 +34,8 @@ class Steering:
 
     def rows(self, chosen: Sequence[int]) -> Steering:
         """The steering of some of the rows."""
-        return Steering(self.direction, self.layer, tuple(self.alphas[i] for i in chosen))
+        direction = self.direction if self.direction.ndim == 1 else self.direction[list(chosen)]
+        return Steering(direction, self.layer, tuple(self.alphas[i] for i in chosen))
 
     @contextmanager
     def applied(self, model: LocalModel) -> Iterator[None]:
@@ -44,7 +45,8 @@ class Steering:
         for a layer out of range, and for a direction of another width or with values that are not finite.
         """
         block = model.block(self.layer)
-        if self.direction.shape != (model.d_model,) or not np.isfinite(self.direction).all():
+        shapes = ((model.d_model,), (len(self.alphas), model.d_model))
+        if self.direction.shape not in shapes or not np.isfinite(self.direction).all():
             raise TrapsError(
                 f"the direction has shape {self.direction.shape} {'and' if self.direction.shape else ''} for "
                 f"{model.checkpoint.name}, whose states are {model.d_model} finite numbers: extract it from this model"
@@ -68,7 +70,8 @@ class _Adding:
 
         alphas = torch.tensor(steering.alphas, dtype=torch.float32)
         direction = torch.from_numpy(np.ascontiguousarray(steering.direction, dtype=np.float32))
-        self._added = (alphas[:, None, None] * direction).to(model.device, model.network.dtype)  # (rows, 1, d)
+        added = alphas[:, None] * direction  # (rows, d), for a shared direction too
+        self._added = added[:, None, :].to(model.device, model.network.dtype)
 
     def __call__(self, _: Any, __: Any, output: Any) -> Any:
         states = output[0] if isinstance(output, tuple) else output

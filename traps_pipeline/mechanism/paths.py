@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import permutations, product
 from typing import Literal
 
-from traps_pipeline.partitions import DATASETS, LONG, SHORT, taxonomy_of
+from traps_pipeline.partitions import ANSWERABLE, DATASETS, LONG, SHORT, taxonomy_of
 
 Path = tuple[str, str]  # source and target dataset
 PathSet = Literal["transfer", "within_domain"]
@@ -28,9 +28,19 @@ STEERING_PATHS = tuple(dict.fromkeys(TRANSFER + WITHIN_DOMAIN))  # 14
 TRANSFER_PAIRS = tuple(permutations(DATASETS, 2))  # the twelve ordered pairs of the probes
 
 # Analyses of probes that have a value at every layer (`probing`); they are part of the version of probes.
-CURVES = ("transfer", "held_out", "confabulated", "within", "shuffled", "answerable_void", "answerable_control")
+CURVES = (
+    *("transfer", "held_out", "confabulated", "within", "shuffled"),
+    *("answerable_void", "answerable_control", "time_swapped"),
+)
 
+# Items that can be answered although they look like voids, and the dataset whose voids they look like.
+LOOK_ALIKES = {ANSWERABLE: "occlusion", "decoy": "occlusion", "length_matched": "chaotic"}
 TRANSFER_TYPES = ("Cross-modality", "Cross-domain", "Cross-both", "Within")
+
+
+def probed_taxonomy(dataset: str) -> str:
+    """The taxonomy whose scenarios a probed dataset has."""
+    return "chaotic" if LOOK_ALIKES.get(dataset, dataset).startswith("chaotic") else "occlusion"
 
 
 def path_name(source: str, target: str) -> str:

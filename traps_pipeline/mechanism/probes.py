@@ -187,7 +187,12 @@ def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
 def auroc_interval(
     void: np.ndarray, scores: np.ndarray, scenario: np.ndarray, weights: np.ndarray, level: float = 0.95
 ) -> tuple[float, float]:
-    """Percentile interval of the AUROC from resampled scenarios, with the probe held fixed.
+    """Percentile interval of the AUROC from resampled scenarios, with the probe held fixed, and with a floor: where all
+    resamples agree (a probe that separates 16 pairs), percentiles would say that the value is certain.
+
+    The floor is the exact binomial one. If a share s of n scenarios fails, none of them fails with probability
+    (1 - s)^n; so with n scenarios of the scarcer side, an interval reaches down to at least ((1 - level) / 2)^(1/n),
+    which is .79 for 16, and up to at least 1 minus that.
 
     weights: (resamples, scenarios), how often each is drawn (`scoring.bootstrap.scenario_weights`); scenario: (n,), the
     column of `weights` for each item. A resample in which a class is empty is dropped.
@@ -201,7 +206,8 @@ def auroc_interval(
     if not (pairs > 0).any():
         return np.nan, np.nan
     low, high = np.quantile(won[pairs > 0] / pairs[pairs > 0], [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
+    certain = ((1 - level) / 2) ** (1 / min(len(np.unique(scenario[side])) for side in (void, ~void)))
+    return min(float(low), certain), max(float(high), 1 - certain)
 
 
 # --- within a split ---------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.mechanism.paths import CURVES, TRANSFER_PAIRS, Path
+from traps_pipeline.mechanism.paths import CURVES, LOOK_ALIKES, TRANSFER_PAIRS, Path, probed_taxonomy
 from traps_pipeline.mechanism.probes import (
     Split,
     auroc,
@@ -28,7 +28,7 @@ from traps_pipeline.mechanism.probes import (
     transfer_scores,
     within_split,
 )
-from traps_pipeline.partitions import ANSWERABLE, DATASETS, PROBED_DATASETS, taxonomy_of
+from traps_pipeline.partitions import DATASETS, PROBED_DATASETS, TIME_SWAPPED, taxonomy_of
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.storage.study import ProbeSettings
 
@@ -91,7 +91,7 @@ class ProbeRun:
         self._pairs = [pair for pair in TRANSFER_PAIRS if set(pair) <= set(self._own)]
         self._of = {name: self.items.loc[self.items["dataset"] == name] for name in self._datasets}
         taxonomies = {taxonomy: self._scenarios(taxonomy) for taxonomy in ("occlusion", "chaotic")}
-        self._index = {name: taxonomies["chaotic" if "chaotic" in name else "occlusion"] for name in self._datasets}
+        self._index = {name: taxonomies[probed_taxonomy(name)] for name in self._datasets}
         self._weights = {
             taxonomy: scenario_weights(len(index), self.settings.resamples, [self.seed, k])
             for k, (taxonomy, index) in enumerate(taxonomies.items())
@@ -107,7 +107,7 @@ class ProbeRun:
         }
 
     def _scenarios(self, taxonomy: str) -> pd.Index:
-        ids = self.items.loc[self.items["dataset"].str.startswith(taxonomy), "scenario_id"]
+        ids = self.items.loc[self.items["dataset"].map(probed_taxonomy) == taxonomy, "scenario_id"]
         return pd.Index(sorted(ids.unique()))
 
     def _split(self, name: str, layer: int) -> Split:
@@ -132,11 +132,15 @@ class ProbeRun:
     def layer_rows(self, layer: int) -> list[Row]:
         """Every row of one layer, whose states are in memory only during this call."""
         splits = {name: self._split(name, layer) for name in self._datasets}
-        rows = self.transfer(layer, splits) + self.confabulated_transfer(layer, splits)
-        unseen = {source: self._unseen_scores(source, splits) for source in self._own}
-        rows += self.within(layer, splits) + self.held_out(layer, splits, unseen)
-        rows += self.answerable(layer, splits, unseen)
+        rows = self.comparable(layer, splits) + self.confabulated_transfer(layer, splits) + self.within(layer, splits)
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
+
+    def comparable(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
+        """The rows of one layer that baselines have as well: transfer, held out, look-alikes, swapped times."""
+        splits = splits or {name: self._split(name, layer) for name in self._datasets}
+        unseen = {source: self._unseen_scores(source, splits) for source in self._own}
+        rows = self.transfer(layer, splits) + self.held_out(layer, splits, unseen)
+        return rows + self.answerable(layer, splits, unseen) + self.time_swapped(layer, splits, unseen)
 
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """The twelve ordered pairs on all samples. The two datasets of a taxonomy share their control items, so that
@@ -167,35 +171,46 @@ class ProbeRun:
     def held_out(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """The pairs within a taxonomy, by probes that were fitted without the scored scenario."""
-        pairs = [(s, t) for s, t in self._pairs if taxonomy_of(s) == taxonomy_of(t)]
+        """The pairs within a taxonomy, and each dataset on itself, by probes that were fitted without the scored
+        scenario."""
+        pairs = [(s, t) for s in self._own for t in self._own if taxonomy_of(s) == taxonomy_of(t)]
         return [self._scored("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
 
     def answerable(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Void clips with an answerable question, scored by the probes of each dataset.
+        """Clips that can be answered although they look like voids, scored by the probes of each dataset: void clips
+        with a question that they answer, decoys (a panel that hides nothing), and whole clips as short as a void.
 
-        answerable_void: AUROC of void items against the same clips with the answerable question; 0.5 for a probe that
-        detects a hidden object, 1 for a probe that detects that the answer cannot be known. answerable_control: AUROC
-        of these clips against the controls; the reverse. Probes of occlusion sources are fitted without the scored
-        scenario.
+        answerable_void: AUROC of void items against these; 0.5 for a probe that detects what both have (a panel, the
+        length), 1 for a probe that detects that the answer cannot be known. answerable_control: AUROC of these against
+        the controls; the reverse. Probes of the same taxonomy are fitted without the scored scenario.
         """
-        if not {ANSWERABLE, "occlusion"} <= set(splits):
-            return []
         rows = []
-        for source in self._own:
+        for source, (extra, of_extra) in product(self._own, LOOK_ALIKES.items()):
+            if not {extra, of_extra} <= set(splits):
+                continue
             for analysis, positive, negative in (
-                ("answerable_void", ("occlusion", True), (ANSWERABLE, None)),
-                ("answerable_control", (ANSWERABLE, None), ("occlusion", False)),
+                ("answerable_void", (of_extra, True), (extra, None)),
+                ("answerable_control", (extra, None), (of_extra, False)),
             ):
                 chosen = [self._side(splits, unseen[source], *side) for side in (positive, negative)]
                 labels = np.repeat([True, False], [len(values) for values, _ in chosen])
                 values = np.concatenate([values for values, _ in chosen])
                 scenario = np.concatenate([places for _, places in chosen])
                 of = Split(values[:, None], labels, scenario)
-                rows.append(self._scored(analysis, (source, ANSWERABLE), layer, of, values))
+                rows.append(self._scored(analysis, (source, extra), layer, of, values))
         return rows
+
+    def time_swapped(
+        self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
+    ) -> list[Row]:
+        """Chaotic's frames with the times of the other side, whose label is that of the frames: 1 for a probe that
+        reads the frames, 0 for one that reads the time stamps."""
+        if TIME_SWAPPED not in splits:
+            return []
+        of = splits[TIME_SWAPPED]
+        return [self._scored("time_swapped", (s, TIME_SWAPPED), layer, of, unseen[s][TIME_SWAPPED]) for s in self._own]
 
     @staticmethod
     def _side(
@@ -205,10 +220,10 @@ class ProbeRun:
         return scores[name][mask], splits[name].scenario[mask]
 
     def _unseen_scores(self, source: str, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
-        """Scores of the items of the source's taxonomy, of occlusion and of the answerable dataset, by probes that were
-        not fitted on their scenarios: one probe for items of another taxonomy, one per fold for the source's own."""
+        """Scores of the items of every dataset by probes that were not fitted on their scenarios: one probe for items
+        of another taxonomy, one per fold for those of the source's own."""
         split, own = splits[source], [name for name in splits if self._index[name] is self._index[source]]
-        others = [name for name in ("occlusion", ANSWERABLE) if name in splits and name not in own]
+        others = [name for name in splits if name not in own]
         scores = {name: np.empty(len(splits[name].void)) for name in own}
         if others:
             probe = fit_probe(split.states, split.void, self.settings.solver)
@@ -240,7 +255,7 @@ class ProbeRun:
         return rows
 
     def _scored(self, analysis: str, path: Path, layer: int, of: Split, scores: np.ndarray) -> Row:
-        weights = self._weights["chaotic" if "chaotic" in path[1] else "occlusion"]
+        weights = self._weights[probed_taxonomy(path[1])]
         interval = auroc_interval(of.void, scores, of.scenario, weights)
         return _row(analysis, path, layer, float(auroc(of.void, scores)), of, interval=interval)
 

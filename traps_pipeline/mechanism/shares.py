@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.judging.ratings import ABSTENTION, decided, majority, ratings
+from traps_pipeline.judging.ratings import ABSTENTION, CORRECTNESS, decided, majority, ratings
 from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS
 from traps_pipeline.mechanism.steering import UNSTEERED
 from traps_pipeline.mechanism.tables import SteeringEffectRow, SteeringShareRow
@@ -25,56 +25,64 @@ from traps_pipeline.scoring.metrics import wilson
 ALL = "all"
 _RUN = ["model", "directions", "regime"]
 _CELL = [*_RUN, "dataset"]
-_ANSWER = [*_CELL, "source", "kind", "layer", "alpha", "item_id"]
-VOTE_COLUMNS = [*_ANSWER, "side", "task", "judge", "valid", "abstained", "epoch", "benchmark_version"]
+_ALONG = ["source", "kind", "draw", "layer", "unit", "signs"]
+_ANSWER = [*_CELL, *_ALONG, "dose", "item_id"]
+VOTE_COLUMNS = [*_ANSWER, "side", "task", "judge", "valid", "abstained", "correct", "epoch", "benchmark_version"]
+_EFFECT = [*_CELL, *_ALONG, "dose", "side"]
 _PATH = [*_CELL, "source", "kind", "layer", "alpha", "side"]
 _PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
 
 
-def _answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
+def of_paper(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of answers, votes or effects that follow the paper's protocol: void directions, doses in alpha, and
+    signs by label. Unsteered answers (alpha 0) are among them."""
+    return rows.loc[rows["kind"].isin(["void", UNSTEERED]) & (rows["unit"] == "alpha") & (rows["signs"] == "label")]
+
+
+def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
     """The answers with their verdicts, one row for every path that an answer belongs to; an unsteered answer (alpha 0)
     belongs to every path."""
-    copied = ["side", "scenario_id", "alpha_relative", "request_key", "epoch"]
+    copied = ["side", "alpha", "scenario_id", "alpha_relative", "degenerate", "request_key", "epoch"]
     joined = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *copied]]), votes)
     steered = joined.loc[joined["kind"] != UNSTEERED]
-    plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=["source", "kind", "layer"])
-    paths = steered[[*_RUN, "dataset", "source", "kind", "layer", "side"]].drop_duplicates()
+    plain = joined.loc[joined["kind"] == UNSTEERED].drop(columns=_ALONG)
+    paths = steered[[*_RUN, "dataset", *_ALONG, "side"]].drop_duplicates()
     return pd.concat([steered, plain.merge(paths, on=[*_RUN, "dataset", "side"])], ignore_index=True)
 
 
 def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """The answers with `abstained`, the majority's decision; null without a text, votes or a majority. Each cell is
-    decided by itself: after a change of panel, a cell has votes of the old panel until its votes are made again."""
+    """The answers with `abstained` and `correct`, the majority's decisions; null without a text, votes or a majority,
+    and `correct` on voids. Each cell is decided by itself: after a change of panel, a cell has votes of the old panel
+    until its votes are made again."""
     votes_on, none = dict(iter(votes.groupby(_CELL))), votes.head(0)
     parts: list[pd.DataFrame] = []
     for cell, of_cell in answers.groupby(_CELL, sort=False):
-        values, _ = ratings(votes_on.get(cell, none), answer=_ANSWER).on(of_cell, ABSTENTION)
-        parts.append(of_cell.assign(abstained=decided(majority(values))))
+        matrix = ratings(votes_on.get(cell, none), answer=_ANSWER)
+        tasks = {"abstained": ABSTENTION, "correct": CORRECTNESS}
+        parts.append(of_cell.assign(**{n: decided(majority(matrix.on(of_cell, t)[0])) for n, t in tasks.items()}))
     return pd.concat(parts, ignore_index=True)
 
 
 def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffectRow]:
-    """Rows of STEERING_EFFECTS: abstention by path, kind, layer, alpha and side."""
+    """Rows of STEERING_EFFECTS: abstention by path, kind, draw, layer, dose, signs and side."""
     rows: list[SteeringEffectRow] = []
-    for key, group in _answers_of_paths(answers, votes).groupby(_PATH, sort=True):
-        model, directions, regime, target, source, kind, layer, alpha, side = cast(tuple[Any, ...], key)
-        decided = group["abstained"].dropna().to_numpy(bool)
+    for key, group in answers_of_paths(answers, votes).groupby(_EFFECT, sort=True):
+        about = dict(zip(_EFFECT, cast(tuple[Any, ...], key), strict=True))
+        target = about.pop("dataset")
+        decided, correct = (group[name].dropna().to_numpy(bool) for name in ("abstained", "correct"))
         n, yes = len(decided), int(np.count_nonzero(decided))
         low, high = wilson(np.array([yes]), np.array([n]))
         relative = group["alpha_relative"].dropna()
         rows.append(
             SteeringEffectRow(
-                model=model,
-                directions=directions,
-                regime=regime,
-                source=source,
+                **about,
                 target=target,
-                transfer_type=transfer_type(str(source), str(target)),
-                kind=kind,
-                layer=layer,
-                alpha=alpha,
+                transfer_type=transfer_type(str(about["source"]), str(target)),
+                alpha=float(group["alpha"].iloc[0]),
                 alpha_relative=float(relative.iloc[0]) if len(relative) else None,
-                side=side,
+                correct=int(np.count_nonzero(correct)),
+                n_correct=len(correct),
+                degenerate=int(group["degenerate"].notna().sum()),
                 n=n,
                 n_missing=len(group) - n,
                 abstained=yes,
@@ -90,9 +98,10 @@ def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffe
 def share_rows(
     answers: pd.DataFrame, votes: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> list[SteeringShareRow]:
-    """Rows of STEERING_SHARES: mean abstention over the paths of a set, for each regime of directions and of answers
-    and over all regimes, with an interval from resampled scenarios (all paths share the scenarios of a resample)."""
-    decided = _answers_of_paths(answers, votes).dropna(subset=["abstained"])
+    """Rows of STEERING_SHARES, of the paper's protocol alone: mean abstention over the paths of a set, for each regime
+    of directions and of answers and over all regimes, with an interval from resampled scenarios (all paths share the
+    scenarios of a resample)."""
+    decided = answers_of_paths(of_paper(answers), of_paper(votes)).dropna(subset=["abstained"])
     decided = decided.merge(decided.loc[decided["side"] == "void", ["model", "layer"]].drop_duplicates())  # no sweep
     rows: list[SteeringShareRow] = []
     for _, of_model in decided.groupby("model", sort=True):

@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from traps_pipeline import progress
-from traps_pipeline.benchmark.items import categories_of_dataset
-from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.mechanism.directions import (
-    KINDS,
     Directions,
     Origin,
     cosine_matrix,
@@ -31,22 +23,20 @@ from traps_pipeline.mechanism.directions import (
 )
 from traps_pipeline.mechanism.paths import CURVES
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
+from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import (
     DIRECTIONS,
-    HIDDEN_STATES,
     PROBE_ITEMS,
     PROBES,
     CosineRow,
     DirectionRow,
     HiddenStatesRow,
-    ProbeItemRow,
     ProbeRow,
 )
 from traps_pipeline.mechanism.versions import states_folder
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
 from traps_pipeline.partitions import (
-    ANSWERABLE,
     DATASETS,
     Cell,
     Evaluation,
@@ -73,45 +63,6 @@ def examined_model(workspace: Workspace, model: str) -> ModelEntry:
     return entry
 
 
-# --- items ------------------------------------------------------------------------------------------------------------
-
-
-def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
-    """Rows of a dataset's probe_items: those of items, or occlusion's void clips with the answerable question."""
-    if dataset != ANSWERABLE:
-        rows = workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
-        columns = ("item_id", "dataset", *COPIED, "benchmark_version")
-        return [ProbeItemRow(**{name: row[name] for name in columns}) for row in rows]
-    rows = []
-    for category in categories_of_dataset("occlusion"):
-        if workspace.tables.state(SCENE_SPECS, {"category": category}) is None:
-            continue
-        clips = workspace.tables.read(VIDEOS, {"category": category})
-        voids = clips.loc[clips["side"] == "void"].set_index("scenario_id")
-        for spec in workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records"):
-            if spec["scenario_id"] not in voids.index:
-                raise TrapsError(f"{spec['scenario_id']}: has no void clip yet; materialize videos for {category}")
-            rows.append(_answerable_item(spec, voids.loc[spec["scenario_id"]].to_dict()))
-    if not rows:
-        raise TrapsError(f"probe_items {dataset}: no occlusion scenarios yet; materialize scene_specs and videos first")
-    return rows
-
-
-def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeItemRow:
-    """The void clip with a question that it answers; its side is control, since it must be answered."""
-    pair = f"{ANSWERABLE}:{spec['scenario_id']}"
-    return ProbeItemRow(
-        **{name: spec[name] for name in ("scenario_id", "category", "sub_scenario", "benchmark_version")},
-        item_id=f"{pair}:control",
-        pair_id=pair,
-        dataset=ANSWERABLE,
-        side="control",
-        question=json.loads(spec["answerable_question"])["question"],
-        clip=clip["path"],
-        media_digest=clip["file_sha256"],
-    )
-
-
 # --- hidden states ----------------------------------------------------------------------------------------------------
 
 
@@ -127,7 +78,14 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     _check_layers(workspace, entry.id, model.n_layers)
     folder = states_folder(workspace, cell)
     wanted = [
-        clip_item(model, entry.media, {str(k): v for k, v in item.items()}, workspace.resolve(item["clip"]), system)
+        clip_item(
+            model,
+            entry.media,
+            {str(k): v for k, v in item.items()},
+            workspace.resolve(item["clip"]),
+            system,
+            workspace.resolve(item["times_clip"]) if item["times_clip"] else None,
+        )
         for item in items
     ]
     done = extract(model, wanted, folder, pooling=settings.pooling, what=f"items of {cell.key}")
@@ -174,53 +132,6 @@ def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
                 f"mechanism.models.{model}.{name}: layer {layer} is out of range, {model} has blocks 1 to {n_layers} "
                 "(layer 0 is the embeddings); name one of these in the experiment and in study.yaml"
             )
-
-
-@dataclass
-class StoredStates:
-    """The hidden states of one extraction: an id table, and a reader of single layers in the order of that table."""
-
-    workspace: Workspace
-    extraction: Extraction
-    items: pd.DataFrame
-
-    @staticmethod
-    def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
-        """The states of an extraction. Raises TrapsError when nothing was extracted."""
-        items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
-        if items.empty:
-            raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
-        return StoredStates(workspace, extraction, items.reset_index(drop=True))
-
-    @property
-    def n_layers(self) -> int:
-        """Layers, the embeddings included."""
-        return int(self.items["n_layers"].iloc[0]) + 1
-
-    @property
-    def digest(self) -> str:
-        """Digest of the items and their states."""
-        return digest(sorted(zip(self.items["item_id"], self.items["states_key"], strict=True)))
-
-    def dataset(self, name: str) -> pd.DataFrame:
-        """The rows of a dataset."""
-        return self.items.loc[self.items["dataset"] == name]
-
-    def read(self, dataset: str, layer: int) -> np.ndarray:
-        """States (n, d) float32 in the order of the rows. Raises TrapsError when the shards do not hold these items."""
-        from traps_pipeline.mechanism.hidden_states import read_layer
-
-        cell = StatesCell(dataset, self.extraction)
-        ids, states = read_layer(states_folder(self.workspace, cell), layer)
-        wanted = self.dataset(dataset)
-        # By item, not by key: two items with the same clip and question share one.
-        places = pd.Index(ids["item_id"]).get_indexer(pd.Index(wanted["item_id"]))
-        if (places < 0).any() or (ids["key"].to_numpy()[places] != wanted["states_key"].to_numpy()).any():
-            raise TrapsError(
-                f"hidden states {cell.key}: the shards hold other items than the table; materialize hidden_states for "
-                "it again"
-            )
-        return states[places]
 
 
 # --- probes -----------------------------------------------------------------------------------------------------------
@@ -315,7 +226,9 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
     layers = [states.read(dataset, layer) for layer in range(states.n_layers)]
     voids, controls = (np.stack([of[rows] for of in layers]) for rows in sides)
     seed = [settings.seed, DATASETS.index(dataset)]
-    directions = extract_directions(voids, controls, seed)
+    nulls = steering.nulls
+    kinds, draws = (nulls.kinds, nulls.draws) if nulls else ((), 1)
+    directions = extract_directions(voids, controls, seed, kinds, draws)
     path = directions_file(workspace, states.extraction, dataset)
     used = items.loc[items["scenario_id"].isin(chosen)]
     first = used.iloc[0]
@@ -334,17 +247,20 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
             prompt=states.extraction.prompt,
             dataset=dataset,
             kind=kind,
+            draw=draw,
             layer=layer,
             n_pairs=len(chosen),
             n_steered=len(steered),
-            norm=float(directions.norms[kind][layer]),
+            norm=float(directions.gaps[layer]),
+            cosine=float(vectors[layer] @ directions.void[layer]),
             residual_norm=float(directions.residual_norms[layer]),
             width=voids.shape[2],
             path=workspace.relative(path),
-            direction_digest=vector_digest(directions.vectors[kind][layer]),
+            direction_digest=vector_digest(vectors[layer]),
             pooling=origin.pooling,
         )
-        for kind in KINDS
+        for kind, of_kind in directions.vectors.items()
+        for draw, vectors in enumerate(of_kind)
         for layer in range(states.n_layers)
     ]
 
@@ -356,7 +272,7 @@ def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, 
     for path in sorted(set(table["path"])):
         directions, description = load_directions(workspace.resolve(path))
         rows = table.loc[(table["path"] == path) & (table["kind"] == "void")].sort_values("layer")
-        if [vector_digest(vector) for vector in directions.vectors["void"]] != list(rows["direction_digest"]):
+        if [vector_digest(vector) for vector in directions.void] != list(rows["direction_digest"]):
             raise TrapsError(
                 f"{path}: differs from the directions in the table; delete it, then `traps run` makes it again"
             )
@@ -371,7 +287,7 @@ def cosine_rows(workspace: Workspace) -> list[CosineRow]:
     rows: list[CosineRow] = []
     for model in sorted({extraction.model for extraction in extractions}):
         named = [
-            ((extraction.prompt, dataset), directions.vectors["void"])
+            ((extraction.prompt, dataset), directions.void)
             for extraction in extractions
             if extraction.model == model
             for dataset, directions in saved_directions(workspace, extraction).items()

@@ -3,22 +3,27 @@
 A steered answer is a request like any other, so it goes through the same ledger: its key holds the direction's digest,
 the layer and the signed alpha, beside the prompt, the clip and the checkpoint. At alpha 0 the key holds none of the
 three, so that all directions share one answer. The two datasets of a taxonomy have the same control items, and share
-their answers too.
+their answers too; so do two sign policies where they add the same.
+
+Doses are given as alphas, the paper's, and in units of the class gap, since one alpha is a large step in one model and
+none in another. Nulls are steered at the largest dose, along the direction of the dataset that is steered.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, vote_columns, vote_request
+from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_request
+from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.paths import sources_of
 from traps_pipeline.mechanism.tables import STEERING, SteeringRow, SteeringVoteRow
@@ -42,13 +47,14 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.backend import _Batch
 
 UNSTEERED = "none"  # source and kind where alpha is 0
+BY_LABEL = "label"  # the paper's sign policy, which knows the side of each item
 PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every direction and strength
 
 
 @dataclass(frozen=True)
 class Strength:
-    """One direction at one strength. alpha has no sign: alpha times the direction is added on controls and subtracted
-    on voids."""
+    """One direction at one strength. alpha has no sign: `signs` says on which side alpha times the direction is added
+    and on which it is subtracted. dose: alpha in its unit, alpha or gap."""
 
     source: str
     kind: str
@@ -56,10 +62,19 @@ class Strength:
     alpha: float
     digest: str | None = None
     relative: float | None = None
+    draw: int = 0
+    unit: str = "alpha"
+    dose: float = 0.0
+    signs: str = BY_LABEL
 
     def signed(self, side: str) -> float:
         """The signed alpha for a row of that side."""
-        return self.alpha if side == "control" else -self.alpha
+        return sign_of(self.signs, side) * self.alpha
+
+
+def sign_of(signs: str, side: str) -> int:
+    """Whether a policy adds (1) or subtracts (-1) on a side."""
+    return {"plus": 1, "minus": -1}.get(signs, 1 if side == "control" else -1)
 
 
 NO_STEERING = Strength(UNSTEERED, UNSTEERED, 0, 0.0, None, 0.0)
@@ -88,35 +103,62 @@ def strengths(
     plan = _plan(target, layers, steering, directions)
     if not plan:
         raise TrapsError(f"no direction leads to {target}; materialize hidden_states and directions first")
-    for source, kind, layer, sides in plan:
-        of = directions[source]
-        vector = of.vectors[kind][_in_range(layer, of)]
+    for row in plan:
+        of, layer = directions[row.source], row.layer
+        if row.kind not in of.vectors or row.draw >= len(of.vectors[row.kind]):
+            raise TrapsError(
+                f"the directions of {row.source} have no {row.kind} draw {row.draw}; materialize directions again"
+            )
+        vector = of.vectors[row.kind][row.draw][_in_range(layer, of)]
         if not vector.any():
             raise TrapsError(
-                f"the {kind} direction of {source} at layer {layer} is zero, since the sides do not differ there; name "
-                "another layer in the experiment and in study.yaml"
+                f"the {row.kind} direction of {row.source} at layer {layer} is zero, since the sides do not differ "
+                "there; name another layer in the experiment and in study.yaml"
             )
-        for alpha in steering.alphas:
+        for unit, dose in row.doses:
+            alpha = float(dose * of.gaps[layer]) if unit == "gap" else float(dose)
             relative = float(alpha / of.residual_norms[layer]) if of.residual_norms[layer] > 0 else None
-            wanted.append((Strength(source, kind, layer, float(alpha), vector_digest(vector), relative), sides))
+            along = (row.source, row.kind, layer, alpha, vector_digest(vector), relative)
+            wanted.append((Strength(*along, row.draw, unit, dose, row.signs), row.sides))
     return wanted
 
 
-def _plan(
-    target: str, layers: Layers, steering: SteeringSettings, sources: Container[str]
-) -> list[tuple[str, str, int, tuple[str, ...]]]:
-    """Source, kind, layer and sides of every direction along which a target is steered, among these sources."""
-    kinds, sweep = ("void", *steering.controls), [layer for layer in layers.sweep if layer != layers.steering]
-    paths = [(source, kind, layers.steering, SIDES) for source in sources_of(target) for kind in kinds]
-    plan = [*paths, *((target, "void", layer, ("control",)) for layer in sweep)]
-    return [row for row in plan if row[0] in sources]
+Dose = tuple[str, float]  # unit (alpha or gap) and number
+
+
+class _Planned(NamedTuple):
+    """A direction along which a target is steered, with the sides and doses."""
+
+    source: str
+    kind: str
+    draw: int
+    layer: int
+    signs: str
+    sides: tuple[str, ...]
+    doses: tuple[Dose, ...]
+
+
+def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Container[str]) -> list[_Planned]:
+    """Every direction along which a target is steered, among these sources: all paths into it; along its own direction
+    also the other sign policies, the nulls at the largest dose, and on controls the sweep over layers."""
+    alphas: tuple[Dose, ...] = tuple(("alpha", float(alpha)) for alpha in steering.alphas)
+    doses: tuple[Dose, ...] = (*alphas, *(("gap", float(gap)) for gap in steering.gaps))
+    at = layers.steering
+    plan = [_Planned(source, "void", 0, at, BY_LABEL, SIDES, doses) for source in sources_of(target)]
+    plan += [_Planned(target, "void", 0, at, signs, SIDES, doses) for signs in steering.signs]
+    if steering.nulls:
+        draws = product(steering.nulls.kinds, range(steering.nulls.draws))
+        plan += [_Planned(target, kind, draw, at, BY_LABEL, SIDES, doses[-1:]) for kind, draw in draws]
+    sweep = [layer for layer in layers.sweep if layer != at]
+    plan += [_Planned(target, "void", 0, layer, BY_LABEL, ("control",), alphas) for layer in sweep]
+    return [row for row in plan if row.source in sources]
 
 
 def count_answers(
     settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
-) -> dict[str, int]:
-    """The number of answers that steering a model needs, by inference regime; an answer that cells share counts once.
-    scenarios: their number by taxonomy."""
+) -> dict[str, Counter[str]]:
+    """The number of answers that steering a model needs, by inference regime and side; an answer that cells share
+    counts once. scenarios: their number by taxonomy."""
     steering = settings.steering
     if steering is None:
         return {}
@@ -124,12 +166,13 @@ def count_answers(
     for target, side in product(datasets, SIDES):
         owner = taxonomy_of(target) if side == "control" else target
         cells.add((owner, side))
-        for source, kind, layer, sides in _plan(target, settings.models[model], steering, datasets):
-            # Random directions depend on the seed alone, so they are the same for both VQA prompts.
-            prompts = ("any",) if kind == "random" else steering.direction_regimes
-            if side in sides:
-                cells |= {(owner, side, source, kind, layer, *rest) for rest in product(prompts, steering.alphas)}
-    answers = sum(min(steering.pairs, scenarios.get(taxonomy_of(str(cell[0])), 0)) for cell in cells)
+        for row in _plan(target, settings.models[model], steering, datasets):
+            if side in row.sides:
+                along = (owner, side, row.source, row.kind, row.draw, row.layer, sign_of(row.signs, side))
+                cells |= {(*along, *rest) for rest in product(steering.direction_regimes, row.doses)}
+    answers = Counter[str]()
+    for cell in cells:
+        answers[cell[1]] += min(steering.pairs, scenarios.get(taxonomy_of(str(cell[0])), 0))
     return dict.fromkeys(steering.inference_regimes, answers)
 
 
@@ -199,7 +242,8 @@ def shared_item(item: Mapping[str, Any]) -> str:
 
 
 class SteeredBackend(LocalBackend):
-    """A local model that answers with a direction added to one block, each row with an alpha of its own."""
+    """A local model that answers with a direction added to one block, each row with a direction and an alpha of its
+    own."""
 
     def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray]) -> None:
         super().__init__(entry)
@@ -207,13 +251,14 @@ class SteeredBackend(LocalBackend):
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
 
     def _answers(self, batch: _Batch) -> list[Outcome]:
-        """Answer a batch, in the worker thread; all rows of one direction and layer are generated together."""
+        """Answer a batch, in the worker thread; all rows of one layer are generated together, and unsteered rows
+        apart."""
         from traps_pipeline.mechanism.hook import Steering
 
-        groups: dict[tuple[str, int] | None, list[int]] = {}
+        groups: dict[int | None, list[int]] = {}
         for number, request in enumerate(batch.requests):
             steering = request.params["steering"]
-            groups.setdefault((steering["direction"], steering["layer"]) if steering else None, []).append(number)
+            groups.setdefault(steering["layer"] if steering else None, []).append(number)
         outcomes: dict[int, Outcome] = {}
         model = self._model()
         for group, numbers in groups.items():
@@ -221,8 +266,9 @@ class SteeredBackend(LocalBackend):
             prompts = [self._prompt(r.media, r.media_digest, r.system, r.user) for r in requests]
             hook = None
             if group is not None:
-                alphas = tuple(float(request.params["steering"]["alpha"]) for request in requests)
-                hook = Steering(self._vectors[group[0]], group[1], alphas)
+                along = [request.params["steering"] for request in requests]
+                vectors = np.stack([self._vectors[steering["direction"]] for steering in along])
+                hook = Steering(vectors, group, tuple(float(steering["alpha"]) for steering in along))
             most = requests[0].params["max_new_tokens"]
             made = model.generate(prompts, most, None, hook, stopped=batch.abandoned.is_set)
             for number, one in zip(numbers, made, strict=True):
@@ -254,14 +300,17 @@ def collect_steered(
         for of_prompt in directions.values()
         for of in of_prompt.values()
         for kind in of.vectors
-        for vector in of.vectors[kind]
+        for draw in of.vectors[kind]
+        for vector in draw
     }
 
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
         return wanted_steered(workspace, entry, cell, directions[cell.directions])
 
     def finish(settled: Settled[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, Made]:
-        return settled.made(_steering_row)
+        answered = settled.answered()
+        plain = {q.item["item_id"]: row["text"] for q, row in answered if q.strength.kind == UNSTEERED}
+        return settled.made(partial(_steering_row, plain))
 
     def make(entry: Entry) -> SteeredBackend:
         return SteeredBackend(entry, vectors)
@@ -269,18 +318,19 @@ def collect_steered(
     yield from collect(workspace, "steering", workspace.answers, [entry], cells, calls, finish, make)
 
 
-def _steering_row(cell: SteeringCell, question: SteeredQuestion, row: Row) -> SteeringRow:
+def _steering_row(
+    plain: Mapping[str, str | None], cell: SteeringCell, question: SteeredQuestion, row: Row
+) -> SteeringRow:
     item, strength = question.item, question.strength
     return SteeringRow(
         **cell.partition,
         **{name: item[name] for name in ("item_id", "scenario_id", "side", "benchmark_version")},
         **{name: row[name] for name in ("outcome", "text", "served_model", "completion_tokens")},
         **when_asked(row),
-        source=strength.source,
-        kind=strength.kind,
-        layer=strength.layer,
+        **{name: getattr(strength, name) for name in ("source", "kind", "draw", "layer", "unit", "dose", "signs")},
         alpha=strength.alpha,
         alpha_relative=strength.relative,
+        degenerate=degeneracy(row["text"], row["outcome"], plain.get(item["item_id"])),
         direction_digest=strength.digest,
         request_key=row["key"],
     )
@@ -290,26 +340,29 @@ def _steering_row(cell: SteeringCell, question: SteeredQuestion, row: Row) -> St
 
 
 def collect_steering_votes(workspace: Workspace, cells: Sequence[SteeringCell]) -> Iterator[tuple[SteeringCell, Made]]:
-    """Ask the study's panel whether each steered answer abstains; yields the STEERING_VOTES rows of each finished
-    cell."""
+    """Ask the study's panel whether each steered answer abstains and whether a control's is correct; yields the
+    STEERING_VOTES rows of each finished cell."""
     panel = load_panel(workspace.study.panel)
     calls = partial(wanted_steering_ballots, workspace, panel)
     yield from ask_judges(workspace, "steering_votes", panel, cells, calls, lambda settled: settled.made(_vote_row))
 
 
 def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: SteeringCell) -> list[Ballot]:
-    """The calls for every vote on the steered answers of a cell. A ballot's item is the answer's row."""
+    """The calls for every vote on the steered answers of a cell. A ballot's item is the answer's row with the columns
+    of its item."""
     ballots = []
     for answer, item in judged_answers(workspace, STEERING, cell):
         shared = item | {"item_id": shared_item(answer)}
-        for judge in panel:
-            request = vote_request(judge, "abstention", cell, shared, answer["text"])
+        for task, judge in product(tasks_for(answer["side"]), panel):
+            request = vote_request(judge, task, cell, shared, answer["text"])
             about = {**request.about, "steered": answer["request_key"]}
-            ballots.append(Ballot(replace(request, about=about), answer, "abstention"))
+            ballots.append(Ballot(replace(request, about=about), item | answer, task))
     return ballots
 
 
 def _vote_row(cell: SteeringCell, ballot: Ballot, row: Row) -> SteeringVoteRow:
-    copied = ("source", "kind", "layer", "alpha", "item_id", "side", "benchmark_version")
-    about = {name: ballot.item[name] for name in copied}
-    return SteeringVoteRow(**cell.partition, **about, **vote_columns(ballot, ballot.vote(row), row))
+    copied = ("source", "kind", "draw", "layer", "unit", "dose", "signs", "alpha", "item_id", "side")
+    about = {name: ballot.item[name] for name in (*copied, "benchmark_version")}
+    vote = ballot.vote(row)
+    correct = vote.decision if ballot.task == "correctness" else None
+    return SteeringVoteRow(**cell.partition, **about, **vote_columns(ballot, vote, row), correct=correct)

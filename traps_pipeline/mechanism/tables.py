@@ -13,10 +13,14 @@ Target = Annotated[str, "the target: one of four"]
 DirectionPrompt = Annotated[str, "VQA prompt that the direction was extracted under"]
 AnswerRegime = Annotated[str, "system prompt of the steered answer"]
 SteeredSource = Annotated[str, "dataset of the direction; none where alpha is 0"]
-SteeredKind = Annotated[str, "void, random or shuffled; none where alpha is 0"]
+SteeredKind = Annotated[str, "void, or a null: isotropic, covariance or shuffled; none where alpha is 0"]
+Draw = Annotated[int, "number of a null's draw; 0 for void"]
+DoseUnit = Annotated[str, "of the dose: alpha, or gap (the distance between the sides' means at the layer)"]
+Dose = Annotated[float, "strength in that unit; 0 is the unsteered model"]
+Signs = Annotated[str, "label: added on controls and subtracted on voids; plus or minus: the same on both sides"]
 SteeredLayer = Annotated[int, "steered block, counted as in hidden_states; 0 where alpha is 0"]
-Strength = Annotated[float, "strength: alpha times the direction is added on controls and subtracted on voids"]
-Kind = Annotated[str, "void, random or shuffled"]
+Strength = Annotated[float, "length of what is added or subtracted"]
+Kind = Annotated[str, "void, or a null: isotropic, covariance or shuffled"]
 Block = Annotated[int, "steered block"]
 Alpha = Annotated[float, "strength; 0 is the unsteered model"]
 AlphaRelative = Annotated[float | None, "alpha over the mean length of the states at that layer"]
@@ -31,7 +35,8 @@ class ProbeItemRow:
     pair_id: shared.PairId
     dataset: Annotated[
         str,
-        "one of four, or occlusion_answerable: the void clips of occlusion with a question that they answer",
+        "one of four; occlusion_answerable: the void clips of occlusion with a question that they answer; "
+        "chaotic_time_swapped: clips with the frame times of the other side; or an arm",
     ]
     scenario_id: shared.ScenarioId
     side: Annotated[str, "control (it can be answered) or void"]
@@ -40,6 +45,8 @@ class ProbeItemRow:
     question: shared.Question
     clip: shared.ClipPath
     media_digest: shared.MediaDigest
+    times_clip: Annotated[str | None, "clip whose frame times are shown; null: the item's own"]
+    times_digest: Annotated[str | None, "digest of that clip's file"]
     benchmark_version: shared.BenchmarkVersion
 
 
@@ -51,7 +58,7 @@ class HiddenStatesRow:
     """An item whose hidden states were extracted at every layer."""
 
     item_id: shared.ItemId
-    dataset: Annotated[str, "one of four, or occlusion_answerable"]
+    dataset: Annotated[str, "as in probe_items"]
     model: shared.Model
     prompt: Prompt
     scenario_id: shared.ScenarioId
@@ -81,7 +88,8 @@ class ProbeRow:
     prompt: Prompt
     analysis: Annotated[
         str,
-        "transfer, held_out, confabulated, within, shuffled, answerable_void, answerable_control or centroid_..",
+        "transfer, held_out, confabulated, within, shuffled, answerable_void, answerable_control, time_swapped or "
+        "centroid_..",
     ]
     source: Annotated[str, "dataset that the probe or the centroids were fitted on"]
     target: Annotated[str, "dataset that they were applied to"]
@@ -91,7 +99,11 @@ class ProbeRow:
         float | None,
         "AUROC; for shuffled its mean over shuffles; for centroid_* the share assigned to void",
     ]
-    low: Annotated[float | None, "95 % percentile interval: target scenarios resampled, the probe held fixed"]
+    low: Annotated[
+        float | None,
+        "95 % percentile interval: target scenarios resampled, the probe held fixed; never nearer to 0 or 1 than so "
+        "many scenarios allow",
+    ]
     high: Percentile
     spread: Annotated[float | None, "standard deviation over label shuffles"]
     n_voids: Annotated[int, "void items of the target"]
@@ -124,11 +136,13 @@ class DirectionRow:
     model: shared.Model
     prompt: Prompt
     dataset: shared.Dataset
-    kind: Annotated[str, "void, or its controls: random, shuffled (labels)"]
+    kind: Kind
+    draw: Draw
     layer: Layer
     n_pairs: Annotated[int, "pairs from which it was computed"]
     n_steered: Annotated[int, "of these, pairs that are steered as well (0 if there are enough scenarios)"]
-    norm: Annotated[float, "length of mean(void) - mean(control) before normalisation; 1 for random"]
+    norm: Annotated[float, "the class gap: length of mean(void) - mean(control)"]
+    cosine: Annotated[float, "with the void direction of the same layer; 0 for a null, up to rounding"]
     residual_norm: Annotated[
         float,
         "mean length of the pairs' control states: alpha in its units is alpha / residual_norm",
@@ -139,7 +153,9 @@ class DirectionRow:
     pooling: Pooling
 
 
-DIRECTIONS = Table("directions", DirectionRow, partition_by=("model", "prompt"), key=("dataset", "kind", "layer"))
+DIRECTIONS = Table(
+    "directions", DirectionRow, partition_by=("model", "prompt"), key=("dataset", "kind", "draw", "layer")
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +189,11 @@ class SteeringRow:
     regime: AnswerRegime
     source: SteeredSource
     kind: SteeredKind
+    draw: Draw
     layer: SteeredLayer
+    unit: DoseUnit
+    dose: Dose
+    signs: Signs
     alpha: Strength
     alpha_relative: AlphaRelative
     item_id: shared.ItemId
@@ -183,6 +203,7 @@ class SteeringRow:
     text: Annotated[str | None, "the answer; null unless outcome is answer or truncated"]
     served_model: Annotated[str | None, "checkpoint, digest and precision that answered"]
     completion_tokens: shared.Tokens
+    degenerate: Annotated[str | None, "why the text is no answer: truncated, repetition or script; null if it is one"]
     direction_digest: Annotated[str | None, "digest of the direction's numbers"]
     request_key: Annotated[str, "ledger key; the two datasets of a taxonomy share the key of a control"]
     epoch: shared.Epoch
@@ -194,7 +215,7 @@ STEERING = Table(
     "steering",
     SteeringRow,
     partition_by=("dataset", "model", "directions", "regime"),
-    key=("source", "kind", "layer", "alpha", "item_id"),
+    key=("source", "kind", "draw", "layer", "unit", "dose", "signs", "item_id"),
 )
 
 
@@ -208,15 +229,20 @@ class SteeringVoteRow:
     regime: AnswerRegime
     source: SteeredSource
     kind: SteeredKind
+    draw: Draw
     layer: SteeredLayer
+    unit: DoseUnit
+    dose: Dose
+    signs: Signs
     alpha: Strength
     item_id: shared.ItemId
     side: shared.Side
-    task: Annotated[str, "abstention"]
+    task: Annotated[str, "abstention, and correctness on controls"]
     judge: shared.Judge
     valid: Annotated[bool, "whether the judge's JSON meets the schema"]
     invalid_reason: Annotated[str | None, "why not"]
-    abstained: Annotated[bool | None, "null if invalid"]
+    abstained: Annotated[bool | None, "null if invalid, and for correctness"]
+    correct: Annotated[bool | None, "null if invalid, and for abstention"]
     confidence: Annotated[str | None, "high, medium or low"]
     rationale: Annotated[str | None, "one sentence"]
     vote_key: Annotated[str, "ledger key; the two datasets of a taxonomy share the key of a control"]
@@ -229,7 +255,7 @@ STEERING_VOTES = Table(
     "steering_votes",
     SteeringVoteRow,
     partition_by=("dataset", "model", "directions", "regime"),
-    key=("source", "kind", "layer", "alpha", "item_id", "judge"),
+    key=("source", "kind", "draw", "layer", "unit", "dose", "signs", "item_id", "task", "judge"),
 )
 
 
@@ -244,7 +270,11 @@ class SteeringEffectRow:
     target: Annotated[str, "dataset that was steered"]
     transfer_type: Annotated[str, "Cross-modality, Cross-domain, Cross-both or Within, from the definitions"]
     kind: Kind
+    draw: Draw
     layer: Block
+    unit: DoseUnit
+    dose: Dose
+    signs: Signs
     alpha: Alpha
     alpha_relative: AlphaRelative
     side: shared.Side
@@ -254,6 +284,9 @@ class SteeringEffectRow:
     abstention: Annotated[float | None, "abstained / n"]
     low: shared.Wilson
     high: shared.Wilson
+    correct: Annotated[int, "answers to controls that are correct"]
+    n_correct: Annotated[int, "answers to controls that were decided for correctness"]
+    degenerate: Annotated[int, "answers cut off, repetitive or in another script than the unsteered one"]
     epoch: shared.AnswerEpochs
 
 
@@ -261,7 +294,10 @@ STEERING_EFFECTS = Table(
     "steering_effects",
     SteeringEffectRow,
     partition_by=(),
-    key=("model", "directions", "regime", "source", "target", "kind", "layer", "alpha", "side"),
+    key=(
+        *("model", "directions", "regime", "source", "target", "kind", "draw", "layer", "unit", "dose", "signs"),
+        "side",
+    ),
 )
 
 

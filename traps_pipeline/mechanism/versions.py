@@ -64,9 +64,21 @@ def probing_version(workspace: Workspace, extraction: Extraction) -> str:
     if settings is None or extraction.model not in settings.models:
         return "none"
     steering = settings.steering
-    pairs = [steering.well_posed_pairs, steering.ill_posed_pairs, steering.pairs] if steering else []
+    pairs: list[Any] = [steering.well_posed_pairs, steering.ill_posed_pairs, steering.pairs] if steering else []
+    if steering and steering.nulls:
+        pairs.append(steering.nulls.model_dump(mode="json"))
     layers = settings.models[extraction.model]
-    return digest([settings.probes.model_dump(mode="json"), layers.centroid, pairs, settings.seed, CURVES])[:16]
+    gate = settings.gate.model_dump(mode="json")
+    return digest([settings.probes.model_dump(mode="json"), layers.centroid, pairs, settings.seed, CURVES, gate])[:16]
+
+
+def patching_version(workspace: Workspace, extraction: Extraction) -> str:
+    """Digest of the inputs of patching besides items: those of hidden states, the pairs and sites, the seed."""
+    settings = workspace.study.mechanism
+    if settings is None or settings.patching is None or extraction.model not in settings.models:
+        return "none"
+    chosen = settings.patching.model_dump(mode="json"), settings.seed
+    return digest([extraction_version(workspace, extraction), *chosen])[:16]
 
 
 def steering_version(workspace: Workspace, run: str) -> str:

@@ -18,8 +18,10 @@ from traps_pipeline.partitions import (
     ARMS,
     CATEGORIES,
     DATASETS,
+    PROBED_ARMS,
     PROBED_DATASETS,
     REGIMES,
+    TIME_SWAPPED,
     VQA_PROMPTS,
     Cell,
     Evaluation,
@@ -120,10 +122,18 @@ class Wanted:
         return self._inside is not None and (self._inside[1] is None or self._inside[1].steering is not None)
 
     @cached_property
+    def patches(self) -> bool:
+        """Whether activations are patched."""
+        return self._inside is not None and (self._inside[1] is None or self._inside[1].patching is not None)
+
+    @cached_property
     def probed(self) -> list[str]:
         """Datasets whose hidden states are extracted."""
         datasets = self._inside[0] if self._inside else []
-        return [d for d in PROBED_DATASETS if d in datasets or (d == ANSWERABLE and "occlusion" in datasets)]
+        asked = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
+        there = {*datasets, *(arm for arm in PROBED_ARMS if self._inside and arm in asked)}
+        there |= {made for made, of in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if of in there}
+        return [d for d in PROBED_DATASETS if d in there]
 
     @cached_property
     def extractions(self) -> list[Extraction]:
@@ -136,9 +146,9 @@ class Wanted:
 
     @cached_property
     def states(self) -> list[str]:
-        """Keys of hidden_states: the answerable questions serve probes alone."""
+        """Keys of hidden_states: what is no dataset of pairs serves probes alone."""
         cells = [StatesCell(d, e) for d, e in product(self.probed, self.extractions)]
-        return [c.key for c in cells if c.dataset != ANSWERABLE or c.extraction.prompt == PROBE_PROMPT]
+        return [c.key for c in cells if c.dataset in DATASETS or c.extraction.prompt == PROBE_PROMPT]
 
     @cached_property
     def steered(self) -> list[str]:

@@ -14,7 +14,7 @@ from traps_pipeline.mechanism.paths import TRANSFER_TYPES
 from traps_pipeline.mechanism.shares import ALL
 from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.models.local.checkpoint import as_folder, folder_digest
-from traps_pipeline.partitions import transfer_type
+from traps_pipeline.partitions import ANSWERABLE, transfer_type
 from traps_pipeline.pocket.evaluate import MODEL
 from traps_pipeline.pocket.seeds import write_seeds
 from traps_pipeline.storage.workspace import Workspace
@@ -68,6 +68,8 @@ def figures_of(workspace: Workspace) -> list[Figure]:
         ("answerable_control", "answerable_control", "source_best"),
     ):
         rows = probes.loc[(probes["analysis"] == analysis) & probes[flag]]
+        if analysis.startswith("answerable"):
+            rows = rows.loc[rows["target"] == ANSWERABLE]
         copied = ["source", "target", "layer", "value", "low", "high"]
         found += [Figure(**of, figure=figure, **row) for row in _records(rows[copied])]
     shuffled = probes.loc[probes["analysis"] == "shuffled"].groupby("source")["value"].mean().reset_index()

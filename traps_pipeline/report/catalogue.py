@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from traps_pipeline.report.figures import abstention, grids, landscape, mechanism
+from traps_pipeline.report.figures import inside as figures_of_inside
 from traps_pipeline.report.printed import mechanism as printed_mechanism
 from traps_pipeline.report.printed import scores as printed_scores
 from traps_pipeline.report.printed import setup as printed_setup
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables import comparisons, judges, leaderboards, setup, sub_scenarios
+from traps_pipeline.report.tables import comparisons, inside, judges, leaderboards, setup, sub_scenarios
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
 from traps_pipeline.report.tables.shared import printed
 from traps_pipeline.report.writing import PrintedTable, figure_bytes, figure_files, table_files
@@ -174,6 +175,11 @@ TABLES: tuple[TableReport, ...] = (
         "probes", tables_of_mechanism.probes, ("probes",), printed_mechanism.probes, ("probe_means",), "Probes"
     ),
     TableReport(
+        "probe_baselines", inside.probe_baselines, ("probes", "probe_baselines"), title="Probes and their baselines"
+    ),
+    TableReport("gate", inside.gate, ("gate",), title="Probe-gated abstention"),
+    TableReport("patching", inside.patching, ("patching",)),
+    TableReport(
         "cosines", tables_of_mechanism.cosines, ("cosines",), printed_mechanism.cosines, title="Void directions"
     ),
     TableReport(
@@ -183,6 +189,12 @@ TABLES: tuple[TableReport, ...] = (
         printed_mechanism.steering,
         recomputed=("steering_regimes",),
         title="Steering",
+    ),
+    TableReport(
+        "steering_controls",
+        inside.steering_nulls,
+        ("steering_nulls", "steering_pecs"),
+        title="Steering among its controls",
     ),
     TableReport("composition", setup.composition, ("items",), printed_setup.composition),
     TableReport("models", setup.models, ("leaderboard",), printed_setup.models),
@@ -198,6 +210,28 @@ FIGURES: tuple[FigureReport, ...] = (
     ),
     FigureReport("sub_scenarios", "AbsRec by sub-scenario", grids.sub_scenarios, ("metrics", "items")),
     FigureReport("confabulation", "Prevalence of confabulation", grids.confabulation, ("confabulation_prevalence",)),
+    FigureReport(
+        "probe_baselines",
+        "Probes against their baselines",
+        figures_of_inside.probe_baselines,
+        ("probes", "probe_baselines"),
+        published=False,
+    ),
+    FigureReport(
+        "gate_arrows",
+        "Probe-gated abstention",
+        figures_of_inside.gate_arrows,
+        ("gate", "risk_coverage"),
+        published=False,
+    ),
+    FigureReport("patching", "Activation patching", figures_of_inside.patching, ("patching",), published=False),
+    FigureReport(
+        "doses_among_nulls",
+        "Doses among nulls",
+        figures_of_inside.doses_among_nulls,
+        ("steering_effects",),
+        published=False,
+    ),
     FigureReport("probe_curves", "Probe transfer by layer", mechanism.probe_curves, ("probes",), published=False),
     FigureReport("confabulated_strip", "Probes on confabulated voids", mechanism.confabulated_strip, ("probes",)),
     FigureReport(

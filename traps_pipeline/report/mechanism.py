@@ -44,7 +44,7 @@ def published_effects() -> pd.DataFrame:
     gemma = published("steering_dose_gemma").assign(model="gemma-4-e4b", epoch="verification")
     rows = _long(pd.concat([qwen, gemma], ignore_index=True))
     rows = rows.rename(columns={"direction_regime": "directions", "inference_regime": "regime"})
-    rows = rows.assign(kind="void", n=PAIRS, layer=_steered(rows))
+    rows = rows.assign(kind="void", unit="alpha", dose=rows["alpha"], signs="label", n=PAIRS, layer=_steered(rows))
     sides = [rows.assign(side=s, abstention=rows[f"{s}_abstention_pct"] / 100) for s in ("control", "void")]
     return _as(STEERING_EFFECTS, sides)
 

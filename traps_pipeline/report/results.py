@@ -12,6 +12,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.mechanism import effects
+from traps_pipeline.mechanism.control_tables import (
+    GATE,
+    PATCHING,
+    PROBE_BASELINES,
+    RISK_COVERAGE,
+    STEERING_NULLS,
+    STEERING_PECS,
+)
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_SHARES
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.tables import (
@@ -103,7 +111,17 @@ class Results:
     composition = Made("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
     probes = Made("PROBES rows; the paper has only transfer, confabulated, shuffled, centroid_void.", table=PROBES)
     cosines = Made("COSINES rows at the steered layer of each model.")
-    effects = Made(table=STEERING_EFFECTS)
+    effects = Made("STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label.")
+    baselines = Made(table=PROBE_BASELINES)
+    gate = Made(table=GATE)
+    risk_coverage = Made(table=RISK_COVERAGE)
+    patching = Made(table=PATCHING)
+    own_effects = Made(
+        "STEERING_EFFECTS rows of datasets along their own directions and nulls, and `gaps`, the dose.",
+        derive=lambda results: effects.own_effects(results.rows(STEERING_EFFECTS)),
+    )
+    nulls = Made(table=STEERING_NULLS)
+    steering_pecs = Made(table=STEERING_PECS)
     shares = Made(table=STEERING_SHARES)
     steering_regimes = Made(
         "Rows of `mechanism.effects.regime_matrix`.", derive=lambda results: effects.regime_matrix(results.effects)

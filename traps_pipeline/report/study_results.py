@@ -8,7 +8,8 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.mechanism.tables import COSINES
+from traps_pipeline.mechanism.shares import of_paper
+from traps_pipeline.mechanism.tables import COSINES, STEERING_EFFECTS
 from traps_pipeline.partitions import DATASETS, taxonomy_of
 from traps_pipeline.report.results import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Made, Makers, Results, joined
 from traps_pipeline.scoring import analyses
@@ -113,6 +114,7 @@ class StudyResults(Results):
         "labels": lambda results: analyses.accuracy_by_label(_scoped(results, "label")),
         "composition": _composition,
         "cosines": _cosines,
+        "effects": lambda results: of_paper(results.rows(STEERING_EFFECTS)),
     }
 
     def __init__(self, workspace: Workspace) -> None:

@@ -34,6 +34,15 @@ class ProbeSettings(BaseModel):
     resamples: int = Field(default=1000, ge=100)
 
 
+class NullSettings(BaseModel):
+    """The directions against which an effect is ranked: so many draws of each kind, steered at the largest dose on the
+    datasets that they come from."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    kinds: tuple[Literal["isotropic", "covariance", "shuffled"], ...] = ("isotropic", "covariance", "shuffled")
+    draws: int = Field(default=20, ge=1, description="19 are the fewest with which p can reach .05")
+
+
 class SteeringSettings(BaseModel):
     """What is steered (docs/spec.md 8.2)."""
 
@@ -44,15 +53,41 @@ class SteeringSettings(BaseModel):
     ill_posed_pairs: int = Field(default=50, ge=2, description="pairs that an ill-posed direction comes from")
     direction_regimes: tuple[Regime, ...] = Field(default=VQA_PROMPTS, min_length=1)
     inference_regimes: tuple[Regime, ...] = Field(default=VQA_PROMPTS, min_length=1)
-    controls: tuple[Literal["random", "shuffled"], ...] = ("random", "shuffled")
+    gaps: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(
+        default=(1.0,), description="further doses, in units of the distance between the sides' means at the layer"
+    )
+    signs: tuple[Literal["plus", "minus"], ...] = Field(
+        default=("plus", "minus"), description="policies beside the paper's, which knows each item's side"
+    )
+    nulls: NullSettings | None = NullSettings()
     max_new_tokens: int = Field(default=512, ge=1)
 
-    @field_validator("alphas")
+    @field_validator("alphas", "gaps")
     @classmethod
     def _ascending(cls, values: tuple[float, ...]) -> tuple[float, ...]:
         if list(values) != sorted(set(values)):
             raise ValueError(f"{values} must ascend; alpha 0, the unsteered model, is always there")
         return values
+
+
+class GateSettings(BaseModel):
+    """Probe-gated abstention (docs/mechanism.md)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    false_abs: float = Field(default=0.05, gt=0, lt=1, description="of source controls, that conformal gates promise")
+    untrained: bool = Field(
+        default=False, description="also a gate on states of the same network with random weights, loaded beside it"
+    )
+
+
+class PatchingSettings(BaseModel):
+    """Activation patching between matched controls and voids (docs/mechanism.md)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    pairs: int = Field(default=50, ge=1, description="pairs of each well-posed dataset, the first of a seeded order")
+    sites: tuple[Literal["residual", "attention", "mlp"], ...] = Field(
+        default=("residual", "attention", "mlp"), min_length=1
+    )
 
 
 class MechanismSettings(BaseModel):
@@ -62,6 +97,8 @@ class MechanismSettings(BaseModel):
     models: dict[str, Layers] = Field(min_length=1)
     prompts: tuple[Regime, ...] = Field(default=VQA_PROMPTS, min_length=1, description="VQA prompts extracted")
     probes: ProbeSettings = ProbeSettings()
+    gate: GateSettings = GateSettings()
+    patching: PatchingSettings | None = Field(default=None, description="null: nothing is patched")
     pooling: Literal["last", "mean"] = Field(default="last", description="of tokens; the paper does not say which")
     steering: SteeringSettings | None = SteeringSettings()
     seed: int = 20260101

@@ -21,6 +21,7 @@ from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import (
     ARMS,
+    DATASETS,
     Cell,
     Evaluation,
     SteeredEvaluation,
@@ -99,12 +100,14 @@ def _count_steered(workspace: Workspace | None, experiment: Experiment) -> dict[
     taxonomies = [datasets_of_category(scenario.category)[0] for scenario in scenarios]
     for model in settings.models:
         answers, votes = counts[model] = (Count(), Count())
-        for regime, wanted in count_answers(settings, model, experiment.datasets, Counter(taxonomies)).items():
+        datasets = [name for name in experiment.datasets if name in DATASETS]
+        for regime, by_side in count_answers(settings, model, datasets, Counter(taxonomies)).items():
+            wanted, ballots = by_side.total(), PANEL_SIZE * sum(len(tasks_for(s)) * n for s, n in by_side.items())
             folder, known = SteeredEvaluation(model, regime, 1).key, [0, 0]
             if workspace is not None:
                 known = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
             answers.add(wanted, min(known[0], wanted))
-            votes.add(PANEL_SIZE * wanted, min(known[1], PANEL_SIZE * wanted))
+            votes.add(ballots, min(known[1], ballots))
     return counts
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.mechanism import effects
+from traps_pipeline.mechanism.directions import KINDS
 from traps_pipeline.mechanism.paths import TRANSFER_PAIRS, path_name
 from traps_pipeline.partitions import SHORT, transfer_type
 from traps_pipeline.report.results import Results
@@ -214,7 +215,7 @@ def cosines(results: Results) -> list[PrintedTable]:
 def _place(values: pd.Series) -> pd.Series:
     if values.name == "name":
         return values.map({short: place for place, short in enumerate(SHORT.values())})
-    orders = {"prompt": ("standard", "guided"), "kind": ("void", "shuffled", "random")}
+    orders = {"prompt": ("standard", "guided"), "kind": KINDS}
     order = orders.get(str(values.name))
     return values if order is None else values.map(order.index)
 
@@ -270,9 +271,7 @@ def _regimes(results: Results, name: str, title: str) -> PrintedTable:
         Column("control_top", "Control, α, %", "percent"), Column("void_0", "Void, α 0, %", "percent"),
         Column("void_top", "Void, α, %", "percent"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
-    notes = [
-        "mean over the paths of a set; +α on controls, −α on voids; random and shuffled directions have norm 1 too"
-    ]
+    notes = ["mean over the paths of a set; +α on controls, −α on voids"]
     return PrintedTable(name, title, rows, columns, notes, _why(results, rows))
 
 

@@ -1,0 +1,122 @@
+"""The gate: thresholds and figures worked out by hand, and what a gate may not have seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from traps_pipeline.mechanism.gate import (
+    NEVER,
+    OTHER_DATASETS,
+    OTHER_FAMILIES,
+    Items,
+    Outcomes,
+    decide,
+    risk_coverage,
+    thresholds,
+)
+from traps_pipeline.partitions import DATASETS, taxonomy_of
+
+
+def test_thresholds_are_the_ones_worked_out() -> None:
+    score = np.array([0.0, 1.0, 2.0, 3.0, 6.0, 8.0])
+    void = np.array([False, False, False, True, True, True])
+    found = thresholds(score, void, 0.05)
+    assert found["mid"] == pytest.approx((17 / 3 + 1) / 2)
+    assert found["J"] == pytest.approx(2.5)
+    assert found["conformal"] == NEVER  # three controls cannot promise 5 %
+    assert thresholds(score, void, 0.25)["conformal"] == 2.0  # rank ceil(4 x 0.75) = 3 of 3
+    many = np.arange(19.0)
+    found = thresholds(np.append(many, 50.0), np.arange(20) == 19, 0.05)
+    assert found["conformal"] == 18.0  # 19 controls are the fewest: rank ceil(20 x 0.95) = 19
+
+
+def test_gating_turns_answers_into_abstentions_and_nothing_else() -> None:
+    nan = np.nan
+    outcomes = Outcomes(
+        void=np.array([False] * 4 + [True] * 4),
+        correct=np.array([1, 1, 0, nan, nan, nan, nan, nan]),
+        abstained=np.array([0, 0, 0, 0, 1, 0, 0, 0.0]),
+    )
+    plain = {name: value.item() for name, value in outcomes.figures().items()}
+    assert plain == pytest.approx({"acc": 2 / 3, "false_abs": 0, "abs_rec": 0.25, "pecs": 2 / 3 * 0.25})
+    gate = np.array([True, False, False, False, False, True, True, False])
+    gated = {name: value.item() for name, value in outcomes.gated(gate).figures().items()}
+    assert gated == pytest.approx({"acc": 1 / 3, "false_abs": 0.25, "abs_rec": 0.75, "pecs": 1 / 3 * 0.5})
+    twice = np.array([[2, 0, 1, 1, 0, 1, 1, 2.0]])  # a resample: the first control twice, the second not at all
+    drawn = outcomes.figures(twice)
+    assert drawn["acc"].tolist() == pytest.approx([2 / 3]) and drawn["abs_rec"].tolist() == [0.0]
+
+
+def test_risk_falls_as_the_riskiest_answers_are_given_up() -> None:
+    outcomes = Outcomes(
+        np.array([False, False, True, True]), np.array([1, 0, np.nan, np.nan]), np.array([0, 0, 0, 1.0])
+    )
+    score = np.array([-2.0, -1.0, 3.0, 9.0])  # the last item is answered by nobody: the model abstained itself
+    points = risk_coverage(score, outcomes, [0.25, 0.5, 0.75, 1.0])
+    assert points == [(0.25, 0.0, 1), (0.5, 0.5, 2), (0.75, pytest.approx(2 / 3), 3)]
+
+
+def study(pairs: int = 12, families: int = 3) -> tuple[Items, np.ndarray]:
+    """Items of all datasets. Column 0 is the side everywhere; column 1 names the scenario so loudly that a gate which
+    has seen it would know it."""
+    rows, rng = [], np.random.default_rng(0)
+    for dataset in DATASETS:
+        for number in range(pairs):
+            for void in (False, True):
+                name = f"{taxonomy_of(dataset)}-{number:02d}"
+                rows.append(
+                    (
+                        dataset,
+                        name,
+                        f"{taxonomy_of(dataset)}:{number % families}",
+                        f"{name}{dataset if void else ''}",
+                        void,
+                    )
+                )
+    table = pd.DataFrame(rows, columns=["dataset", "scenario_id", "family", "prompt", "void"])
+    features = rng.normal(size=(len(table), 10))
+    features[:, 0] += 4 * table["void"]
+    return Items(table, features), rng.integers(0, 2, len(table)).astype(bool)
+
+
+SETTINGS = {"folds": 3, "seed": 1, "false_abs": 0.05}
+
+
+@pytest.mark.parametrize("source", ["one:chaotic", "one:occlusion", OTHER_DATASETS, OTHER_FAMILIES])
+def test_a_gate_depends_on_no_label_of_a_scenario_that_it_decides_about(source: str) -> None:
+    """Changing the sides of one scenario in every dataset leaves its own scores as they are, bit for bit."""
+    items, _ = study()
+    before = decide(items, source, "chaotic", **SETTINGS)
+    mine = (items.table["scenario_id"] == "chaotic-04").to_numpy()
+    changed = items.table.assign(void=np.where(mine, ~items.void, items.void))
+    after = decide(Items(changed, items.features), source, "chaotic", **SETTINGS)
+    own = mine[before.place]
+    assert own.sum() == 2 and (before.score[own] == after.score[own]).all()
+    assert all((before.threshold[name][own] == after.threshold[name][own]).all() for name in before.threshold)
+    if source != "one:occlusion":
+        assert (before.score[~own] != after.score[~own]).any()
+
+
+def test_a_gate_that_leaves_families_out_sees_no_label_of_the_family() -> None:
+    items, _ = study()
+    before = decide(items, OTHER_FAMILIES, "occlusion", **SETTINGS)
+    family = (items.table["family"] == "occlusion:1").to_numpy()
+    changed = Items(items.table.assign(void=np.where(family, ~items.void, items.void)), items.features)
+    after = decide(changed, OTHER_FAMILIES, "occlusion", **SETTINGS)
+    own = family[before.place]
+    assert own.sum() == 8 and (before.score[own] == after.score[own]).all()
+
+
+def test_a_planted_signal_is_gated_and_shuffled_labels_are_not() -> None:
+    items, coins = study()
+    found = decide(items, OTHER_DATASETS, "chaotic", **SETTINGS)
+    void = items.void[found.place]
+    gate = found.score > found.threshold["J"]
+    assert gate[void].mean() > 0.9 and gate[~void].mean() < 0.25
+    conformal = found.score > found.threshold["conformal"]
+    assert conformal[~void].mean() < 0.35 and np.isfinite(found.threshold["conformal"]).all()
+    noise = decide(Items(items.table.assign(void=coins), items.features), OTHER_DATASETS, "chaotic", **SETTINGS)
+    loose = noise.score > noise.threshold["mid"]
+    assert abs(loose[void].mean() - loose[~void].mean()) < 0.6

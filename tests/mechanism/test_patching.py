@@ -1,0 +1,130 @@
+"""Patching: a patch with itself changes nothing, all positions give the source's answer, deepstack features included;
+the positions of a prompt's parts; and an independent re-implementation in plain transformers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.local_models import QUESTIONS, SYSTEM, Family, ask, model
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.margin import abstention_tokens
+from traps_pipeline.mechanism.patching import SITES, Patch, Recorded, patched_changes, record, require_patchable
+from traps_pipeline.models.local.adapter import LocalModel, Prompt
+from traps_pipeline.models.local.spans import PARTS, spans
+
+pytestmark = pytest.mark.slow
+FAMILIES: tuple[Family, ...] = ("qwen3-vl", "llava-next-video")
+
+
+def other(prompt: Prompt, seed: int = 0) -> Prompt:
+    """The prompt with other pixels and another question of the same length."""
+    generator = torch.Generator().manual_seed(seed)
+    inputs = dict(prompt.inputs)
+    for name, value in inputs.items():
+        if value.is_floating_point():
+            inputs[name] = value + torch.randn(value.shape, generator=generator)
+    ids = inputs["input_ids"].clone()
+    ids[0, -12:-9] = ids[0, -20:-17]
+    return Prompt(prompt.text, inputs | {"input_ids": ids})
+
+
+def pair(family: Family) -> tuple[LocalModel, Recorded, Recorded, list[int], Prompt, Prompt]:
+    of = model(family)
+    target = ask(of)
+    source, tokens = other(target), abstention_tokens(of)
+    return of, record(of, target, tokens), record(of, source, tokens), tokens, target, source
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_all_positions_give_the_source_and_a_patch_with_itself_nothing(family: Family) -> None:
+    of, target, source, tokens, *_ = pair(family)
+    whole = np.ones(target.length, bool)
+    assert abs(source.margin - target.margin) > 1e-3
+    everywhere = [Patch("residual", layer, whole) for layer in range(of.n_layers + 1)]
+    effects = patched_changes(of, target, source, everywhere, tokens) / (source.margin - target.margin)
+    assert np.abs(effects - 1).max() < 1e-4
+    every_site = [Patch(s, layer, whole) for s in SITES for layer in range(1, of.n_layers + 1)]
+    assert (patched_changes(of, target, target, [*everywhere, *every_site], tokens) == 0).all()
+    assert (patched_changes(of, target, source, [Patch("residual", 2, ~whole)], tokens) == 0).all()
+
+
+def test_without_the_deepstack_features_all_positions_do_not_give_the_source() -> None:
+    """What `_patch_inputs` is for: with the target's own features behind the site, the effect is not 1."""
+    of, target, source, tokens, *_ = pair("qwen3-vl")
+    assert target.inputs["deepstack_visual_embeds"] is not None
+    own = {"deepstack_visual_embeds": target.inputs["deepstack_visual_embeds"]}
+    naive = Recorded({**source.inputs, **own}, source.states, source.margin)
+    whole = [Patch("residual", 1, np.ones(target.length, bool))]
+    effect = patched_changes(of, target, naive, whole, tokens)[0] / (source.margin - target.margin)
+    assert abs(effect - 1) > 1e-3
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_patch_is_what_a_plain_hook_on_the_whole_model_does(family: Family) -> None:
+    """Independent: the library's own forward pass from pixels to logits, one hook, one prompt at a time."""
+    of, target, source, tokens, prompt, donor = pair(family)
+    chosen = torch.zeros(target.length, dtype=torch.bool)
+    chosen[-9:-2] = True  # text behind the clip, so that no deepstack feature is concerned
+    for name, layer, get in (
+        ("residual", 3, lambda block: block), ("attention", 2, lambda block: block.self_attn),
+        ("mlp", 4, lambda block: block.mlp),
+    ):  # fmt: skip
+        kept: list[torch.Tensor] = []
+        module = get(of.network.get_decoder().layers[layer - 1])
+
+        def first(output: object) -> torch.Tensor:
+            return output[0] if isinstance(output, tuple) else output  # type: ignore[return-value]
+
+        handle = module.register_forward_hook(lambda m, i, out, kept=kept: kept.append(first(out).clone()))
+        with torch.no_grad():
+            of.network(**donor.inputs)
+        handle.remove()
+
+        def swap(m: object, i: object, out: object, kept: list[torch.Tensor] = kept) -> object:
+            states = first(out).clone()
+            states[:, chosen] = kept[0][:, chosen]
+            return (states, *out[1:]) if isinstance(out, tuple) else states
+
+        handle = module.register_forward_hook(swap)
+        with torch.no_grad():
+            logits = of.network(**prompt.inputs).logits[0, -1].double()
+        handle.remove()
+        never = of.network.generation_config.suppress_tokens or []
+        rest = [t for t in range(len(logits)) if t not in tokens and t not in never]
+        expected = (torch.logsumexp(logits[tokens], 0) - torch.logsumexp(logits[rest], 0)).item()
+        change = patched_changes(of, target, source, [Patch(name, layer, chosen.numpy())], tokens)[0]
+        assert target.margin + change == pytest.approx(expected, abs=1e-5)
+
+
+def test_models_that_read_more_than_the_residual_stream_are_refused() -> None:
+    require_patchable(model("qwen3-vl"))
+    with pytest.raises(TrapsError, match="later blocks reuse keys and values of earlier ones"):
+        require_patchable(model("gemma-4"))
+
+
+def test_prompts_of_another_form_are_refused() -> None:
+    of, target, _, tokens, *_ = pair("qwen3-vl")
+    longer = record(of, ask(of, QUESTIONS[1]), tokens)
+    with pytest.raises(TrapsError, match="cannot be patched into one of"):
+        patched_changes(of, target, longer, [], tokens)
+
+
+@pytest.mark.parametrize("family", ["qwen3-vl", "gemma-4", "llava-next-video"])
+def test_the_parts_of_a_prompt_are_where_their_texts_are(family: Family) -> None:
+    of = model(family)
+    prompt = ask(of, QUESTIONS[1])
+    found = spans(of, prompt, SYSTEM, QUESTIONS[1])
+    assert set(found) == {*PARTS} and sum(part.astype(int) for part in found.values()).max() == 1
+    ids, decode = prompt.inputs["input_ids"][0], of.processor.tokenizer.decode
+
+    def text(part: str) -> str:
+        return "".join(decode(ids[found[part]]).split())
+
+    assert text("system") == "".join(SYSTEM.split()) and text("question") == "".join(QUESTIONS[1].split())
+    videos = ids == of.processor.tokenizer.convert_tokens_to_ids(of.processor.video_token)
+    assert found["visual"].sum() >= videos.sum().item() > 0 and not found["visual"][found["question"].argmax() :].any()
+    stamps = {"qwen3-vl": 3, "gemma-4": 6, "llava-next-video": 0}[family]  # Qwen3-VL merges two of the six frames
+    assert text("stamps").count("seconds" if family == "qwen3-vl" else ":") == stamps
+    assert found["last"].nonzero()[0].tolist() == [len(ids) - 1]

@@ -1,0 +1,186 @@
+"""What a probe must beat: the same protocol on raw inputs, on the model's own output, and on noise.
+
+Every baseline replaces the states of an item by other features and leaves the rest as it is: the same items, folds,
+solver, intervals and targets (`probing.ProbeRun`). A probe on states says nothing about understanding where the
+question's words, the first frame, the clip's length or the time stamps separate as well; and nothing about a gap
+between representation and output where the output margin does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline import progress
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.control_tables import ProbeBaselineRow
+from traps_pipeline.mechanism.probing import ProbeRun, Row
+from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.tables import PROBE_ITEMS
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.storage.media import MediaSpec, sample
+from traps_pipeline.storage.workspace import Workspace
+
+THUMBNAIL = (32, 24)  # pixels of a frame that a baseline sees, width and height
+NOISE_DRAWS = 10
+RAW = ("question words", "first frame", "all frames", "length", "time stamps")
+MARGIN, NOISE = "output margin", "noise"
+Features = Mapping[str, np.ndarray]  # dataset -> (n, columns), rows in the order of the dataset's items
+
+
+def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[ProbeBaselineRow]:
+    """Rows of PROBE_BASELINES for the items of an extraction. Raises TrapsError for a damaged clip."""
+    settings = workspace.mechanism
+    items = {name: probed_items(workspace, states, name) for name in dict.fromkeys(states.items["dataset"])}
+    assert entry.media is not None, "local entries have media"
+    found: list[ProbeBaselineRow] = []
+
+    def add(features: str, rows: Sequence[Row], note: str | None = None) -> None:
+        names = ("analysis", "source", "target", "value", "low", "high", "spread", "n_voids", "n_controls")
+        found.extend(
+            ProbeBaselineRow(
+                **states.extraction.partition, features=features, note=note, **{name: row[name] for name in names}
+            )
+            for row in rows
+        )
+
+    run = ProbeRun(states.items, lambda dataset, _: np.empty(0), 1, 0, settings.probes, settings.seed)
+    raw = raw_features(items, entry.media, workspace.resolve)
+    for number, (name, features) in enumerate(raw.items()):
+        progress.current().tick("probe_baselines", f"of {states.extraction.key}", number + 1, len(raw) + 2)
+        add(name, scored(run, features))
+    try:
+        add(MARGIN, scored(run, output_margins(entry, states, [*items])))
+    except NoMargin as error:
+        add(MARGIN, [_without_figure()], str(error))
+    add(NOISE, noise_floor(run, settings.seed))
+    return found
+
+
+def scored(run: ProbeRun, features: Features) -> list[Row]:
+    """The rows of the protocol on features in the place of states."""
+    return replace(run, read=lambda dataset, _: features[dataset]).comparable(0)
+
+
+# --- features ---------------------------------------------------------------------------------------------------------
+
+
+def probed_items(workspace: Workspace, states: StoredStates, dataset: str) -> pd.DataFrame:
+    """The PROBE_ITEMS rows of a dataset in the order of its states."""
+    rows = workspace.tables.read(PROBE_ITEMS, {"dataset": dataset}).set_index("item_id")
+    wanted = states.dataset(dataset)["item_id"]
+    missing = sorted(set(wanted) - set(rows.index))
+    if missing:
+        raise TrapsError(
+            f"probe_items {dataset}: has no {missing[0]}, which has states; materialize hidden_states again"
+        )
+    return rows.loc[list(wanted)].reset_index()
+
+
+def raw_features(
+    items: Mapping[str, pd.DataFrame], spec: MediaSpec, resolve: Callable[[str], Path]
+) -> dict[str, Features]:
+    """RAW features by name, then by dataset, (n, columns).
+
+    question words: which words and pairs of words the question has. first frame: its pixels at THUMBNAIL. all frames:
+    those of all frames that the model is shown, with the mean in the place of a missing one. length: the clip's last
+    frame time, s. time stamps: how many frames are shown, and their first, mean and last times, s.
+    """
+    from sklearn.feature_extraction.text import CountVectorizer
+
+    questions = [question for rows in items.values() for question in rows["question"]]
+    words = CountVectorizer(ngram_range=(1, 2), binary=True, token_pattern=r"(?u)\b\w+\b").fit(questions)
+    clips = {clip for rows in items.values() for name in ("clip", "times_clip") for clip in rows[name].dropna()}
+    seen = {clip: _seen(resolve(clip), spec) for clip in sorted(clips)}
+    most = max(len(frames) for frames, _, _ in seen.values())
+
+    def pixels(clip: str) -> np.ndarray:
+        frames = seen[clip][0]
+        missing = np.repeat(frames.mean(axis=0, keepdims=True), most - len(frames), axis=0)
+        return np.concatenate([frames, missing]).ravel()
+
+    def stamps(row: Mapping[str, Any]) -> list[float]:
+        times = seen[row["times_clip"] or row["clip"]][1]
+        return [len(seen[row["clip"]][1]), times[0], times.mean(), times[-1]]
+
+    made: dict[str, dict[str, np.ndarray]] = {name: {} for name in RAW}
+    for dataset, rows in items.items():
+        records = rows.astype(object).where(rows.notna(), None).to_dict("records")
+        made["question words"][dataset] = words.transform(rows["question"]).toarray().astype(float)
+        made["first frame"][dataset] = np.stack([seen[row["clip"]][0][0].ravel() for row in records])
+        made["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in records])
+        made["length"][dataset] = np.array([[seen[row["clip"]][2]] for row in records])
+        made["time stamps"][dataset] = np.array([stamps(row) for row in records])
+    return dict(made)
+
+
+def _seen(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
+    """Thumbnails (N, h, w, 3) in [0, 1] and times (N,) of the frames that a model is shown, and the last one's time."""
+    import cv2
+
+    try:
+        shown = sample(clip, spec)
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
+    small = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in shown.frames]
+    return np.stack(small) / 255, shown.times_s, float(shown.times_s[-1])
+
+
+class NoMargin(TrapsError):
+    """The output margin of these states cannot be read."""
+
+
+def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[str]) -> Features:
+    """The output margin of every item under the prompt of the extraction, (n, 1): no pass is made, the stored state
+    that left the final norm goes through the model's head. Raises TrapsError for states that are means over tokens, and
+    for a model without a token that begins an abstention."""
+    from traps_pipeline.mechanism.margin import abstention_tokens, first_token_margins
+    from traps_pipeline.models.local.adapter import load_local_model
+
+    if set(states.items["pooling"]) != {"last"}:
+        raise NoMargin("states are means over tokens; set `pooling: last` to read the output margin")
+    model = load_local_model(entry, inside=True)
+    try:
+        tokens = abstention_tokens(model)
+    except TrapsError as error:
+        raise NoMargin(str(error)) from error
+    return {
+        name: first_token_margins(model, states.read(name, "normed"), tokens).double().numpy()[:, None]
+        for name in datasets
+    }
+
+
+# --- noise ------------------------------------------------------------------------------------------------------------
+
+
+def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]:
+    """Rows of the protocol on noise: mean over draws, and their deviation as `spread`.
+
+    Every distinct prompt has one vector of independent normal numbers, as wide as the states. Items that are one prompt
+    (the controls of a taxonomy's two datasets) share it, as their states are equal. So `transfer` shows what shared
+    controls alone give, and `held_out` the floor after the split by scenario.
+    """
+    items, width = run.items, int(run.items["width"].iloc[0])
+    prompts, place = np.unique(items["states_key"].to_numpy(str), return_inverse=True)
+    of = {name: place[(items["dataset"] == name).to_numpy()] for name in dict.fromkeys(items["dataset"])}
+    drawn: dict[tuple[str, str, str], list[Row]] = {}
+    for draw in range(draws):
+        vectors = np.random.default_rng([seed, draw]).standard_normal((len(prompts), width))
+        for row in scored(run, {name: vectors[rows] for name, rows in of.items()}):
+            drawn.setdefault((row["analysis"], row["source"], row["target"]), []).append(row)
+    rows = []
+    for same in drawn.values():
+        values = np.array([row["value"] for row in same], float)
+        rows.append(same[0] | {"value": values.mean(), "spread": values.std(), "low": None, "high": None})
+    return rows
+
+
+def _without_figure() -> Row:
+    nothing = dict.fromkeys(("value", "low", "high", "spread"))
+    return {"analysis": "held_out", "source": "", "target": "", "n_voids": 0, "n_controls": 0, **nothing}

@@ -1,0 +1,46 @@
+"""Whether a steered text is still an answer: a model that is pushed far enough babbles, and a judge may call it either
+abstention or an answer."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections import Counter
+
+REPEATED = 4  # times in a row that the same words make a repetition
+LONGEST = 8  # words of a repeated phrase
+
+
+def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | None:
+    """Why a text is no answer, or None if it is one.
+
+    `truncated`: the limit of tokens cut it off (outcome). `repetition`: a phrase of one to eight words stands four
+    times in a row. `script`: most of its letters are of another script than those of the unsteered answer to the same
+    item. A text that is missing is `empty`.
+    """
+    if outcome == "truncated":
+        return outcome
+    if not text:
+        return "empty"
+    if repeats(text):
+        return "repetition"
+    own, other = script(unsteered or ""), script(text)
+    return "script" if own and other and own != other else None
+
+
+def repeats(text: str) -> bool:
+    """Whether a phrase of at most LONGEST words stands REPEATED times in a row."""
+    words = text.lower().split()
+    for size in range(1, LONGEST + 1):
+        same = 0
+        for place in range(size, len(words)):
+            same = same + 1 if words[place] == words[place - size] else 0
+            if same >= size * (REPEATED - 1):
+                return True
+    return False
+
+
+def script(text: str) -> str:
+    """The script of most letters, by the first word of their Unicode names (LATIN, CJK, CYRILLIC); empty for a text
+    without letters."""
+    names = Counter(unicodedata.name(letter, "?").split()[0] for letter in text if letter.isalpha())
+    return names.most_common(1)[0][0] if names else ""

@@ -1,0 +1,196 @@
+"""Probe-gated abstention: a linear probe on the model's states decides whether the model's answer is kept.
+
+The paper's probes find that states separate what can be known from what cannot, while answers do not. A gate puts that
+to use: where the probe's score is above a threshold, the answer becomes an abstention. Nothing is asked and nothing is
+judged again: a gated answer is an abstention, and every other answer keeps its verdict.
+
+No gate has seen the scenario that it decides about, in its fit or in its threshold. Its sources say how much more it
+has not seen: `one:DATASET` (one dataset), `other datasets` (all but the target) and `other families` (no scenario of
+the target's family in any dataset).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.paths import probed_taxonomy
+from traps_pipeline.mechanism.probes import Solver, auroc, fit_probe, scenario_folds
+from traps_pipeline.partitions import DATASETS
+
+MID, J, CONFORMAL = THRESHOLDS = ("mid", "J", "conformal")
+OTHER_DATASETS, OTHER_FAMILIES = "other datasets", "other families"
+SOURCES = (*(f"one:{name}" for name in DATASETS), OTHER_DATASETS, OTHER_FAMILIES)
+NEVER = float("inf")  # a threshold that no score exceeds
+
+
+@dataclass(frozen=True, eq=False)
+class Items:
+    """What a gate is fitted on and applied to. table: rows with dataset, scenario_id, family, prompt (equal for items
+    that are one prompt) and void (bool). features: (n, d), rows in the same order."""
+
+    table: pd.DataFrame
+    features: np.ndarray
+
+    def rows(self, chosen: np.ndarray) -> Items:
+        """The items that a boolean mask chooses."""
+        return Items(self.table.loc[chosen].reset_index(drop=True), self.features[chosen])
+
+    @property
+    def void(self) -> np.ndarray:
+        """(n,) bool."""
+        return self.table["void"].to_numpy(bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Decisions:
+    """A gate's decisions about some items. place: (n,) rows of the items' table. score: (n,) log-odds of void.
+    threshold: by name, (n,). expected: by name, (n,) share of the calibrating controls above the threshold."""
+
+    place: np.ndarray
+    score: np.ndarray
+    threshold: Mapping[str, np.ndarray]
+    expected: Mapping[str, np.ndarray]
+
+
+def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[str, float]:
+    """The three thresholds from calibrating scores (n,) and labels (n,); a score above a threshold is gated.
+
+    mid: half-way between the mean scores of voids and of controls. J: the cut with the largest AbsRec - FalseAbs,
+    half-way to the next score. conformal: the smallest control score that at most a share `false_abs` of new controls
+    from the same source exceeds, in expectation over sources (split conformal prediction: rank ceil((n + 1)(1 -
+    false_abs)) of n); with too few controls for that (18 at 0.05), no answer is gated.
+    """
+    control = np.sort(score[~void])
+    mid = (score[void].mean() + control.mean()) / 2
+    levels = np.unique(score)
+    cuts = np.concatenate([[levels[0] - 1], (levels[1:] + levels[:-1]) / 2, [NEVER]])
+    gained = [(score[void] > cut).mean() - (control > cut).mean() for cut in cuts]
+    rank = int(np.ceil((len(control) + 1) * (1 - false_abs) - 1e-9))
+    conformal = float(control[rank - 1]) if rank <= len(control) else NEVER
+    return {MID: float(mid), J: float(cuts[int(np.argmax(gained))]), CONFORMAL: conformal}
+
+
+def decide(
+    items: Items, source: str, target: str, *, folds: int, seed: int, false_abs: float, solver: Solver = "exact"
+) -> Decisions:
+    """The decisions of the gates of a source about every item of a target dataset.
+
+    A gate is fitted for each fold of the target's scenarios (each family, for `other families`) on source items of all
+    other scenarios. Its thresholds come from scores of those same source items in a cross-validation of their own, so
+    that they are scores of unseen items too; items that are one prompt count once. Raises TrapsError for a source
+    without items.
+    """
+    wanted = items.table["dataset"].to_numpy(str)
+    scored = np.flatnonzero(wanted == target)
+    if source == OTHER_DATASETS:
+        inside = np.isin(wanted, [name for name in DATASETS if name != target])
+    elif source == OTHER_FAMILIES:
+        inside = np.isin(wanted, DATASETS)
+    else:
+        inside = wanted == source.removeprefix("one:")
+    if not inside.any():
+        raise TrapsError(f"a gate from {source} has no items; extract the hidden states of its datasets first")
+    groups = items.table["family" if source == OTHER_FAMILIES else "scenario_id"].to_numpy(str)
+    score = np.full(len(scored), np.nan)
+    cut = {name: np.full(len(scored), NEVER) for name in THRESHOLDS}
+    expected = {name: np.zeros(len(scored)) for name in THRESHOLDS}
+    for held in _held_groups(groups[scored], source, folds, seed):
+        here = np.isin(groups[scored], held)
+        train = items.rows(inside & ~np.isin(groups, held))
+        if len(set(train.void)) < 2:
+            continue
+        probe = fit_probe(train.features, train.void, solver)
+        score[here] = probe.scores(items.features[scored[here]])
+        calibrating, void = _own_scores(train, folds, seed, solver)
+        for name, value in thresholds(calibrating, void, false_abs).items():
+            cut[name][here] = value
+            expected[name][here] = (calibrating[~void] > value).mean()
+    return Decisions(scored, score, cut, expected)
+
+
+def _held_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iterator[np.ndarray]:
+    """The groups of scored items that a gate must not have seen, one gate after another."""
+    names = np.unique(groups)
+    if source == OTHER_FAMILIES or len(names) < folds:
+        yield from (names[k : k + 1] for k in range(len(names)))
+        return
+    fold = scenario_folds(names, folds, seed)
+    yield from (names[fold == k] for k in range(folds))
+
+
+def _own_scores(train: Items, folds: int, seed: int, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
+    """Scores and labels of the source's distinct prompts, each by a probe that was not fitted on its scenario."""
+    fold = scenario_folds(train.table["scenario_id"].to_numpy(str), folds, seed)
+    score = np.full(len(fold), np.nan)
+    for k in range(folds):
+        rest = train.rows(fold != k)
+        if len(set(rest.void)) == 2:
+            score[fold == k] = fit_probe(rest.features, rest.void, solver).scores(train.features[fold == k])
+    first = ~train.table.duplicated(["prompt"]).to_numpy() & np.isfinite(score)
+    return score[first], train.void[first]
+
+
+# --- what gating does to an evaluation --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Outcomes:
+    """Verdicts of a target's items, (n,) each: void; correct (of controls) and abstained, NaN where undecided."""
+
+    void: np.ndarray
+    correct: np.ndarray
+    abstained: np.ndarray
+
+    def gated(self, gate: np.ndarray) -> Outcomes:
+        """The outcomes after a gate (n,) bool has turned answers into abstentions. An undecided answer that is gated is
+        decided: it abstains."""
+        return Outcomes(self.void, np.where(gate, 0.0, self.correct), np.where(gate, 1.0, self.abstained))
+
+    def figures(self, weight: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """acc, false_abs, abs_rec and pecs, each () or, with weights (resamples, n), (resamples,). NaN where nothing
+        was decided."""
+        weight = np.ones((1, len(self.void))) if weight is None else weight
+        parts = {"acc": (~self.void, self.correct), "false_abs": (~self.void, self.abstained)}
+        parts |= {"abs_rec": (self.void, self.abstained)}
+        found: dict[str, np.ndarray] = {}
+        for name, (side, values) in parts.items():
+            kept = side & np.isfinite(values)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                found[name] = (weight[:, kept] @ values[kept]) / weight[:, kept].sum(axis=1)
+        found["pecs"] = found["acc"] * np.maximum(0, found["abs_rec"] - found["false_abs"])
+        return found
+
+
+def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[float]) -> list[tuple[float, float, int]]:
+    """(coverage, risk, answers kept) where answers are given up from the highest score down.
+
+    Answered items are those on which the model did not abstain. Coverage is the share of all items that are answered
+    and kept; risk the share of kept answers that are wrong: every answer to a void, and a control's that is not
+    correct. Coverages beyond the share of answered items are left out.
+    """
+    answered = outcomes.abstained == 0
+    wrong = np.where(outcomes.void, 1.0, 1 - outcomes.correct)
+    known = answered & np.isfinite(wrong) & np.isfinite(score)
+    order = np.flatnonzero(known)[np.argsort(score[known], kind="stable")]
+    points = []
+    for coverage in coverages:
+        kept = round(coverage * len(score))
+        if 0 < kept <= len(order):
+            points.append((kept / len(score), float(wrong[order[:kept]].mean()), kept))
+    return points
+
+
+def separation(decisions: Decisions, void: np.ndarray) -> float:
+    """AUROC of a gate's scores on its target, whose labels are void (n,); NaN with one side alone."""
+    known = np.isfinite(decisions.score)
+    return float(auroc(void[known], decisions.score[known]))
+
+
+def families(items: pd.DataFrame) -> np.ndarray:
+    """The family of each item for `other families`: its sub-scenario with its taxonomy."""
+    return np.array([f"{probed_taxonomy(d)}:{s}" for d, s in zip(items["dataset"], items["sub_scenario"], strict=True)])

@@ -1,0 +1,290 @@
+"""The gate stage: from stored states and verdicts to the rows of GATE and RISK_COVERAGE."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline import progress
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.mechanism.baselines import MARGIN, NoMargin, output_margins, probed_items, raw_features
+from traps_pipeline.mechanism.control_tables import GateRow, RiskCoverageRow
+from traps_pipeline.mechanism.gate import (
+    MID,
+    OTHER_DATASETS,
+    OTHER_FAMILIES,
+    SOURCES,
+    THRESHOLDS,
+    Decisions,
+    Items,
+    Outcomes,
+    decide,
+    families,
+    risk_coverage,
+    separation,
+)
+from traps_pipeline.mechanism.probes import swapped_labels
+from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.tables import PROBES
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.partitions import DATASETS, Cell, Evaluation
+from traps_pipeline.scoring.bootstrap import percentiles, scenario_weights
+from traps_pipeline.storage.workspace import Workspace
+
+STATES, SHUFFLED, UNTRAINED, NO_GATE = "states", "shuffled labels", "untrained model", "no gate"
+REGIMES = ("standard", "guided")
+COVERAGES = tuple(k / 20 for k in range(1, 21))
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Gates:
+    """A kind of features with the gates that use it. features: dataset -> (n, d), or by layer for states."""
+
+    name: str
+    by_layer: Mapping[int, Mapping[str, np.ndarray]]
+    sources: Sequence[str]
+
+
+def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[GateRow]:
+    """Rows of GATE of an extraction, for each regime that the model was asked under in run 1.
+
+    Raises TrapsError when the model has no verdicts yet.
+    """
+    resamples, seed = workspace.mechanism.probes.resamples, workspace.mechanism.seed
+    return [
+        row
+        for regime, outcomes, gates, source, made in _each(workspace, entry, states, SOURCES)
+        for row in _rows(states, (gates, regime, source), made, outcomes, resamples, seed)
+    ]
+
+
+def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[RiskCoverageRow]:
+    """Rows of RISK_COVERAGE of an extraction: gates from other datasets, and as `gate_rows` else."""
+    return [
+        row
+        for regime, outcomes, gates, _, made in _each(workspace, entry, states, (OTHER_DATASETS,))
+        for row in _curves(states, gates, regime, made, outcomes)
+    ]
+
+
+Made = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
+
+
+def _each(
+    workspace: Workspace, entry: ModelEntry, states: StoredStates, sources: Sequence[str]
+) -> Iterator[tuple[str, Mapping[str, Outcomes], str, str, Made]]:
+    """Regime, its outcomes, features, source and decisions of every gate."""
+    outcomes = {
+        regime: found for regime in REGIMES if (found := _outcomes(workspace, entry.id, regime, states)) is not None
+    }
+    if not outcomes:
+        raise TrapsError(
+            f"gate {states.extraction.key}: {entry.id} has no verdicts under {' or '.join(REGIMES)} in run 1; the "
+            "experiment must ask the model under one of these regimes"
+        )
+    table = _table(states)
+    best = _best_layers(workspace, states)
+    kinds = [*_kinds(workspace, entry, states, best, sources)]
+    for number, gates in enumerate(kinds):
+        progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
+        made = _decisions(workspace, table, gates, best)
+        for regime, source in product(outcomes, gates.sources):
+            own = {target: one for (of, target), one in made.items() if of == source}
+            yield regime, outcomes[regime], gates.name, source, own
+
+
+def _table(states: StoredStates) -> pd.DataFrame:
+    """The items of all datasets in the order of `states.items`, as a gate wants them."""
+    items = states.items
+    named = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
+    return named.assign(family=families(items), prompt=items["states_key"], void=items["side"] == "void")
+
+
+def _best_layers(workspace: Workspace, states: StoredStates) -> dict[str, int]:
+    """The layer of each source's gates: the highest mean AUROC of its datasets' own cross-validations. For `other
+    datasets` the key is that with the target behind a colon."""
+    probes = workspace.tables.read(PROBES, states.extraction.partition)
+    within = probes.loc[probes["analysis"] == "within"].pivot(index="layer", columns="source", values="value")
+    of = {f"one:{name}": [name] for name in within}
+    of |= {f"{OTHER_DATASETS}:{name}": [other for other in within if other != name] for name in DATASETS}
+    every = {source: [*within] for source in SOURCES if source not in of and source != OTHER_DATASETS}
+    return {source: int(within[names].mean(axis=1).idxmax()) for source, names in (of | every).items() if names}
+
+
+def _kinds(
+    workspace: Workspace, entry: ModelEntry, states: StoredStates, best: Mapping[str, int], sources: Sequence[str]
+) -> Iterator[Gates]:
+    """States with every source; the controls with the sources that no single dataset's accidents decide."""
+    names = [*dict.fromkeys(states.items["dataset"])]
+    yield Gates(STATES, {layer: _read(states, names, layer) for layer in sorted(set(best.values()))}, sources)
+    controls = (OTHER_DATASETS,)
+    assert entry.media is not None, "local entries have media"
+    items = {name: probed_items(workspace, states, name) for name in names}
+    for name, features in raw_features(items, entry.media, workspace.resolve).items():
+        yield Gates(name, {-1: features}, controls)
+    try:
+        yield Gates(MARGIN, {-1: output_margins(entry, states, names)}, controls)
+    except NoMargin as error:
+        progress.current().note(f"gate: no output margin ({error})")
+    yield Gates(SHUFFLED, {layer: _read(states, names, layer) for layer in sorted(set(best.values()))}, controls)
+    if workspace.mechanism.gate.untrained:
+        from traps_pipeline.mechanism.untrained import untrained_states
+
+        yield Gates(UNTRAINED, {-1: untrained_states(workspace, entry, states, items)}, controls)
+
+
+def _read(states: StoredStates, names: Sequence[str], layer: int) -> dict[str, np.ndarray]:
+    return {name: states.read(name, layer) for name in names}
+
+
+def _decisions(
+    workspace: Workspace, table: pd.DataFrame, gates: Gates, best: Mapping[str, int]
+) -> dict[tuple[str, str], tuple[Decisions, int]]:
+    """By source and target, a gate's decisions and the layer of its states (-1 for other features)."""
+    settings, seed = workspace.mechanism, workspace.mechanism.seed
+    about = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
+    made: dict[tuple[str, str], tuple[Decisions, int]] = {}
+    for source, target in product(gates.sources, dict.fromkeys(table["dataset"])):
+        # To a target that is no dataset of pairs all four datasets are others, as they are to other families.
+        layer = best.get(f"{source}:{target}", best.get(source, best[OTHER_FAMILIES]))
+        layer = layer if layer in gates.by_layer else -1
+        items = _items(table, gates.by_layer[layer], gates.name == SHUFFLED, seed)
+        found = decide(items, source, str(target), solver=settings.probes.solver, **about)
+        if np.isfinite(found.score).any():
+            made[source, str(target)] = found, layer
+    return made
+
+
+def _items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> Items:
+    """The table with its features; with shuffled labels, where a coin for each scenario swaps its sides."""
+    values = np.empty((len(table), next(iter(features.values())).shape[1]))
+    for name, of in features.items():
+        values[(table["dataset"] == name).to_numpy()] = of
+    if shuffled:
+        void = swapped_labels(table["void"].to_numpy(), pd.factorize(table["scenario_id"])[0], 1, seed)[:, 0]
+        table = table.assign(void=void)
+    return Items(table, values)
+
+
+def _outcomes(workspace: Workspace, model: str, regime: str, states: StoredStates) -> dict[str, Outcomes] | None:
+    """Outcomes by dataset, in the order of the states; None if the four datasets that have states have no verdicts.
+    Items without verdicts (those that no model is asked) have undecided ones."""
+    found: dict[str, Outcomes] = {}
+    judged = False
+    for dataset in dict.fromkeys(states.items["dataset"]):
+        items = states.dataset(dataset)
+        cell = Cell(dataset, Evaluation(model, regime, 1))
+        rows = pd.DataFrame(columns=["item_id", "correct", "abstained"])
+        if workspace.tables.state(VERDICTS, cell.partition) is not None:
+            rows = workspace.tables.read(VERDICTS, cell.partition)
+            judged |= dataset in DATASETS
+        rows = rows.set_index("item_id").reindex(items["item_id"])
+        correct, abstained = (
+            rows[name].astype("Float64").to_numpy(float, na_value=np.nan) for name in ("correct", "abstained")
+        )
+        found[dataset] = Outcomes((items["side"] == "void").to_numpy(), correct, abstained)
+    return found if judged else None
+
+
+def _rows(
+    states: StoredStates,
+    about: tuple[str, str, str],
+    made: Made,
+    outcomes: Mapping[str, Outcomes],
+    resamples: int,
+    seed: int,
+) -> list[GateRow]:
+    """The rows of one gate (features, regime, source) on every target and over the four datasets."""
+    rows: list[GateRow] = []
+    names = states.items["scenario_id"].to_numpy(str)
+    for threshold in THRESHOLDS:
+        of_datasets: list[dict[str, float]] = []
+        draws: list[np.ndarray] = []
+        for target, (decisions, layer) in made.items():
+            scenario, index = pd.factorize(names[decisions.place])
+            weight = scenario_weights(len(index), resamples, [seed, 0])[:, scenario]
+            outcome = outcomes[target]
+            gate = decisions.score > decisions.threshold[threshold]
+            gated = outcome.gated(gate)
+            plain_figures, figures = outcome.figures(), gated.figures()
+            if target not in DATASETS:  # what the gate alone would do to items that must be answered
+                figures = {"acc": np.array([np.nan]), "pecs": np.array([np.nan]), "abs_rec": np.array([np.nan])}
+                figures["false_abs"] = np.array([gate[~outcome.void].mean() if (~outcome.void).any() else np.nan])
+            values = {name: value.item() for name, value in figures.items()}
+            values |= {f"plain_{name}": value.item() for name, value in plain_figures.items()}
+            values |= {"expected_false_abs": float(decisions.expected[threshold].mean())}
+            drawn = gated.figures(weight)["pecs"] if target in DATASETS else np.full(resamples, np.nan)
+            if target in DATASETS:
+                of_datasets.append(values)
+                draws.append(drawn)
+            area = separation(decisions, outcome.void)
+            sides = int((~outcome.void).sum()), int(outcome.void.sum())
+            rows.append(_row(states, (*about, threshold, target), layer, area, values, drawn, sides))
+        if len(of_datasets) == len(DATASETS):
+            means = {name: float(np.mean([one[name] for one in of_datasets])) for name in of_datasets[0]}
+            sides = [
+                sum(getattr(r, name) for r in rows[-len(made) :] if r.target in DATASETS)
+                for name in ("n_controls", "n_voids")
+            ]
+            layers = {layer for target, (_, layer) in made.items() if target in DATASETS}
+            layer = layers.pop() if len(layers) == 1 else -1
+            rows.append(
+                _row(
+                    states, (*about, threshold, ALL), layer, np.nan, means, np.mean(draws, axis=0), (sides[0], sides[1])
+                )
+            )
+    return rows
+
+
+def _row(
+    states: StoredStates,
+    about: tuple[str, str, str, str, str],
+    layer: int,
+    area: float,
+    values: Mapping[str, float],
+    draws: np.ndarray,
+    sides: tuple[int, int],
+) -> GateRow:
+    low, high = percentiles(draws)
+    figures = {**values, "auroc": area, "pecs_low": float(low), "pecs_high": float(high)}
+    named = dict(zip(("features", "regime", "source", "threshold", "target"), about, strict=True))
+    return GateRow(
+        **states.extraction.partition,
+        **named,
+        **{name: None if np.isnan(value) else value for name, value in figures.items()},
+        layer=layer,
+        n_controls=sides[0],
+        n_voids=sides[1],
+    )
+
+
+def _curves(
+    states: StoredStates,
+    features: str,
+    regime: str,
+    made: Made,
+    outcomes: Mapping[str, Outcomes],
+) -> list[RiskCoverageRow]:
+    """Risk against coverage over the four datasets together; a score counts from its own gate's mid threshold, so that
+    the scores of four gates are comparable."""
+    own = [name for name in made if name in DATASETS]
+    if not own:
+        return []
+    score = np.concatenate([made[name][0].score - made[name][0].threshold[MID] for name in own])
+    parts = [outcomes[name] for name in own]
+    whole = Outcomes(*(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained")))
+    points = [(features, *point) for point in risk_coverage(score, whole, COVERAGES)]
+    if features == STATES:
+        answered = int((whole.abstained == 0).sum())
+        wrong = np.where(whole.void, 1.0, 1 - whole.correct)[whole.abstained == 0]
+        points.append((NO_GATE, answered / len(score), float(np.nanmean(wrong)) if answered else 0.0, answered))
+    return [
+        RiskCoverageRow(**states.extraction.partition, regime=regime, features=name, coverage=c, risk=r, n=n)
+        for name, c, r, n in points
+    ]

@@ -1,0 +1,72 @@
+"""The output margin: how much more likely a model is to begin an answer by abstaining than in any other way.
+
+It is read off the first answer token: the log-odds of the tokens with which an abstention begins against all others.
+A probe says something about a gap between representation and output only as far as it separates better than this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from traps_pipeline.errors import TrapsError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from traps_pipeline.models.local.adapter import LocalModel
+
+# How an abstention begins. "I don't know" is what the guided prompt asks for (assets/prompts).
+PHRASES = ("i don't know", "i do not know", "i cannot", "i can't", "cannot", "unable", "unanswerable", "unknown")
+_FIRST_WORDS = frozenset(phrase.split()[0] for phrase in PHRASES)
+
+
+def begins_abstention(token: str) -> bool:
+    """Whether a token's text begins an abstention: a whole phrase of PHRASES with whatever follows it, or the first
+    word of one. "I" counts, although other sentences begin with it too: the margin is a lower bound of what the first
+    token says."""
+    text = token.strip().lower().replace("\u2019", "'")
+    return text in _FIRST_WORDS or text.startswith(PHRASES)
+
+
+def abstention_tokens(model: LocalModel) -> list[int]:
+    """The tokens of a model's vocabulary with which an abstention begins. Raises TrapsError if there is none."""
+    tokenizer = model.processor.tokenizer
+    texts = tokenizer.batch_decode([[token] for token in range(len(tokenizer))])
+    found = [token for token, text in enumerate(texts) if begins_abstention(text)]
+    if not found:
+        raise TrapsError(
+            f"{model.checkpoint.name}: no token of its vocabulary begins an abstention ({', '.join(PHRASES)}), so its "
+            "output margin cannot be read; leave out what needs it"
+        )
+    return found
+
+
+def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) -> Tensor:
+    """Log-odds of `tokens` against all others but `never`, from logits (.., vocabulary): (..)."""
+    import torch
+
+    chosen = torch.zeros(logits.shape[-1], dtype=torch.bool, device=logits.device)
+    chosen[list(tokens)] = True
+    others = ~chosen
+    if never:
+        others[list(never)] = False
+    logits = logits.float()
+    return torch.logsumexp(logits[..., chosen], -1) - torch.logsumexp(logits[..., others], -1)
+
+
+def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -> Tensor:
+    """The margins (n,) of states (n, d) that left the final norm at the last position of a prompt, on the CPU."""
+    import torch
+
+    head, config = model.network.get_output_embeddings(), model.network.config.get_text_config()
+    with torch.inference_mode():
+        states = torch.as_tensor(np.asarray(normed)) if not torch.is_tensor(normed) else normed
+        logits = head(states.to(model.device, model.network.dtype)).float()
+        cap = getattr(config, "final_logit_softcapping", None)
+        if cap:
+            logits = torch.tanh(logits / cap) * cap
+        never = model.network.generation_config.suppress_tokens or ()
+        return margin_of(logits, tokens, never).cpu()

@@ -1,0 +1,103 @@
+"""Steering beside its controls, from STEERING_EFFECTS rows: the void direction's effect ranked among nulls, and PECS
+under each sign policy.
+
+The paper adds a direction on controls and subtracts it on voids, which nobody can do who does not know the sides. So
+PECS is also given where the same is added, or subtracted, on both sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.mechanism.control_tables import SteeringNullRow, SteeringPecsRow
+from traps_pipeline.mechanism.directions import NULLS, VOID
+from traps_pipeline.scoring.metrics import joined_epochs, pecs_of
+
+ALL = "all"
+_CELL = ["model", "directions", "regime"]
+_AT = [*_CELL, "layer", "unit", "dose", "side"]
+
+
+def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
+    """Rows of STEERING_NULLS: every dataset along its own direction, and the mean over datasets. Without nulls there
+    are no rows."""
+    own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
+    moved = _moved(own)
+    drawn = moved.loc[moved["kind"].isin(NULLS)]
+    rows: list[SteeringNullRow] = []
+    for target in [*sorted(set(drawn["target"])), ALL]:
+        part = moved if target == ALL else moved.loc[moved["target"] == target]
+        rows += _ranked(part, target)
+    return rows
+
+
+def _moved(own: pd.DataFrame) -> pd.DataFrame:
+    """Steered effects with `moved`, the change against the unsteered answers in the direction that is claimed: more
+    abstention on controls, less on voids."""
+    path = [*_CELL, "target", "kind", "draw", "layer", "unit", "side"]
+    plain = own.loc[own["dose"] == 0, [*path, "abstention"]].rename(columns={"abstention": "plain"})
+    steered = own.loc[own["dose"] != 0].merge(plain, on=path)
+    change = steered["abstention"].astype(float) - steered["plain"].astype(float)
+    return steered.assign(moved=np.where(steered["side"] == "control", change, -change))
+
+
+def _ranked(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
+    for key, group in moved.groupby(_AT, sort=True):
+        about: dict[str, Any] = dict(zip(_AT, key if isinstance(key, tuple) else (key,), strict=True))
+        void = group.loc[group["kind"] == VOID]
+        for null in NULLS:
+            draws = group.loc[group["kind"] == null].groupby("draw")
+            here = void.loc[void["target"].isin(set(group.loc[group["kind"] == null, "target"]))]
+            values = draws["moved"].mean().dropna().to_numpy(float)  # without draws on which no answer was decided
+            if not len(values) or here["moved"].isna().any() or here.empty:
+                continue
+            effect = float(here["moved"].mean())
+            # Shares of few answers tie often, so ties count against the direction; rounding must not break a tie.
+            reached = int(np.count_nonzero(values >= effect - 1e-9))
+            yield SteeringNullRow(
+                **about,
+                target=target,
+                null=null,
+                effect=effect,
+                null_mean=float(values.mean()),
+                null_lowest=float(values.min()),
+                null_highest=float(values.max()),
+                draws=len(values),
+                n_at_least=reached,
+                p=(1 + reached) / (1 + len(values)),
+                n=int(here["n"].sum()),
+                epoch=joined_epochs(here["epoch"]),
+            )
+
+
+def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
+    """Rows of STEERING_PECS: every path, dose and sign policy of the void directions that was steered on both sides.
+    Figures without a decided answer are null."""
+    keys = [*_CELL, "source", "target", "layer", "unit", "dose", "signs"]
+    rows: list[SteeringPecsRow] = []
+    for key, group in effects.loc[effects["kind"] == VOID].groupby(keys, sort=True):
+        sides = {str(row["side"]): row for row in group.to_dict("records")}
+        if len(sides) < 2:
+            continue  # a layer of the sweep, which has controls alone
+        control, void = sides["control"], sides["void"]
+        acc = control["correct"] / control["n_correct"] if control["n_correct"] else np.nan
+        false_abs, abs_rec = (row["abstained"] / row["n"] if row["n"] else np.nan for row in (control, void))
+        j = abs_rec - false_abs
+        figures = {"acc": acc, "false_abs": false_abs, "abs_rec": abs_rec, "j": j}
+        figures |= {"pecs": float(pecs_of(np.array(acc), np.array(j)))}
+        answers = sum(row["n"] + row["n_missing"] for row in (control, void))
+        rows.append(
+            SteeringPecsRow(
+                **dict(zip(keys, key if isinstance(key, tuple) else (key,), strict=True)),
+                **{name: None if np.isnan(value) else float(value) for name, value in figures.items()},
+                degenerate=(control["degenerate"] + void["degenerate"]) / answers,
+                n_controls=int(control["n"]),
+                n_voids=int(void["n"]),
+                epoch=joined_epochs([control["epoch"], void["epoch"]]),
+            )
+        )
+    return rows

@@ -1,0 +1,83 @@
+"""The clips and questions for which hidden states are extracted: the pairs, and what settles whether a probe reads a
+shortcut."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+
+from traps_pipeline.benchmark.items import categories_of_dataset
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.tables import ProbeItemRow
+from traps_pipeline.partitions import ANSWERABLE, TIME_SWAPPED
+from traps_pipeline.storage.workspace import Workspace
+
+COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "question", "clip", "media_digest")
+
+
+def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
+    """Rows of a dataset's probe_items: those of items; occlusion's void clips with the answerable question; or
+    chaotic's clips with the frame times of the other side."""
+    if dataset == TIME_SWAPPED:
+        return time_swapped(workspace.tables.read(ITEMS, {"dataset": "chaotic"}))
+    if dataset != ANSWERABLE:
+        rows = workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
+        columns = ("item_id", "dataset", *COPIED, "benchmark_version")
+        own = {"times_clip": None, "times_digest": None}
+        return [ProbeItemRow(**{name: row[name] for name in columns}, **own) for row in rows]
+    rows = []
+    for category in categories_of_dataset("occlusion"):
+        if workspace.tables.state(SCENE_SPECS, {"category": category}) is None:
+            continue
+        clips = workspace.tables.read(VIDEOS, {"category": category})
+        voids = clips.loc[clips["side"] == "void"].set_index("scenario_id")
+        for spec in workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records"):
+            if spec["scenario_id"] not in voids.index:
+                raise TrapsError(f"{spec['scenario_id']}: has no void clip yet; materialize videos for {category}")
+            rows.append(_answerable_item(spec, voids.loc[spec["scenario_id"]].to_dict()))
+    if not rows:
+        raise TrapsError(f"probe_items {dataset}: no occlusion scenarios yet; materialize scene_specs and videos first")
+    return rows
+
+
+def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeItemRow:
+    """The void clip with a question that it answers; its side is control, since it must be answered."""
+    pair = f"{ANSWERABLE}:{spec['scenario_id']}"
+    return ProbeItemRow(
+        **{name: spec[name] for name in ("scenario_id", "category", "sub_scenario", "benchmark_version")},
+        item_id=f"{pair}:control",
+        pair_id=pair,
+        dataset=ANSWERABLE,
+        side="control",
+        question=json.loads(spec["answerable_question"])["question"],
+        clip=clip["path"],
+        media_digest=clip["file_sha256"],
+        times_clip=None,
+        times_digest=None,
+    )
+
+
+def time_swapped(items: pd.DataFrame) -> list[ProbeItemRow]:
+    """Both sides of chaotic's pairs with the frame times of the other side, from ITEMS rows of chaotic: a probe that
+    reads time stamps takes a control for a void and a void for a control. A scenario without both sides is left out."""
+    rows: list[ProbeItemRow] = []
+    for _, pair in items.groupby("scenario_id", sort=True):
+        sides = {str(row["side"]): row for row in pair.to_dict("records")}
+        if len(sides) < 2:
+            continue
+        for side, other in (("control", "void"), ("void", "control")):
+            row, name = sides[side], f"{TIME_SWAPPED}:{sides[side]['scenario_id']}"
+            rows.append(
+                ProbeItemRow(
+                    **{name: row[name] for name in (*COPIED, "benchmark_version")} | {"pair_id": name},
+                    item_id=f"{name}:{side}",
+                    dataset=TIME_SWAPPED,
+                    times_clip=sides[other]["clip"],
+                    times_digest=sides[other]["media_digest"],
+                )
+            )
+    return rows

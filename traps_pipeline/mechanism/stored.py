@@ -1,0 +1,64 @@
+"""The hidden states of a study, read layer by layer in the order of their table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.tables import HIDDEN_STATES
+from traps_pipeline.mechanism.versions import states_folder
+from traps_pipeline.partitions import Extraction, StatesCell
+from traps_pipeline.storage.workspace import Workspace
+
+
+@dataclass
+class StoredStates:
+    """The hidden states of one extraction: an id table, and a reader of single layers in the order of that table."""
+
+    workspace: Workspace
+    extraction: Extraction
+    items: pd.DataFrame
+
+    @staticmethod
+    def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
+        """The states of an extraction. Raises TrapsError when nothing was extracted."""
+        items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
+        if items.empty:
+            raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
+        return StoredStates(workspace, extraction, items.reset_index(drop=True))
+
+    @property
+    def n_layers(self) -> int:
+        """Layers, the embeddings included."""
+        return int(self.items["n_layers"].iloc[0]) + 1
+
+    @property
+    def digest(self) -> str:
+        """Digest of the items and their states."""
+        return digest(sorted(zip(self.items["item_id"], self.items["states_key"], strict=True)))
+
+    def dataset(self, name: str) -> pd.DataFrame:
+        """The rows of a dataset."""
+        return self.items.loc[self.items["dataset"] == name]
+
+    def read(self, dataset: str, layer: int | Literal["normed"]) -> np.ndarray:
+        """States (n, d) float32 in the order of the rows; layer `normed` is the last one after the final norm. Raises
+        TrapsError when the shards do not hold these items."""
+        from traps_pipeline.mechanism.hidden_states import read_layer
+
+        cell = StatesCell(dataset, self.extraction)
+        ids, states = read_layer(states_folder(self.workspace, cell), layer)
+        wanted = self.dataset(dataset)
+        # By item, not by key: two items with the same clip and question share one.
+        places = pd.Index(ids["item_id"]).get_indexer(pd.Index(wanted["item_id"]))
+        if (places < 0).any() or (ids["key"].to_numpy()[places] != wanted["states_key"].to_numpy()).any():
+            raise TrapsError(
+                f"hidden states {cell.key}: the shards hold other items than the table; materialize hidden_states for "
+                "it again"
+            )
+        return states[places]

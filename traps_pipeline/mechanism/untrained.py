@@ -1,0 +1,57 @@
+"""States of a network that has learnt nothing: the same class, sizes and prompts, with random weights.
+
+What a gate does on them, it does from the inputs alone, through features that no training chose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.mechanism.hidden_states import clip_item
+from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.models.local.adapter import load_local_model
+from traps_pipeline.models.local.library import load_transformers
+from traps_pipeline.models.local.model import LocalModel
+from traps_pipeline.models.prompts import vqa_prompt
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.storage.workspace import Workspace
+
+
+def untrained_model(entry: ModelEntry, seed: int) -> LocalModel:
+    """The entry's network with random weights, on its device and in its precision, unquantised. It takes the memory of
+    a second model."""
+    import torch
+
+    trained = load_local_model(entry, inside=True)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = load_transformers().AutoModelForImageTextToText.from_config(
+            trained.network.config, dtype=trained.network.dtype
+        )
+    return LocalModel(
+        network.to(trained.device).eval(), trained.processor, trained.checkpoint, trained.params, trained.device
+    )
+
+
+def untrained_states(
+    workspace: Workspace, entry: ModelEntry, states: StoredStates, items: Mapping[str, pd.DataFrame]
+) -> dict[str, np.ndarray]:
+    """The states (n, d) of every item at the middle block of the untrained network, pooled as the study pools."""
+    model = untrained_model(entry, workspace.mechanism.seed)
+    system, layer = vqa_prompt(states.extraction.prompt), (model.n_layers + 1) // 2
+    assert entry.media is not None, "local entries have media"
+    made: dict[str, np.ndarray] = {}
+    found: dict[str, list[np.ndarray]] = {}
+    for dataset, rows in items.items():
+        keys = states.dataset(dataset)["states_key"]
+        for key, row in zip(keys, rows.to_dict("records"), strict=True):
+            if key not in made:
+                times = workspace.resolve(row["times_clip"]) if row["times_clip"] else None
+                named = {str(name): value for name, value in row.items()}
+                item = clip_item(model, entry.media, named, workspace.resolve(row["clip"]), system, times)
+                made[key] = model.forward_states(item.prompt(), workspace.mechanism.pooling).raw[layer]
+            found.setdefault(dataset, []).append(made[key])
+    return {dataset: np.stack(vectors) for dataset, vectors in found.items()}

@@ -1,0 +1,68 @@
+"""Which tokens of a prompt are what: system prompt, time stamps, visual tokens, question, the last one.
+
+Nothing here knows a family. Visual tokens are those of the processor's own placeholders. The rest is found by its text:
+tokens are decoded one by one, blanks are left out on both sides (tokenizers write them differently), and a token
+belongs to a part if any of its characters does.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from traps_pipeline.errors import TrapsError
+
+if TYPE_CHECKING:
+    from traps_pipeline.models.local.adapter import LocalModel, Prompt
+
+PARTS = ("system", "stamps", "visual", "question", "last")
+# `<0.4 seconds>` of Qwen3-VL and `00:01` of Gemma 4; LLaVA-NeXT-Video writes no times.
+_STAMP = re.compile(r"<\d+(?:\.\d+)?seconds>|\d\d:\d\d(?!\d)")
+
+
+def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict[str, np.ndarray]:
+    """By part, whether each token of the prompt belongs to it, (T,) bool. No token belongs to two parts; those of the
+    chat template belong to none. Raises TrapsError where a part cannot be found."""
+    ids = prompt.inputs["input_ids"][0].tolist()
+    placeholders = {getattr(model.processor, f"{kind}_token_id", None) for kind in ("image", "video")}
+    visual = np.isin(ids, [token for token in placeholders if token is not None])
+    texts = [
+        "" if is_visual else _plain(model.processor.tokenizer.decode([token]))
+        for token, is_visual in zip(ids, visual, strict=True)
+    ]
+    ends = np.cumsum([len(text) for text in texts])
+    starts, whole = ends - [len(text) for text in texts], "".join(texts)
+
+    def tokens(first: int, last: int) -> np.ndarray:
+        return (starts < last) & (ends > first)
+
+    found = {name: np.zeros(len(ids), bool) for name in PARTS}
+    found["visual"] = visual
+    for name, text in (("system", system), ("question", question)):
+        plain = _plain(text)
+        place = whole.rfind(plain) if name == "question" else whole.find(plain)
+        if place < 0 or not plain:
+            raise TrapsError(
+                f"{model.checkpoint.name}: the {name} cannot be found among the tokens of its prompt; its tokenizer "
+                "changes texts, so positions cannot be chosen by part"
+            )
+        found[name] = tokens(place, place + len(plain)) & ~visual
+    between = int(np.flatnonzero(found["system"])[-1]) + 1, int(np.flatnonzero(found["question"])[0])
+    for first, last in _stamps(whole, int(starts[between[0]]), int(starts[between[1]])):
+        found["stamps"] |= tokens(first, last) & ~visual
+    found["last"][-1] = True
+    for name in PARTS[:-1]:
+        found[name] &= ~found["last"]
+    return found
+
+
+def _stamps(whole: str, first: int, last: int) -> Iterator[tuple[int, int]]:
+    for match in _STAMP.finditer(whole, first, last):
+        yield match.span()
+
+
+def _plain(text: str) -> str:
+    return "".join(text.split())

@@ -1,0 +1,314 @@
+"""Controls beside the mechanistic claims: directions among their nulls, and what steering does to PECS."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from traps_pipeline.mechanism.paths import path_name, probed_taxonomy
+from traps_pipeline.partitions import DATASETS, SHORT, taxonomy_of
+from traps_pipeline.report.results import Results
+from traps_pipeline.report.tables.mechanism import DIRECTIONS, INFERENCE, NO_MECHANISM
+from traps_pipeline.report.tables.shared import MODEL
+from traps_pipeline.report.writing import Column, PrintedTable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FEW = 10  # items of a side below which a value is marked
+FEW_NOTE = f"† fewer than {FEW} controls or voids: the value says little"
+LAYER = Column("layer", "Layer", "count")
+DOSE = Column("step", "Dose")
+SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "− everywhere"}
+
+
+def why(results: Results, frame: pd.DataFrame) -> str:
+    """The reason why a frame of a study has no rows."""
+    return NO_MECHANISM if results.is_study and not len(frame) else results.why("probes")
+
+
+def few(rows: pd.DataFrame, *counts: str) -> list[str]:
+    """The mark of each row: a dagger where one of the counts is below FEW."""
+    return ["†" if min(values) < FEW else "" for values in zip(*(rows[name] for name in counts), strict=True)]
+
+
+# --- probes and their baselines ---------------------------------------------------------------------------------------
+
+SHORTCUTS = ("question words", "first frame", "all frames", "length", "time stamps")
+WHAT = {
+    "occlusion_answerable": "void clip, answerable question",
+    "decoy": "decoy: a panel that hides nothing",
+    "length_matched": "whole clip as short as a void",
+    "chaotic_time_swapped": "frame times of the other side",
+}
+
+
+def probe_baselines(results: Results) -> list[PrintedTable]:
+    """The probe on states beside probes on raw inputs, on the output margin and on noise: on every pair of datasets,
+    and on clips that only look like voids."""
+    return [_beside(results), _look_alikes(results)]
+
+
+def beside(results: Results) -> pd.DataFrame:
+    """One row per model and ordered pair of datasets, a dataset on itself among them: the probe at the source's own
+    layer, with its interval, and each baseline. Within a taxonomy all of them are fitted without the scored scenario
+    (`held_out`), elsewhere on all of the source (`transfer`)."""
+    import pandas as pd
+
+    wanted = pd.DataFrame(
+        [(s, t, "held_out" if taxonomy_of(s) == taxonomy_of(t) else "transfer") for s in DATASETS for t in DATASETS],
+        columns=pd.Index(["source", "target", "analysis"]),
+    )
+    probe = results.probes.loc[results.probes["source_best"].eq(True)]
+    return _with_baselines(results, probe.merge(wanted, on=["source", "target", "analysis"]))
+
+
+def look_alikes(results: Results) -> pd.DataFrame:
+    """As `beside`, on the items that only look like voids, by probes of the datasets of their taxonomy."""
+    probe = results.probes.loc[results.probes["source_best"].eq(True) & results.probes["target"].isin([*WHAT])]
+    own = [taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)]
+    return _with_baselines(results, probe.loc[own])
+
+
+def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
+    import pandas as pd
+
+    keys = ["model", "prompt", "analysis", "source", "target"]
+    rows = results.baselines
+    wide = rows.pivot_table(index=keys, columns="features", values="value", observed=True)
+    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise"])).reset_index()
+    noise = rows.loc[rows["features"] == "noise", [*keys, "spread"]].rename(columns={"spread": "noise_spread"})
+    kept = probe[[*keys, "layer", "value", "low", "high", "n_voids", "n_controls"]]
+    table = kept.merge(wide, on=keys, how="left").merge(noise, on=keys, how="left")
+    return table.assign(mark=few(table, "n_voids", "n_controls"))
+
+
+_PROBE = (
+    Column("layer", "Layer", "count"), Column("value", "States", "fraction", mark="mark"),
+    Column("low", "from", "fraction"), Column("high", "to", "fraction"),
+)  # fmt: skip
+_BASELINES = (
+    *(Column(name, name.capitalize(), "fraction") for name in SHORTCUTS),
+    Column("output margin", "Output margin", "fraction"),
+    Column("noise", "Noise", "fraction", spread="noise_spread"),
+)
+_SIDES = (Column("n_voids", "Voids", "count"), Column("n_controls", "Controls", "count"))
+_NOTES = (
+    "AUROC of the same protocol on other features than states; the layer is the source’s own, which uses no label of "
+    "a target",
+    "output margin: log-odds that the first answer token begins an abstention; noise: random vectors as wide as "
+    "states, mean ± deviation over draws, the floor of the split",
+    "a probe shows understanding only as far as it is above the raw inputs, and a gap between states and output only "
+    "as far as it is above the output margin",
+)
+
+
+def _beside(results: Results) -> PrintedTable:
+    rows = beside(results)
+    rows = rows.assign(path=[path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)])
+    columns = [MODEL, Column("path", "Path"), *_PROBE, *_BASELINES, *_SIDES]
+    notes = [
+        *_NOTES,
+        "pairs within a taxonomy and a dataset on itself: fitted without the scored scenario, controls included",
+        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+    ]
+    absent = why(results, rows) if results.is_study else "the paper has no such baselines"
+    return PrintedTable("probe_baselines", "Probes beside their baselines", rows, columns, notes, absent)
+
+
+def _look_alikes(results: Results) -> PrintedTable:
+    rows = look_alikes(results)
+    named = rows.assign(
+        what=[WHAT[name] for name in rows["target"]],
+        against=[AGAINST[name] for name in rows["analysis"]],
+        path=[SHORT.get(name, name) for name in rows["source"]],
+    )
+    columns = [
+        MODEL, Column("what", "Items"), Column("against", "Told apart from"), Column("path", "Source"), *_PROBE,
+        *_BASELINES, *_SIDES,
+    ]  # fmt: skip
+    notes = [
+        "told apart from voids: 1 for a probe that detects what cannot be known, 0.5 for one that detects what both "
+        "have; from controls: the reverse",
+        "frame times of the other side: 1 for a probe that reads the frames, 0 for one that reads the time stamps",
+        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+    ]
+    absent = why(results, rows) if results.is_study else "the paper has no such items"
+    return PrintedTable("probe_look_alikes", "What only looks like a void", named, columns, notes, absent)
+
+
+AGAINST = {"answerable_void": "voids", "answerable_control": "controls", "time_swapped": "its other side"}
+
+
+# --- steering ---------------------------------------------------------------------------------------------------------
+
+
+def steering_nulls(results: Results) -> list[PrintedTable]:
+    """The effect of void directions on their own datasets among nulls of the same length, and PECS of the steered
+    model under each sign policy."""
+    return [_nulls(results), _pecs(results)]
+
+
+def _dose(rows: pd.DataFrame) -> list[str]:
+    return [
+        "none" if not dose else f"α {dose:g}" if unit == "alpha" else f"{dose:g} gap"
+        for unit, dose in zip(rows["unit"], rows["dose"], strict=True)
+    ]
+
+
+def _nulls(results: Results) -> PrintedTable:
+    rows = results.nulls
+    named = rows.assign(
+        step=_dose(rows), dataset=[SHORT.get(name, name) for name in rows["target"]], mark=few(rows, "n")
+    )
+    columns = [
+        MODEL, DIRECTIONS, INFERENCE, Column("dataset", "Dataset"), LAYER, DOSE, Column("side", "Side"),
+        Column("null", "Null"), Column("effect", "Effect, points", "percent", mark="mark"),
+        Column("null_mean", "Null, mean", "percent"), Column("null_lowest", "lowest", "percent"),
+        Column("null_highest", "highest", "percent"), Column("draws", "Draws", "count"),
+        Column("n_at_least", "Draws at least as large", "count"), Column("p", "p", "p", 3), Column("n", "n", "count"),
+    ]  # fmt: skip
+    notes = [
+        "effect: more abstention on controls (+), less on voids (−), against the unsteered answers of the same items",
+        "nulls are orthogonal to the void direction and have its length; p = (1 + draws at least as large) / "
+        "(1 + draws), one-sided, not corrected for the number of rows",
+        *([FEW_NOTE] if "†" in set(named["mark"]) else []),
+    ]
+    absent = why(results, rows) if results.is_study else "the paper has no such nulls"
+    return PrintedTable("steering_nulls", "Void directions among their nulls", named, columns, notes, absent)
+
+
+def _pecs(results: Results) -> PrintedTable:
+    rows = results.steering_pecs
+    rows = rows.loc[rows["source"] == rows["target"]]
+    named = rows.assign(
+        step=_dose(rows),
+        policy=[SIGNS[name] for name in rows["signs"]],
+        path=[path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)],
+        mark=few(rows, "n_controls", "n_voids"),
+    )
+    columns = [
+        MODEL, DIRECTIONS, INFERENCE, Column("path", "Path"), LAYER, Column("policy", "Signs"), DOSE,
+        Column("acc", "Acc %", "percent"), Column("false_abs", "FalseAbs %", "percent"),
+        Column("abs_rec", "AbsRec %", "percent"), Column("j", "J", "fraction"),
+        Column("pecs", "PECS", "fraction", mark="mark"), Column("degenerate", "Degenerate %", "percent"),
+        Column("n_controls", "Controls", "count"), Column("n_voids", "Voids", "count"),
+    ]  # fmt: skip
+    notes = [
+        "each dataset along its own direction; + on controls and − on voids needs the side of each item, which nobody "
+        "has who uses a model",
+        "degenerate: cut off, a phrase four times in a row, or another script than the unsteered answer",
+        *([FEW_NOTE] if "†" in set(named["mark"]) else []),
+    ]
+    absent = why(results, rows) if results.is_study else "the paper prints no correctness of steered answers"
+    return PrintedTable("steering_pecs", "PECS of the steered model", named, columns, notes, absent)
+
+
+# --- the gate and patching --------------------------------------------------------------------------------------------
+
+DEFAULT_GATE = {"source": "other datasets", "threshold": "mid"}
+SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
+
+
+def gate(results: Results) -> list[PrintedTable]:
+    """Probe-gated abstention: PECS before and after the gate, by its sources and thresholds; beside gates on other
+    features; and what it does to items that must be answered."""
+    return [_gate_sources(results), _gate_controls(results), _gate_answerable(results)]
+
+
+_GATED = (
+    Column("plain_pecs", "PECS, plain", "fraction"), Column("pecs", "PECS, gated", "fraction", mark="mark"),
+    Column("pecs_low", "from", "fraction"), Column("pecs_high", "to", "fraction"),
+    Column("acc", "Acc %", "percent"), Column("abs_rec", "AbsRec %", "percent"),
+    Column("false_abs", "FalseAbs %", "percent"), Column("expected_false_abs", "expected %", "percent"),
+)  # fmt: skip
+_GATE_NOTES = (
+    "a gated answer becomes an abstention and every other answer keeps its verdict; no gate has seen the scenario that "
+    "it decides about",
+    "expected: share of the sources’ own unseen controls above the threshold; the difference from FalseAbs of answers "
+    "that do not abstain by themselves is the shift of calibration",
+)
+
+
+def _gates(results: Results) -> pd.DataFrame:
+    rows = results.gate
+    return rows.assign(
+        mark=few(rows, "n_controls", "n_voids"),
+        dataset=[SHORT.get(name, name) for name in rows["target"]],
+        sources=[SOURCE_NAMES.get(name, name) for name in rows["source"]],
+    )
+
+
+def _gate_sources(results: Results) -> PrintedTable:
+    rows = _gates(results)
+    rows = rows.loc[(rows["features"] == "states") & rows["target"].isin([*SHORT, "all"])]
+    columns = [
+        MODEL, Column("regime", "Answers"), Column("sources", "Gate from"), Column("threshold", "Threshold"),
+        Column("dataset", "Target"), LAYER, *_GATED,
+    ]  # fmt: skip
+    notes = [
+        *_GATE_NOTES,
+        "mid: half-way between the means of the sides; J: the cut with the largest J on unseen source items; "
+        "conformal: at most 5 % of new source controls in expectation, or as the experiment says",
+        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
+    ]
+    absent = why(results, rows) if results.is_study else "the paper gates nothing"
+    return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, absent)
+
+
+def _gate_controls(results: Results) -> PrintedTable:
+    rows = _gates(results)
+    for name, value in (DEFAULT_GATE | {"target": "all"}).items():
+        rows = rows.loc[rows[name] == value]
+    columns = [MODEL, Column("regime", "Answers"), Column("features", "Features"), *_GATED]
+    notes = [
+        "gates from other datasets at the mid threshold, mean over the four datasets",
+        "a gate on states shows what states add only as far as it is above gates on raw inputs, on the output margin "
+        "and on an untrained model’s states",
+    ]
+    absent = why(results, rows) if results.is_study else "the paper gates nothing"
+    return PrintedTable("gate_controls", "The gate beside its controls", rows, columns, notes, absent)
+
+
+def _gate_answerable(results: Results) -> PrintedTable:
+    rows = _gates(results)
+    rows = rows.loc[~rows["target"].isin([*SHORT, "all"]) & (rows["source"] == DEFAULT_GATE["source"])]
+    rows = rows.loc[rows["target"].isin([*WHAT]) & (rows["target"] != "chaotic_time_swapped")]
+    rows = rows.drop_duplicates(["model", "features", "threshold", "target"])  # gates know no regime here
+    rows = rows.assign(what=[WHAT[name] for name in rows["target"]])
+    columns = [
+        MODEL, Column("features", "Features"), Column("threshold", "Threshold"), Column("what", "Items"),
+        Column("false_abs", "Abstained on %", "percent"), Column("expected_false_abs", "expected %", "percent"),
+        Column("n_controls", "n", "count"),
+    ]  # fmt: skip
+    notes = ["all of these items can be answered, so that every abstention of a gate is a false one"]
+    absent = why(results, rows) if results.is_study else "the paper gates nothing"
+    return PrintedTable("gate_answerable", "The gate on items that can be answered", rows, columns, notes, absent)
+
+
+def patching(results: Results) -> list[PrintedTable]:
+    """Indirect effects of activation patching between matched controls and voids, by group of positions, beside
+    nulls."""
+    rows = results.patching
+    own = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual")]
+    keys = ["model", "dataset", "into", "layer", "group"]
+    nulls = rows.loc[(rows["source"] != "pair") & (rows["site"] == "residual")]
+    wide = nulls.pivot_table(index=keys, columns="source", values="effect", observed=True)
+    names = ["other scenario", "same side", "other times"]
+    table = own.merge(wide.reindex(columns=names).reset_index(), on=keys, how="left")
+    table = table.assign(name=[SHORT.get(name, name) for name in table["dataset"]], mark=few(table, "n"))
+    columns = [
+        MODEL, Column("name", "Dataset"), Column("into", "Into"), LAYER, Column("group", "Positions"),
+        Column("tokens", "Tokens", "ratio"), Column("effect", "Indirect effect", "fraction", mark="mark"),
+        Column("low", "from", "fraction"), Column("high", "to", "fraction"), Column("flips", "Flipped %", "percent"),
+        Column("n_flippable", "of", "count"), *(Column(name, name.capitalize(), "fraction") for name in names),
+        Column("n", "Pairs", "count"), Column("n_left_out", "Left out", "count"),
+    ]  # fmt: skip
+    notes = [
+        "share of the way from the patched side’s log-odds of abstention to the other side’s, residual stream; 1 for "
+        "all positions by construction; effects of groups need not add up",
+        "changed: visual tokens whose pixels differ between the sides; the last columns are patches from another "
+        "scenario’s other side, another scenario’s same side, and the item’s own frames with the other side’s times",
+        *([FEW_NOTE.replace("controls or voids", "pairs")] if "†" in set(table["mark"]) else []),
+    ]
+    absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
+    return [PrintedTable("patching", "Activation patching", table, columns, notes, absent)]
