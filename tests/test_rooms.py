@@ -34,6 +34,7 @@ ROOMS = (
     "report",
     "orchestration",
     "study",
+    "explorer",
     "defs",
     "definitions",
     "cli",

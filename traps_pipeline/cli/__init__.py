@@ -24,6 +24,7 @@ from traps_pipeline.cli import (
     pocket,
     results,
     run,
+    site,
     status,
     ui,
 )
@@ -92,6 +93,7 @@ def build_parser() -> argparse.ArgumentParser:
         status,
         ui,
         results,
+        site,
         exchange,
         models,
         judges,
