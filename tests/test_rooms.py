@@ -23,6 +23,7 @@ ROOMS = (
     "yamlfile",
     "partitions",
     "progress",
+    "webguard",
     "scenes",
     "storage",
     "benchmark",

@@ -2,8 +2,12 @@
 
 const PAGE_ROWS = 25;
 const DECISIONS = [
-  ["correct", "correct"], ["wrong", "wrong"], ["abstained", "abstained"], ["answered", "answered"],
-  ["undecided", "undecided"], ["unjudged", "no text (refused, empty, failed)"],
+  ["correct", "correct"],
+  ["wrong", "wrong"],
+  ["abstained", "abstained"],
+  ["answered", "answered"],
+  ["undecided", "undecided"],
+  ["unjudged", "no text (refused, empty, failed)"],
 ];
 
 // The rows of the answers that fit the filters, in order.
@@ -57,21 +61,55 @@ async function answersView(route) {
   return {
     title: "Answers",
     body: [
-      h("div", { class: "filters" },
-        h("form", { class: "choice search", role: "search", onsubmit: (event) => { event.preventDefault(); route.change({ q: event.target.elements.q.value }); } },
+      h(
+        "div",
+        { class: "filters" },
+        h(
+          "form",
+          {
+            class: "choice search",
+            role: "search",
+            onsubmit: (event) => {
+              event.preventDefault();
+              route.change({ q: event.target.elements.q.value });
+            },
+          },
           h("label", { for: "choice-q" }, "Text"),
-          h("input", { id: "choice-q", name: "q", type: "search", value: words, placeholder: "words of an answer, its reasoning or a rationale" }),
-          h("button", { type: "submit" }, "Search")),
+          h("input", {
+            id: "choice-q",
+            name: "q",
+            type: "search",
+            value: words,
+            placeholder: "words of an answer, its reasoning or a rationale",
+          }),
+          h("button", { type: "submit" }, "Search"),
+        ),
         choice(route, "model", "Model", same(modelsOf(info))),
         choice(route, "regime", "Regime", same(info.regimes)),
         runsOf(info).length > 1 ? choice(route, "run", "Run", same(runsOf(info))) : null,
         choice(route, "dataset", "Dataset", datasetOptions(info)),
         choice(route, "family", "Family", same(found.families)),
-        choice(route, "side", "Side", [["control", "control"], ["void", "void"]]),
-        choice(route, "outcome", "Pair", OUTCOMES.map(({ id, title }) => [id, title.toLowerCase()])),
+        choice(route, "side", "Side", [
+          ["control", "control"],
+          ["void", "void"],
+        ]),
+        choice(
+          route,
+          "outcome",
+          "Pair",
+          OUTCOMES.map(({ id, title }) => [id, title.toLowerCase()]),
+        ),
         choice(route, "decision", "Answer", DECISIONS),
         toggle(route, "split", "judges disagree"),
-        filter.scenario ? h("span", { class: "choice" }, h("span", null, "Scenario"), link(["answers"], { ...filter, scenario: "" }, `${filter.scenario} ✕`)) : null),
+        filter.scenario
+          ? h(
+              "span",
+              { class: "choice" },
+              h("span", null, "Scenario"),
+              link(["answers"], { ...filter, scenario: "" }, `${filter.scenario} ✕`),
+            )
+          : null,
+      ),
       section(null, status, list),
     ],
   };
@@ -86,9 +124,19 @@ function showAnswers(route, found, rows, words, list) {
   list.replaceChildren(...shown.map((row) => answerLine(found, row, words)));
   if (!rows.length) list.append(notice("No answer fits. Widen the filters above."));
   if (pages > 1) {
-    const to = (target, text) => target < 1 || target > pages ? h("span", { class: "button off" }, text)
-      : link(["answers"], { ...route.parameters, page: target === 1 ? "" : target }, text, { class: "button" });
-    list.append(h("nav", { class: "pages", "aria-label": "pages" }, to(page - 1, "Previous"), ` page ${count(page)} of ${count(pages)} `, to(page + 1, "Next")));
+    const to = (target, text) =>
+      target < 1 || target > pages
+        ? h("span", { class: "button off" }, text)
+        : link(["answers"], { ...route.parameters, page: target === 1 ? "" : target }, text, { class: "button" });
+    list.append(
+      h(
+        "nav",
+        { class: "pages", "aria-label": "pages" },
+        to(page - 1, "Previous"),
+        ` page ${count(page)} of ${count(pages)} `,
+        to(page + 1, "Next"),
+      ),
+    );
   }
 }
 
@@ -99,25 +147,44 @@ function answerLine(found, row, words) {
   const pair = pairs[pairOf[item]];
   const [decision, kind] = decisionWords(info, items, decisions, row);
   const text = h("div", { class: "excerpt" }, "…");
-  answer(row).then((read) => text.replaceChildren(excerpt(read, words)), (error) => text.replaceChildren(notice(error.message, "error")));
-  return h("article", { class: "answer" },
-    h("div", { class: "about" },
+  answer(row).then(
+    (read) => text.replaceChildren(excerpt(read, words)),
+    (error) => text.replaceChildren(notice(error.message, "error")),
+  );
+  return h(
+    "article",
+    { class: "answer" },
+    h(
+      "div",
+      { class: "about" },
       pairLink(pair, evaluation, info, {}, pair.scenario),
-      h("span", { class: "tag" }, items.side[item]), chip(decision, kind),
-      h("span", { class: "soft" }, `${evaluationName(info, evaluation)} · ${titleOf(info, pair.dataset)}`)),
-    text);
+      h("span", { class: "tag" }, items.side[item]),
+      chip(decision, kind),
+      h("span", { class: "soft" }, `${evaluationName(info, evaluation)} · ${titleOf(info, pair.dataset)}`),
+    ),
+    text,
+  );
 }
 
 // The beginning of an answer, or the place of its text, reasoning or votes where the words stand.
 function excerpt(read, words) {
   const low = words.toLowerCase();
-  const places = [["", read.text], ["reasoning: ", read.reasoning], ...read.votes.map((vote) => [`${vote.judge}: `, vote.rationale])];
+  const places = [
+    ["", read.text],
+    ["reasoning: ", read.reasoning],
+    ...read.votes.map((vote) => [`${vote.judge}: `, vote.rationale]),
+  ];
   const [label, text] = (low && places.find(([, each]) => each && each.toLowerCase().includes(low))) || places[0];
-  if (text === null || text === undefined) return h("span", { class: "absent" }, read.error ? `no text (${read.error})` : "no text");
+  if (text === null || text === undefined)
+    return h("span", { class: "absent" }, read.error ? `no text (${read.error})` : "no text");
   const at = Math.max(0, low ? text.toLowerCase().indexOf(low) - 120 : 0);
   const cut = text.slice(at, at + 320);
-  return [label ? h("span", { class: "soft" }, label) : null, at ? "… " : null, untrusted(cut, { found: low }), at + 320 < text.length ? " …" : null]
-    .reduce((box, part) => add(box, [part]), h("span"));
+  return [
+    label ? h("span", { class: "soft" }, label) : null,
+    at ? "… " : null,
+    untrusted(cut, { found: low }),
+    at + 320 < text.length ? " …" : null,
+  ].reduce((box, part) => add(box, [part]), h("span"));
 }
 
 // Look for words in the texts of these rows, shard by shard; the list grows as they are found.
@@ -156,7 +223,8 @@ async function searchTexts(route, found, rows, words, status, list) {
 function mentions({ texts, votes }, at, low) {
   const holds = (text) => text && text.toLowerCase().includes(low);
   if (holds(texts.text[at]) || holds(texts.reasoning[at])) return true;
-  for (let k = lowerBound(votes.answer, at); k < votes.length && votes.answer[k] === at; k++) if (holds(votes.rationale[k])) return true;
+  for (let k = lowerBound(votes.answer, at); k < votes.length && votes.answer[k] === at; k++)
+    if (holds(votes.rationale[k])) return true;
   return false;
 }
 

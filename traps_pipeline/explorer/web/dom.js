@@ -24,8 +24,15 @@ function add(element, children) {
   return element;
 }
 
-// Characters that nobody sees and that change how others are shown: controls, zero-width and bidirectional ones.
-const HIDDEN = /[\u0000-\u0008\u000b-\u001f\u007f-\u009f\u00ad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f\u2028-\u202e\u2060-\u206f\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff9-\ufffb]|\udb40[\udc00-\udfff]/g;
+// Characters that nobody sees and that change how others are shown: controls, zero-width and bidirectional ones. What
+// belongs to an emoji is none of them: its variation selector, and the joiner before the next one.
+const HIDDEN = new RegExp(
+  "(?![\\t\\n]|\\r\\n)" +
+    "(?!(?<=[\\p{Extended_Pictographic}0-9#*])\\ufe0f)" +
+    "(?!(?<=[\\p{Extended_Pictographic}\\p{Emoji_Modifier}\\ufe0f])\\u200d\\p{Extended_Pictographic})" +
+    "[\\p{Cc}\\p{Default_Ignorable_Code_Point}\\u2028\\u2029\\ufff9-\\ufffb]",
+  "gu",
+);
 
 // A text that somebody else wrote, in an element of its own that isolates its direction. A hidden character is shown
 // by its number, so that a reader sees what was said. found: a part to mark, in lower case.

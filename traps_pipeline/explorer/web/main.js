@@ -1,6 +1,13 @@
 // Addresses and views.
 
-const VIEWS = { "": leaderboardView, model: modelView, matrix: matrixView, answers: answersView, pair: pairView, compare: compareView };
+const VIEWS = {
+  "": leaderboardView,
+  model: modelView,
+  matrix: matrixView,
+  answers: answersView,
+  pair: pairView,
+  compare: compareView,
+};
 let shownRoute = null;
 let keysOfView = {};
 let number = 0; // of the address that was shown last
@@ -9,7 +16,12 @@ function routeOf(hash) {
   const [path, query = ""] = hash.replace(/^#?\/?/, "").split(/\?(.*)/s);
   const [name = "", ...rest] = path.split("/").map(decoded);
   const own = ++number;
-  const route = { name, path: rest, parameters: Object.fromEntries(new URLSearchParams(query)), isCurrent: () => own === number };
+  const route = {
+    name,
+    path: rest,
+    parameters: Object.fromEntries(new URLSearchParams(query)),
+    isCurrent: () => own === number,
+  };
   route.change = (changes) => {
     const path = [name, ...rest];
     location.hash = address(path, { ...route.parameters, page: "", ...changes }).slice(1);
@@ -62,7 +74,13 @@ async function show() {
 }
 
 document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, select, textarea, button, summary")) return;
+  if (
+    event.ctrlKey ||
+    event.metaKey ||
+    event.altKey ||
+    event.target.closest("input, select, textarea, button, summary")
+  )
+    return;
   if (event.key === " " && event.target.closest("a")) return;
   const act = keysOfView[event.key];
   if (!act) return;

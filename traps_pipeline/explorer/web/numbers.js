@@ -7,7 +7,9 @@ const NOT_RUN = "not run";
 function fraction(value, digits = 3) {
   if (value === null || value === undefined || Number.isNaN(value)) return NONE;
   let text = Math.abs(value).toFixed(digits);
-  const rest = Math.abs(value).toFixed(Math.min(100, digits + 60)).slice(digits ? text.length : text.length + 1);
+  const rest = Math.abs(value)
+    .toFixed(Math.min(100, digits + 60))
+    .slice(digits ? text.length : text.length + 1);
   if (/^50*$/.test(rest) && Number(text.at(-1)) % 2) {
     text = text.slice(0, -1) + (Number(text.at(-1)) - 1); // toFixed rounds a half up; an odd digit is one too many
   }

@@ -6,7 +6,11 @@ const YES = 1; // of a decision; 2: not judged, or no majority
 // Outcomes of a pair under one evaluation. Acc counts the first two, AbsRec the first, third and fourth.
 const OUTCOMES = [
   { id: "right", title: "Both right", meaning: "the control is answered correctly, the void is abstained on" },
-  { id: "confabulated", title: "Confabulated", meaning: "the control is answered correctly, and the void is answered too" },
+  {
+    id: "confabulated",
+    title: "Confabulated",
+    meaning: "the control is answered correctly, and the void is answered too",
+  },
   { id: "cautious", title: "Over-cautious", meaning: "the void is abstained on, and the control as well" },
   { id: "mistaken", title: "Control wrong", meaning: "the void is abstained on, the control is answered wrongly" },
   { id: "wrong", title: "Both wrong", meaning: "the control is not answered correctly, and the void is answered" },
@@ -16,7 +20,11 @@ const MISSING = 5;
 
 function pairOutcome(decisions, control, empty) {
   if (control < 0 || empty < 0) return MISSING;
-  const [correct, cautious, abstained] = [decisions.correct[control], decisions.abstained[control], decisions.abstained[empty]];
+  const [correct, cautious, abstained] = [
+    decisions.correct[control],
+    decisions.abstained[control],
+    decisions.abstained[empty],
+  ];
   if (correct > YES || cautious > YES || abstained > YES) return MISSING;
   if (correct === YES) return abstained === YES ? 0 : 1;
   if (abstained === NO) return 4;
@@ -39,7 +47,8 @@ function pairOutcomes({ pairs, width, rowOf, decisions }) {
 // How many pairs (over these evaluations) have each outcome.
 function countOutcomes({ pairOutcome: of, width }, pairs, evaluations) {
   const counts = new Array(OUTCOMES.length).fill(0);
-  for (const p of pairs) for (const e of evaluations) if (of[p * width + e] < OUTCOMES.length) counts[of[p * width + e]]++;
+  for (const p of pairs)
+    for (const e of evaluations) if (of[p * width + e] < OUTCOMES.length) counts[of[p * width + e]]++;
   return counts;
 }
 
@@ -63,7 +72,8 @@ function decisionWords(info, items, decisions, row) {
   const [abstained, correct] = [decisions.abstained[row], decisions.correct[row]];
   if (abstained > YES) return ["undecided", "missing"];
   if (!isControl) return abstained === YES ? ["abstained", "right"] : ["answered", "confabulated"];
-  if (correct > YES) return [abstained === YES ? "abstained, correctness undecided" : "answered, correctness undecided", "missing"];
+  if (correct > YES)
+    return [abstained === YES ? "abstained, correctness undecided" : "answered, correctness undecided", "missing"];
   if (abstained === YES) return [correct === YES ? "abstained, yet correct" : "abstained", "cautious"];
   return correct === YES ? ["correct", "right"] : ["wrong", "wrong"];
 }

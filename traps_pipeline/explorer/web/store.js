@@ -24,11 +24,16 @@ function content(name) {
   if (!LOADS.has(name)) {
     const load = expect(name);
     const script = h("script", { src: `${DATA}/${name}.js?v=${VERSION}` });
-    script.onload = () => { script.remove(); load.fail(new Error(`data/${name}.js holds no data`)); };
+    script.onload = () => {
+      script.remove();
+      load.fail(new Error(`data/${name}.js holds no data`));
+    };
     script.onerror = () => {
       script.remove();
       LOADS.delete(name);
-      load.fail(new Error(`${DATA}/${name}.js cannot be read: copy the whole folder of the site, not index.html alone`));
+      load.fail(
+        new Error(`${DATA}/${name}.js cannot be read: copy the whole folder of the site, not index.html alone`),
+      );
     };
     document.head.append(script);
   }
@@ -69,14 +74,20 @@ async function rowsOf(base64) {
 
 function once(make) {
   let made = null;
-  return () => (made ||= make().catch((error) => { made = null; throw error; }));
+  return () =>
+    (made ||= make().catch((error) => {
+      made = null;
+      throw error;
+    }));
 }
 
 const study = once(() => content("study"));
 
 const contrasts = once(async () => rowsOf((await content("contrasts")).contrasts));
 const regimeTests = once(async () => rowsOf((await content("regime_tests")).regime_tests));
-const scenarios = once(async () => new Map((await content("scenarios")).scenarios.map((row) => [row.scenario_id, row])));
+const scenarios = once(
+  async () => new Map((await content("scenarios")).scenarios.map((row) => [row.scenario_id, row])),
+);
 
 // All items and decisions (the outcomes of pairs are counted from these):
 // items: columns; pairs: their dataset, scenario, family and the places of their items; of each answer (row) its item,
@@ -96,8 +107,12 @@ const world = once(async () => {
     if (!byId.has(id)) {
       byId.set(id, pairs.length);
       pairs.push({
-        id, dataset: items.dataset[item], scenario: items.scenario_id[item], family: items.family[item],
-        control: -1, void: -1,
+        id,
+        dataset: items.dataset[item],
+        scenario: items.scenario_id[item],
+        family: items.family[item],
+        control: -1,
+        void: -1,
       });
     }
     pairOf[item] = byId.get(id);
@@ -153,9 +168,17 @@ async function answer(row) {
   const at = row - first;
   const cast = [];
   for (let k = lowerBound(votes.answer, at); k < votes.length && votes.answer[k] === at; k++) {
-    cast.push(Object.fromEntries(Object.keys(votes).filter((name) => name !== "length").map((name) => [name, votes[name][k]])));
+    cast.push(
+      Object.fromEntries(
+        Object.keys(votes)
+          .filter((name) => name !== "length")
+          .map((name) => [name, votes[name][k]]),
+      ),
+    );
   }
-  const own = Object.keys(texts).filter((name) => name !== "length").map((name) => [name, texts[name][at]]);
+  const own = Object.keys(texts)
+    .filter((name) => name !== "length")
+    .map((name) => [name, texts[name][at]]);
   return { ...Object.fromEntries(own), votes: cast };
 }
 

@@ -10,8 +10,14 @@ const libraries = ["hyparquet", "fzstd"].map((name) => {
   return `${name} ${version}\n\n${licence}`;
 });
 const built = buildSync({
-  entryPoints: ["entry.js"], bundle: true, minify: true, format: "iife", globalName: "trapsParquet",
-  target: "es2020", charset: "ascii", write: false,
+  entryPoints: ["entry.js"],
+  bundle: true,
+  minify: true,
+  format: "iife",
+  globalName: "trapsParquet",
+  target: "es2020",
+  charset: "ascii",
+  write: false,
 });
 const script = `/*\n${libraries.join("\n\n")}\n*/\n${built.outputFiles[0].text}`;
 writeFileSync("parquet.js", script);
