@@ -22,8 +22,9 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class Touched:
-    """What corrections touch: items by id, answers and at most so many votes that are asked again, dollars of calls
-    over the network (None where a price is unknown), scenarios whose clips are rendered again, scenarios that left."""
+    """What corrections touch: items by id, how many answers and votes are asked again at most (the ledger may know
+    some), dollars of calls over the network (None where a price is unknown), scenarios whose clips are rendered again,
+    scenarios that left, and the question after the correction."""
 
     items: list[str] = field(default_factory=list)
     answers: int = 0
@@ -45,9 +46,8 @@ class Touched:
     def sentence(self) -> str:
         """The counts in words."""
         money = "an unknown price" if self.dollars is None else f"about {self.dollars:.2f} USD"
-        asked = (
-            f"{len(self.items)} items are asked again: {self.answers} answers and at most {self.votes} votes, {money}"
-        )
+        calls = f"at most {self.answers} answers and {self.votes} votes"
+        asked = f"{len(self.items)} items are asked or judged again: {calls}, {money}"
         return asked + (f"; clips of {', '.join(self.rendered)} are rendered again" if self.rendered else "")
 
 
