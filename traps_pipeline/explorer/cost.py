@@ -24,7 +24,7 @@ from traps_pipeline.storage.workspace import Workspace
 class Touched:
     """What corrections touch: items by id, how many answers and votes are asked again at most (the ledger may know
     some), dollars of calls over the network (None where a price is unknown), scenarios whose clips are rendered again,
-    scenarios that left, and the question after the correction."""
+    scenarios that left and that are new, and the question after the correction."""
 
     items: list[str] = field(default_factory=list)
     answers: int = 0
@@ -32,6 +32,7 @@ class Touched:
     dollars: float | None = 0.0
     rendered: list[str] = field(default_factory=list)
     gone: list[str] = field(default_factory=list)
+    added: list[str] = field(default_factory=list)
     question: str = ""
 
     def plus(self, other: Touched) -> Touched:
@@ -40,7 +41,7 @@ class Touched:
         return Touched(
             self.items + other.items, self.answers + other.answers, self.votes + other.votes,
             (self.dollars or 0) + (other.dollars or 0) if known else None,
-            self.rendered + other.rendered, self.gone + other.gone,
+            self.rendered + other.rendered, self.gone + other.gone, self.added + other.added,
         )  # fmt: skip
 
     def sentence(self) -> str:

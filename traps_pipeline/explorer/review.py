@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from datetime import date
 from functools import cached_property
+from itertools import count
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from traps_pipeline.benchmark.corrections import WORDS, Correction, load_scenarios, read_corrections
 from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decide, decisions_on, is_reviewed, undo
+from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.explorer.cost import Touched, touched
@@ -31,11 +33,12 @@ Record = Mapping[str, Any]
 
 
 class Decision(BaseModel):
-    """What a reviewer sends. seen: how many decisions about the scenario the page showed."""
+    """What a reviewer sends. seen: how many decisions about the scenario the page showed. `add` makes a new scenario of
+    the same family, with the parameters of this one and those of the changes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenario_id: str
-    action: Literal["keep", "correct", "discard"]
+    action: Literal["keep", "correct", "discard", "add"]
     changes: dict[str, Any] = {}
     why: str = Field(min_length=1, max_length=2000)
     seen: int = Field(ge=0)
@@ -107,12 +110,21 @@ class Review:
 
     def decide(self, sent: Decision) -> None:
         """Append a decision. Raises NotThere, Refused and Conflict."""
-        self.spec(sent.scenario_id)
-        decide_ = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why)
+        spec = self.spec(sent.scenario_id)
+        correction, seen = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why), sent.seen
+        if sent.action == "add":
+            params = json.loads(spec["params"]) | (correction.params or {})
+            new = {"scenario_id": self._free_id(spec["family"]), "family": spec["family"], "params": params}
+            correction, seen = correction.model_copy(update=new), 0
         try:
-            decide(decide_, sent.seen)
+            decide(correction, seen)
         except DecidedMeanwhile as error:
             raise Conflict(str(error)) from error
+
+    def _free_id(self, family: str) -> str:
+        """The first id from 9001 on that no scenario of the benchmark has or had."""
+        taken = {*load_released(), *(each.scenario_id for _, each in read_corrections())}
+        return next(name for k in count(9001) if (name := f"{family}-{k}") not in taken)
 
     def undo(self, sent: Undo) -> None:
         """Take back the last decision. Raises NotThere, Refused and Conflict."""
@@ -142,7 +154,7 @@ class Review:
     def summary(self) -> Touched:
         """What the decisions touch that the study's tables do not have yet."""
         scenarios = load_scenarios(self.workspace.study)
-        total = Touched()
+        total = Touched(added=sorted({*scenarios} - {*self.specs}))
         for scenario_id, spec in self.specs.items():
             scenario = scenarios.get(scenario_id)
             if scenario is None:

@@ -103,15 +103,16 @@ async function decide(action) {
       location.reload();
       return;
     }
-    const found = action === "correct" ? changes() : {};
-    if (action === "correct" && !Object.keys(found).length) {
+    const found = action === "correct" || action === "add" ? changes() : {};
+    if ((action === "correct" || action === "add") && !Object.keys(found).length) {
       field("changes").open = true;
       field("question").focus();
       said.textContent = "Change something first: question, labels, answer or parameters.";
       return;
     }
     await post("/decide", { action, changes: found, why, seen: SHOWN.seen });
-    leave(SHOWN.after);
+    if (action === "add") said.textContent = "Added. A run makes it in every study that holds all scenarios, or names it.";
+    else leave(SHOWN.after);
   } catch (error) {
     said.textContent = error.message;
     said.classList.add("error");
@@ -128,13 +129,14 @@ const KEYS = {
   k: () => decide("keep"),
   c: () => decide("correct"),
   d: () => decide("discard"),
+  a: () => decide("add"),
   u: () => !field("undo").disabled && decide("undo"),
   n: () => SHOWN.after && leave(SHOWN.after),
   p: () => SHOWN.before && leave(SHOWN.before),
   e: open_changes,
   w: () => field("why").focus(),
 };
-for (const name of ["keep", "correct", "discard", "undo"]) field(name).addEventListener("click", () => decide(name));
+for (const name of ["keep", "correct", "discard", "add", "undo"]) field(name).addEventListener("click", () => decide(name));
 field("before").addEventListener("click", KEYS.p);
 field("after").addEventListener("click", KEYS.n);
 document.addEventListener("keydown", (event) => {
