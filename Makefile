@@ -10,10 +10,11 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test ui bench lint setup render-packages test-packages clean
+.PHONY: demo demo-mechanism check fast-tests test ui bench explorer-vendor lint setup render-packages test-packages clean
 
 demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
+	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps site
 
 demo-mechanism: setup ## the pocket model from hidden states to steering, on the CPU, no key needed
 	TRAPS_WORKSPACE=$(CURDIR)/.workspaces/mechanism $(BIN)/traps run mechanism
@@ -44,6 +45,11 @@ bench: setup ## ratios against what one would otherwise use
 	$(BIN)/python bench/probes.py
 	$(BIN)/python bench/scoring.py
 	$(BIN)/python bench/shortcuts.py
+	$(BIN)/python bench/explorer.py
+
+# For maintainers, after a version in the explorer's package.json was changed; the bundle is checked in.
+explorer-vendor:
+	cd traps_pipeline/explorer/web/vendor && npm ci --ignore-scripts --no-audit --no-fund && npm run bundle && rm -rf node_modules
 
 lint: setup
 	$(BIN)/ruff check .

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import http.client
 import json
 import shutil
@@ -20,11 +21,13 @@ import uvicorn
 from tests.foreign_page import CHROMIUM, attack
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.orchestration.webserver import Guard, token_for
+from traps_pipeline.orchestration.webserver import DANGER, TOKEN_VARIABLE
+from traps_pipeline.webguard import Guard, token_for
 
 TOKEN = "a-token-of-a-test-0123"
 JSON = {"Content-Type": "application/json"}
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
+token_of = functools.partial(token_for, danger=DANGER, variable=TOKEN_VARIABLE)
 
 
 @dataclass
@@ -164,7 +167,7 @@ def test_beyond_this_machine_a_token_of_ones_own_is_wanted(
     told = capsys.readouterr().err
     assert "--host 0.0.0.0: everybody who reaches that address could launch runs" in told and "--token" in told
     with pytest.raises(TrapsError, match="16 or more"):
-        token_for("0.0.0.0", "short")
-    assert token_for("192.0.2.1", TOKEN) == TOKEN
-    assert token_for("127.0.0.1", None) != token_for("127.0.0.1", None)
-    assert len(json.dumps(token_for("::1", None))) > 30
+        token_of("0.0.0.0", "short")
+    assert token_of("192.0.2.1", TOKEN) == TOKEN
+    assert token_of("127.0.0.1", None) != token_of("127.0.0.1", None)
+    assert len(json.dumps(token_of("::1", None))) > 30

@@ -7,7 +7,8 @@
 
 keep: reviewed, nothing changes. correct: any of question, labels, aliases, answer, ill_posed_question,
 answerable_question, params. discard: the pair leaves the benchmark (its answers stay in the ledger). add: a new
-scenario of a known family with `family` and `params`; words that are not given are drawn from the family.
+scenario of a known family with `family` and `params`; words that are not given are drawn from the family. restore: a
+released scenario is again as it was released; all earlier decisions about it are taken back.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Correction(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenario_id: str = Field(pattern=Slug)
-    action: Literal["keep", "correct", "discard", "add"]
+    action: Literal["keep", "correct", "discard", "add", "restore"]
     family: str | None = None
     params: dict[str, Any] | None = None
     question: str | None = None
@@ -130,19 +131,29 @@ def fold(released: Mapping[str, SceneSpec], corrections: Sequence[tuple[str, Cor
                 )
             scenarios[correction.scenario_id] = _added(where, correction)
             continue
-        if known is None:
-            gone = "was discarded" if correction.scenario_id in released else "is unknown"
-            raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {gone}; name a scenario of the benchmark")
-        if correction.action in ("keep", "discard") and correction.changes():
+        if correction.action in ("keep", "discard", "restore") and correction.changes():
             raise TrapsError(
                 f"{where}: `{correction.action}` changes nothing, yet gives {sorted(correction.changes())}; "
                 "use `correct`"
             )
+        if correction.action == "restore":
+            scenarios[correction.scenario_id] = _restored(where, correction.scenario_id, released)
+            continue
+        if known is None:
+            gone = "was discarded" if correction.scenario_id in released else "is unknown"
+            raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {gone}; name a scenario of the benchmark")
         if correction.action == "discard":
             del scenarios[correction.scenario_id]
         elif correction.action == "correct":
             scenarios[correction.scenario_id] = _corrected(where, known, correction)
     return dict(sorted(scenarios.items()))
+
+
+def _restored(where: str, scenario_id: str, released: Mapping[str, SceneSpec]) -> Scenario:
+    spec = released.get(scenario_id)
+    if spec is None:
+        raise TrapsError(f"{where}: scenario {scenario_id!r} was never released; `discard` takes back an added one")
+    return Scenario(scenario_id, spec.family, spec.category, spec, where="released")
 
 
 def _corrected(where: str, known: Scenario, correction: Correction) -> Scenario:

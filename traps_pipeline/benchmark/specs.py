@@ -84,9 +84,14 @@ def _physics(scenario: Scenario) -> dict[str, Any]:
 
 
 def _wording(scenario: Scenario, params: Mapping[str, Any]) -> Wording:
-    """The family's words for some parameters, always drawn in the same way for a scenario."""
-    family = get_family(scenario.family)
-    rng = np.random.default_rng([_seed(scenario), *scenario.scenario_id.encode()])
+    return wording_of(scenario.family, _seed(scenario), scenario.scenario_id, params)
+
+
+def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[str, Any]) -> Wording:
+    """The family's words for some parameters, always drawn in the same way for a scenario. Raises ValueError or
+    TypeError where the family has no such parameters."""
+    family = get_family(family_name)
+    rng = np.random.default_rng([seed, *scenario_id.encode()])
     return family.word(family.params_from(params), rng)
 
 

@@ -23,7 +23,9 @@ from traps_pipeline.cli import (
     plan,
     pocket,
     results,
+    review,
     run,
+    site,
     status,
     ui,
 )
@@ -92,6 +94,8 @@ def build_parser() -> argparse.ArgumentParser:
         status,
         ui,
         results,
+        site,
+        review,
         exchange,
         models,
         judges,

@@ -19,9 +19,11 @@ def add(commands: Commands) -> None:
 def ui(arguments: argparse.Namespace) -> int:
     """See `traps ui --help`."""
     from traps_pipeline.orchestration.run import dagster_history
-    from traps_pipeline.orchestration.webserver import TOKEN_VARIABLE, serve_with_dagster, token_for
+    from traps_pipeline.orchestration.webserver import DANGER, TOKEN_VARIABLE, serve_with_dagster
+    from traps_pipeline.webguard import token_for
 
-    token = token_for(arguments.host, arguments.token or os.environ.get(TOKEN_VARIABLE))
+    given = arguments.token or os.environ.get(TOKEN_VARIABLE)
+    token = token_for(arguments.host, given, danger=DANGER, variable=TOKEN_VARIABLE)
     workspace = open_workspace(arguments)
     with dagster_history(workspace):
         pass  # made once by one process, before several open it

@@ -79,18 +79,19 @@ def _entry(spec: Mapping[str, Any], clips: Mapping[tuple[str, str], str]) -> Sho
     scenario_id, evidence, twin = spec["scenario_id"], json.loads(spec["evidence"]), json.loads(spec["twin"])
     captions = {
         "control": f"control: {spec['ground_truth']}",
-        "void": f"void: {_intervention(spec)}",
+        "void": f"void: {intervention(spec)}",
         "twin": f"twin, same void: {twin['ground_truth']}",
     }
     pictures = tuple(
         Picture(side, f"../{clips[scenario_id, side]}", _poster(scenario_id, side), captions[side]) for side in SIDES
     )
     labels = ", ".join(spec["labels"])
-    certificate = dict(_certificate(evidence))
+    certificate = dict(certificate_phrases(evidence))
     return ShownScenario(scenario_id, spec["question"], labels, spec["ill_posed_question"], pictures, certificate)
 
 
-def _intervention(spec: Mapping[str, Any]) -> str:
+def intervention(spec: Mapping[str, Any]) -> str:
+    """What was done to the control's clip to make the void, from a SCENE_SPECS row."""
     at = f"{spec['void_from_s']:.1f} s"
     return f"hidden from {at}" if spec["void_kind"] == "occluder" else f"cut at {at}"
 
@@ -110,7 +111,8 @@ _PHRASES = {
 }
 
 
-def _certificate(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def certificate_phrases(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Name and words of each number that the certificates of a scenario rest on, from its evidence."""
     for name, phrase in _PHRASES.items():
         if name in evidence:
             yield name, phrase.format(evidence[name])

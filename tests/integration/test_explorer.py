@@ -1,0 +1,364 @@
+"""The explorer in a real browser, from disk and from a web host: its figures, its ways to an answer, its silence."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import re
+import shutil
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+from scipy.stats import binomtest
+
+from tests.conftest import Checkout
+from tests.foreign_page import CHROMIUM, QUIET
+from tests.report.test_items import row, write_cell
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.explorer.site import write_site
+from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.report.leaderboard import leaderboards
+from traps_pipeline.report.published_results import PublishedResults
+from traps_pipeline.report.writing import fraction, percent
+from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.slow
+FIGURES = {"pecs": fraction, "acc": percent, "abs_rec": percent, "false_abs": percent, "j": fraction}
+# Markup, LaTeX, a right-to-left override, a zero-width space, a byte-order mark and a tag character.
+HOSTILE = (
+    '<script>parent.document.title="owned"</script><img src="http://evil.example/x.png" onerror="alert(1)"> '
+    "\\textbf{bold} $x$ \u202etxet desrever\u202c zero\u200bwidth \ufeffmark \U000e0041 end"
+)
+AS_SHOWN = HOSTILE
+for _hidden in ("\u202e", "\u202c", "\u200b", "\ufeff", "\U000e0041"):
+    AS_SHOWN = AS_SHOWN.replace(_hidden, f"U+{ord(_hidden):04X}")
+
+
+@dataclass(frozen=True)
+class Site:
+    """A site in a folder, and the study that it shows."""
+
+    folder: Path
+    workspace: Workspace
+
+    @property
+    def address(self) -> str:
+        return (self.folder / "index.html").as_uri()
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A page of the site, with its console messages and the requests that left the folder."""
+
+    page: Page
+    address: str
+    problems: list[str]
+
+    def go(self, view: str) -> Page:
+        """Show a view of the page as it is open, and wait until it is there."""
+        self.page.evaluate("delete document.documentElement.dataset.shown")
+        if "#" in self.page.url and self.page.url.startswith(self.address):
+            self.page.evaluate("hash => { location.hash = hash; dispatchEvent(new Event('hashchange')); }", view)
+        else:
+            self.page.goto(self.address + view)
+        self.page.wait_for_function("document.documentElement.dataset.shown")
+        return self.page
+
+
+@pytest.fixture(scope="module")
+def site(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Site:
+    """The site of the small study, written by the command, then moved: nothing in it names where it was made."""
+    made, folder = tmp_path_factory.mktemp("made") / "site", tmp_path_factory.mktemp("moved") / "site"
+    finished = small.traps("site", made)
+    assert finished.code == 0, finished.err
+    assert str(made / "index.html") in finished.out
+    shutil.move(made, folder)
+    return Site(folder, Workspace.open(small.workspace))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def visit(browser: Browser, address: str, width: int = 1280) -> Iterator[Visit]:
+    """A new page at an address; at the end it must have said nothing and asked for nothing outside."""
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    problems: list[str] = []
+    inside = address.rpartition("/")[0], "data:,"
+    page.on("console", lambda message: problems.append(message.text))
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("dialog", lambda dialog: problems.append(dialog.message))
+    page.on("request", lambda r: None if r.url.startswith(inside) else problems.append(r.url))
+    yield Visit(page, address, problems)
+    page.close()
+    assert problems == []
+
+
+@contextmanager
+def hosted(folder: Path) -> Iterator[str]:
+    """The address of a folder on a web host of this machine."""
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=folder))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/index.html"
+    finally:
+        server.shutdown()
+
+
+def cells(page: Page, name: str) -> list[list[str]]:
+    """The texts of a table's rows."""
+    script = "rows => rows.map(row => [...row.children].map(cell => cell.innerText.trim()))"
+    return page.locator(f"table[data-name={name}] tbody tr").evaluate_all(script)
+
+
+def test_every_leaderboard_figure_is_that_of_the_table(site: Site, browser: Browser) -> None:
+    board = site.workspace.tables.read(LEADERBOARD, {})
+    compared = 0
+    with visit(browser, site.address) as visited:
+        for dataset in board["dataset"].unique():
+            page = visited.go(f"#/?dataset={dataset}")
+            shown = {(line[0], line[1]): line for line in cells(page, "leaderboard")}
+            rows = board.loc[board["dataset"] == dataset].to_dict("records")
+            assert len(shown) == len(rows)
+            for wanted in rows:
+                line = shown[wanted["model"], wanted["regime"]]
+                for place, (name, printed) in enumerate(FIGURES.items(), start=2):
+                    low, high = (printed(wanted[f"{name}_ci_{end}"]) for end in ("low", "high"))
+                    assert line[place].split("\n") == [printed(wanted[name]), f"[{low}, {high}]"], (wanted, name)
+                    compared += 3
+                low, high = wanted["rank_low"], wanted["rank_high"]
+                assert line[7] == (f"{low:.0f}" if low == high else f"{low:.0f}–{high:.0f}")
+                assert line[8:] == [str(wanted["n_pairs"]), str(wanted["n_runs"]), str(wanted["n_missing"])]
+        # The order by PECS is the report's own.
+        (ranked, *_) = leaderboards(board)
+        page = visited.go("#/")
+        assert [line[:2] for line in cells(page, "leaderboard")] == [line[:2] for line in ranked.cells]
+    assert compared == 3 * len(FIGURES) * len(board) == 450
+
+
+def test_the_paper_stands_beside_the_study_and_what_was_not_run_says_so(site: Site, browser: Browser) -> None:
+    published = PublishedResults().cells
+    published = published.loc[published["dataset"] == "chaotic"].set_index(["model", "regime"])
+    with visit(browser, site.address) as visited:
+        page = visited.go("#/?dataset=chaotic&paper=1")
+        lines = {(line[0], line[1]): line for line in cells(page, "leaderboard")}
+        assert len(lines) == 6 + len(published)
+        for key, paper in published.iterrows():
+            line = lines[key]
+            assert line[2:7] == ["not run"] * 5
+            wanted = [fraction(paper["pecs"]), *(percent(paper[name]) for name in ("acc", "abs_rec", "false_abs"))]
+            assert line[8:12] == wanted
+        assert lines["oracle", "json"][8:12] == ["–"] * 4
+        assert "This study did not ask it" in visited.go("#/model/gpt-5-pro").inner_text("main")
+
+
+def test_counts_of_pairs_agree_with_the_table_of_metrics(site: Site, browser: Browser) -> None:
+    metrics = site.workspace.tables.read_all(METRICS)
+    whole = metrics.loc[(metrics["scope"] == "all") & (metrics["n_missing"] == 0)]
+    assert len(whole) == len(metrics.loc[metrics["scope"] == "all"])
+    with visit(browser, site.address) as visited:
+        for cell in whole.to_dict("records"):
+            page = visited.go(f"#/model/{cell['model']}?dataset={cell['dataset']}&regime={cell['regime']}")
+            heading = page.get_by_role("table", name="Outcomes of pairs by regime")
+            line = heading.locator("tbody tr", has=page.get_by_role("rowheader", name=cell["regime"], exact=True))
+            pairs, _, *counts = line.locator("td").all_inner_texts()
+            right, confabulated, cautious, mistaken, wrong, missing = map(int, counts)
+            assert int(pairs) == cell["n_pairs"] == sum(map(int, counts))
+            assert right + confabulated == round(cell["acc"] * cell["n_acc"])
+            assert right + cautious + mistaken == round(cell["abs_rec"] * cell["n_abs_rec"])
+            assert missing == 0 and wrong >= 0
+
+
+def test_a_comparison_counts_what_differs_and_tests_it_as_the_tables_do(site: Site, browser: Browser) -> None:
+    tests = site.workspace.tables.read(REGIME_TESTS, {})
+    verdicts = site.workspace.tables.read_all(VERDICTS)
+    differences = site.workspace.tables.read(CONTRASTS, {})
+
+    def counted(page: Page) -> tuple[list[int], str]:
+        numbers = [int(text) for line in cells(page, "counts") for text in line[1:]]
+        return numbers, page.locator("[data-field=p]").inner_text().removeprefix("p ").removeprefix("= ")
+
+    def printed(p: float) -> str:
+        return "< 0.0001" if p < 1e-4 else fraction(p, 4)
+
+    with visit(browser, site.address) as visited:
+        for test in tests.to_dict("records"):
+            page = visited.go(
+                f"#/compare?left={test['model']}&leftRegime={test['left_regime']}&right={test['model']}"
+                f"&rightRegime={test['right_regime']}&dataset={test['dataset']}&decision={test['decision']}"
+            )
+            (_, only_left, only_right, _), p = counted(page)
+            assert (only_left, only_right, p) == (test["only_left"], test["only_right"], printed(test["p"]))
+        voids = verdicts.loc[(verdicts["dataset"] == "chaotic") & (verdicts["side"] == "void")]
+        by = voids.loc[voids["regime"] == "standard"].pivot(index="item_id", columns="model", values="abstained")
+        left, right = by["oracle"].astype(bool), by["random-50"].astype(bool)
+        page = visited.go(
+            "#/compare?left=oracle&right=random-50&leftRegime=standard&rightRegime=standard&dataset=chaotic"
+        )
+        numbers, p = counted(page)
+        only = int((left & ~right).sum()), int((right & ~left).sum())
+        assert numbers == [int((left & right).sum()), *only, int((~left & ~right).sum())]
+        assert p == printed(binomtest(only[0], sum(only), 0.5).pvalue)
+        key = ["kind", "dataset", "figure", "left_model", "left_regime", "right_model"]
+        found = differences.set_index(key).loc["models", "chaotic", "pecs", "oracle", "standard", "random-50"].iloc[0]
+        line = next(line for line in cells(page, "differences") if line[:2] == ["Chaotic", "PECS"])
+        assert line[2:4] == [
+            fraction(found["difference"]),
+            f"[{fraction(found['ci_low'])}, {fraction(found['ci_high'])}]",
+        ]
+        listed = page.locator("ul.pairs").first.locator("a").all_inner_texts()
+        assert sorted(listed) == sorted(item.split(":")[1] for item in by.index[left & ~right])
+
+
+@pytest.mark.parametrize("over", ["file", "http"])
+def test_a_confabulation_is_found_in_three_clicks_and_its_clips_play_in_step(
+    site: Site, browser: Browser, over: str
+) -> None:
+    with hosted(site.folder) as web, visit(browser, site.address if over == "file" else web) as visited:
+        page = visited.go("#/")
+        page.get_by_role("link", name="prior").first.click()
+        page.get_by_role("link", name=re.compile(r"\d+ Confabulated, standard|\d+ Confabulated, json")).first.click()
+        first = page.locator(".answer").first
+        assert first.locator(".chip").inner_text() == "answered"
+        first.get_by_role("link").first.click()
+        page.wait_for_selector(".panel h3 .chip")
+        assert page.locator(".panel h3 .chip").inner_text() == "Confabulated"
+        assert page.locator(".panel .text").count() == 2
+        page.wait_for_function("document.querySelectorAll('video').length >= 1")
+        page.wait_for_function("[...document.querySelectorAll('video')].every(video => video.readyState >= 2)")
+        times = "[...document.querySelectorAll('.control video, .void video')].map(video => video.currentTime)"
+        page.get_by_role("button", name="one frame on").click()
+        page.keyboard.press("Escape")
+        assert "frame 2 of" in page.locator("output").inner_text()
+        page.wait_for_function(f"{times}.every(time => time > 0)")
+        assert len({round(time, 4) for time in page.evaluate(times)}) == 1
+        page.get_by_role("button", name="Play").click()
+        page.wait_for_function(f"{times}[0] > 0.5")
+        page.get_by_role("button", name="Pause").click()
+        playing = page.evaluate(times)
+        assert max(playing) - min(playing) <= 3 / 10  # three frames, while two cores decode
+        if over == "http":
+            assert visited.page.url.startswith("http://127.0.0.1")
+
+
+def test_filters_and_search_find_exactly_what_the_tables_hold(site: Site, browser: Browser) -> None:
+    responses = site.workspace.tables.read_all(RESPONSES, ["item_id", "model", "regime", "side", "text"])
+    verdicts = site.workspace.tables.read_all(VERDICTS, ["item_id", "model", "regime", "abstained"])
+    rows = responses.merge(verdicts, on=["item_id", "model", "regime"])
+    with visit(browser, site.address) as visited:
+        page = visited.go("#/answers")
+        assert page.locator(".status").inner_text() == f"{len(rows)} of {len(rows)} answers"
+        page.get_by_label("Model").select_option("random-50")
+        page.get_by_label("Side").select_option("void")
+        page.get_by_label("Answer").select_option("answered")
+        fits = rows["model"].eq("random-50") & rows["side"].eq("void") & rows["abstained"].eq(False)
+        page.wait_for_function("!location.hash.includes('page') && location.hash.includes('decision')")
+        page.wait_for_function(f"document.querySelector('.status').textContent.startsWith('{fits.sum()} of')")
+        page.get_by_label("Text").fill("The Answer is: LEFT")
+        page.keyboard.press("Enter")
+        wanted = int((fits & rows["text"].str.contains("the answer is: left", case=False, regex=False)).sum())
+        page.wait_for_function("/ mention /.test(document.querySelector('.status').textContent)")
+        assert page.locator(".status").inner_text() == f"{wanted} of {fits.sum()} answers mention “The Answer is: LEFT”"
+        assert page.locator(".answer mark").count() == min(wanted, 25)
+
+
+def test_the_keyboard_reaches_a_pair_and_moves_through_its_neighbours(site: Site, browser: Browser) -> None:
+    with visit(browser, site.address) as visited:
+        page = visited.go("#/answers?model=prior&regime=standard&side=void&decision=answered")
+        page.keyboard.press("Tab")
+        assert page.evaluate("document.activeElement.id") == "skip"
+        page.keyboard.press("Enter")
+        assert page.evaluate("document.activeElement.tagName") == "H1"
+        for _ in range(40):
+            page.keyboard.press("Tab")
+            if page.evaluate("Boolean(document.activeElement.closest('.answer'))"):
+                break
+        listed = page.locator(".answer a").all_inner_texts()
+        page.keyboard.press("Enter")
+        page.wait_for_function(f"document.querySelector('h1').textContent === '{listed[0]}'")
+        assert page.evaluate("document.activeElement.tagName") == "H1"
+        page.wait_for_function("[...document.querySelectorAll('video')].every(video => video.readyState >= 2)")
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press("ArrowRight")
+        assert "frame 3 of" in page.locator("output").inner_text()
+        page.keyboard.press("]")
+        page.wait_for_function(f"document.querySelector('h1').textContent === '{listed[1]}'")
+        page.keyboard.press("[")
+        page.wait_for_function(f"document.querySelector('h1').textContent === '{listed[0]}'")
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_no_view_is_wider_than_the_screen(site: Site, browser: Browser, width: int) -> None:
+    pair = "#/pair/occlusion/hidden_race-0001?model=random-50&regime=standard&run=1&model2=prior&regime2=json"
+    with visit(browser, site.address, width) as visited:
+        for view in ("#/", "#/?paper=1", "#/model/prior", "#/matrix", "#/compare", "#/answers", pair):
+            page = visited.go(view)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, view
+            assert page.evaluate("document.querySelectorAll('h1').length") == 1
+
+
+def test_text_of_a_model_is_text_wherever_it_is_shown(browser: Browser, tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study(name="hostile", scenarios=["plinko-0001"]))
+    write_cell(workspace, text=HOSTILE)
+    write_site(workspace, tmp_path / "site")
+    with visit(browser, (tmp_path / "site" / "index.html").as_uri()) as visited:
+        page = visited.go("#/pair/chaotic/plinko-0001?model=oracle")
+        assert page.locator(".panel div.text").first.inner_text() == AS_SHOWN
+        assert "no text: refused" in page.locator(".side").last.inner_text()
+        assert page.locator("main script, main img, main iframe").count() == 0
+        for view in ("#/answers", "#/answers?q=desrever"):
+            page = visited.go(view)
+            page.wait_for_function("document.querySelector('.excerpt .untrusted')")
+            assert AS_SHOWN[40:] in page.locator(".excerpt").first.inner_text()  # from a little before what was found
+            assert page.locator("main script, main img").count() == 0
+        assert page.locator("mark").inner_text() == "desrever"
+        assert "owned" not in page.title()
+
+
+def test_what_was_not_run_or_cannot_be_read_says_so(browser: Browser, tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study(name="empty", scenarios=["plinko-0001"]))
+    about = {"dataset": "chaotic", "pair_id": "chaotic:plinko-0001", "scenario_id": "plinko-0001"}
+    items = [row(ITEMS, item_id=f"chaotic:plinko-0001:{side}", side=side, **about) for side in ("control", "void")]
+    workspace.tables.write(ITEMS, {"dataset": "chaotic"}, items, {})
+    write_site(workspace, tmp_path / "site")
+    address = (tmp_path / "site" / "index.html").as_uri()
+    with visit(browser, address) as visited:
+        assert "not run: this study has no leaderboard yet" in visited.go("#/").inner_text("main")
+        assert "not run: no answers fit" in visited.go("#/matrix").inner_text("main")
+        assert "not run: this study has no answers yet" in visited.go("#/compare").inner_text("main")
+        assert "0 of 0 answers" in visited.go("#/answers").inner_text("main")
+        assert "The clips were left out" in visited.go("#/pair/chaotic/plinko-0001").inner_text("main")
+        assert "did not ask it" in visited.go("#/model/nobody").inner_text("main")
+        assert "no page “nowhere”" in visited.go("#/nowhere").inner_text("main")
+    (tmp_path / "site" / "data" / "items.js").unlink()
+    page = browser.new_page()
+    page.goto(address + "#/matrix")
+    page.wait_for_selector("[role=alert]")
+    assert "items.js cannot be read: copy the whole folder" in page.inner_text("main")
+    page.close()
+
+
+def test_the_command_names_its_folder_and_refuses_another(small: Checkout, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    finished = small.run(sys.executable, "-m", "traps_pipeline.cli", "site", tmp_path)
+    assert finished.code == 1
+    assert f"{tmp_path}: holds something that is no site" in finished.err

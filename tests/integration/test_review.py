@@ -1,0 +1,228 @@
+"""`traps review` in a real browser: ten scenarios by keyboard, a kill in between, then a run asks what they touch."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, sync_playwright
+
+from tests.conftest import EXPERIMENT, Checkout
+from tests.foreign_page import CHROMIUM, QUIET
+
+pytestmark = pytest.mark.slow
+TOKEN = "token-of-a-reviewer-0123"
+JSON = {"Content-Type": "application/json", "Authorization": f"Bearer {TOKEN}"}
+
+
+@dataclass
+class Server:
+    """A server of `traps review` of one person."""
+
+    port: int
+    process: subprocess.Popen[str]
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.port}/?token={TOKEN}"
+
+    def ask(self, method: str, path: str, body: Any = None, **headers: str) -> tuple[int, Any]:
+        """Status and JSON (or text) of a request with the token."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        named = {name.replace("_", "-"): value for name, value in headers.items()}
+        connection.request(method, path, None if body is None else json.dumps(body), JSON | named)
+        answer = connection.getresponse()
+        text = answer.read()
+        connection.close()
+        is_json = (answer.getheader("content-type") or "").startswith("application/json")
+        return answer.status, json.loads(text) if is_json else text
+
+    def kill(self) -> None:
+        self.process.send_signal(signal.SIGKILL)
+        self.process.communicate()
+
+
+@contextmanager
+def reviewing(study: Checkout, who: str) -> Iterator[Server]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [
+        sys.executable,
+        "-m",
+        "traps_pipeline.cli",
+        "review",
+        "--port",
+        str(port),
+        "--token",
+        TOKEN,
+        "--who",
+        who,
+    ]
+    process = study.start(*command)
+    server = Server(port, process)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == f"open {server.address}\n"
+        until = time.monotonic() + 60
+        while time.monotonic() < until:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            time.sleep(0.05)
+        yield server
+    finally:
+        if process.poll() is None:
+            server.kill()
+
+
+def decisions(study: Checkout) -> list[dict[str, Any]]:
+    file = study.root / "scene_specs" / "corrections" / "review.jsonl"
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+@contextmanager
+def a_page() -> Iterator[tuple[Page, list[str]]]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+        page, problems = browser.new_page(viewport={"width": 1280, "height": 1000}), list[str]()
+        page.on("console", lambda message: problems.append(message.text))
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on(
+            "request", lambda r: None if r.url.startswith(("http://127.0.0.1:", "data:,")) else problems.append(r.url)
+        )
+        yield page, problems
+        browser.close()
+
+
+def press(page: Page, *keys: str) -> None:
+    """Press keys one after another; then another page has been reached."""
+    before = page.url
+    for key in keys:
+        page.keyboard.press(key)
+    page.wait_for_url(lambda url: url != before)
+    page.wait_for_load_state()
+
+
+def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(study: Checkout) -> None:
+    with a_page() as (page, problems):
+        with reviewing(study, "jd") as server:
+            page.goto(server.address)
+            assert page.locator("#progress").inner_text() == "0 of 12 reviewed"
+            first = page.locator("h1").inner_text()
+            page.keyboard.press("k")  # without a reason nothing is decided: the field for it is there
+            page.keyboard.type("looks right")
+            press(page, "Enter")
+            for _ in range(4):
+                press(page, "k")
+            assert page.locator("#progress").inner_text() == "5 of 12 reviewed"
+            server.kill()
+        kept = decisions(study)
+        assert [each["action"] for each in kept] == ["keep"] * 5
+        assert kept[0] | {"when": ""} == {
+            "scenario_id": first, "action": "keep", "who": "jd", "when": "", "why": "looks right",
+        }  # fmt: skip
+        with reviewing(study, "jd") as server:
+            page.goto(server.address)
+            assert page.locator("#progress").inner_text() == "5 of 12 reviewed"
+            sixth = page.locator("h1").inner_text()
+            assert sixth not in [each["scenario_id"] for each in kept]
+            page.keyboard.press("e")  # another question: three items
+            page.keyboard.press("End")
+            page.keyboard.press("Control+a")
+            page.keyboard.type("What happens, in your words?")
+            page.wait_for_function("document.getElementById('preview').textContent.includes('3 items')")
+            page.keyboard.press("Escape")
+            page.keyboard.press("w")
+            page.keyboard.press("Control+a")
+            page.keyboard.type("unclear")
+            page.keyboard.press("Escape")
+            press(page, "c")
+            seventh = page.locator("h1").inner_text()
+            page.keyboard.press("e")  # another ill-posed question: one item
+            page.keyboard.press("Tab")
+            page.keyboard.press("Control+a")
+            page.keyboard.type("How heavy is it?")
+            page.wait_for_function("document.getElementById('preview').textContent.includes('1 items')")
+            page.keyboard.press("Escape")
+            press(page, "c")
+            eighth = page.locator("h1").inner_text()
+            press(page, "d")
+            press(page, "k")
+            press(page, "k")
+            assert page.locator("#progress").inner_text() == "10 of 12 reviewed"
+            page.goto(f"http://127.0.0.1:{server.port}/scenario/{eighth}?queue=all")
+            page.keyboard.press("u")  # the discarded one is back, and not reviewed
+            page.wait_for_function("document.querySelector('.lead b').textContent === 'not reviewed'")
+            press(page, "d")
+            page.goto(f"http://127.0.0.1:{server.port}/done")
+            told = page.locator("section").first.inner_text()
+            assert f"Discarded: {eighth}" in told
+            found = re.search(r"(\d+) items are asked or judged again: at most (\d+) answers and (\d+) votes", told)
+            assert found is not None
+        assert problems == []
+    lines = decisions(study)
+    assert [each["action"] for each in lines] == ["keep"] * 5 + [
+        "correct",
+        "correct",
+        "discard",
+        "keep",
+        "keep",
+        "restore",
+        "discard",
+    ]
+    assert lines[5]["scenario_id"] == sixth and lines[5]["question"] == "What happens, in your words?"
+    assert lines[6]["scenario_id"] == seventh and lines[6]["ill_posed_question"] == "How heavy is it?"
+    ran = study.score(EXPERIMENT)
+    assert ran.code == 0, ran.err
+    answers = 4 * 3 * 2  # four items, three models, two regimes
+    counts = ran.counts()
+    assert (counts["answers"], counts["frames"]) == (answers, 0)
+    assert [*map(int, found.groups())] == [4, answers, counts["votes"]]
+
+
+def test_two_reviewers_lose_nothing_and_strangers_get_nothing(study: Checkout) -> None:
+    with reviewing(study, "jd") as jd, reviewing(study, "ab") as ab:
+        keep = {"action": "keep", "why": "fine", "seen": 0}
+        assert jd.ask("POST", "/decide", {"scenario_id": "plinko-0001", **keep}) == (200, {"seen": 1})
+        status, said = ab.ask("POST", "/decide", {"scenario_id": "plinko-0001", **keep, "action": "discard"})
+        assert (status, said["error"]) == (409, "plinko-0001: jd decided meanwhile; look at the pair again")
+        assert ab.ask("POST", "/decide", {"scenario_id": "plinko-0002", **keep})[0] == 200
+        assert [(each["scenario_id"], each["who"]) for each in decisions(study)] == [
+            ("plinko-0001", "jd"),
+            ("plinko-0002", "ab"),
+        ]
+
+        wrong = {"scenario_id": "plinko-0003", "action": "correct", "why": "no", "seen": 0}
+        status, said = jd.ask("POST", "/decide", wrong | {"changes": {"answer": "purple"}})
+        assert status == 400 and "plinko-0003" in said["error"]
+        assert jd.ask("POST", "/decide", wrong | {"changes": {"who": "somebody"}})[0] == 400
+        assert jd.ask("POST", "/decide", wrong | {"why": ""})[0] == 400
+        assert jd.ask("POST", "/decide", {"scenario_id": "nobody-0001", **keep})[0] == 404
+        for path in (
+            "/scenario/nobody-0001",
+            "/clip/nobody-0001/control",
+            "/clip/plinko-0001/secret",
+            "/docs",
+            "/../study.yaml",
+        ):
+            assert jd.ask("GET", path)[0] == 404, path
+        assert jd.ask("GET", "/clip/plinko-0001/control", Range="bytes=0-99")[0] == 206
+
+        for headers in ({"Origin": "http://evil.example"}, {"Sec_Fetch_Site": "cross-site"}):
+            assert jd.ask("POST", "/decide", {"scenario_id": "plinko-0003", **keep}, **headers)[0] == 403
+        assert jd.ask("GET", "/", Host=f"rebound.test:{jd.port}")[0] == 421
+        assert jd.ask("GET", "/", Authorization="Bearer wrong-token-0123456")[0] == 403
+        assert jd.ask("POST", "/decide", {"scenario_id": "plinko-0003", **keep}, Content_Type="text/plain")[0] == 415
+        assert len(decisions(study)) == 2

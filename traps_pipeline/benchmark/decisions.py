@@ -1,0 +1,135 @@
+"""Review decisions as they are made: appended to the corrections, one after another, whoever makes them.
+
+The append-only file is the only store. A decision is checked by folding it over all that stand before it, written at
+once and brought to the disk before it is confirmed; so a kill between two decisions loses none that was confirmed, and
+of several reviewers at once each appends behind the other.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.benchmark.corrections import Correction, Scenario, fold, folded, read_corrections
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import sync_folder
+from traps_pipeline.paths import CORRECTIONS
+
+FILE = "review.jsonl"
+Signed = Callable[..., Correction]
+
+
+class DecidedMeanwhile(TrapsError):
+    """Somebody else decided about the scenario since the reviewer looked at it."""
+
+
+def decisions_on(scenario_id: str, folder: Path = CORRECTIONS) -> list[Correction]:
+    """All decisions about a scenario, in order. Raises TrapsError for a file that cannot be read."""
+    return [each for _, each in read_corrections(folder) if each.scenario_id == scenario_id]
+
+
+def is_reviewed(decisions: Sequence[Correction]) -> bool:
+    """Whether the last decision about a scenario stands: `restore` takes back those before it."""
+    return bool(decisions) and decisions[-1].action != "restore"
+
+
+def decide(correction: Correction, seen: int, folder: Path = CORRECTIONS) -> None:
+    """Append a decision. seen: how many decisions about the scenario the reviewer knew of.
+
+    Raises DecidedMeanwhile where there are more by now, and TrapsError where the decision does not fit the record;
+    nothing is written then.
+    """
+    with _appending(folder) as append:
+        _require_known(correction.scenario_id, seen, folder)
+        append([correction])
+
+
+def undo(scenario_id: str, seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
+    """Take back the last decision about a scenario, by further decisions that bring back what was before it.
+
+    Raises DecidedMeanwhile as `decide` does, and TrapsError where there is nothing to take back.
+    """
+    with _appending(folder) as append:
+        own = _require_known(scenario_id, seen, folder)
+        if not is_reviewed(own):
+            raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
+        released = load_released()
+        others = [(where, each) for where, each in read_corrections(folder) if each.scenario_id != scenario_id]
+        before = fold(released, [*others, *(("before", each) for each in own[:-1])]).get(scenario_id)
+
+        def signed(action: str, **changes: Any) -> Correction:
+            about = {"who": who, "when": date.today(), "why": why}
+            return Correction.model_validate({"scenario_id": scenario_id, "action": action, **changes, **about})
+
+        append(_bring_back(scenario_id in released, before, was_reviewed=is_reviewed(own[:-1]), signed=signed))
+
+
+def _bring_back(is_released: bool, before: Scenario | None, *, was_reviewed: bool, signed: Signed) -> list[Correction]:
+    """The decisions after which a scenario is as it was before, and reviewed only if it was."""
+    if not is_released:
+        if before is None:
+            return [signed("discard")]  # it had been added
+        changes = {**before.words, "params": dict(before.params or {})}
+        return [signed("correct", **changes)]
+    steps = [signed("restore")]
+    if before is None:
+        return [*steps, signed("discard")]
+    changes = dict(before.words) | ({} if before.params is None else {"params": dict(before.params)})
+    if changes:
+        return [*steps, signed("correct", **changes)]
+    return [*steps, signed("keep")] if was_reviewed else steps
+
+
+def _require_known(scenario_id: str, seen: int, folder: Path) -> list[Correction]:
+    own = decisions_on(scenario_id, folder)
+    if len(own) != seen:
+        raise DecidedMeanwhile(
+            f"{scenario_id}: {own[-1].who if own else 'somebody'} decided meanwhile; look at the pair again"
+        )
+    return own
+
+
+@contextmanager
+def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]:
+    """What appends decisions, while no other process does. Raises TrapsError where a later file would overrule them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    later = sorted(path.name for path in folder.glob("*.jsonl") if path.name > FILE)
+    if later:
+        raise TrapsError(
+            f"{folder / later[0]}: is read after {FILE}, to which reviews are appended, and would overrule them; "
+            f"rename it to a name that comes before {FILE}"
+        )
+    path = folder / FILE
+    is_new = not path.exists()
+    with path.open("a+b") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        _cut_torn_line(stream)
+
+        def append(corrections: Sequence[Correction]) -> None:
+            where = f"{path} (new)"
+            fold(load_released(), [*read_corrections(folder), *((where, each) for each in corrections)])
+            lines = [each.model_dump(mode="json", exclude_none=True) for each in corrections]
+            stream.write("".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines).encode())
+            stream.flush()
+            os.fsync(stream.fileno())
+            if is_new:
+                sync_folder(folder)
+            folded.cache_clear()
+
+        yield append
+
+
+def _cut_torn_line(stream: Any) -> None:
+    """Remove what a power cut left of a line that was never confirmed."""
+    stream.seek(0)
+    content = stream.read()
+    whole = content.rfind(b"\n") + 1
+    if whole != len(content):
+        stream.truncate(whole)

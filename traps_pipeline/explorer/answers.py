@@ -1,0 +1,184 @@
+"""Answers, decisions and votes of a study in the order in which the explorer reads them.
+
+Every answer has a row: sorted by item, then by evaluation. Items are sorted so that those of a pair, and the pairs of a
+family, follow each other; a shard holds the texts and votes of consecutive pairs, so that a page of one pair needs one
+file, and rows need no key but their place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute
+
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, SIDES, Evaluation
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+pc: Any = pyarrow.compute  # it makes its functions when it is imported, where no type checker sees them
+NO, YES, NONE = 0, 1, 2  # values of a decision; none where an answer is not judged, or has no majority
+SHARD_ROWS = 2400  # answers: some 17 items of the paper's 138 evaluations, 250 KB a file
+_EVALUATION = ("model", "regime", "run")
+_TEXTS = ("text", "reasoning", "finish_reason", "error", "served_model", "cost_usd")
+_VOTES = ("task", "judge", "valid", "invalid_reason", "abstained", "correct")
+_VOTE_TEXTS = ("extracted_value", "confidence", "rationale")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """The answers of some consecutive items: rows [first, first + answers) of `decisions`, their texts and votes."""
+
+    first: int
+    texts: pa.Table
+    votes: pa.Table
+
+
+@dataclass(frozen=True)
+class StudyAnswers:
+    """A study's answers. items: ITEMS rows with `family`, in order. evaluations: in order. decisions: one row an answer
+    (item and evaluation by place, outcome and epoch by place in `outcomes` and `epochs`, abstained and correct as NO,
+    YES or NONE, unanimous as 0 or 1)."""
+
+    items: pd.DataFrame
+    evaluations: Sequence[Evaluation]
+    outcomes: Sequence[str]
+    epochs: Sequence[str]
+    decisions: pa.Table
+    texts: pa.Table
+    votes: pa.Table
+
+    def shards(self) -> Iterator[Shard]:
+        """The shards, in order; no pair is divided."""
+        item_of = self.decisions["item"].to_numpy()
+        pairs = self.items["pair_id"].to_numpy()
+        begins = [0, *(np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist(), len(pairs)]
+        rows = np.searchsorted(item_of, begins)
+        votes = np.searchsorted(self.votes["answer"].to_numpy(), rows)
+        first = 0
+        for k in range(1, len(rows)):
+            last = k == len(rows) - 1
+            if rows[k] > rows[first] and (last or rows[k + 1] - rows[first] > SHARD_ROWS):
+                texts = self.texts.slice(rows[first], rows[k] - rows[first])
+                cast = self.votes.slice(votes[first], votes[k] - votes[first])
+                own = pc.subtract(cast["answer"], pa.scalar(int(rows[first]), pa.int32()))
+                yield Shard(int(rows[first]), texts, cast.set_column(0, "answer", own))
+                first = k
+
+
+def study_items(workspace: Workspace) -> pd.DataFrame:
+    """ITEMS rows with the column `family`: datasets in the benchmark's order, then by family, scenario and side. Raises
+    TrapsError where there are none."""
+    items, specs = workspace.tables.read_all(ITEMS), workspace.tables.read_all(SCENE_SPECS, ["scenario_id", "family"])
+    if items.empty:
+        raise TrapsError(f"{workspace.root}: has no items yet; run `traps run EXPERIMENT` in it first")
+    place = {name: k for k, name in enumerate((*DATASETS, *ARMS, *SIDES))}
+    items = items.merge(specs, on="scenario_id", how="left", validate="many_to_one")
+    items["family"] = items["family"].fillna(items["sub_scenario"])
+    order = ["dataset", "family", "scenario_id", "side"]
+    return items.sort_values(
+        order, key=lambda column: column.map(lambda value: place.get(value, value)), ignore_index=True
+    )
+
+
+def study_answers(workspace: Workspace) -> StudyAnswers:
+    """All answers to items that are still in the benchmark, with their decisions and votes. Raises TrapsError where the
+    study has no items."""
+    items = study_items(workspace)
+    responses = _of_items(workspace, RESPONSES, ("outcome", "epoch", *_TEXTS), items)
+    evaluations = _evaluations(responses)
+    responses = _sorted(_keyed(responses, evaluations))
+    keys = responses["key"].to_numpy()
+    verdicts = _keyed(_of_items(workspace, VERDICTS, ("abstained", "correct", "unanimous"), items), evaluations)
+    judged = verdicts["key"].to_numpy()
+    at = np.full(len(items) * max(len(evaluations), 1), -1, np.int64)
+    at[judged] = np.arange(len(judged))
+    found = at[keys]
+    outcomes, outcome = _coded(responses["outcome"])
+    epochs, epoch = _coded(responses["epoch"])
+    decisions = {
+        "item": keys // max(len(evaluations), 1),
+        "evaluation": keys % max(len(evaluations), 1),
+        "outcome": outcome,
+        "epoch": epoch,
+        "abstained": _decision(verdicts["abstained"], found),
+        "correct": _decision(verdicts["correct"], found),
+        "unanimous": _decision(verdicts["unanimous"], found) == YES,
+    }
+    votes = _keyed(_of_items(workspace, VOTES, (*_VOTES, *_VOTE_TEXTS), items), evaluations)
+    at[:] = -1
+    at[keys] = np.arange(len(keys))
+    votes = votes.append_column("answer", pa.array(at[votes["key"].to_numpy()].astype(np.int32)))
+    votes = votes.filter(pc.greater_equal(votes["answer"], 0))
+    votes = votes.sort_by([(name, "ascending") for name in ("answer", "task", "judge")])
+    return StudyAnswers(
+        items,
+        evaluations,
+        outcomes,
+        epochs,
+        pa.table({name: pa.array(column.astype(np.int32)) for name, column in decisions.items()}),
+        responses.select([*_TEXTS]),
+        votes.select(["answer", *_VOTES, *_VOTE_TEXTS]),
+    )
+
+
+def _of_items(workspace: Workspace, table: Table, columns: Sequence[str], items: pd.DataFrame) -> pa.Table:
+    """Rows of a table whose item is in `items`, with the place of the item as the column `item`."""
+    rows = workspace.tables.read_arrow(table, ["item_id", *_EVALUATION, *columns])
+    place = pc.index_in(rows["item_id"], value_set=pa.array(items["item_id"].tolist(), pa.string()))
+    rows = rows.drop_columns("item_id").append_column("item", place)
+    return rows.filter(pc.is_valid(place))
+
+
+def _evaluations(responses: pa.Table) -> list[Evaluation]:
+    """Those that gave answers, by model, regime (in the benchmark's order) and run."""
+    distinct = responses.group_by([*_EVALUATION]).aggregate([]).to_pylist()
+    found = [Evaluation(row["model"], row["regime"], row["run"]) for row in distinct]
+    return sorted(found, key=lambda e: (e.model, REGIMES.index(e.regime), e.run))
+
+
+def _keyed(rows: pa.Table, evaluations: Sequence[Evaluation]) -> pa.Table:
+    """The rows with `key`: their item's place times the number of evaluations, plus their evaluation's place. Rows of
+    an evaluation without answers are left out."""
+    place = {(e.model, e.regime, e.run): k for k, e in enumerate(evaluations)}
+    columns = [rows[name].combine_chunks().dictionary_encode() for name in _EVALUATION]
+    sizes = [len(column.dictionary) for column in columns]
+    codes = np.zeros(len(rows), np.int64)
+    for column, size in zip(columns, sizes, strict=True):
+        codes = codes * size + column.indices.to_numpy()
+    used = np.unique(codes)
+    values = [column.dictionary.to_pylist() for column in columns]
+    of_code = np.full(int(used.max()) + 1 if len(used) else 1, -1, np.int64)
+    for code in used.tolist():
+        rest, run = divmod(code, sizes[2])
+        model, regime = divmod(rest, sizes[1])
+        of_code[code] = place.get((values[0][model], values[1][regime], values[2][run]), -1)
+    evaluation = of_code[codes]
+    key = rows["item"].to_numpy() * max(len(evaluations), 1) + evaluation
+    return rows.append_column("key", pa.array(key)).filter(pa.array(evaluation >= 0))
+
+
+def _sorted(rows: pa.Table) -> pa.Table:
+    return rows.sort_by([("key", "ascending")])
+
+
+def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
+    """The distinct values of a column, sorted, and each row's place among them."""
+    values = sorted(column.unique().to_pylist())
+    return values, pc.index_in(column, value_set=pa.array(values, pa.string())).to_numpy()
+
+
+def _decision(column: pa.ChunkedArray, rows: np.ndarray) -> np.ndarray:
+    """The column at these rows as NO, YES or NONE; NONE where the row is -1."""
+    filled = pc.fill_null(column.cast(pa.int8()), NONE)
+    return np.append(filled.to_numpy(), NONE)[rows]

@@ -1,0 +1,105 @@
+"""What a correction would make asked again: items, calls and dollars, before anybody decides."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from traps_pipeline.benchmark.corrections import Correction
+from traps_pipeline.benchmark.specs import wording_of
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.panel import tasks_for
+from traps_pipeline.models.forecast import Experience, forecast
+from traps_pipeline.models.judges import PANEL_SIZE
+from traps_pipeline.models.registry import NETWORK, load_models
+from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.partitions import DATASETS, SIDES, Cell, is_ill_posed, taxonomy_of
+from traps_pipeline.storage.workspace import Workspace
+
+
+@dataclass
+class Touched:
+    """What corrections touch: items by id, how many answers and votes are asked again at most (the ledger may know
+    some), dollars of calls over the network (None where a price is unknown), scenarios whose clips are rendered again,
+    scenarios that left and that are new, and the question after the correction."""
+
+    items: list[str] = field(default_factory=list)
+    answers: int = 0
+    votes: int = 0
+    dollars: float | None = 0.0
+    rendered: list[str] = field(default_factory=list)
+    gone: list[str] = field(default_factory=list)
+    added: list[str] = field(default_factory=list)
+    question: str = ""
+
+    def plus(self, other: Touched) -> Touched:
+        """Both together."""
+        known = self.dollars is not None and other.dollars is not None
+        return Touched(
+            self.items + other.items, self.answers + other.answers, self.votes + other.votes,
+            (self.dollars or 0) + (other.dollars or 0) if known else None,
+            self.rendered + other.rendered, self.gone + other.gone, self.added + other.added,
+        )  # fmt: skip
+
+    def sentence(self) -> str:
+        """The counts in words."""
+        money = "an unknown price" if self.dollars is None else f"about {self.dollars:.2f} USD"
+        calls = f"at most {self.answers} answers and {self.votes} votes"
+        asked = f"{len(self.items)} items are asked or judged again: {calls}, {money}"
+        return asked + (f"; clips of {', '.join(self.rendered)} are rendered again" if self.rendered else "")
+
+
+def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correction) -> Touched:
+    """What a correction of a scenario touches, against its SCENE_SPECS row. Raises TrapsError where the family refuses
+    the parameters."""
+    changes = correction.changes()
+    question, renders = changes.get("question", spec["question"]), False
+    if "params" in changes:
+        params = json.loads(spec["params"])
+        renders = any(params.get(name) != value for name, value in changes["params"].items())
+        question = changes.get("question") or _question(spec, params | changes["params"])
+    asked_again = question != spec["question"]
+    ill_posed = changes.get("ill_posed_question", spec["ill_posed_question"]) != spec["ill_posed_question"]
+    judged_again = changes.get("answer", spec["ground_truth"]) != spec["ground_truth"] or "labels" in changes
+    found = Touched(question=question, rendered=[spec["scenario_id"]] if renders else [])
+    for model, dataset, evaluations in _asked(workspace, spec["taxonomy"]):
+        for side in SIDES:
+            of_ill_posed = is_ill_posed(dataset) and side == "void"
+            again = renders or (ill_posed if of_ill_posed else asked_again)
+            item = f"{dataset}:{spec['scenario_id']}:{side}"
+            if again or (judged_again and side == "control"):
+                found.items += [] if item in found.items else [item]
+                found.votes += evaluations * PANEL_SIZE * (len(tasks_for(side)) if again else 1)
+            if again:
+                found.answers += evaluations
+                found.dollars = _plus(found.dollars, _dollars(model, evaluations))
+    return found
+
+
+def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:
+    try:
+        return wording_of(spec["family"], int(spec["seed"]), spec["scenario_id"], params).question
+    except (ValueError, TypeError) as error:
+        raise TrapsError(f"{spec['scenario_id']}: params: {error}") from error
+
+
+def _asked(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
+    """Model, dataset of the taxonomy, and how many evaluations the study's experiments ask of it."""
+    cells = [Cell.parse(key) for key in Wanted(workspace).cells]
+    counts = Counter((c.evaluation.model, c.dataset) for c in cells if c.dataset in DATASETS)
+    yield from ((model, d, count) for (model, d), count in sorted(counts.items()) if taxonomy_of(d) == taxonomy)
+
+
+def _dollars(model: str, calls: int) -> float | None:
+    entry = load_models().get(model)
+    if entry is None or entry.backend != NETWORK:
+        return 0.0
+    dollars = forecast(entry, calls, Experience()).dollars
+    return None if dollars is None else dollars[1]
+
+
+def _plus(left: float | None, right: float | None) -> float | None:
+    return None if left is None or right is None else left + right

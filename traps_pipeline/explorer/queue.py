@@ -1,0 +1,43 @@
+"""Which scenarios a reviewer is shown, and in which order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, get_args
+
+import pandas as pd
+
+from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging.verdicts import current
+from traps_pipeline.storage.workspace import Workspace
+
+QueueName = Literal["unreviewed", "judges", "models", "all"]
+QUEUES: tuple[QueueName, ...] = get_args(QueueName)
+MEANINGS: Mapping[QueueName, str] = {
+    "unreviewed": "not reviewed yet",
+    "judges": "judges disagree, the most first",
+    "models": "models disagree on the control, the most first",
+    "all": "all scenarios",
+}
+
+
+def flags(workspace: Workspace) -> pd.DataFrame:
+    """By scenario: how many judged answers have no unanimous panel (`judges`), and how evenly models are divided on the
+    controls (`models`: p (1 - p) of the share p that is correct, 0 to 0.25). Empty without verdicts."""
+    rows = current(workspace, VERDICTS, ["scenario_id", "item_id", "side", "n_valid", "correct", "unanimous"])
+    judged = rows.loc[rows["n_valid"] > 0]
+    split = (~judged["unanimous"].astype(bool)).groupby(judged["scenario_id"]).sum()
+    controls = rows.loc[(rows["side"] == "control") & rows["correct"].notna()]
+    share = controls["correct"].astype(float).groupby(controls["scenario_id"]).mean()
+    return pd.DataFrame({"judges": split, "models": share * (1 - share)}).fillna(0.0)
+
+
+def queue(name: QueueName, scenarios: Sequence[str], reviewed: frozenset[str], found: pd.DataFrame) -> list[str]:
+    """The scenarios of a queue, in order. A scenario that is reviewed leaves every queue but `all`."""
+    if name == "all":
+        return list(scenarios)
+    left = [each for each in scenarios if each not in reviewed]
+    if name == "unreviewed":
+        return left
+    scores = found[name].to_dict() if len(found) else {}
+    return sorted((each for each in left if scores.get(each, 0) > 0), key=lambda each: (-scores[each], each))

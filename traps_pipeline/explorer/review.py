@@ -1,0 +1,298 @@
+"""`traps review`: one scenario a screen, its clips in step, and decisions that are appended to the corrections."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from datetime import date
+from functools import cached_property
+from itertools import count
+from typing import Any, Literal
+
+import numpy as np
+from fastapi import FastAPI
+from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, Response
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from traps_pipeline.benchmark.corrections import WORDS, Correction, load_scenarios, read_corrections
+from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decide, decisions_on, is_reviewed, undo
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.explorer.cost import Touched, touched
+from traps_pipeline.explorer.queue import MEANINGS, QUEUES, QueueName, flags, queue
+from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.report.gallery import certificate_phrases, intervention
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.yamlfile import explain
+
+SCRIPTS = ("dom.js", "player.js", "review.js")
+STRIP_FRAMES, STRIP_WIDTH = 8, 200  # frames of a side in the contact strip, and their width in pixels
+Record = Mapping[str, Any]
+
+
+class Decision(BaseModel):
+    """What a reviewer sends. seen: how many decisions about the scenario the page showed. `add` makes a new scenario of
+    the same family, with the parameters of this one and those of the changes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    scenario_id: str
+    action: Literal["keep", "correct", "discard", "add"]
+    changes: dict[str, Any] = {}
+    why: str = Field(min_length=1, max_length=2000)
+    seen: int = Field(ge=0)
+
+
+class Undo(BaseModel):
+    """The wish to take back the last decision."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    scenario_id: str
+    why: str = Field(min_length=1, max_length=2000)
+    seen: int = Field(ge=0)
+
+
+class Preview(BaseModel):
+    """Changes whose cost a reviewer wants to know before they decide."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    scenario_id: str
+    changes: dict[str, Any]
+
+
+class Review:
+    """A study under review by one person."""
+
+    def __init__(self, workspace: Workspace, who: str) -> None:
+        self.workspace, self.who = workspace, who
+
+    @cached_property
+    def specs(self) -> dict[str, Record]:
+        """SCENE_SPECS rows by scenario. Raises TrapsError without any."""
+        rows = self.workspace.tables.read_all(SCENE_SPECS).sort_values("scenario_id").to_dict("records")
+        if not rows:
+            raise TrapsError(f"{self.workspace.root}: has no scenes yet; run `traps run EXPERIMENT` in it first")
+        return {str(row["scenario_id"]): {str(k): v for k, v in row.items()} for row in rows}
+
+    @cached_property
+    def clips(self) -> dict[tuple[str, str], Record]:
+        """VIDEOS rows by scenario and side."""
+        rows = self.workspace.tables.read_all(VIDEOS).to_dict("records")
+        return {(str(row["scenario_id"]), str(row["side"])): {str(k): v for k, v in row.items()} for row in rows}
+
+    @cached_property
+    def flags(self) -> Any:
+        """See `queue.flags`; as the study was when the review began."""
+        return flags(self.workspace)
+
+    @cached_property
+    def observed(self) -> dict[str, str]:
+        """What the observer answered under the first regime that it was asked, by item."""
+        rows = self.workspace.tables.read_all(RESPONSES, ["item_id", "model", "regime", "run", "text"])
+        own = rows.loc[rows["model"] == "observer"].sort_values(["item_id", "regime", "run"])
+        return own.dropna(subset=["text"]).drop_duplicates("item_id").set_index("item_id")["text"].to_dict()
+
+    def spec(self, scenario_id: str) -> Record:
+        """The row of a scenario. Raises NotThere."""
+        if scenario_id not in self.specs:
+            raise NotThere(f"{scenario_id}: not a scenario of this study")
+        return self.specs[scenario_id]
+
+    def reviewed(self) -> frozenset[str]:
+        """The scenarios about which a decision stands."""
+        last = {each.scenario_id: each for _, each in read_corrections()}
+        return frozenset(id_ for id_, each in last.items() if is_reviewed([each]))
+
+    def queue(self, name: QueueName) -> list[str]:
+        """See `queue.queue`."""
+        return queue(name, list(self.specs), self.reviewed(), self.flags)
+
+    def decide(self, sent: Decision) -> None:
+        """Append a decision. Raises NotThere, Refused and Conflict."""
+        spec = self.spec(sent.scenario_id)
+        correction, seen = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why), sent.seen
+        if sent.action == "add":
+            params = json.loads(spec["params"]) | (correction.params or {})
+            new = {"scenario_id": self._free_id(spec["family"]), "family": spec["family"], "params": params}
+            correction, seen = correction.model_copy(update=new), 0
+        try:
+            decide(correction, seen)
+        except DecidedMeanwhile as error:
+            raise Conflict(str(error)) from error
+
+    def _free_id(self, family: str) -> str:
+        """The first id from 9001 on that no scenario of the benchmark has or had."""
+        taken = {*load_released(), *(each.scenario_id for _, each in read_corrections())}
+        return next(name for k in count(9001) if (name := f"{family}-{k}") not in taken)
+
+    def undo(self, sent: Undo) -> None:
+        """Take back the last decision. Raises NotThere, Refused and Conflict."""
+        self.spec(sent.scenario_id)
+        try:
+            undo(sent.scenario_id, sent.seen, who=self.who, why=sent.why)
+        except DecidedMeanwhile as error:
+            raise Conflict(str(error)) from error
+
+    def preview(self, sent: Preview) -> dict[str, Any]:
+        """The words after the changes, and what asking again would take. Raises NotThere and Refused."""
+        spec = self.spec(sent.scenario_id)
+        correction = self._correction(sent.scenario_id, "correct", sent.changes, "preview")
+        found = touched(self.workspace, spec, correction)
+        return {"question": found.question, "cost": found.sentence()}
+
+    def _correction(self, scenario_id: str, action: str, changes: Mapping[str, Any], why: str) -> Correction:
+        allowed = {*WORDS, "answer", "params"}
+        if set(changes) - allowed:
+            raise Refused(f"changes: {', '.join(sorted(set(changes) - allowed))} cannot be corrected here")
+        fields = {**changes, "scenario_id": scenario_id, "action": action, "why": why}
+        try:
+            return Correction.model_validate({**fields, "who": self.who, "when": date.today()})
+        except ValidationError as error:
+            raise Refused(f"{scenario_id}: {explain(error)}") from error
+
+    def summary(self) -> Touched:
+        """What the decisions touch that the study's tables do not have yet."""
+        scenarios = load_scenarios(self.workspace.study)
+        total = Touched(added=sorted({*scenarios} - {*self.specs}))
+        for scenario_id, spec in self.specs.items():
+            scenario = scenarios.get(scenario_id)
+            if scenario is None:
+                total.gone.append(scenario_id)
+            elif scenario.words or scenario.params is not None:
+                changes = dict(scenario.words) | ({"params": dict(scenario.params)} if scenario.params else {})
+                correction = self._correction(scenario_id, "correct", changes, "summary")
+                total = total.plus(touched(self.workspace, spec, correction))
+        return total
+
+    # --- pages --------------------------------------------------------------------------------------------------------
+
+    def scenario_page(self, scenario_id: str, name: QueueName) -> str:
+        """The page of one scenario."""
+        spec, waiting = self.spec(scenario_id), self.queue(name)
+        decisions = decisions_on(scenario_id)
+        place = waiting.index(scenario_id) if scenario_id in waiting else -1
+        items = {side: f"{spec['taxonomy']}:{scenario_id}:{side}" for side in ("control", "void")}
+        shown = {
+            "scenario_id": scenario_id,
+            "seen": len(decisions),
+            "queue": name,
+            "fps": self.clips.get((scenario_id, "control"), {}).get("fps"),
+            "clips": [side for side in ("control", "void", "twin") if (scenario_id, side) in self.clips],
+            "before": waiting[place - 1] if place > 0 else "",
+            "after": next((each for each in waiting[place + 1 :] if each != scenario_id), ""),
+            "params": json.loads(spec["params"]),
+            "words": {word: _as_json(spec[word]) for word in ("question", "ill_posed_question", "labels")}
+            | {"answer": spec["ground_truth"]},
+            "captions": {
+                "control": f"Control: {spec['ground_truth']}",
+                "void": f"Void: {intervention(spec)}",
+                "twin": f"Twin, same void: {json.loads(spec['twin'])['ground_truth']}",
+            },
+        }
+        return page(
+            "review.html.j2",
+            shown=shown,
+            spec=spec,
+            labels=", ".join(spec["labels"]),
+            certificate=[words for _, words in certificate_phrases(json.loads(spec["evidence"]))],
+            observed={side: self.observed.get(item, "not asked") for side, item in items.items()},
+            decisions=decisions,
+            is_reviewed=is_reviewed(decisions),
+            queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},
+            reviewed=len(self.reviewed() & set(self.specs)),
+            total=len(self.specs),
+            flags=self.flags.loc[scenario_id].to_dict() if scenario_id in self.flags.index else {},
+            who=self.who,
+        )
+
+    def done_page(self, name: QueueName) -> str:
+        """The page at the end of a queue: what the decisions touch, and the commands that follow them."""
+        return page(
+            "review_done.html.j2",
+            touched=self.summary(),
+            queue=name,
+            queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},
+            reviewed=len(self.reviewed() & set(self.specs)),
+            total=len(self.specs),
+            experiments=[*self.workspace.study.experiments],
+            who=self.who,
+        )
+
+    def strip(self, scenario_id: str) -> bytes:
+        """The contact strip: frames of the control above the void's at the same times, as JPEG. Raises NotThere."""
+        import cv2
+
+        from traps_pipeline.scenes.encode import decode
+
+        self.spec(scenario_id)
+        both = [decode(self.clip(scenario_id, side))[0] for side in ("control", "void")]
+        places = np.linspace(0, len(both[0]) - 1, STRIP_FRAMES).round().astype(int)
+        size = (STRIP_WIDTH, both[0].shape[1] * STRIP_WIDTH // both[0].shape[2])
+        blank = np.full((size[1], size[0], 3), 235, np.uint8)  # after the end of a clip
+
+        def small(frames: np.ndarray, k: int) -> np.ndarray:
+            return cv2.resize(frames[k], size, interpolation=cv2.INTER_AREA) if k < len(frames) else blank
+
+        rows = [np.hstack([small(frames, k) for k in places]) for frames in both]
+        _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(np.vstack(rows)[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])
+        return jpeg.tobytes()
+
+    def clip(self, scenario_id: str, side: str) -> Any:
+        """The file of a clip. Raises NotThere where the study has none."""
+        row = self.clips.get((scenario_id, side))
+        path = self.workspace.resolve(row["path"]) if row else None
+        inside = path is not None and path.resolve().is_relative_to((self.workspace.root / "clips").resolve())
+        if path is None or not inside or not path.is_file():
+            raise NotThere(f"{scenario_id}: the study has no {side} clip of it")
+        return path
+
+
+def _as_json(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def review_app(review: Review) -> FastAPI:
+    """The app of a review; it stands behind the guard."""
+    app = new_app()
+
+    @app.get("/")
+    def start(queue: QueueName = "unreviewed") -> Response:
+        waiting = review.queue(queue)
+        return RedirectResponse(f"/scenario/{waiting[0]}?queue={queue}" if waiting else f"/done?queue={queue}", 303)
+
+    @app.get("/scenario/{scenario_id}")
+    def one(scenario_id: str, queue: QueueName = "unreviewed") -> Response:
+        return HTMLResponse(review.scenario_page(scenario_id, queue))
+
+    @app.get("/done")
+    def done(queue: QueueName = "unreviewed") -> Response:
+        return HTMLResponse(review.done_page(queue))
+
+    @app.get("/clip/{scenario_id}/{side}")
+    def clip(scenario_id: str, side: str) -> Response:
+        return FileResponse(review.clip(scenario_id, side), media_type="video/mp4")
+
+    @app.get("/strip/{scenario_id}")
+    def strip(scenario_id: str) -> Response:
+        return Response(review.strip(scenario_id), media_type="image/jpeg")
+
+    @app.get("/review.js")
+    def code() -> Response:
+        return Response(script(*SCRIPTS), media_type="text/javascript")
+
+    @app.post("/decide")
+    def decide_(sent: Decision) -> dict[str, int]:
+        review.decide(sent)
+        return {"seen": len(decisions_on(sent.scenario_id))}
+
+    @app.post("/undo")
+    def undo_(sent: Undo) -> dict[str, int]:
+        review.undo(sent)
+        return {"seen": len(decisions_on(sent.scenario_id))}
+
+    @app.post("/preview")
+    def preview(sent: Preview) -> dict[str, Any]:
+        return review.preview(sent)
+
+    return app

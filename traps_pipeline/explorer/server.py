@@ -1,0 +1,89 @@
+"""What the pages that listen share: a FastAPI app behind the guard, its templates, errors as sentences, clips.
+
+Nothing is served but what a study's tables name. The guard (`webguard`) lets in who has the token alone, and refuses
+foreign hosts, foreign origins and every change that is not a POST of JSON.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from base64 import b64encode
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.webguard import Guard
+
+WEB = Path(__file__).parent / "web"
+
+
+class NotThere(TrapsError):
+    """The study has nothing of this name: 404."""
+
+
+class Refused(TrapsError):
+    """What was sent cannot be taken: 400."""
+
+
+class Conflict(TrapsError):
+    """Somebody else was faster: 409."""
+
+
+def new_app() -> FastAPI:
+    """An app without documentation pages, in which a TrapsError becomes a sentence and a status."""
+    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+
+    @app.exception_handler(TrapsError)
+    async def said(request: Request, error: TrapsError) -> Response:
+        status = 404 if isinstance(error, NotThere) else 409 if isinstance(error, Conflict) else 400
+        return JSONResponse({"error": str(error)}, status)
+
+    @app.exception_handler(RequestValidationError)
+    async def malformed(request: Request, error: RequestValidationError) -> Response:
+        fields = sorted({".".join(map(str, each["loc"][1:])) or "body" for each in error.errors()})
+        return JSONResponse({"error": f"not understood: {', '.join(fields)}"}, 400)
+
+    return app
+
+
+@cache
+def templates() -> jinja2.Environment:
+    """The templates of the pages; all text is escaped, and an unknown name is an error."""
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(WEB),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def page(template: str, **values: Any) -> str:
+    """A page with the explorer's look. Its policy lets it load its own scripts, clips and pictures alone."""
+    style = (WEB / "style.css").read_text(encoding="utf-8")
+    digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
+    return templates().get_template(template).render(style=style, style_digest=digest, **values)
+
+
+@cache
+def script(*names: str) -> str:
+    """Some of the explorer's sources as one classic script, in a scope of their own."""
+    sources = "\n".join((WEB / name).read_text(encoding="utf-8") for name in names)
+    return f'(() => {{\n"use strict";\n{sources}\n}})();\n'
+
+
+def serve(app: FastAPI, host: str, port: int, token: str, command: str) -> None:
+    """Serve an app behind the guard until Ctrl-C, and print the address with its token."""
+    import uvicorn
+
+    shown = f"[{host}]" if ":" in host else host
+    print(f"open http://{shown}:{port}/?token={token}", flush=True)
+    uvicorn.run(
+        Guard(app, token, host, port, command=command), host=host, port=port, access_log=False, log_level="warning"
+    )

@@ -1,0 +1,268 @@
+"""The explorer: a folder that opens from disk or from any web host, on which people find and look at answers.
+
+`index.html` has one classic script; all data are script files (`scripts`), clips have relative paths. The page makes no
+request that leaves the folder: its content policy forbids it. Figures come from the study's tables; the page counts
+decisions and computes no metric.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from base64 import b64encode
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.benchmark.records import load_release
+from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.explorer.answers import StudyAnswers, study_answers
+from traps_pipeline.explorer.scripts import data_script, parquet_text
+from traps_pipeline.files import write_bytes
+from traps_pipeline.models.request import JUDGED
+from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, sides_of
+from traps_pipeline.report.gallery import certificate_phrases, intervention
+from traps_pipeline.report.leaderboard import legend, provenance
+from traps_pipeline.report.published_results import PublishedResults
+from traps_pipeline.report.tables.shared import entries
+from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
+from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WEB = Path(__file__).parent / "web"
+INDEX, SCRIPT, MANIFEST, DATA, CLIPS = "index.html", "explorer.js", "site.json", "data", "clips"
+LIBRARY = WEB / "vendor" / "parquet.js"
+_SOURCES = (
+    *("dom.js", "numbers.js", "store.js", "outcomes.js", "parts.js"),
+    *("leaderboard.js", "model.js", "matrix.js", "answers.js", "player.js", "pair.js", "compare.js", "main.js"),
+)
+_ITEM_COLUMNS = (
+    *("dataset", "scenario_id", "pair_id", "side", "category", "family", "sub_scenario", "question", "ground_truth"),
+    *("control_answer", "answer_type", "clip"),
+)
+_PUBLISHED = ("acc", "abs_rec", "false_abs", "pecs")
+
+
+@dataclass
+class Written:
+    """What a site holds: files and bytes by kind, and clips that the study lacks."""
+
+    answers: int = 0
+    votes: int = 0
+    files: int = 0
+    bytes: int = 0
+    clips: int = 0
+    clip_bytes: int = 0
+    lacking: list[str] = field(default_factory=list)
+
+
+def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Written:
+    """Write the explorer of a study to a folder and return what it holds.
+
+    Files of an earlier site in the folder are replaced, or removed where they are no longer needed; `index.html` is
+    written last. clips: whether clips are put there, as hard links where the file system allows it, else as copies.
+    Raises TrapsError where the folder holds something else, or the study has no items.
+    """
+    former = _former_files(folder)
+    answers = study_answers(workspace)
+    shown = _scenarios(workspace)
+    names = _clip_names(answers.items, shown) if clips else []
+    there = {name for name in names if workspace.resolve(name).is_file()}
+    written = Written(len(answers.decisions), len(answers.votes), lacking=sorted(set(names) - there))
+    contents = _contents(workspace, answers, shown, there)
+    stamp = _digest(contents)
+    files = {f"{DATA}/{name}.js": data_script(name, stamp, content) for name, content in contents.items()}
+    files[SCRIPT] = script().encode()
+    files[INDEX] = index_page(workspace, stamp).encode()
+    for name in sorted(there):
+        written.clip_bytes += _put_clip(workspace.resolve(name), folder / name)
+        written.clips += 1
+    manifest = json.dumps(sorted([*files, *there]), indent=0).encode()
+    write_bytes(folder / MANIFEST, json.dumps(sorted({*files, *there, *former}), indent=0).encode())
+    for name, content in files.items():  # the index comes last
+        write_bytes(folder / name, content)
+        written.files, written.bytes = written.files + 1, written.bytes + len(content)
+    for name in sorted(former - {*files, *there}):
+        (folder / name).unlink(missing_ok=True)
+    write_bytes(folder / MANIFEST, manifest)
+    return written
+
+
+def _former_files(folder: Path) -> set[str]:
+    """The files of an earlier site in the folder. Raises TrapsError where the folder holds something else."""
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return set()
+    try:
+        listed = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise TrapsError(
+            f"{folder}: holds something that is no site; name a folder that is empty, or does not exist yet"
+        ) from None
+    return {name for name in listed if isinstance(name, str) and _is_inside(name)}
+
+
+def _is_inside(name: str) -> bool:
+    """Whether a relative path stays in its folder."""
+    parts = Path(name).parts
+    return bool(parts) and not Path(name).is_absolute() and ".." not in parts
+
+
+def _put_clip(source: Path, target: Path) -> int:
+    """Link or copy a clip; returns its bytes. A clip's name holds what it shows, so one that is there is right."""
+    size = source.stat().st_size
+    if not (target.is_file() and target.stat().st_size == size):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.unlink(missing_ok=True)
+        try:
+            os.link(source, target)
+        except OSError:  # another file system, or one without links
+            shutil.copyfile(source, target)
+    return size
+
+
+# --- data -------------------------------------------------------------------------------------------------------------
+
+
+def _contents(
+    workspace: Workspace, answers: StudyAnswers, scenarios: list[dict[str, Any]], clips: set[str]
+) -> dict[str, dict[str, Any]]:
+    """Every data file by name: JSON values, and Parquet files under the name of their table."""
+    import pyarrow as pa
+
+    contents: dict[str, dict[str, Any]] = {}
+    shards = []
+    for number, shard in enumerate(answers.shards()):
+        name = f"answers-{number:04d}"
+        contents[name] = {"texts": parquet_text(shard.texts), "votes": parquet_text(shard.votes)}
+        shards.append([name, shard.first, len(shard.texts)])
+    items = answers.items.loc[:, [*_ITEM_COLUMNS]].copy()
+    items["clip"] = [clip if clip in clips else None for clip in items["clip"]]
+    contents["items"] = {"items": parquet_text(pa.Table.from_pandas(items, preserve_index=False))}
+    contents["decisions"] = {"decisions": parquet_text(answers.decisions)}
+    shown = [{**row, "twin_clip": row["twin_clip"] if row["twin_clip"] in clips else None} for row in scenarios]
+    contents["scenarios"] = {"scenarios": shown}
+    for table in (CONTRASTS, REGIME_TESTS):
+        contents[table.name] = {table.name: parquet_text(workspace.tables.read_arrow(table))}
+    return {"study": _study(workspace, answers, shards, bool(clips)), **contents}
+
+
+def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_clips: bool) -> dict[str, Any]:
+    """What every page of the explorer needs, and the leaderboard."""
+    from traps_pipeline.models.registry import load_models
+
+    board, robust = workspace.tables.read_all(LEADERBOARD), workspace.tables.read_all(ROBUST)
+    release, registry = load_release(), load_models()
+    published = entries(PublishedResults())
+    evaluations = [[e.model, e.regime, e.run] for e in answers.evaluations]
+    models = sorted({*(e.model for e in answers.evaluations), *board["model"], *published["model"]})
+    unknown = "not in the registry"
+    datasets = [name for name in (*DATASETS, *ARMS) if name in set(answers.items["dataset"])]
+    return {
+        "name": workspace.study.name,
+        "benchmark": f"{release.name} {release.version}",
+        "provenance": provenance(board) if len(board) else "",
+        "has_clips": has_clips,
+        "datasets": [{"id": d, "title": {**TITLES, **ARM_TITLES}[d], "sides": [*sides_of(d)]} for d in datasets],
+        "titles": TITLES,
+        "regimes": [name for name in REGIMES if name in {e.regime for e in answers.evaluations}],
+        "models": [{"id": m, "group": registry[m].groups.group if m in registry else unknown} for m in models],
+        "evaluations": evaluations,
+        "outcomes": [*answers.outcomes],
+        "judged": [*JUDGED],
+        "epochs": [*answers.epochs],
+        "shards": shards,
+        "n_votes": len(answers.votes),
+        "leaderboard": _records(board),
+        "robust": _records(robust),
+        "published": _records(published.loc[:, ["model", "regime", "dataset", "epoch", *_PUBLISHED]]),
+        "legend": legend(board, robust) if len(board) else {},
+        "marks": MARKS,
+    }
+
+
+def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows as JSON values; a missing value is null."""
+    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    return [{str(name): _plain(value) for name, value in row.items()} for row in rows]
+
+
+def _plain(value: Any) -> Any:
+    """A value of a frame as JSON has it."""
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
+    """What the page of a pair says about its scenario, by scenario."""
+    specs, videos = workspace.tables.read_all(SCENE_SPECS), workspace.tables.read_all(VIDEOS)
+    clips = {(row["scenario_id"], row["side"]): row for row in _records(videos)}
+    rows = []
+    for spec in sorted(specs.to_dict("records"), key=lambda row: row["scenario_id"]):
+        twin, evidence = json.loads(spec["twin"]), json.loads(spec["evidence"])
+        of_control, of_twin = (clips.get((spec["scenario_id"], side)) for side in ("control", "twin"))
+        rows.append(
+            {
+                "scenario_id": spec["scenario_id"],
+                "intervention": intervention(spec),
+                "labels": [*spec["labels"]],
+                "certificate": [words for _, words in certificate_phrases(evidence)],
+                "twin_answer": twin["ground_truth"],
+                "twin_clip": of_twin["path"] if of_twin else None,
+                "fps": of_control["fps"] if of_control else None,
+            }
+        )
+    return rows
+
+
+def _clip_names(items: pd.DataFrame, scenarios: Iterable[Mapping[str, Any]]) -> list[str]:
+    """The clips that the pages show, as the tables name them. A name that leads out of the folder is left out."""
+    named = {*items["clip"], *(row["twin_clip"] for row in scenarios)}
+    return sorted(name for name in named if name and Path(name).parts[0] == CLIPS and _is_inside(name))
+
+
+def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
+    """The version of a site: a digest of all its data and of its script."""
+    found = hashlib.sha256(script().encode())
+    for name, content in contents.items():
+        for key, value in content.items():
+            text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+            found.update(f"\0{name}\0{key}\0{text}".encode())
+    return found.hexdigest()[:16]
+
+
+# --- page -------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def script() -> str:
+    """The one script: the bundled libraries with their licences, then our sources, which share one function's scope.
+
+    Raises TrapsError where the bundle is not the one that was checked in.
+    """
+    library = LIBRARY.read_bytes()
+    wanted = LIBRARY.with_name("parquet.js.sha256").read_text(encoding="ascii").split()[0]
+    if hashlib.sha256(library).hexdigest() != wanted:
+        raise TrapsError(f"{LIBRARY}: is not what was checked in; restore it from git, or run `make explorer-vendor`")
+    sources = "\n".join((WEB / name).read_text(encoding="utf-8") for name in _SOURCES)
+    return f'{library.decode("utf-8")}\n(() => {{\n"use strict";\n{sources}\n}})();\n'
+
+
+def index_page(workspace: Workspace, stamp: str) -> str:
+    """The page that opens the explorer. It may load scripts and clips of its own folder, and nothing else."""
+    import jinja2
+
+    style = (WEB / "style.css").read_text(encoding="utf-8")
+    digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
+    template = environment.from_string((WEB / "index.html.j2").read_text(encoding="utf-8"))
+    return template.render(
+        title=f"{load_release().name}: {workspace.study.name}", version=stamp, style=style, style_digest=digest,
+        script=SCRIPT, data=DATA,
+    )  # fmt: skip

@@ -1,0 +1,206 @@
+// The leaderboard: the rows of the study's table, beside the paper's.
+
+const FIGURES = [
+  { field: "pecs", title: "PECS", print: fraction },
+  { field: "acc", title: "Acc %", print: percent },
+  { field: "abs_rec", title: "AbsRec %", print: percent },
+  { field: "false_abs", title: "FalseAbs %", print: percent },
+  { field: "j", title: "J", print: fraction },
+];
+const PAPER = FIGURES.filter(({ field }) => field !== "j");
+
+// A figure with its deviation over runs and its interval below it.
+function figure(row, { field, print }, mark = "") {
+  if (!row || row[field] === null || row[field] === undefined)
+    return row ? NONE : h("span", { class: "absent" }, NOT_RUN);
+  const low = row[`${field}_ci_low`];
+  const spread = row.n_runs > 1 ? `± ${print(row[`${field}_std`])}` : "";
+  const interval = low === null || low === undefined ? "" : `[${print(low)}, ${print(row[`${field}_ci_high`])}]`;
+  return [
+    h("span", { class: "figure", "data-field": field }, print(row[field])),
+    mark ? ` ${mark}` : null,
+    spread || interval ? h("span", { class: "interval" }, [interval, spread].filter(Boolean).join(" ")) : null,
+  ];
+}
+
+function rankOf(row) {
+  if (!row || row.rank_low === null) return NONE;
+  return row.rank_low === row.rank_high ? String(row.rank_low) : `${row.rank_low}–${row.rank_high}`;
+}
+
+async function leaderboardView(route) {
+  const info = await study();
+  const own = info.leaderboard;
+  const hasOverall = own.some((row) => row.dataset === "overall");
+  const dataset = route.parameters.dataset || (hasOverall || !own.length ? "overall" : own[0].dataset);
+  const { regime = "", group = "", sort = "pecs", up = "", paper = "" } = route.parameters;
+  const groupOf = new Map(info.models.map((model) => [model.id, model.group]));
+  const published = new Map(
+    info.published.filter((row) => row.dataset === dataset).map((row) => [`${row.model} ${row.regime}`, row]),
+  );
+  const robust = new Map((dataset === "overall" ? info.robust : []).map((row) => [`${row.model} ${row.regime}`, row]));
+  const asked = new Map(own.map((row) => [`${row.model} ${row.regime}`, { model: row.model, regime: row.regime }]));
+  const entries = [...asked.values()];
+  if (paper) for (const row of published.values()) if (!asked.has(`${row.model} ${row.regime}`)) entries.push(row);
+  const here = new Map(own.filter((row) => row.dataset === dataset).map((row) => [`${row.model} ${row.regime}`, row]));
+  const shown = entries
+    .map(({ model, regime: of }) => ({
+      model,
+      regime: of,
+      own: here.get(`${model} ${of}`),
+      paper: published.get(`${model} ${of}`),
+      robust: robust.get(`${model} ${of}`),
+    }))
+    .filter((row) => (!regime || row.regime === regime) && (!group || groupOf.get(row.model) === group));
+  shown.sort(ordering(sort, up, info.regimes));
+  const withPaper = shown.some((row) => row.paper);
+  const columns = [
+    { title: "Model", sort: "model" },
+    { title: "Regime", sort: "regime" },
+    ...FIGURES.map(({ field, title }) => ({
+      title,
+      number: true,
+      sort: field,
+      hint: info.legend[title.replace(" %", "")],
+    })),
+    { title: "Rank", number: true, hint: "by PECS among the models of a regime; ranks in between are not separable" },
+    ...(robust.size
+      ? [
+          { title: "PECS-R", number: true, group: true, hint: info.legend["PECS-R"] },
+          { title: "gap", number: true, hint: info.legend.gap },
+        ]
+      : []),
+    ...(withPaper
+      ? PAPER.map(({ field, title }, k) => ({
+          title: `Paper: ${title}`,
+          number: true,
+          sort: `paper_${field}`,
+          group: !k,
+        }))
+      : []),
+    { title: "n", number: true, sort: "n_pairs", group: true, hint: info.legend.n },
+    { title: "Runs", number: true },
+    { title: "Missing", number: true, sort: "n_missing", hint: info.legend.Missing },
+  ];
+  const [missingMark, incompleteMark] = Object.keys(info.marks);
+  const rows = shown.map((row) => [
+    row.own || asked.has(`${row.model} ${row.regime}`)
+      ? link(["model", row.model], { regime: row.regime, dataset: dataset === "overall" ? "" : dataset }, row.model)
+      : row.model,
+    h("span", { class: "tag" }, row.regime),
+    ...FIGURES.map((each) =>
+      figure(row.own, each, each.field === "pecs" && row.own && row.own.incomplete ? incompleteMark : ""),
+    ),
+    rankOf(row.own),
+    ...(robust.size
+      ? [row.robust ? `${fraction(row.robust.pecs_r)}` : NOT_RUN, row.robust ? fraction(row.robust.gap) : NOT_RUN]
+      : []),
+    ...(withPaper
+      ? PAPER.map(({ field, print }) =>
+          row.paper ? h("span", { title: `epoch ${row.paper.epoch}` }, print(row.paper[field])) : NONE,
+        )
+      : []),
+    row.own ? count(row.own.n_pairs) : NONE,
+    row.own ? count(row.own.n_runs) : NONE,
+    row.own ? `${count(row.own.n_missing)}${row.own.n_missing ? ` ${missingMark}` : ""}` : NONE,
+  ]);
+  const change = (by, down) => route.change({ sort: by === "pecs" ? "" : by, up: down ? "" : "1" });
+  const models = distinct(own.map((row) => row.model));
+  const known = new Set(info.published.map((row) => row.model));
+  const inPaper = models.filter((model) => known.has(model)).length;
+  return {
+    title: "Leaderboard",
+    body: [
+      h(
+        "p",
+        { class: "lead" },
+        "Each pair has a control, which can be answered, and a void, which cannot. ",
+        "PECS rewards models that answer the one and abstain on the other. ",
+        "Choose a model to see its answers. ",
+        info.provenance,
+      ),
+      h(
+        "div",
+        { class: "filters" },
+        choice(
+          route,
+          "dataset",
+          "Dataset",
+          datasetOptions(info, { overall: true }).filter(([id]) => id in info.titles),
+          { empty: null, fallback: dataset },
+        ),
+        choice(
+          route,
+          "regime",
+          "Regime",
+          same(distinct([...info.regimes, ...(paper ? info.published.map((row) => row.regime) : [])])),
+        ),
+        choice(route, "group", "Models", same(distinct(entries.map((row) => groupOf.get(row.model))).sort())),
+        toggle(route, "paper", "also the paper's other models"),
+      ),
+      section(
+        null,
+        table(columns, rows, {
+          caption: `${info.titles[dataset] || dataset}: ${rows.length} entries`,
+          name: "leaderboard",
+          order: { by: sort, down: !up },
+          sortBy: change,
+          absent: own.length ? "no entry fits these filters" : `${NOT_RUN}: this study has no leaderboard yet`,
+        }),
+        notes(info, shown, dataset),
+        inPaper
+          ? null
+          : h("p", { class: "note" }, own.length ? "No model of this study is in the paper's tables." : null),
+      ),
+      meanings(info),
+    ],
+  };
+}
+
+function ordering(sort, up, regimes) {
+  const valueOf = (row) => {
+    if (sort === "model") return row.model;
+    if (sort === "regime") return regimes.indexOf(row.regime);
+    const found = sort.startsWith("paper_") ? row.paper?.[sort.slice(6)] : row.own?.[sort];
+    return found ?? null;
+  };
+  return (left, right) => {
+    const [a, b] = [valueOf(left), valueOf(right)];
+    if ((a === null) !== (b === null)) return a === null ? 1 : -1; // without a figure: last, in either direction
+    const by = a === b ? 0 : (a < b ? -1 : 1) * (up ? 1 : -1);
+    const ofPaper = a === null ? (right.paper?.pecs ?? -1) - (left.paper?.pecs ?? -1) : 0;
+    return (
+      by ||
+      ofPaper ||
+      left.model.localeCompare(right.model) ||
+      regimes.indexOf(left.regime) - regimes.indexOf(right.regime)
+    );
+  };
+}
+
+function notes(info, shown, dataset) {
+  const [missingMark, incompleteMark] = Object.keys(info.marks);
+  const used = [];
+  if (shown.some((row) => row.own?.n_missing)) used.push(`${missingMark} ${info.marks[missingMark]}`);
+  if (shown.some((row) => row.own?.incomplete)) used.push(`${incompleteMark} ${info.marks[incompleteMark]}`);
+  if (dataset === "overall" && shown.some((row) => !row.own))
+    used.push(`${NOT_RUN}: this study did not ask the model, or not on all four datasets`);
+  used.push("Brackets: 95 % interval, cluster bootstrap over scenarios. ±: population standard deviation over runs.");
+  return used.map((text) => h("p", { class: "note" }, text));
+}
+
+function meanings(info) {
+  const terms = Object.entries(info.legend);
+  return terms.length
+    ? h(
+        "details",
+        null,
+        h("summary", null, "What the columns mean"),
+        h(
+          "dl",
+          { class: "legend" },
+          terms.map(([term, meaning]) => [h("dt", null, term), h("dd", null, meaning)]),
+        ),
+      )
+    : null;
+}

@@ -1,0 +1,151 @@
+// The review of one scenario: its clips, a key for each decision, and what a correction would cost.
+
+const SHOWN = JSON.parse(document.getElementById("shown").textContent);
+const FIELDS = ["question", "ill_posed_question", "labels", "answer", "params"];
+const field = (name) => document.getElementById(name);
+const said = field("said");
+let wanted = ""; // the decision that waits for a reason
+
+const clips = SHOWN.clips.map((side) => {
+  const path = `/clip/${encodeURIComponent(SHOWN.scenario_id)}/${side}`;
+  const [title, note] = SHOWN.captions[side].split(/: (.*)/s);
+  return { title, note, path, kind: side };
+});
+const shownPlayer = player(clips, SHOWN.fps, true);
+field("clips").append(shownPlayer.element);
+
+// --- what a correction changes ----------------------------------------------------------------------------------------
+
+const original = {
+  question: SHOWN.words.question,
+  ill_posed_question: SHOWN.words.ill_posed_question,
+  labels: SHOWN.words.labels.join(", "),
+  answer: SHOWN.words.answer,
+  params: JSON.stringify(SHOWN.params, null, 1),
+};
+for (const name of FIELDS) field(name).value = original[name];
+
+// The fields that differ from the record, as the corrections have them. Throws SyntaxError for parameters that are no
+// JSON object.
+function changes() {
+  const found = {};
+  for (const name of FIELDS) {
+    const value = field(name).value.trim();
+    if (value === original[name].trim()) continue;
+    if (name === "labels")
+      found.labels = value
+        .split(",")
+        .map((label) => label.trim())
+        .filter(Boolean);
+    else if (name === "params") found.params = changedParams(value);
+    else found[name] = value;
+  }
+  return found;
+}
+
+function changedParams(text) {
+  const given = JSON.parse(text);
+  const differs = ([name, value]) => JSON.stringify(value) !== JSON.stringify(SHOWN.params[name]);
+  return Object.fromEntries(Object.entries(given).filter(differs));
+}
+
+async function post(path, body) {
+  const answer = await fetch(path, {
+    method: "POST",
+    headers: { "content-type": "application/json" },
+    body: JSON.stringify({ scenario_id: SHOWN.scenario_id, ...body }),
+  });
+  const read = await answer.json().catch(() => ({ error: `the server said ${answer.status}` }));
+  if (!answer.ok) throw new Error(read.error || `the server said ${answer.status}`);
+  return read;
+}
+
+let asked = 0;
+async function preview() {
+  const own = ++asked;
+  await new Promise((next) => setTimeout(next, 250)); // until the reviewer pauses
+  if (own !== asked) return;
+  let text;
+  try {
+    const found = changes();
+    if (Object.keys(found).length) {
+      const read = await post("/preview", { changes: found });
+      text = `Question: ${read.question}\n${read.cost}.`;
+    } else text = "Nothing is changed yet.";
+  } catch (error) {
+    text = error.message;
+  }
+  if (own === asked) field("preview").textContent = text;
+}
+for (const name of FIELDS) field(name).addEventListener("input", preview);
+
+// --- decisions --------------------------------------------------------------------------------------------------------
+
+field("why").value = sessionStorage.getItem("why") || "";
+
+function leave(to) {
+  location.href = to ? `/scenario/${encodeURIComponent(to)}?queue=${SHOWN.queue}` : `/?queue=${SHOWN.queue}`;
+}
+
+async function decide(action) {
+  const why = field("why").value.trim();
+  if (!why) {
+    wanted = action;
+    said.textContent = `Write the reason to ${action}, then press Enter.`;
+    field("why").focus();
+    return;
+  }
+  sessionStorage.setItem("why", why);
+  wanted = "";
+  try {
+    if (action === "undo") {
+      await post("/undo", { why, seen: SHOWN.seen });
+      location.reload();
+      return;
+    }
+    const found = action === "correct" || action === "add" ? changes() : {};
+    if ((action === "correct" || action === "add") && !Object.keys(found).length) {
+      field("changes").open = true;
+      field("question").focus();
+      said.textContent = "Change something first: question, labels, answer or parameters.";
+      return;
+    }
+    await post("/decide", { action, changes: found, why, seen: SHOWN.seen });
+    if (action === "add") said.textContent = "Added. A run makes it in every study that holds all scenarios, or names it.";
+    else leave(SHOWN.after);
+  } catch (error) {
+    said.textContent = error.message;
+    said.classList.add("error");
+  }
+}
+
+function open_changes() {
+  field("changes").open = true;
+  field("question").focus();
+}
+
+const KEYS = {
+  ...shownPlayer.keys,
+  k: () => decide("keep"),
+  c: () => decide("correct"),
+  d: () => decide("discard"),
+  a: () => decide("add"),
+  u: () => !field("undo").disabled && decide("undo"),
+  n: () => SHOWN.after && leave(SHOWN.after),
+  p: () => SHOWN.before && leave(SHOWN.before),
+  e: open_changes,
+  w: () => field("why").focus(),
+};
+for (const name of ["keep", "correct", "discard", "add", "undo"]) field(name).addEventListener("click", () => decide(name));
+field("before").addEventListener("click", KEYS.p);
+field("after").addEventListener("click", KEYS.n);
+document.addEventListener("keydown", (event) => {
+  if (event.key === "Escape") return document.activeElement.blur();
+  if (event.key === "Enter" && event.target.id === "why") return decide(wanted || "keep");
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, textarea, select")) return null;
+  if ((event.key === " " || event.key === "Enter") && event.target.closest("a, button, summary")) return null;
+  const act = KEYS[event.key];
+  if (!act) return null;
+  event.preventDefault();
+  return act();
+});

@@ -1,0 +1,170 @@
+"""A guard before a web server of this machine, so that only the person who started it can use it.
+
+A server takes any request that reaches its port: a page of another site, opened in the same browser, could act in the
+user's name. The guard lets through what carries the token of the address that was printed, comes from a page of this
+very server, and changes something by a POST of JSON only.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import secrets
+from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qsl, quote, urlencode, urlsplit
+
+from traps_pipeline.errors import TrapsError
+
+LEAST_TOKEN = 16  # characters
+LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+_SAFE_METHODS = ("GET", "HEAD")
+_OWN_SITE = (b"same-origin", b"none")
+# Added to every answer: it is not shown in a frame, its address (which may hold the token) goes to no other site.
+_HEADERS = (
+    (b"x-frame-options", b"DENY"),
+    (b"content-security-policy", b"frame-ancestors 'none'"),
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"cache-control", b"no-store"),
+)
+
+Message = MutableMapping[str, Any]
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only programs of this machine reach what listens there."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def token_for(host: str, given: str | None, *, danger: str, variable: str) -> str:
+    """The token of a server that listens there: the given one, or a fresh one. Raises TrapsError beyond this machine
+    without one, and for one that can be guessed.
+
+    danger: what everybody who reaches the address could do; variable: the environment variable that may hold a token.
+    """
+    if given is None and not is_loopback(host):
+        raise TrapsError(
+            f"--host {host}: everybody who reaches that address could {danger}; "
+            f"give a token of your own (--token, or {variable}), and put a server that speaks HTTPS before it, "
+            "since the token crosses the network; or leave --host out and use an SSH tunnel"
+        )
+    if given is not None and (len(given) < LEAST_TOKEN or not given.isascii() or not given.isprintable()):
+        raise TrapsError(f"--token: {LEAST_TOKEN} or more printable ASCII characters, so that it cannot be guessed")
+    return given or secrets.token_urlsafe(24)
+
+
+class Guard:
+    """An ASGI app before another one. command: what printed the address, in words for who comes without its token."""
+
+    def __init__(self, app: App, token: str, host: str, port: int, *, command: str = "make ui") -> None:
+        self._app, self._token, self._cookie, self._command = app, token, f"traps-ui-{port}", command
+        self._names = {f"{name}:{port}" for name in (*LOOPBACK, host)} if is_loopback(host) else None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request through, or say in a sentence why not."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        if scope["type"] not in ("http", "websocket"):
+            return
+        headers = {name.lower(): value for name, value in scope["headers"]}
+        refused = self._refusal(scope, headers)
+        if refused is None and scope["type"] == "http" and self._token_in(scope):
+            await self._enter(scope, send)
+        elif refused is None and not self._is_known(headers):
+            refused = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
+        if refused is not None:
+            await _refuse(scope, receive, send, *refused)
+        elif not (scope["type"] == "http" and self._token_in(scope)):
+            await self._app(scope, receive, _with_headers(send))
+
+    def _refusal(self, scope: Scope, headers: Mapping[bytes, bytes]) -> tuple[int, str] | None:
+        host = headers.get(b"host", b"").decode("latin-1").lower()
+        if sum(name.lower() == b"host" for name, _ in scope["headers"]) != 1 or (
+            self._names is not None and host not in self._names
+        ):
+            return 421, f"this is not the name of this server: open the address that `{self._command}` printed"
+        origin, websocket = headers.get(b"origin"), scope["type"] == "websocket"
+        if origin is not None or websocket:
+            of_origin = urlsplit((origin or b"").decode("latin-1").lower())
+            if of_origin.scheme not in ("http", "https") or of_origin.netloc != host:
+                return 403, "a page of another site asked for this"
+        reads = not websocket and scope["method"] in _SAFE_METHODS
+        if headers.get(b"sec-fetch-site", b"none") not in _OWN_SITE and not (reads and self._token_in(scope)):
+            return 403, "a page of another site asked for this"
+        if websocket:
+            return None
+        path = scope["path"].rstrip("/")
+        if reads:
+            if path.endswith("/graphql") and scope.get("query_string"):
+                return 405, "GraphQL is asked by POST"
+            return None
+        if scope["method"] != "POST":
+            return 405, "POST changes something here, GET reads, and nothing else does anything"
+        kind = headers.get(b"content-type", b"").split(b";")[0].strip().lower()
+        return None if kind == b"application/json" else (415, "a POST holds JSON here")
+
+    def _token_in(self, scope: Scope) -> bool:
+        if scope["method"] not in _SAFE_METHODS:
+            return False
+        given = dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token")
+        return given is not None and self._is_token(given)
+
+    def _is_token(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), self._token.encode())
+
+    def _is_known(self, headers: Mapping[bytes, bytes]) -> bool:
+        """Whether the browser was let in before, or a program brings the token as `Authorization: Bearer TOKEN`."""
+        scheme, _, given = headers.get(b"authorization", b"").decode("latin-1").partition(" ")
+        if scheme.lower() == "bearer":
+            return self._is_token(given.strip())
+        try:
+            cookies = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1"))
+        except CookieError:
+            return False
+        return self._cookie in cookies and self._is_token(cookies[self._cookie].value)
+
+    async def _enter(self, scope: Scope, send: Send) -> None:
+        """Give the browser the token as a cookie and show the page without it: an address is seen and kept."""
+        left = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
+        place = "/" + quote(scope["path"].lstrip("/\\")) + (f"?{urlencode(left)}" if left else "")
+        cookie = f"{self._cookie}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+        headers = [(b"location", place.encode()), (b"set-cookie", cookie.encode("latin-1"))]
+        await _answer(send, 303, b"", headers)
+
+
+async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, why: str) -> None:
+    if scope["type"] == "websocket":
+        await receive()
+        await send({"type": "websocket.close", "code": 1008, "reason": why[:120]})
+        return
+    await _answer(send, status, f"{why}\n".encode(), [(b"content-type", b"text/plain; charset=utf-8")])
+
+
+async def _answer(send: Send, status: int, body: bytes, headers: Iterable[tuple[bytes, bytes]]) -> None:
+    length = (b"content-length", str(len(body)).encode())
+    await send({"type": "http.response.start", "status": status, "headers": [*headers, length, *_HEADERS]})
+    await send({"type": "http.response.body", "body": body})
+
+
+def _with_headers(send: Send) -> Send:
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            own = {name for name, _ in _HEADERS if name != b"cache-control"}
+            sent = [(name, value) for name, value in message.get("headers", ()) if name.lower() not in own]
+            cached = any(name.lower() == b"cache-control" for name, _ in sent)
+            message["headers"] = [*sent, *(each for each in _HEADERS if not cached or each[0] != b"cache-control")]
+        await send(message)
+
+    return sending
