@@ -7,7 +7,7 @@ import re
 import sys
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, experiment_of
+from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, add_panel, experiment_of
 from traps_pipeline.cli.init import create
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.terminal import plain
@@ -23,6 +23,7 @@ def add(commands: Commands) -> None:
     """Add `traps run`."""
     parser = commands.add("run", run, "materialize every missing or stale partition of an experiment")
     parser.add_argument("experiment")
+    add_panel(parser)
     parser.add_argument(
         "--budget-usd", action="append", default=[], metavar="[MODEL=]USD",
         help="most dollars for calls over the network, in this study or to one model or judge; kept in study.yaml",

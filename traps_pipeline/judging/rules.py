@@ -158,8 +158,9 @@ def judge_abstention(answer: str, question: str = "") -> dict[str, object]:
 def judge_correctness(answer: str, ground_truth: str, question: str = "") -> dict[str, object]:
     """The vote on correctness: it extracts a value of the ground truth's kind; code decides whether it is correct."""
     final = final_statement(answer)
-    _, committed = _read(_lower(final), _asked(question))
-    value = extract(committed or final, ground_truth, question)
+    declined, committed = _read(_lower(final), _asked(question))
+    # What a statement amounts to is read where it commits; one that declines has the value that it names, if any.
+    value = extract(committed or final, ground_truth, "" if declined else question)
     return {
         "correct": value is not None and normalise(value) == normalise(ground_truth),
         "extracted_value": value,

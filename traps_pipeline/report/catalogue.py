@@ -10,17 +10,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from traps_pipeline.models.judges import BY_RULES
 from traps_pipeline.report.figures import abstention, grids, landscape, mechanism
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables import comparisons, judges, leaderboards, setup, sub_scenarios
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
 from traps_pipeline.report.tables.shared import printed
-from traps_pipeline.report.writing import PrintedTable, figure_bytes, figure_files, table_files
+from traps_pipeline.report.writing import PrintedTable, figure_bytes, figure_files, say_below, table_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAPER = "published"  # folder below tables/ and figures/
+JUDGED_STAGES = {"leaderboard", "metrics", "contrasts", "regime_tests", "steering_effects", "steering_shares"}
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,9 @@ class TableReport:
 
     def tables(self, results: Results) -> list[PrintedTable]:
         """The tables; those of the paper's numbers without the columns that the paper does not print."""
-        return [replace(t, columns=printed(results, t.rows, t.columns)) for t in self.make(results)]
+        said = [results.judged_by] if _is_judged(self.reads) else []
+        shown = ((table, printed(results, table.rows, table.columns)) for table in self.make(results))
+        return [replace(table, columns=columns, notes=[*said, *table.notes]) for table, columns in shown]
 
     def files(self, results: Results) -> dict[str, bytes]:
         """Files by path: `tables/name.csv` and so on, for the paper's numbers in `tables/published`."""
@@ -70,12 +74,19 @@ class FigureReport:
 
     def picture(self, results: Results) -> dict[str, bytes]:
         """The PNG alone, by path, for the page and for Dagster."""
-        return {self.path(results): figure_bytes(self.make(results))}
+        return {self.path(results): figure_bytes(self._figure(results))}
 
     def files(self, results: Results) -> dict[str, bytes]:
         """PDF, SVG and PNG by path."""
-        files = figure_files(self.name, self.make(results))
+        files = figure_files(self.name, self._figure(results))
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
+
+    def _figure(self, results: Results) -> Figure:
+        """The figure; where its numbers are not comparable it says so itself, since pictures lose their captions."""
+        figure = self.make(results)
+        if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
+            say_below(figure, BY_RULES)
+        return figure
 
 
 Report = TableReport | FigureReport
@@ -151,6 +162,11 @@ def folder(kind: str, results: Results) -> str:
 def workspace_files(report: Report, results: Results) -> dict[str, bytes]:
     """The files that a workspace keeps: all files of a table, the PNG of a figure; `traps export` writes the rest."""
     return report.files(results) if isinstance(report, TableReport) else report.picture(results)
+
+
+def _is_judged(reads: Sequence[str]) -> bool:
+    """Whether a report shows numbers that a panel decided, by the stages that it reads."""
+    return bool({*reads} & JUDGED_STAGES)
 
 
 def _first_paragraph(make: Callable[..., object]) -> str:
