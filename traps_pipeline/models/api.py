@@ -21,6 +21,7 @@ from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import (
     MALFORMED,
     RATE_LIMITED,
+    UNREACHABLE,
     WITH_TEXT,
     Outcome,
     OutcomeKind,
@@ -144,6 +145,8 @@ class ApiBackend:
         if isinstance(error, self._litellm.ContentPolicyViolationError):
             return Outcome("refused", error="content_policy", cost_usd=free)
         kind = failure_kind(error, self._litellm, exchange)
+        if kind == "connection" and exchange.unsent:
+            kind = UNREACHABLE
         if kind == MALFORMED:
             kept = self._without_key((exchange.content or b"").decode("utf-8", "replace"))
             self._tell(kind, str(error) or type(error).__name__)

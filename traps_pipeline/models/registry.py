@@ -279,6 +279,11 @@ def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     return {name: parse_yaml_model(Account, raw or {}, path, f"account {name}") for name, raw in accounts.items()}
 
 
+def account_of(entry: Entry) -> Account:
+    """The account that a network entry is asked through."""
+    return load_accounts()[str(entry.account)]
+
+
 def effective_params(entry: ModelEntry, regime: str) -> dict[str, Any]:
     """What is sent under a regime: the entry's parameters, in the JSON regime the schema where the entry has it, and of
     a checkpoint the digest of its weights (`declared_digest`)."""
