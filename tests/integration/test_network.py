@@ -64,7 +64,7 @@ def experiment(study: Checkout, models: list[str], **more: Any) -> Path:
     settings = {"models": models, "regimes": ["standard", "json"], "runs": [1], **more}
     head = "".join(f"{name}: {value!r}\n".replace("'", '"') for name, value in settings.items())
     path = study.root / "network.yaml"
-    path.write_text(f"name: network\n{head}{scenarios}")
+    path.write_text(f"name: network\npanel: rules\njudged_by_rules: true\n{head}{scenarios}")
     return path
 
 
@@ -75,7 +75,7 @@ def responses(study: Checkout) -> list[dict[str, Any]]:
 
 def ask(study: Checkout, path: Path, *more: str) -> Finished:
     """Run an experiment as far as these tests look."""
-    return study.traps("run", path, "--until", "responses", *more)
+    return study.traps("run", path, "--no-preflight", "--until", "responses", *more)
 
 
 def settled(study: Checkout) -> list[dict[str, Any]]:

@@ -39,7 +39,8 @@ def vote_rows(
     """VOTES rows of answers, each a string with one of y (yes), n (no) and - (invalid) for each judge."""
     side = "void" if task == "void_abstention" else "control"
     kind = "correctness" if task == "correctness" else "abstention"
-    about = {"model": "m", "regime": "standard", "run": 1, "epoch": "e1", "benchmark_version": "v1"} | cell
+    about: dict[str, Any] = {"model": "m", "regime": "standard", "run": 1, "epoch": "e1"}
+    about |= {"panel": "three@1", "benchmark_version": "v1"} | cell
     rows = []
     for k, answer in enumerate(answers):
         for judge, word in zip(judges, answer, strict=True):

@@ -40,7 +40,7 @@ from traps_pipeline.scoring.prevalence import prevalence
 from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import load_experiment
-from traps_pipeline.study.plan import make_plan
+from traps_pipeline.study.plan import Plan, make_plan
 
 THINKS, SPEAKS = "gemini-2.5-flash", "gemini-2.5-flash-nt"  # trace and output, output alone
 JUDGE = "labeller"
@@ -311,10 +311,15 @@ def test_a_wrong_protocol_is_named(tmp_path: Path, change: tuple[str, str], comp
     assert complaint in str(raised.value)
 
 
+def plan_of(name: str) -> Plan:
+    experiment = load_experiment(name)
+    return make_plan(None, experiment, experiment.study)
+
+
 def test_the_plan_counts_a_sample_of_each_model_and_none_where_there_is_no_judge() -> None:
-    paper = make_plan(None, load_experiment("paper"))
+    paper = plan_of("paper")
     assert paper.labels is not None
     assert (paper.labels.wanted, paper.labels.known) == (600, 0)
     (line,) = (row for row in paper.forecasts if row.participant == "confabulation labels")
     assert line.calls == 600 and line.dollars is not None and line.dollars[0] > 0
-    assert make_plan(None, load_experiment("demo")).labels is None
+    assert plan_of("demo").labels is None

@@ -146,26 +146,26 @@ JUDGES = "judges: [{id: a, backend: rule}, {id: b, backend: rule}, {id: c, backe
 
 
 def test_a_panel_seats_its_judges_in_order(tmp_path: Path) -> None:
-    path = panels(tmp_path, JUDGES + "panels: {p: [c, a, b]}")
-    assert [judge.id for judge in load_panel("p", path)] == ["c", "a", "b"]
+    path = panels(tmp_path, JUDGES + "panels: {rules: [c, a, b]}")
+    assert [judge.id for judge in load_panel("rules", path)] == ["c", "a", "b"]
 
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (JUDGES + "panels: {q: [a, b, c]}", "no panel 'p'; it has q"),
-        (JUDGES + "panels: {p: [a, b]}", "must seat 3 different known judges"),
-        (JUDGES + "panels: {p: [a, b, b]}", "must seat 3 different known judges"),
-        (JUDGES + "panels: {p: [a, b, c, c]}", "must seat 3 different known judges"),
-        (JUDGES + "panels: {p: [a, b, d]}", "must seat 3 different known judges"),
-        (JUDGES.replace("id: b", "id: a") + "panels: {p: [a, b, c]}", "judge 2: id 'a' occurs twice"),
+        (JUDGES + "panels: {q: [a, b, c]}", "no panel 'rules'; it has q"),
+        (JUDGES + "panels: {rules: [a, b]}", "must seat 1 or 3 different known judges"),
+        (JUDGES + "panels: {rules: [a, b, b]}", "must seat 1 or 3 different known judges"),
+        (JUDGES + "panels: {rules: [a, b, c, c]}", "must seat 1 or 3 different known judges"),
+        (JUDGES + "panels: {rules: [a, b, d]}", "must seat 1 or 3 different known judges"),
+        (JUDGES.replace("id: b", "id: a") + "panels: {rules: [a, b, c]}", "judge 2: id 'a' occurs twice"),
         (
-            JUDGES.replace("rule}]", "rule, mood: bad}]") + "panels: {p: [a, b, c]}",
+            JUDGES.replace("rule}]", "rule, mood: bad}]") + "panels: {rules: [a, b, c]}",
             r"judge 3 .*: mood: Extra",
         ),
-        (JUDGES.replace("id: b", "id: B") + "panels: {p: [a, b, c]}", r"judge 2 \(B\): id: .*must match"),
+        (JUDGES.replace("id: b", "id: B") + "panels: {rules: [a, b, c]}", r"judge 2 \(B\): id: .*must match"),
     ],
 )
 def test_a_wrong_panel_is_named(tmp_path: Path, text: str, complaint: str) -> None:
     with pytest.raises(TrapsError, match=rf"judges\.yaml: .*{complaint}"):
-        load_panel("p", panels(tmp_path, text))
+        load_panel("rules", panels(tmp_path, text))

@@ -7,6 +7,7 @@ import json
 
 import pytest
 
+from tests.judging.plain_sentences import Half, sentences, share_right
 from traps_pipeline.judging.panel import parse_vote, render
 from traps_pipeline.judging.rules import RuleJudge, extract, final_statement, judge_abstention
 from traps_pipeline.models.judges import Task
@@ -167,3 +168,11 @@ def test_a_user_message_without_an_answer_is_an_error_not_a_vote() -> None:
 
 def test_the_reason_quotes_the_words_that_decline() -> None:
     assert judge_abstention("It cannot be determined.")["reasoning"] == "The response says 'cannot be determined'."
+
+
+@pytest.mark.parametrize("half", ["looked at", "held out"])
+def test_of_100_plain_sentences_that_the_rules_were_written_on_and_of_100_others_at_least_95_are_read_right(
+    half: Half,
+) -> None:
+    mine = [sentence for sentence in sentences() if sentence.half == half]
+    assert len(mine) == 100 and share_right(half) >= 0.95

@@ -34,7 +34,7 @@ def undone(side: str, outcome: str = "answer", item: int = 0) -> tuple[pd.DataFr
     item_id = f"occlusion:s-{item:04d}:{side}"
     items = pd.DataFrame([{"item_id": item_id, **named, "benchmark_version": "v1"}])
     about = {"dataset": "occlusion", "model": "m", "regime": "standard", "run": 1, "epoch": "e1"}
-    response = {"item_id": item_id, "pair_id": "p", "side": side, "outcome": outcome, **about}
+    response = {"item_id": item_id, "pair_id": "p", "side": side, "outcome": outcome, "is_json": None, **about}
     return items, pd.DataFrame([response])
 
 
@@ -77,7 +77,7 @@ def test_a_judged_answer_without_three_votes_a_task_is_refused_by_name() -> None
     whole = control_votes("nnn", "yyy")
     for votes in (whole[whole["task"] == "abstention"], whole[whole["judge"] != "c"], whole.iloc[1:]):
         with pytest.raises(
-            TrapsError, match=r"votes occlusion\|m__standard__run1: item occlusion:s-0000:control does not have 3 votes"
+            TrapsError, match=r"votes occlusion\|m__standard__run1: item occlusion:s-0000:control does not have"
         ):
             decide(items, responses, votes)
 

@@ -18,6 +18,7 @@ import random
 import re
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.request
 from collections import Counter
@@ -94,6 +95,8 @@ class Config:
     API come with a few of their values, or their end, replaced. usd_a_token: what the server bills for prompt and
     completion; an attempt that its status does not refuse is billed, and one that is odd as the most that it may take.
     hang_s: when even the server gives up. served_suffix goes behind the model's name, as real ones answer with a date.
+    blind: models that leave images and videos out, as a server of text models may; the others name the colours of a
+    clip that they are asked for. served: what the list of models holds.
     """
 
     latency_s: float = 0.0
@@ -109,6 +112,8 @@ class Config:
     raw_by_model: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     fuzzed: bool = False
     usd_a_token: tuple[float, float] = (0.0, 0.0)
+    blind: Sequence[str] = ()
+    served: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         unknown = ({*self.faults} | {*self.fault_by_model.values()}) - {*FAULTS, None}
@@ -156,6 +161,7 @@ class Question:
     structured: bool
     shows_reasoning: bool
     prompt_tokens: int
+    colours: tuple[str, ...] = ()  # of the clip, where it is asked for them
     most_tokens: int = 0  # that the completion may take
 
 
@@ -169,14 +175,16 @@ def api_of(path: str) -> tuple[Api, str] | None:
     return ("gemini", found[1]) if found else None
 
 
-def read_question(api: Api, model: str, body: Json) -> Question:
-    """Read a body. Raises KeyError, TypeError or AttributeError where it is not of that API, or asks for a stream."""
+def read_question(api: Api, model: str, body: Json, blind: Sequence[str] = ()) -> Question:
+    """Read a body, without its media for a blind model. Raises KeyError, TypeError or AttributeError where it is not of
+    that API, or asks for a stream."""
     turns = _TURNS[api](body)
     model = model or body["model"]
     if not isinstance(model, str) or body.get("stream"):
         raise TypeError
     texts = [(role, part["text"]) for role, parts in turns for part in parts if "text" in part]
-    media = sum(len(parts) for _, parts in turns) - len(texts)
+    clips = [] if model in blind else [part for _, parts in turns for part in parts if "text" not in part]
+    media = len(clips)
     asked = [text for role, text in texts if role == "user"]
     return Question(
         api=api,
@@ -186,8 +194,34 @@ def read_question(api: Api, model: str, body: Json) -> Question:
         structured=_is_structured(api, body),
         shows_reasoning=_shows_reasoning(api, body),
         prompt_tokens=sum(len(text) for _, text in texts) // 4 + 1 + media * _MEDIA_TOKENS,
+        colours=_colours(clips) if asked and _ASKS_COLOURS in asked[-1] else (),
         most_tokens=int(body.get("max_tokens") or body.get("max_output_tokens") or 0),
     )
+
+
+_ASKS_COLOURS = "which two colours does the clip show"
+
+
+def _colours(clips: Sequence[Json]) -> tuple[str, ...]:
+    """The strongest colour of the first and of the last frame of OpenAI's images or of its video."""
+    import cv2
+    import numpy as np
+
+    frames = list[Any]()
+    for clip in clips:
+        uri = (clip.get("image_url") or clip.get("video_url") or {}).get("url", "")
+        data = base64.b64decode(uri.partition(",")[2])
+        if "video" not in uri[:16]:
+            frames.append(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
+            continue
+        with tempfile.NamedTemporaryFile(suffix=".mp4") as file:
+            file.write(data)
+            file.flush()
+            video = cv2.VideoCapture(file.name)
+            while (read := video.read())[0]:
+                frames.append(read[1])
+    named = ("blue", "green", "red")
+    return tuple(named[int(np.argmax(frame.mean(axis=(0, 1))))] for frame in (frames[0], frames[-1])) if frames else ()
 
 
 def _parts(content: Any) -> list[Json]:
@@ -261,7 +295,7 @@ def text_for(question: Question) -> str:
         return json.dumps(_abstention(question.text))
     if '{"correct"' in question.system:
         return json.dumps(_correctness(question.text))
-    answer = answer_to(question.text)
+    answer = " and then ".join(question.colours) or answer_to(question.text)
     if question.structured:
         return json.dumps({"reason": f"It looks like {answer}.", "final_answer": answer})
     return f"The answer is: {answer}."
@@ -653,12 +687,14 @@ class Server:
             tallies.records.append(record)
             record |= {"method": request.method, "path": request.path}
             record |= {"query": redacted(request.query), "headers": redacted(request.headers), "body": None}
+        if request.method == "GET" and request.path.endswith("/models") and self._config.served is not None:
+            return json_reply({"object": "list", "data": [{"id": name} for name in self._config.served]})
         known = api_of(request.path) if request.method == "POST" else None
         if known is None:
             return json_reply(error_body("chat", _UNKNOWN_PATH), 404)
         try:
             body = json.loads(content)
-            question = read_question(*known, body)
+            question = read_question(*known, body, blind=self._config.blind)
         except (ValueError, KeyError, TypeError, AttributeError):
             return json_reply(error_body(known[0], _MALFORMED), 400)
         if self._keeps_records:

@@ -19,7 +19,7 @@ from traps_pipeline.report.figures.landscape import landscape_figure
 from traps_pipeline.report.leaderboard import leaderboard_markdown, leaderboard_text, leaderboards
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.terms import TITLES
-from traps_pipeline.report.writing import figure_bytes, fraction, percent
+from traps_pipeline.report.writing import figure_bytes, fraction, percent, table_latex
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.parquet import TableStore
@@ -48,7 +48,8 @@ def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6
         **{"model": model, "regime": regime, "dataset": dataset, "n_runs": 3, "n_pairs": 1404, "n_missing": 0},
         **{name: float(value) for name, value in figures.items()},
         **{f"{name}_std": 0.01 for name in figures},
-        **{"n_refused": 0, "n_empty": 0, "n_errors": 0, "answered": 1.0, "incomplete": False},
+        **dict.fromkeys(("n_refused", "n_empty", "n_truncated", "n_degenerate", "n_not_json", "n_errors"), 0),
+        **{"answered": 1.0, "incomplete": False, "broken": 0.0, "is_broken": False, "panel": "three@1"},
         **{f"{name}_ci_{end}": float(value) for name, value in figures.items() for end in ("low", "high")},
         **{
             "rank": 1,
@@ -95,7 +96,7 @@ def test_text_lists_models_by_overall_pecs_with_their_interval(board):
     shown = board[board["model"] != HOSTILE]
     shown = pd.concat([shown, board_of(board_row("mid", pecs_ci_low=0.2, pecs_ci_high=0.3))])
     lines = leaderboard_text(shown).splitlines()
-    assert lines[0] == "Overall. Benchmark version v1; epoch e1."
+    assert lines[0] == "Overall. Judged by the panel three (version 1). Benchmark version v1; epoch e1."
     assert lines[3].split()[:6] == ["oracle", "standard", "1.000", "[1.000,", "1.000]", "100.0"]
     # Acc 0.5, J 0.6 - 0.1 = 0.5, PECS 0.25; no dataset of its own is on the board.
     assert next(x for x in lines if x.startswith("mid")).split() == [
@@ -427,3 +428,17 @@ def test_the_sheet_of_arms_takes_the_scenario_with_most_arms_and_draws_a_row_a_c
     row = round(150 * (FRAME_IN * 48 / 64 + GAP_IN))  # at 150 dots an inch; the clips are 64 wide and 48 high
     assert tall - less_tall == pytest.approx(row, abs=1)  # control, void and two arms against control, void and one
     assert arms_sheets(items, arms.assign(clip=None), tmp_path) == {}
+
+
+def test_panels_have_tables_of_their_own_and_a_model_judged_by_rules_is_said_not_to_be_comparable():
+    both = board_of(
+        board_row("gpt-5-high", panel="paper@2"),
+        *(board_row(model, panel="rules@1") for model in ("oracle", "pocket")),
+    )
+    by_paper, by_rules = leaderboards(both)
+    assert [list(table.rows["model"]) for table in (by_paper, by_rules)] == [["gpt-5-high"], ["oracle", "pocket"]]
+    assert "not comparable" not in table_latex(by_paper) and "Judged by the panel paper (version 2)" in by_paper.lead
+    assert "Judged by rules, not comparable: pocket." in table_latex(by_rules)
+    for said in (leaderboard_text(both), leaderboard_markdown(both), report_html(both)):
+        assert "Judged by rules, not comparable: pocket." in said
+    assert "not comparable" not in leaderboard_text(both.loc[both["model"] == "oracle"])

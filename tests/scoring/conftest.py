@@ -24,6 +24,7 @@ def verdict_rows(
     labels: Sequence[str] = ("yes",),
     categories: Sequence[str] = ("hidden",),
     outcomes: Sequence[str] = ("answer",),
+    panel: str = "three@1",
 ) -> pd.DataFrame:
     """VERDICTS rows of one cell. Labels, categories and (per item) outcomes are repeated cyclically."""
     rows = []
@@ -51,6 +52,7 @@ def verdict_rows(
                     "n_valid_correctness": 3 if known and side == "control" else 0,
                     "unanimous": known,
                     "undecided": not known,
+                    "panel": panel,
                     "epoch": epoch,
                     "benchmark_version": "v1",
                 }

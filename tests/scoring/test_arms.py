@@ -15,6 +15,7 @@ from traps_pipeline.defs import judging, scoring
 from traps_pipeline.judging.ratings import VOTE_COLUMNS
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import current
+from traps_pipeline.models.judges import panel_id
 from traps_pipeline.partitions import ANSWERABLE_ARMS, ARMS, DATASETS, VOID_ARMS
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.scoring import bootstrap
@@ -46,7 +47,7 @@ def write(workspace: Workspace, verdicts: pd.DataFrame) -> None:
             where = dict(zip(("dataset", "model", "regime", "run"), cell, strict=True))
             tables.write(VERDICTS, where, mine.reset_index(drop=True), {})
             cast = [
-                row(VOTES, item_id=item, side=side, task="abstention", judge=judge, valid=True,
+                row(VOTES, item_id=item, side=side, task="abstention", judge=judge, valid=True, panel=panel_id("rules"),
                     abstained=bool(said) != (judge == JUDGES[0] and dataset in ARMS), **where)
                 for item, side, said in mine[["item_id", "side", "abstained"]].itertuples(index=False)
                 for judge in JUDGES
@@ -79,7 +80,7 @@ def test_rows_of_arms_beside_the_pairs_change_no_figure(
     pairs = [rows([MODELS[c["model"]], (True, False, True)], dataset=d, **c) for c in cells for d in DATASETS]
     # All is wrong in the arms: whoever reads them shows it.
     arms = [of_arm(rows, arm, [(False, True, False)] * 3, **c) for c in cells for arm in ARMS]
-    study = Study(scenarios=["plinko-0001"])
+    study = Study(panel="rules", scenarios=["plinko-0001"])
     alone, beside = (Workspace.create(tmp_path / name, study) for name in ("alone", "beside"))
     write(alone, pd.concat(pairs, ignore_index=True))
     write(beside, pd.concat([*pairs, *arms], ignore_index=True))

@@ -95,14 +95,44 @@ def test_bounds_are_averaged_over_runs_and_datasets(rows):
 
 
 def test_what_became_of_the_items_is_summed_over_runs_and_datasets(rows):
-    # Of the four items of two pairs one has a text in run 1, and two in run 2, where one is truncated.
+    # Of the four items of two pairs one has an answer in each run; in run 2 another is cut off before it answers.
     pairs = [(True, False, None), (None, None, None)]
     kinds = {1: ["answer", "refused", "empty", "error"], 2: ["answer", "truncated", "empty", "error"]}
     parts = [rows(pairs, dataset=d, run=r, outcomes=o) for d in DATASETS for r, o in kinds.items()]
     board = board_of(pd.concat(parts, ignore_index=True))
-    columns = ["n_refused", "n_empty", "n_errors", "answered", "incomplete"]
-    assert tuple(entry(board)[columns]) == (1, 2, 2, 3 / 8, True)
-    assert tuple(entry(board, "overall")[columns]) == (4, 8, 8, 12 / 32, True)
+    columns = ["n_refused", "n_empty", "n_truncated", "n_errors", "answered", "incomplete", "broken"]
+    assert tuple(entry(board)[columns]) == (1, 2, 1, 2, 2 / 8, True, 3 / 8)
+    assert tuple(entry(board, "overall")[columns]) == (4, 8, 4, 8, 8 / 32, True, 12 / 32)
+
+
+@pytest.mark.parametrize(("dots", "is_broken"), [(0, False), (1, False), (2, True)])
+def test_an_entry_is_broken_where_more_than_1_percent_of_its_texts_say_nothing(dots, is_broken, rows):
+    verdicts = rows([(True, False, True)] * 50, outcomes=["degenerate"] * dots + ["answer"] * (100 - dots))
+    row = entry(board_of(verdicts))
+    assert (row.n_degenerate, row.broken, row.is_broken) == (dots, dots / 100, is_broken)
+
+
+def test_models_of_two_panels_are_neither_ranked_nor_contrasted_together_and_a_mixed_one_has_no_rank(rows):
+    good, bad = [(True, False, True)] * 40, [(True, False, False)] * 40
+    parts = [
+        rows(good, model="a", panel="one@1"),
+        rows(bad, model="b", panel="one@1"),
+        rows(bad, model="c", panel="two@1"),
+        rows(good, model="d", panel="one@1"),
+        rows(good, model="d", panel="two@1", run=2),
+    ]
+    verdicts = pd.concat(parts, ignore_index=True)
+    cells = pd.concat([cell_metrics(part) for _, part in verdicts.groupby("dataset")])
+    table = contrasts(resample(verdicts, 200), cells, verdicts)
+    board = leaderboard(cells, intervals(resample(verdicts, 200)), table).set_index("model")
+    assert board["panel"].to_dict() == {"a": "one@1", "b": "one@1", "c": "two@1", "d": "one@1+two@1"}
+    assert board["rank"].astype("object").where(board["rank"].notna(), None).to_dict() == {
+        "a": 1, "b": 2, "c": 1, "d": None,
+    }  # fmt: skip
+    of_j = table.loc[table["figure"] == "j"].to_dict("records")
+    refused = {(row["left_model"], row["right_model"]): row["refused"] for row in of_j}
+    assert {pair for pair, why in refused.items() if pd.isna(why)} == {("a", "b")}
+    assert "judged by one@1 on one side and by two@1 on the other" in refused["a", "c"]
 
 
 @pytest.mark.parametrize(("lost", "incomplete"), [(0, False), (1, False), (2, True)])

@@ -26,7 +26,7 @@ def study(answers: dict[str, list[str]], **cell: object) -> tuple[pd.DataFrame, 
     items = pd.DataFrame({"item_id": seen["item_id"], "scenario_id": seen["item_id"].str.split(":").str[1]})
     items = items.assign(category="hidden", sub_scenario="x", control_answer="left", benchmark_version="v1")
     named = ["dataset", "model", "regime", "run", "item_id", "side", "epoch"]
-    responses = seen[named].assign(outcome="answer", pair_id=seen["item_id"].str.rsplit(":", n=1).str[0])
+    responses = seen[named].assign(outcome="answer", is_json=None, pair_id=seen["item_id"].str.rsplit(":", n=1).str[0])
     return decide(items, responses, votes), votes
 
 

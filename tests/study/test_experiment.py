@@ -68,3 +68,27 @@ def test_an_unknown_model_or_experiment_is_answered_with_the_known_ones(tmp_path
         load_experiment(str(path))
     with pytest.raises(TrapsError, match=r"no experiment 'demmo': .*known: .*demo"):
         load_experiment("demmo")
+
+
+def test_no_panel_judges_unless_the_experiment_the_command_or_the_study_names_it(tmp_path: Path) -> None:
+    silent = load_experiment(experiment(tmp_path, ""))
+    with pytest.raises(
+        TrapsError, match=r"no panel is named: write `panel: NAME` .* --panel NAME; .* has rules, paper"
+    ):
+        silent.judged(None, None)
+    assert silent.judged(None, "rules").panel == "rules"
+    assert silent.judged(Study(panel="paper"), None).panel == "paper"
+    named = load_experiment(experiment(tmp_path, "panel: paper\n"))
+    assert named.judged(Study(panel="rules"), "paper").panel == "paper"
+    with pytest.raises(TrapsError, match="--panel rules: experiment my names the panel 'paper'"):
+        named.judged(None, "rules")
+
+
+def test_rules_judge_reference_models_and_others_only_where_somebody_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "my.yaml"
+    path.write_text("name: my\nmodels: [oracle, gpt-5-high]\npanel: rules\n")
+    mine = load_experiment(str(path))
+    with pytest.raises(TrapsError, match=r"made for reference models, and gpt-5-high is none: .* --judged-by-rules"):
+        mine.judged(None, None)
+    assert mine.judged(None, None, judged_by_rules=True).judged_by_rules
+    assert mine.judged(Study(panel="rules", judged_by_rules=True), None).panel == "rules"

@@ -98,6 +98,16 @@ def load_definitions() -> None:
     import traps_pipeline.definitions  # noqa: F401 - its import is what declares the graph
 
 
+def add_panel(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that say who judges."""
+    parser.add_argument("--panel", help="who judges, where the experiment names no panel; kept in study.yaml")
+    parser.add_argument(
+        "--judged-by-rules",
+        action="store_true",
+        help="let the panel `rules` judge other models than reference models; every table and page then says so",
+    )
+
+
 def experiment_of(arguments: argparse.Namespace) -> Experiment:
     """The experiment that a command names. Raises TrapsError with the known names."""
     from traps_pipeline.study.experiment import load_experiment

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from traps_pipeline.cli.command import OK, Commands, entered, experiment_of, root_of
+from traps_pipeline.cli.command import OK, Commands, add_panel, entered, experiment_of, root_of
 
 if TYPE_CHECKING:
     from traps_pipeline.storage.workspace import Workspace
@@ -16,6 +16,7 @@ def add(commands: Commands) -> None:
     """Add `traps init`."""
     parser = commands.add("init", init, "make a workspace for an experiment without running it")
     parser.add_argument("experiment", nargs="?", default="demo")
+    add_panel(parser)
 
 
 def init(arguments: argparse.Namespace) -> int:
@@ -33,8 +34,17 @@ def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
     """
     from traps_pipeline.storage.workspace import Workspace
 
-    workspace = Workspace.create(root_of(arguments), experiment.study)
-    experiment.check_study(workspace.study, workspace.root / "study.yaml")
+    root, by_rules = root_of(arguments), arguments.judged_by_rules
+    is_new = not (root / "study.yaml").exists()
+    if is_new:  # refused before a folder is made
+        experiment.judged(None, arguments.panel, judged_by_rules=by_rules)
+    workspace = Workspace.create(root, experiment.study)
+    judged = experiment.judged(workspace.study, arguments.panel, judged_by_rules=by_rules)
+    experiment.check_study(judged, workspace.root / "study.yaml")
+    if judged != workspace.study:
+        if experiment.panel is None and judged.panel != workspace.study.panel:
+            print(f"note: judged by the panel {judged.panel!r}; write `panel: {judged.panel}` into the experiment")
+        workspace = workspace.allow(panel=judged.panel, judged_by_rules=judged.judged_by_rules)
     if experiment.mechanism is not None and workspace.study.mechanism is None:
         workspace = workspace.allow(mechanism=experiment.mechanism)
     asked = workspace.study.experiments | {experiment.name: experiment.asked}

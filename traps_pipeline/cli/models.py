@@ -1,26 +1,75 @@
-"""`traps models check`: whether the registry's entries send what they declare."""
+"""`traps models check`: whether the registry's entries send what they declare, and whether what they name answers."""
 
 from __future__ import annotations
 
 import argparse
 
-from traps_pipeline.cli.command import FAILED, OK, Commands
+from traps_pipeline.cli.command import FAILED, OK, Commands, entered, root_of
+from traps_pipeline.errors import TrapsError
 
 
 def add(commands: Commands) -> None:
     """Add `traps models check`."""
     text = "compare what models and judges are sent with their entries; needs no key, and nothing leaves this machine"
-    parser = commands.noun("models", "check entries of the registry").add("check", check, text, workspace=False)
-    parser.add_argument("names", nargs="*", metavar="MODEL", help="check only these models and judges")
+    parser = commands.noun("models", "check entries of the registry").add("check", check, text)
+    parser.add_argument(
+        "names", nargs="*", metavar="MODEL", help="check only these models and judges, or all of an experiment (a path)"
+    )
+    parser.add_argument(
+        "--live",
+        action="store_true",
+        help="ask them: address, name, key, a clip, the schema, thinking, price; three short calls each, which cost",
+    )
 
 
 def check(arguments: argparse.Namespace) -> int:
     """See `traps models check --help`."""
     from traps_pipeline.study.wire_check import check_named
 
+    names = _named(arguments)
+    if arguments.live:
+        return _check_live(names)
     wrong = 0
-    for checked in check_named(arguments.names):
+    for checked in check_named(names):
         print("\n    ".join([checked.line, *checked.problems]), flush=True)
         wrong += bool(checked.problems)
     print("every entry sends what it declares" if not wrong else f"{wrong} entries do not send what they declare")
     return FAILED if wrong else OK
+
+
+def _named(arguments: argparse.Namespace) -> list[str]:
+    """The ids of models and judges that are named, those of experiments among them. An own entry of the workspace is
+    known, too."""
+    from traps_pipeline.models.judges import load_panel
+    from traps_pipeline.storage.workspace import Workspace
+    from traps_pipeline.study.experiment import load_experiment
+
+    root = root_of(arguments)
+    if (root / "study.yaml").exists():
+        entered(Workspace.open(root))
+    names = list[str]()
+    for name in arguments.names:
+        if not name.endswith((".yaml", ".yml")):
+            names.append(name)
+            continue
+        experiment = load_experiment(name)
+        judges = load_panel(experiment.panel) if experiment.panel else ()
+        names += [*experiment.models, *(judge.id for judge in judges)]
+    return names
+
+
+def _check_live(names: list[str]) -> int:
+    from traps_pipeline.models.registry import NETWORK
+    from traps_pipeline.study.live_check import check_live
+    from traps_pipeline.study.wire_check import participants
+
+    known = participants()
+    if unknown := [name for name in names if name not in known]:
+        raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(known)}")
+    entries = [known[name] for name in names if known[name].backend == NETWORK]
+    if not entries:
+        raise TrapsError("--live asks over the network: name a model or judge with an address, or an experiment")
+    found = check_live(entries)
+    for one in found:
+        print(one.line, flush=True)
+    return FAILED if any(one.problems for one in found) else OK

@@ -6,7 +6,15 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from traps_pipeline.cli.command import OK, Commands, experiment_of, load_definitions, open_workspace, root_of
+from traps_pipeline.cli.command import (
+    OK,
+    Commands,
+    add_panel,
+    experiment_of,
+    load_definitions,
+    open_workspace,
+    root_of,
+)
 from traps_pipeline.terminal import text_table
 
 if TYPE_CHECKING:
@@ -18,6 +26,7 @@ def add(commands: Commands) -> None:
     """Add `traps plan`."""
     parser = commands.add("plan", plan, "count the calls of an experiment: wanted, known, new; nothing is sent")
     parser.add_argument("experiment")
+    add_panel(parser)
 
 
 def plan(arguments: argparse.Namespace) -> int:
@@ -27,7 +36,10 @@ def plan(arguments: argparse.Namespace) -> int:
     experiment, root = experiment_of(arguments), root_of(arguments)
     workspace = open_workspace(arguments) if (root / "study.yaml").exists() else None
     load_definitions()
-    planned = make_plan(workspace, experiment)
+    study = experiment.judged(
+        workspace.study if workspace else None, arguments.panel, judged_by_rules=arguments.judged_by_rules
+    )
+    planned = make_plan(workspace, experiment, study)
     total = (Count(), Count())
     print(f"{experiment.name} in {root if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
     rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, experiment_of
+from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, add_panel, experiment_of
 from traps_pipeline.cli.init import create
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.terminal import plain
@@ -23,6 +24,7 @@ def add(commands: Commands) -> None:
     """Add `traps run`."""
     parser = commands.add("run", run, "materialize every missing or stale partition of an experiment")
     parser.add_argument("experiment")
+    add_panel(parser)
     parser.add_argument(
         "--budget-usd", action="append", default=[], metavar="[MODEL=]USD",
         help="most dollars for calls over the network, in this study or to one model or judge; kept in study.yaml",
@@ -32,6 +34,9 @@ def add(commands: Commands) -> None:
         action="store_true",
         default=None,
         help="ask models that have no price in the registry",
+    )
+    parser.add_argument(
+        "--no-preflight", action="store_true", help="ask at once, without first trying every model and judge"
     )
     parser.add_argument(
         "--until", metavar="STAGES", help="make only these stages (separated by commas) and the stages they need"
@@ -51,6 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
     stages = stages_until(arguments.until)
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
     with reporting(TerminalProgress()) as progress, dagster_history(workspace) as instance:
+        if not arguments.no_preflight:
+            _preflight(workspace, experiment, stages)
         every_asset = defs.resolve_implicit_global_asset_job_def()
         outcome = walk(instance, every_asset, workspace, stages, experiment=experiment.name)
     problems = [*dict.fromkeys([*outcome.problems, *failed_checks(workspace, experiment.name)])]
@@ -83,6 +90,35 @@ def run(arguments: argparse.Namespace) -> int:
     _print_results(workspace)
     print(f"next: open {workspace.reports / 'report.html'}, or run traps why ITEM to examine an item's answers")
     return OK
+
+
+def _preflight(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> None:
+    """Try the models and judges that have something to answer, before a clip is rendered. Raises TrapsError naming all
+    that is wrong."""
+    from traps_pipeline.models.judges import load_panel
+    from traps_pipeline.models.registry import NETWORK, get_model
+    from traps_pipeline.orchestration.lineage import Lineage
+    from traps_pipeline.orchestration.wanted import Wanted
+    from traps_pipeline.partitions import Cell
+    from traps_pipeline.study.live_check import preflight, require_sound
+
+    lineage, cells = Lineage(workspace), Wanted(workspace, experiment.name).cells
+
+    def behind(stage: str) -> dict[str, None]:
+        if stage not in stages:
+            return {}
+        models = (Cell.parse(key).evaluation.model for key in cells if lineage.status(stage, key).kind != "fresh")
+        return dict.fromkeys(models)
+
+    models = [entry for entry in map(get_model, behind("responses")) if entry.backend == NETWORK]
+    judges = load_panel(workspace.study.panel) if behind("votes") else ()
+    judges = [judge for judge in judges if judge.backend == NETWORK]
+    if not models and not judges:
+        return
+    found = preflight(workspace, models, judges)
+    for one in found:
+        print(one.line, flush=True)
+    require_sound(found)
 
 
 def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:

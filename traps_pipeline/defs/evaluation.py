@@ -12,6 +12,7 @@ from traps_pipeline.judging.tables import VERDICTS, VOTES, VoteRow
 from traps_pipeline.models.answers import collect_answers
 from traps_pipeline.models.judges import panel_version
 from traps_pipeline.models.prompts import prompt_version
+from traps_pipeline.models.reading import READING
 from traps_pipeline.models.registry import answering_version
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES, ResponseRow
@@ -97,6 +98,7 @@ responses = stage(
         dg.AssetDep(prompts, partition_mapping=by_evaluation),
     ],
     scheme=CELL,
+    code=f"2.{READING}",
     cost="money",
     columns=_ITEM_COLUMNS,
     checks=[Check("one_answer_an_item", "Every item of the cell has exactly one row.", _answers_missing)],
@@ -117,6 +119,7 @@ votes = stage(
     group=GROUP,
     deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, judges],
     scheme=CELL,
+    code="2",
     cost="money",
     columns={name: [f"responses.{name}"] for name in ("item_id", "side", "benchmark_version")},
     checks=[
@@ -148,8 +151,9 @@ verdicts = stage(
     VERDICTS,
     _make_verdicts,
     group=GROUP,
-    deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, votes],
+    deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, votes, judges],
     scheme=CELL,
+    code="2",
     columns={
         "item_id": ["responses.item_id"],
         "abstained": ["votes.abstained", "votes.valid"],

@@ -53,12 +53,13 @@ def _panel(workspace: Workspace) -> list[str]:
 
 
 def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
-    """The votes of the study's panel. Raises TrapsError if there is none."""
+    """The votes of the study's panel as it is now. Raises TrapsError if there is none."""
     from traps_pipeline.judging.ratings import VOTE_COLUMNS
     from traps_pipeline.judging.verdicts import current
+    from traps_pipeline.models.judges import panel_id
 
-    votes = current(workspace, VOTES, VOTE_COLUMNS)
-    votes = votes.loc[votes["judge"].isin(_panel(workspace))]
+    votes = current(workspace, VOTES, [*VOTE_COLUMNS, "panel"])
+    votes = votes.loc[votes["panel"] == panel_id(workspace.study.panel)]
     if votes.empty:
         raise TrapsError(f"{name}: no votes yet; materialize votes for a cell first")
     return votes

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import dagster as dg
 
 from traps_pipeline.defs.benchmark import items
-from traps_pipeline.defs.evaluation import verdicts
+from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS
@@ -46,8 +46,9 @@ metrics = stage(
     METRICS,
     _make_metrics,
     group=GROUP,
-    deps=[items, dg.AssetDep(verdicts, partition_mapping=by_dataset)],
+    deps=[items, dg.AssetDep(verdicts, partition_mapping=by_dataset), judges],
     scheme=DATASET,
+    code="2",
     needs={"verdicts": "some"},
     columns={
         **_SHARES,
@@ -137,14 +138,19 @@ def _wrong_robust(workspace: Workspace, key: str | None, made: Made) -> str:
 
 
 _OF_SOME: dict[str, Need] = {"metrics": "some", "verdicts": "some"}
-contrasts = stage(CONTRASTS, _make_contrasts, group=GROUP, deps=[metrics, verdicts], needs=_OF_SOME)
-regime_tests = stage(REGIME_TESTS, _make_regime_tests, group=GROUP, deps=[metrics, verdicts], needs=_OF_SOME)
+# The panel is an input of all that is counted from its verdicts: after a change of it they are stale at once, and not
+# only when its votes are made again.
+contrasts = stage(CONTRASTS, _make_contrasts, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME, code="2")
+regime_tests = stage(
+    REGIME_TESTS, _make_regime_tests, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME, code="2"
+)
 leaderboard = stage(
     LEADERBOARD,
     _make_leaderboard,
     group=GROUP,
-    deps=[metrics, verdicts, contrasts],
+    deps=[metrics, verdicts, contrasts, judges],
     needs=_OF_SOME,
+    code="2",
     columns={name: [f"metrics.{name}"] for name in ("acc", "abs_rec", "false_abs", "j", "pecs")},
     checks=[
         Check(
@@ -158,8 +164,9 @@ robust = stage(
     ROBUST,
     _make_robust,
     group=GROUP,
-    deps=[metrics, verdicts],
+    deps=[metrics, verdicts, judges],
     needs=_OF_SOME,
+    code="2",
     columns={"acc_r": ["verdicts.correct"], "abs_rec_r": ["verdicts.abstained"], "false_abs_r": ["verdicts.abstained"]},
     checks=[
         Check(

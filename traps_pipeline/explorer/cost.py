@@ -13,7 +13,7 @@ from traps_pipeline.benchmark.specs import wording_of
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.forecast import Experience, forecast
-from traps_pipeline.models.judges import PANEL_SIZE
+from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import NETWORK, load_models
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import DATASETS, SIDES, Cell, is_ill_posed, taxonomy_of
@@ -64,6 +64,7 @@ def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correctio
     asked_again = question != spec["question"]
     ill_posed = changes.get("ill_posed_question", spec["ill_posed_question"]) != spec["ill_posed_question"]
     judged_again = changes.get("answer", spec["ground_truth"]) != spec["ground_truth"] or "labels" in changes
+    seats = len(load_panel(workspace.study.panel))
     found = Touched(question=question, rendered=[spec["scenario_id"]] if renders else [])
     for model, dataset, evaluations in _asked(workspace, spec["taxonomy"]):
         for side in SIDES:
@@ -72,7 +73,7 @@ def touched(workspace: Workspace, spec: Mapping[str, Any], correction: Correctio
             item = f"{dataset}:{spec['scenario_id']}:{side}"
             if again or (judged_again and side == "control"):
                 found.items += [] if item in found.items else [item]
-                found.votes += evaluations * PANEL_SIZE * (len(tasks_for(side)) if again else 1)
+                found.votes += evaluations * seats * (len(tasks_for(side)) if again else 1)
             if again:
                 found.answers += evaluations
                 found.dollars = _plus(found.dollars, _dollars(model, evaluations))

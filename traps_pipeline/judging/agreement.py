@@ -70,12 +70,12 @@ def fleiss_kappa(values: np.ndarray) -> float:
     """Fleiss' kappa of complete rows, (answers, judges) of YES and NO; NaN where there is one class or no row.
 
     An answer with y yes of k votes agrees by (y (y-1) + (k-y) (k-y-1)) / (k (k-1)); chance by p^2 + (1-p)^2, p being
-    the share of yes in all votes.
+    the share of yes in all votes. NaN also for a single judge.
     """
     n, k = values.shape
     yes = (values == YES).sum(axis=1)
     total = int(yes.sum())
-    if total in (0, n * k):
+    if k < 2 or total in (0, n * k):
         return float("nan")
     observed = float(np.mean(yes * (yes - 1) + (k - yes) * (k - yes - 1))) / (k * (k - 1))
     return _beyond_chance(observed, _same_class(total / (n * k)))
@@ -109,8 +109,10 @@ def krippendorff_alpha(values: np.ndarray) -> float:
 
 
 def unanimous_share(values: np.ndarray) -> float:
-    """Share of complete rows, (answers, judges), on which all votes are the same; NaN where there is no row."""
-    return float(np.mean((values == values[:, :1]).all(axis=1))) if len(values) else float("nan")
+    """Share of complete rows, (answers, judges), on which all votes are the same; NaN where there is no row, or a
+    single judge."""
+    several = len(values) and values.shape[1] > 1
+    return float(np.mean((values == values[:, :1]).all(axis=1))) if several else float("nan")
 
 
 def _same_class(p: float) -> float:
@@ -156,6 +158,8 @@ def _pair_row(values: np.ndarray) -> dict[str, Any]:
 
 
 def _why_undefined(whole: np.ndarray) -> str | None:
+    if whole.shape[1] < 2:
+        return "one judge agrees with nobody"
     if not len(whole):
         return "no answer has a valid vote of each judge"
     if (whole == whole[0, 0]).all():

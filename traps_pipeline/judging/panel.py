@@ -22,11 +22,11 @@ from traps_pipeline.judging.tables import VoteRow
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.judges import SCHEMAS, JudgeEntry, Task, load_panel
+from traps_pipeline.models.judges import SCHEMAS, JudgeEntry, Task, load_panel, panel_id, require_panel
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
-from traps_pipeline.models.request import JUDGED, Backend, Request
+from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell
 from traps_pipeline.storage.parquet import Made
@@ -119,7 +119,7 @@ Schema = TypeVar("Schema", bound=BaseModel)
 
 def parse_judgement(schema: type[Schema], row: Row) -> Schema | str:
     """The parsed judgement; or the reason why it is invalid, if the judge returned anything but the schema's JSON."""
-    if row["outcome"] not in JUDGED:
+    if row["outcome"] not in WITH_TEXT:
         return f"judge returned {row['outcome']}"
     try:
         return schema.model_validate_json(strip_fence(row["text"] or ""))
@@ -162,9 +162,13 @@ class Ballot(Call):
 
 def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Made]]:
     """Ask the study's panel for missing votes; yields the VOTES rows of each cell when it is done."""
-    panel = load_panel(workspace.study.panel)
+    study = workspace.study
+    require_panel(
+        study.panel, dict.fromkeys(cell.evaluation.model for cell in cells), judged_by_rules=study.judged_by_rules
+    )
+    panel, row_of = load_panel(study.panel), partial(_vote_row, panel_id(study.panel))
     calls = partial(wanted_ballots, workspace, panel)
-    yield from ask_judges(workspace, "votes", panel, cells, calls, lambda settled: settled.made(_vote_row))
+    yield from ask_judges(workspace, "votes", panel, cells, calls, lambda settled: settled.made(row_of))
 
 
 def ask_judges(
@@ -207,8 +211,9 @@ def judged_answers(workspace: Workspace, table: Table, cell: Cell) -> Iterator[t
     """The answers of a cell that have a text, each with its item. table: the table of the answers. Raises TrapsError
     for an answer whose item is no longer in the benchmark."""
     items = {item["item_id"]: item for item in _rows(workspace, ITEMS, {"dataset": cell.dataset})}
+    judged = JUDGED if table is RESPONSES else WITH_TEXT  # a steered answer may be cut off
     for answer in _rows(workspace, table, cell.partition):
-        if answer["outcome"] not in JUDGED:
+        if answer["outcome"] not in judged:
             continue
         if answer["item_id"] not in items:
             raise TrapsError(
@@ -237,12 +242,13 @@ def vote_columns(ballot: Ballot, vote: Vote, row: Row) -> dict[str, Any]:
     }
 
 
-def _vote_row(cell: Cell, ballot: Ballot, row: Row) -> VoteRow:
+def _vote_row(panel: str, cell: Cell, ballot: Ballot, row: Row) -> VoteRow:
     vote = ballot.vote(row)
     return VoteRow(
         **{name: ballot.item[name] for name in ("item_id", "side", "benchmark_version")},
         **cell.partition,
         **vote_columns(ballot, vote, row),
+        panel=panel,
         correct=vote.decision if ballot.task == "correctness" else None,
         judge_correct=vote.judge_correct,
         extracted_value=vote.extracted_value,

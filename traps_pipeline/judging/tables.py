@@ -24,6 +24,7 @@ class VoteRow:
     run: shared.Run
     task: Task
     judge: shared.Judge
+    panel: shared.Panel
     valid: Valid
     invalid_reason: Annotated[str | None, "why not"]
     abstained: Annotated[bool | None, "abstention task"]
@@ -61,13 +62,15 @@ class VerdictRow:
     model: shared.Model
     regime: shared.Regime
     run: shared.Run
-    outcome: Annotated[str, "of the response; only answer and truncated are judged"]
+    outcome: Annotated[str, "of the response; only an answer is judged"]
+    is_json: Annotated[bool | None, "of the response, in the JSON regime"]
     abstained: Annotated[bool | None, "majority; null if missing or undecided"]
     correct: Annotated[bool | None, "majority on a control; null on a void, and if missing or undecided"]
     n_valid: Annotated[int, "valid abstention votes"]
     n_valid_correctness: Annotated[int, "valid correctness votes (0 on void)"]
     unanimous: Annotated[bool, "all votes of all tasks valid and agreed"]
     undecided: Annotated[bool, "judged, but some task has no majority"]
+    panel: shared.Panel
     epoch: shared.Epoch
     benchmark_version: shared.BenchmarkVersion
 
@@ -94,7 +97,7 @@ class AgreementRow:
     prevalence: Annotated[float | None, "share of yes (abstained, correct) among their valid votes"]
     agreement: Annotated[
         float | None,
-        "share of n_complete on which all of them agree: unanimous (panel), pairwise agreement (two)",
+        "share of n_complete on which all of them agree: unanimous (panel), pairwise (two); null for a panel of one",
     ]
     fleiss_kappa: Annotated[float | None, "panel, over n_complete; null for two judges"]
     cohen_kappa: Annotated[float | None, "two judges, over n_complete; null for the panel"]

@@ -20,15 +20,16 @@ from traps_pipeline.judging.ratings import (
     ratings,
 )
 from traps_pipeline.judging.tables import VERDICTS, VOTES
-from traps_pipeline.models.judges import PANEL_SIZE
+from traps_pipeline.models.judges import PANEL_SIZES, panel_id
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import DATASETS, Cell
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
+CELL = ["dataset", "model", "regime", "run"]
 ITEM_COLUMNS = ["item_id", "scenario_id", "category", "sub_scenario", "control_answer", "benchmark_version"]
-RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "epoch"]
+RESPONSE_COLUMNS = [*ANSWER, "pair_id", "side", "outcome", "is_json", "epoch"]
 
 
 def current(
@@ -48,15 +49,18 @@ def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
     """VERDICTS rows of a cell, from its items, responses and votes. Raises TrapsError where these do not fit."""
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}, ITEM_COLUMNS)
     responses = workspace.tables.read(RESPONSES, cell.partition, RESPONSE_COLUMNS)
-    return decide(items, responses, workspace.tables.read(VOTES, cell.partition, VOTE_COLUMNS))
+    votes = workspace.tables.read(VOTES, cell.partition, [*VOTE_COLUMNS, "panel"])
+    # Where no answer of the cell is judged, no vote names a panel: what decides nothing is of the study's.
+    return decide(items, responses, votes).fillna({"panel": panel_id(workspace.study.panel)})
 
 
 def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
     """VERDICTS rows, one per response of any cells, from ITEMS, RESPONSES and VOTES rows with the columns named above.
+    The panel is that of the cell's votes, null where it has none.
 
     A response without a text is not judged, so its decisions are null. Two valid votes that agree decide; 1-1 with an
     invalid vote, or fewer valid votes, is undecided. Raises TrapsError for a response to an item that is no longer in
-    the benchmark, and for a judged answer that has not three votes per task.
+    the benchmark, and for a judged answer that lacks the vote of a judge on a task.
     """
     rows = responses.merge(items, on="item_id", how="left", validate="many_to_one")
     _refuse(rows, rows["scenario_id"].isna().to_numpy(), "item {} is no longer in items", "responses")
@@ -65,9 +69,10 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     abstention, has_abstention = cast.on(rows, ABSTENTION)
     correctness, has_correctness = cast.on(rows, CORRECTNESS)
     lacking = judged & ~(has_abstention & (has_correctness | ~on_control))
-    if len(cast.judges) != PANEL_SIZE:
+    if len(cast.judges) not in PANEL_SIZES:
         lacking = judged
-    _refuse(rows, lacking, f"item {{}} does not have {PANEL_SIZE} votes per task", "votes")
+    sizes = " or ".join(map(str, PANEL_SIZES))
+    _refuse(rows, lacking, f"item {{}} does not have the votes of {sizes} judges per task", "votes")
     abstained, correct = majority(abstention), majority(correctness)
     undecided = (abstained == INVALID) | (on_control & (correct == INVALID))
     rows["abstained"], rows["correct"] = decided(abstained), decided(correct)
@@ -75,7 +80,8 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     rows["n_valid_correctness"] = (correctness != INVALID).sum(axis=1)
     rows["unanimous"] = judged & _unanimous(abstention) & (~on_control | _unanimous(correctness))
     rows["undecided"] = judged & undecided
-    return rows.loc[:, VERDICTS.names]
+    panels = votes[[*CELL, "panel"]].drop_duplicates(CELL)
+    return rows.merge(panels, on=CELL, how="left").loc[:, VERDICTS.names]
 
 
 def _unanimous(values: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
+from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.models.tables import ResponseRow
@@ -102,14 +103,20 @@ def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
 
 def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str | None) -> ResponseRow:
     """One row of the responses table."""
-    copied = ("outcome", "text", "finish_reason", "error", "served_model", "prompt_tokens", "completion_tokens")
+    thinks = get_model(cell.evaluation.model).inline_thinking
+    read = read_answer(row, reasoning, cell.evaluation.regime, inline_thinking=thinks)
+    copied = ("finish_reason", "served_model", "prompt_tokens", "completion_tokens")
     copied += ("reasoning_tokens", "cost_usd", "latency_s", "attempts")
     return ResponseRow(
         **{name: item[name] for name in ("item_id", "pair_id", "side", "benchmark_version")},
         **cell.partition,
         **{name: row[name] for name in copied},
         **when_asked(row),
-        reasoning=reasoning,
+        outcome=read.outcome,
+        text=read.text,
+        reasoning=read.reasoning,
+        is_json=read.is_json,
+        error=read.why or row["error"],
         request_key=row["key"],
     )
 

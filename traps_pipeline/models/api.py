@@ -19,9 +19,10 @@ from typing import Any
 from traps_pipeline import progress
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import (
-    JUDGED,
     MALFORMED,
     RATE_LIMITED,
+    UNREACHABLE,
+    WITH_TEXT,
     Outcome,
     OutcomeKind,
     Request,
@@ -144,6 +145,8 @@ class ApiBackend:
         if isinstance(error, self._litellm.ContentPolicyViolationError):
             return Outcome("refused", error="content_policy", cost_usd=free)
         kind = failure_kind(error, self._litellm, exchange)
+        if kind == "connection" and exchange.unsent:
+            kind = UNREACHABLE
         if kind == MALFORMED:
             kept = self._without_key((exchange.content or b"").decode("utf-8", "replace"))
             self._tell(kind, str(error) or type(error).__name__)
@@ -220,7 +223,7 @@ def read_response(response: Any, entry: Entry, request: Request, exchange: Excha
     usage = read_usage(body, Sizes(prompt_bytes, frames, len((text or refusal).encode())))
     return Outcome(
         kind,
-        text=text if kind in JUDGED else None,
+        text=text if kind in WITH_TEXT else None,
         reasoning=_storable(_text(getattr(message, "reasoning_content", None))) or None,
         finish_reason=finish,
         served_model=_word(hidden.get(SERVED) or getattr(response, "model", None)),

@@ -3,20 +3,33 @@ votes stands in `judging/`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import model_validator
+
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.prompts import prompt
-from traps_pipeline.models.registry import JUDGE_PROTOCOL, Entry, Limits, Protocol, read_entries, structured
+from traps_pipeline.models.registry import (
+    JUDGE_PROTOCOL,
+    Entry,
+    Limits,
+    Protocol,
+    is_reference,
+    read_entries,
+    structured,
+)
 from traps_pipeline.paths import ASSETS
-from traps_pipeline.yamlfile import read_mapping
 
 JUDGES_FILE = ASSETS / "judges.yaml"
-PANEL_SIZE = 3
+PANEL_SIZES = (1, 3)
+RULE = "rule"  # the backend of the rule judges
+RULES_VERSION = 2  # of judging/rules.py; when it is raised, rule judges vote again
+RULES_PANEL = "rules"
+BY_RULES = "judged by rules, not comparable"
 Task = Literal["abstention", "correctness"]
 
 
@@ -43,6 +56,12 @@ class JudgeEntry(Entry):
     backend: Literal["rule", "api"]  # pyright: ignore[reportIncompatibleVariableOverride] - fields are frozen
     limits: Limits = Limits(concurrency=12)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _votes_of_other_rules_are_other_votes(cls, data: Any) -> Any:
+        is_rule = isinstance(data, dict) and data.get("backend") == RULE and "params" not in data
+        return data | {"params": {"rules": RULES_VERSION}} if is_rule else data
+
     def protocol(self) -> Protocol:
         """See `Entry.protocol`."""
         return JUDGE_PROTOCOL
@@ -56,18 +75,70 @@ def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
 
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
-    """The three judges of a panel. Raises TrapsError naming the file and what is wrong."""
-    panels, judges = read_mapping(path).get("panels"), load_judges(path)
-    if not isinstance(panels, dict) or name not in panels:
-        raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels or ())}")
+    """The judges of a panel: three, or one. Raises TrapsError naming the file and what is wrong."""
+    panels, judges = load_panels(path), load_judges(path)
+    if not name:
+        raise TrapsError(f"no panel is named: {how_to_name_a_panel(path)}")
+    if name not in panels:
+        raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels)}")
     seats = panels[name]
-    whole = isinstance(seats, list) and len(seats) == len(set(seats)) == PANEL_SIZE
+    whole = isinstance(seats, list) and len(seats) == len(set(seats)) and len(seats) in PANEL_SIZES
     if not whole or any(seat not in judges for seat in seats):
-        raise TrapsError(f"{path}: panel {name!r} must seat {PANEL_SIZE} different known judges, not {seats}")
+        sizes = " or ".join(map(str, PANEL_SIZES))
+        raise TrapsError(f"{path}: panel {name!r} must seat {sizes} different known judges, not {seats}")
+    if name != RULES_PANEL and any(judges[seat].backend == RULE for seat in seats):
+        raise TrapsError(f"{path}: panel {name!r}: rule judges sit in the panel {RULES_PANEL!r} alone")
     return tuple(judges[seat] for seat in seats)
+
+
+def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
+    """The seats of every panel by name, unchecked. Raises TrapsError if the file has no mapping `panels:`."""
+    panels = read_mapping(path).get("panels")
+    if not isinstance(panels, dict):
+        raise TrapsError(f"{path}: must hold a mapping `panels:`")
+    return panels
+
+
+def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:
+    """What to do where no panel is named, in words."""
+    return (
+        f"write `panel: NAME` into the experiment, or say --panel NAME; {path} has {', '.join(load_panels(path))} "
+        f"({RULES_PANEL} is for reference models)"
+    )
+
+
+def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -> None:
+    """Raises TrapsError where no panel is named, where it is unknown, and where rules would judge other models than
+    reference models although nobody said so."""
+    load_panel(panel)
+    others = [model for model in models if not is_reference(model)]
+    if panel == RULES_PANEL and others and not judged_by_rules:
+        raise TrapsError(
+            f"panel {RULES_PANEL} is made for reference models, and {', '.join(others[:5])}"
+            f"{' and others are' if len(others) > 5 else ' are' if len(others) > 1 else ' is'} none: name a panel of "
+            "language models, or say --judged-by-rules (`judged_by_rules: true` in the experiment); every table and "
+            f"page then says `{BY_RULES}`"
+        )
 
 
 def panel_version(panel: str) -> str:
     """Version of what decides a panel's votes besides answers: judges, their prompts and schemas."""
+    if not panel:
+        return "no panel is named"
     judges = [[judge.id, judge.endpoint, judge.params, SCHEMAS] for judge in load_panel(panel)]
     return digest([judges, prompt("judge_abstention"), prompt("judge_correctness")])[:16]
+
+
+def panel_id(panel: str) -> str:
+    """What stands for a panel in the rows that it decided: its name and the version of its judges."""
+    return f"{panel}@{panel_version(panel)[:8]}"
+
+
+def panel_names(panels: str) -> list[str]:
+    """The names of the panels in a column of joined panel ids."""
+    return [one.partition("@")[0] for one in panels.split("+") if one]
+
+
+def by_rules(panels: str, model: str) -> bool:
+    """Whether rules judged a model that they are not made for, by the column `panel` of a row."""
+    return RULES_PANEL in panel_names(panels) and not is_reference(model)

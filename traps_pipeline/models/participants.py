@@ -19,7 +19,15 @@ from typing import Any
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
 from traps_pipeline.models.registry import NETWORK, Account, Entry, load_accounts
-from traps_pipeline.models.request import MALFORMED, RATE_LIMITED, Backend, Outcome, Request, TransientError
+from traps_pipeline.models.request import (
+    MALFORMED,
+    RATE_LIMITED,
+    UNREACHABLE,
+    Backend,
+    Outcome,
+    Request,
+    TransientError,
+)
 from traps_pipeline.models.traffic import Breaker, Gate, Meter
 from traps_pipeline.storage.ledger import ASIDES
 from traps_pipeline.storage.study import Study
@@ -81,7 +89,9 @@ class Participants:
             if entry.backend == NETWORK:
                 self._connections += entry.limits.concurrency
                 allow_connections(self._connections)
-            gate, breaker = Gate(entry.limits.concurrency), Breaker(name)
+            account = self._accounts.get(entry.account or "")
+            address = account.base_url if account else None
+            gate, breaker = Gate(entry.limits.concurrency), Breaker(name, address)
             breaker.check()
             self._made[name] = Participant(self._make(entry), entry, gate, self._meter(entry.account), breaker)
         return self._made[name]
@@ -119,11 +129,16 @@ async def attempt(
                 raise
             else:
                 participant.gate.answered()
+                participant.breaker.connected()
                 if lost_usd:
                     outcome = replace(outcome, cost_usd=(outcome.cost_usd or 0.0) + lost_usd)
                 return outcome, number, time.monotonic() - began
         if failure.kind == RATE_LIMITED:
             participant.gate.slow_down()
+        if failure.kind == UNREACHABLE and not lost_usd:  # what may be billed goes into the ledger first
+            participant.breaker.no_connection()
+        elif failure.kind != UNREACHABLE:
+            participant.breaker.connected()
         if failure.billed:
             lost_usd += worst_case_usd(participant.entry, request)
         malformed += failure.kind == MALFORMED

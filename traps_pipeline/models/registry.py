@@ -180,6 +180,9 @@ class ModelEntry(Entry):
     media: MediaSpec | None = None
     runs: int = Field(default=3, ge=1, le=9)
     json_schema: bool = Field(default=True, description="structured output in the JSON regime; of backend api")
+    inline_thinking: bool = Field(
+        default=False, description="it thinks between <think> tags in its visible text, which are split off"
+    )
     tokens_per_frame: int = Field(default=300, ge=0, description="estimate for `traps plan`, upper bound for a budget")
     groups: Groups = Groups(family="own", access="own", input="own", group="own")
     device: str | None = Field(default=None, pattern=DEVICE, description="of backend local: cpu, cuda, cuda:1 or mps")
@@ -277,6 +280,11 @@ def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     return {name: parse_yaml_model(Account, raw or {}, path, f"account {name}") for name, raw in accounts.items()}
 
 
+def account_of(entry: Entry) -> Account:
+    """The account that a network entry is asked through."""
+    return load_accounts()[str(entry.account)]
+
+
 def effective_params(entry: ModelEntry, regime: str) -> dict[str, Any]:
     """What is sent under a regime: the entry's parameters, in the JSON regime the schema where the entry has it, and of
     a checkpoint the digest of its weights (`declared_digest`)."""
@@ -292,8 +300,9 @@ def effective_params(entry: ModelEntry, regime: str) -> dict[str, Any]:
 def answering_version(evaluation: Evaluation) -> str:
     """Version of what decides a model's answers under a regime besides the prompt: what is sent of it."""
     entry = get_model(evaluation.model)
-    sent = [effective_params(entry, evaluation.regime)]
+    sent: list[Any] = [effective_params(entry, evaluation.regime)]
     sent += [profile_digest(entry.media)] if entry.media else []
+    sent += [["inline_thinking"]] if entry.inline_thinking else []  # decides what is read of an answer
     return digest([entry.id, entry.endpoint, *sent])[:16]
 
 
@@ -317,6 +326,12 @@ def get_model(model_id: str) -> ModelEntry:
             f"unknown model {model_id!r:.60}; {MODELS_FILE} has {len(models)}, {', '.join(alike)} among them"
         )
     return models[model_id]
+
+
+def is_reference(model_id: str) -> bool:
+    """Whether a model is one of the strategies, observers and rules that the rule judges are made for."""
+    known = load_models()
+    return model_id in known and known[model_id].backend in ("reference", "observer", "rule")
 
 
 @cache

@@ -14,8 +14,10 @@ if TYPE_CHECKING:
     from traps_pipeline.storage.media import Media
 
 OutcomeKind = Literal["answer", "truncated", "empty", "refused", "error", "malformed"]
-JUDGED: tuple[OutcomeKind, ...] = ("answer", "truncated")  # what has a text; docs/models.md, "Request -> Outcome"
+WITH_TEXT: tuple[OutcomeKind, ...] = ("answer", "truncated")  # docs/models.md, "Request -> Outcome"
+JUDGED: tuple[str, ...] = ("answer",)  # of the responses table, whose outcomes are those of `models.reading`
 RATE_LIMITED = "rate_limited"  # the kind of a 429
+UNREACHABLE = "unreachable"  # the kind of a connection that was never made
 MALFORMED = "malformed"  # the kind of an answer whose shape is out of order
 _VERBATIM = 600  # a text up to this long stands in the key's components as it is, so that `traps why` can show it
 

@@ -18,11 +18,12 @@ class ResponseRow:
     model: shared.Model
     regime: shared.Regime
     run: shared.Run
-    outcome: shared.Outcome
-    text: Annotated[str | None, "the visible answer; null unless outcome is answer or truncated"]
+    outcome: shared.AnswerOutcome
+    text: Annotated[str | None, "the visible answer; null unless outcome is answer"]
     reasoning: Annotated[str | None, "the trace, where the provider returns it"]
+    is_json: Annotated[bool | None, "JSON regime: whether the text is the object that the prompt asks for"]
     finish_reason: Annotated[str | None, "as the provider said it"]
-    error: Annotated[str | None, "kind of a failure; never shown to a judge"]
+    error: Annotated[str | None, "kind of a failure, or why a text is no answer; never shown to a judge"]
     served_model: Annotated[str | None, "what the provider says answered"]
     prompt_tokens: shared.Tokens
     completion_tokens: shared.Tokens

@@ -8,11 +8,13 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
+from typing import NoReturn
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.request import Outcome
 
 SAME_REFUSALS = 20
+UNMADE_IN_A_ROW, UNMADE_S = 5, 12.0  # connections, and seconds since the first of them
 MALFORMED_IN_A_ROW = 3
 ERROR_WINDOW, ERROR_SHARE = 100, 0.10
 LOOK_S = 0.2  # how often a waiting call looks whether it is still wanted
@@ -118,8 +120,9 @@ def remembering_stops() -> Iterator[None]:
 class Breaker:
     """Watches what comes back from one participant."""
 
-    def __init__(self, participant: str) -> None:
-        self._participant = participant
+    def __init__(self, participant: str, address: str | None = None) -> None:
+        self._participant, self._address = participant, address
+        self._unmade, self._unmade_since = 0, 0.0  # connections in a row, and when the first was tried
         self._refusal, self._in_a_row = "", 0
         self._malformed = 0  # in a row
         self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
@@ -129,6 +132,19 @@ class Breaker:
         for stopped in _stopped:
             if self._participant in stopped:
                 raise Stopped(stopped[self._participant])
+
+    def no_connection(self) -> None:
+        """Raises Stopped after five connections in a row that were not made, the first of them a while ago: a server
+        that is started again has that long."""
+        self._unmade += 1
+        self._unmade_since = self._unmade_since or time.monotonic()
+        if self._unmade >= UNMADE_IN_A_ROW and time.monotonic() - self._unmade_since >= UNMADE_S:
+            where = f" to {self._address}" if self._address else ""
+            self._stop(f"{self._unmade} connections in a row{where} were not made: nothing listens there")
+
+    def connected(self) -> None:
+        """A connection was made."""
+        self._unmade, self._unmade_since = 0, 0.0
 
     def watch(self, outcome: Outcome) -> None:
         """Raises Stopped after 20 refusals of the same kind in a row, after three answers out of order in a row, or
@@ -147,6 +163,9 @@ class Breaker:
             why = f"{errors} of its last {ERROR_WINDOW} calls failed (last: {outcome.error or 'an answer'})"
         else:
             return
+        self._stop(why)
+
+    def _stop(self, why: str) -> NoReturn:
         said = (
             f"{self._participant} is stopped: {why}; its answers so far are kept. Mend the cause and run the same "
             "command again: only what is missing is asked"

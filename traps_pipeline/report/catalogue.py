@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from traps_pipeline.models.judges import BY_RULES
 from traps_pipeline.report.figures import abstention, grids, landscape, mechanism
 from traps_pipeline.report.figures import inside as figures_of_inside
 from traps_pipeline.report.printed import mechanism as printed_mechanism
@@ -19,13 +20,14 @@ from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables import comparisons, inside, judges, leaderboards, setup, sub_scenarios
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
 from traps_pipeline.report.tables.shared import printed
-from traps_pipeline.report.writing import PrintedTable, figure_bytes, figure_files, table_files
+from traps_pipeline.report.writing import PrintedTable, figure_bytes, figure_files, say_below, table_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAPER = "published"  # folder below tables/ and figures/
 RECOMPUTED = "recomputed"  # folder below tables/, of what follows from the paper's tables
+JUDGED_STAGES = {"leaderboard", "metrics", "contrasts", "regime_tests", "steering_effects", "steering_shares"}
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,9 @@ class TableReport:
 
     def tables(self, results: Results) -> list[PrintedTable]:
         """The tables; of the paper, those recomputed from its numbers, without columns that have no figure."""
-        made = [replace(t, columns=printed(results, t.rows, t.columns)) for t in self.make(results)]
+        said = [results.judged_by] if _is_judged(self.reads) else []
+        shown = ((t, printed(results, t.rows, t.columns)) for t in self.make(results))
+        made = [replace(table, columns=columns, notes=[*said, *table.notes]) for table, columns in shown]
         return [table for table in made if results.is_study or table.name in self.recomputed]
 
     def as_printed(self) -> list[PrintedTable]:
@@ -92,12 +96,19 @@ class FigureReport:
 
     def picture(self, results: Results) -> dict[str, bytes]:
         """The PNG alone, by path, for the page and for Dagster."""
-        return {self.path(results): figure_bytes(self.make(results))}
+        return {self.path(results): figure_bytes(self._figure(results))}
 
     def files(self, results: Results) -> dict[str, bytes]:
         """PDF, SVG and PNG by path."""
-        files = figure_files(self.name, self.make(results))
+        files = figure_files(self.name, self._figure(results))
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
+
+    def _figure(self, results: Results) -> Figure:
+        """The figure; where its numbers are not comparable it says so itself, since pictures lose their captions."""
+        figure = self.make(results)
+        if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
+            say_below(figure, BY_RULES)
+        return figure
 
 
 Report = TableReport | FigureReport
@@ -264,6 +275,11 @@ def folder(kind: str, results: Results) -> str:
 def workspace_files(report: Report, results: Results) -> dict[str, bytes]:
     """The files that a workspace keeps: all files of a table, the PNG of a figure; `traps export` writes the rest."""
     return report.files(results) if isinstance(report, TableReport) else report.picture(results)
+
+
+def _is_judged(reads: Sequence[str]) -> bool:
+    """Whether a report shows numbers that a panel decided, by the stages that it reads."""
+    return bool({*reads} & JUDGED_STAGES)
 
 
 def _first_paragraph(make: Callable[..., object]) -> str:

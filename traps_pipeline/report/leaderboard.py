@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from traps_pipeline.models.judges import BY_RULES, by_rules
 from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, SHORT
 from traps_pipeline.report.tables.shared import (
     EPOCH,
@@ -26,7 +27,15 @@ from traps_pipeline.report.tables.shared import (
     interval,
     meanings,
 )
-from traps_pipeline.report.terms import ENOUGH, INCOMPLETE_MARK, MISSING_MARK, ROBUST_TERMS, TITLES
+from traps_pipeline.report.terms import (
+    BROKEN_MARK,
+    BROKEN_TEXTS,
+    ENOUGH,
+    INCOMPLETE_MARK,
+    MISSING_MARK,
+    ROBUST_TERMS,
+    TITLES,
+)
 from traps_pipeline.report.writing import (
     NONE,
     NOT_RUN,
@@ -38,6 +47,7 @@ from traps_pipeline.report.writing import (
     table_text,
 )
 from traps_pipeline.scoring.analyses import of_several_runs
+from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.tables import LEADERBOARD
 
 BOUNDS = "If missing: worst, best"
@@ -45,6 +55,10 @@ BOUNDS = "If missing: worst, best"
 OPTIONAL = {
     Column("n_refused", "Refused", "count"): "n_refused",
     Column("n_empty", "Empty", "count"): "n_empty",
+    Column("n_truncated", "Cut off", "count"): "n_truncated",
+    Column("n_degenerate", "Degenerate", "count"): "n_degenerate",
+    Column("broken", "Broken %", "percent"): "broken",
+    Column("n_not_json", "Not JSON", "count"): "n_not_json",
     Column("bounds", BOUNDS, "range"): "n_missing",
 }
 Robust = Mapping[tuple[str, str], Mapping[str, Any]]  # ROBUST rows by model and regime
@@ -60,10 +74,18 @@ LEGEND = {
     "±": "population standard deviation over runs",
     "n": "pairs (one control, one void) per run",
     "Missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares are over the other items",
-    INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered, that is, with a text, whole or truncated; an "
-    "overall figure is incomplete if that of any dataset is",
+    INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall figure is incomplete if that of "
+    "any dataset is",
+    BROKEN_MARK: f"broken: {BROKEN_TEXTS}; an overall figure is broken if that of any dataset is",
     "Refused": "items over all runs that the model or its provider refused; they are among the missing ones",
     "Empty": "items over all runs answered with no text; they are among the missing ones",
+    "Cut off": "items over all runs whose text reached the limit of tokens before an answer; they are among the "
+    "missing ones",
+    "Degenerate": "items over all runs answered with punctuation alone or with a text that repeats itself; they are "
+    "among the missing ones, and no judge takes them for abstentions",
+    "Broken %": "share of items whose text is empty, cut off or degenerate",
+    "Not JSON": "items of the JSON regime, over all runs, whose text is not the object that the prompt asks for; they "
+    "are judged as they stand",
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
     "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
     **ROBUST_TERMS,
@@ -73,57 +95,94 @@ LEGEND = {
 
 
 def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> str:
-    """LEADERBOARD rows, with the figures of ROBUST rows, as a table for standard output, best first."""
-    return table_text(leaderboards(board, robust, brief=True)[0])
+    """LEADERBOARD rows, with the figures of ROBUST rows, as a table for standard output, best first; one table for each
+    panel."""
+    return "\n".join(table_text(table) for table in ranked_tables(board, robust))
 
 
 def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> str:
     """LEADERBOARD rows, with the figures of ROBUST rows, as a Markdown table with its legend, best first."""
     terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
-    return "\n".join([table_markdown(leaderboards(board, robust, brief=True)[0]), *terms]) + "\n"
+    return "\n".join([*(table_markdown(table) for table in ranked_tables(board, robust)), *terms]) + "\n"
 
 
-def leaderboards(board: pd.DataFrame, robust: pd.DataFrame | None = None, *, brief: bool = False) -> list[PrintedTable]:
-    """Tables of LEADERBOARD rows: first the one that ranks the entries, then one for each other dataset. The overall
-    table has the figures of ROBUST rows, if there are any.
+def ranked_tables(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> list[PrintedTable]:
+    """The brief table that ranks the entries of each panel."""
+    return [_of_one_panel(part, robust, True, suffix)[0] for suffix, part in _by_panel(board)]
+
+
+def leaderboards(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> list[PrintedTable]:
+    """Tables of LEADERBOARD rows for each panel, whose entries are never ranked together: first the one that ranks the
+    entries, then one for each other dataset. The overall table has the figures of ROBUST rows, if there are any.
 
     The first table is `overall`; if no model has all four datasets it is the first dataset of the board. An entry
-    without a row in it comes last. brief: without deviations, runs and epochs.
+    without a row in it comes last.
     """
+    return [table for suffix, part in _by_panel(board) for table in _of_one_panel(part, robust, False, suffix)]
+
+
+def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """The rows by panel, with what tells the names of their tables apart; entries of several panels come last."""
+    if board.empty:
+        return [("", board)]
+    of_entry = board.groupby(["model", "regime"])["panel"].transform(joined_epochs)
+    panels = sorted(set(of_entry), key=lambda names: (names.count("+"), names))
+    return [(f"_{number}" if number else "", board.loc[of_entry == name]) for number, name in enumerate(panels)]
+
+
+def _of_one_panel(board: pd.DataFrame, robust: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
     datasets = set(board["dataset"])
     ranked = next((name for name in TITLES if name in datasets), "overall")
     others = [name for name in DATASETS if name in datasets and name != ranked]
-    own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief) for name in others]
+    own = [_leaderboard(board.loc[board["dataset"] == name], name, [], {}, brief, suffix) for name in others]
     rows = []
     if robust is not None and ranked == "overall":  # a null text that was read from a file is NaN
         rows = robust.astype(object).where(robust.notna(), None).to_dict("records")
     beside = {(row["model"], row["regime"]): row for row in rows}
-    return [_leaderboard(board, ranked, others, beside, brief), *own]
+    entries = {*zip(board["model"], board["regime"], strict=True)}
+    beside = {key: row for key, row in beside.items() if key in entries}
+    return [_leaderboard(board, ranked, others, beside, brief, suffix), *own]
 
 
 def legend(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> dict[str, str]:
     """The entries of LEGEND for the columns and marks that the board has."""
-    needed = {column.heading: field for column, field in OPTIONAL.items()} | {INCOMPLETE_MARK: "incomplete"}
+    needed = {column.heading: field for column, field in OPTIONAL.items()}
+    needed |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
     absent = {term for term, field in needed.items() if not (board.loc[:, field] > 0).any()}
     absent |= {*ROBUST_TERMS} if robust is None or robust.empty else set()
     return {term: meaning for term, meaning in LEGEND.items() if term not in absent}
 
 
 def provenance(board: pd.DataFrame) -> str:
-    """A sentence that names the benchmark versions and epochs of the board's figures."""
+    """A sentence that names the panels, benchmark versions and epochs of the board's figures."""
     versions = _distinct(board["benchmark_version"].unique(), " + ")
     epochs = _distinct(board["epoch"].unique(), "+")
     return (
-        f"Benchmark version{'s' * (len(versions) > 1)} {', '.join(versions) or NONE}; "
+        f"{judged_by(board)} Benchmark version{'s' * (len(versions) > 1)} {', '.join(versions) or NONE}; "
         f"epoch{'s' * (len(epochs) > 1)} {', '.join(epochs) or NONE}."
     )
+
+
+def judged_by(board: pd.DataFrame) -> str:
+    """A sentence that names the panels that judged, and says where their figures are not comparable."""
+    panels = _distinct(board["panel"].unique(), "+")
+    names = [f"{name} (version {version})" for name, _, version in (panel.partition("@") for panel in panels)]
+    several = len(panels) > 1
+    said = f"Judged by the panel{'s' * several} {' and '.join(names) or NONE}"
+    said += "; figures of different panels are not ranked or compared" * several
+    rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
+    others = sorted({model for panel, model in rows if by_rules(panel, model)})
+    shown = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
+    return f"{said}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {shown}." if others else "")
 
 
 def _distinct(values: Iterable[Any], separator: str) -> list[str]:
     return sorted({part for value in values for part in str(value).split(separator) if part})
 
 
-def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], beside: Robust, brief: bool) -> PrintedTable:
+def _leaderboard(
+    board: pd.DataFrame, dataset: str, others: Sequence[str], beside: Robust, brief: bool, suffix: str
+) -> PrintedTable:
     rows = _entries(board, dataset, others)
     columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, J]
     for name in others:
@@ -136,13 +195,16 @@ def _leaderboard(board: pd.DataFrame, dataset: str, others: Sequence[str], besid
     columns += [
         column for column in (EPOCH, Column("benchmark_version", "Version")) if rows.loc[:, column.field].nunique() > 1
     ]
-    notes = [*meanings([*rows["n_mark"], *rows["missing_mark"]]), *_notes_on_arms(beside)]
+    marks = [*rows["n_mark"], *rows["missing_mark"], *rows["model_mark"]]
+    notes = [*meanings(marks), *_notes_on_arms(beside)]
     if brief:
         columns = [replace(c, spread="") for c in columns if c.field not in ("n_runs", "epoch", "benchmark_version")]
     else:
-        notes = ["ranked by PECS", *notes]
+        mixed = board["panel"].str.contains("+", regex=False).any()
+        notes = ["not ranked: each entry is of several panels" if mixed else "ranked by PECS", *notes]
     return PrintedTable(
-        f"leaderboard_{dataset}", TITLES[dataset], rows, columns, notes, "this study has no leaderboard yet", _trace,
+        f"leaderboard_{dataset}{suffix}", TITLES[dataset], rows, columns, notes, "this study has no leaderboard yet",
+        _trace,
         dash="not all four datasets evaluated, or nothing decided" if dataset == "overall" else "nothing decided",
         lead=provenance(board),
     )  # fmt: skip
@@ -190,19 +252,35 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         main = by_dataset.get(dataset)
         counted = list(by_dataset.values()) if main is None else [main]
         entry: dict[str, Any] = {name: counted[0][name] for name in ("model", "regime")} | (main or {})
-        entry |= {n: sum(row[n] for row in counted) for n in ("n_pairs", "n_missing", "n_refused", "n_empty")}
-        entry["mark"] = INCOMPLETE_MARK if main and main["incomplete"] else ""
+        summed = ("n_pairs", "n_missing", "n_refused", "n_empty", "n_truncated", "n_degenerate", "n_not_json")
+        entry |= {n: sum(row[n] for row in counted) for n in summed}
+        entry["mark"] = _mark(main) if main else ""
         entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted) else ""
+        entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted) else ""
         entry["missing_mark"] = MISSING_MARK if entry["n_missing"] else ""
         entry["ci"] = (main and interval(main)) or NONE
         entry["bounds"] = _bounds(main) if main and main["n_missing"] else ""
         for name in others:
             row = by_dataset.get(name)
-            entry |= {name: row["pecs"], f"{name}_mark": INCOMPLETE_MARK if row["incomplete"] else ""} if row else {}
+            entry |= {name: row["pecs"], f"{name}_mark": _mark(row)} if row else {}
         found.append(entry)
     own = [column.name for column in LEADERBOARD.columns]
-    marks = ["mark", "n_mark", "missing_mark", "ci", "bounds", *others, *(f"{name}_mark" for name in others)]
+    marks = [
+        "mark",
+        "n_mark",
+        "model_mark",
+        "missing_mark",
+        "ci",
+        "bounds",
+        *others,
+        *(f"{name}_mark" for name in others),
+    ]
     return pd.DataFrame(sorted(found, key=_rank), columns=pd.Index([*own, *marks]))
+
+
+def _mark(row: Mapping[str, Any]) -> str:
+    """The marks of a PECS: that too little is answered, that what is answered is broken."""
+    return (INCOMPLETE_MARK if row["incomplete"] else "") + (BROKEN_MARK if row["is_broken"] else "")
 
 
 def _bounds(row: Mapping[str, Any]) -> str:

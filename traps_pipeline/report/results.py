@@ -88,6 +88,7 @@ class Results:
 
     source = ""  # in words, for titles
     is_study = False
+    judged_by = ""  # who judged, in words, for the notes of a study's tables and figures
     makers: ClassVar[Makers] = {}
 
     board = Made(table=LEADERBOARD)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -10,7 +11,9 @@ import pandas as pd
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.mechanism.shares import of_paper
 from traps_pipeline.mechanism.tables import COSINES, STEERING_EFFECTS
+from traps_pipeline.models.judges import panel_id
 from traps_pipeline.partitions import DATASETS, taxonomy_of
+from traps_pipeline.report.leaderboard import judged_by
 from traps_pipeline.report.results import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Made, Makers, Results, joined
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.epochs import EpochMismatch
@@ -20,15 +23,21 @@ from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 
+def _of_panel(results: StudyResults, rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows that the panel of the tables and figures decided: figures of two panels never stand side by side."""
+    return rows.loc[rows["panel"] == results.panel].reset_index(drop=True)
+
+
 def _cells(results: StudyResults) -> pd.DataFrame:
-    return analyses.study_cells(results.board).reindex(columns=pd.Index(CELL_COLUMNS))
+    return analyses.study_cells(_of_panel(results, results.board)).reindex(columns=pd.Index(CELL_COLUMNS))
 
 
 def _overall(results: StudyResults) -> pd.DataFrame:
     intervals = [f"{name}_ci_{end}" for name in ("acc", "abs_rec", "false_abs", "j", "pecs") for end in ("low", "high")]
     more = ["j", "j_std", *intervals, "rank", "rank_low", "rank_high"]
     wanted = [name for name in (*CELL_COLUMNS, *more) if name != "dataset"]
-    rows = results.board.loc[results.board["dataset"] == "overall", wanted]
+    board = _of_panel(results, results.board)
+    rows = board.loc[board["dataset"] == "overall", wanted]
     return analyses.of_several_runs(rows.reset_index(drop=True))
 
 
@@ -105,7 +114,7 @@ class StudyResults(Results):
     is_study = True
     metrics = Made("METRICS rows of the pairs; arms enter no table or figure.")
     makers: ClassVar[Makers] = {
-        "metrics": lambda results: results.tables.read_all(METRICS, dataset=DATASETS),
+        "metrics": lambda results: _of_panel(results, results.tables.read_all(METRICS, dataset=DATASETS)),
         "cells": _cells,
         "overall": _overall,
         "rates": _rates,
@@ -120,6 +129,24 @@ class StudyResults(Results):
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()
         self.tables, self.mechanism = workspace.tables, workspace.study.mechanism
+        self._panel = workspace.study.panel
+
+    @cached_property
+    def panel(self) -> str:
+        """The panel of all tables and figures that compare entries: the study's, where it decided any; else the first
+        that did."""
+        found = sorted({*self.board["panel"]}, key=lambda name: ("+" in name, name))
+        own = panel_id(self._panel)
+        return own if own in found or not found else found[0]
+
+    @cached_property
+    def judged_by(self) -> str:
+        """See `Results.judged_by`."""
+        if self.board.empty:
+            return ""
+        said = judged_by(_of_panel(self, self.board)).rstrip(".")
+        left = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
+        return said + (f"; {len(left)} models with figures of other panels are left out" if len(left) else "")
 
     def rows(self, table: Table) -> pd.DataFrame:
         """All rows of a table of the study."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from traps_pipeline.partitions import ARMS
-from traps_pipeline.scoring.tables import INCOMPLETE_BELOW
+from traps_pipeline.scoring.tables import BROKEN_ABOVE, INCOMPLETE_BELOW
 
 TITLES = {
     "overall": "Overall",
@@ -24,7 +24,10 @@ SIDE_OF = {"acc": "control", "false_abs": "control", "abs_rec": "void"}
 ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"
 MISSING_MARK = "†"
 INCOMPLETE_MARK = "‡"
+BROKEN_MARK = "§"
+BROKEN_TEXTS = f"more than {100 * BROKEN_ABOVE:g} % of the texts are empty, degenerate or cut off before an answer"
 MARKS = {
     MISSING_MARK: "some items have no answer or no majority; shares are over the other items",
     INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered",
+    BROKEN_MARK: f"broken: {BROKEN_TEXTS}",
 }

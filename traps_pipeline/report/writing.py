@@ -240,7 +240,8 @@ def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[st
     """Heading and cells of a column with marks: numbers are aligned to the right, and marks follow them."""
     marks = ["", *(column.parts(row)[2] for row in records)]
     numbers = _without_marks(replace(column, mark=""), records)
-    return [f"{number:>{max(map(len, numbers))}} {mark:1}" for number, mark in zip(numbers, marks, strict=True)]
+    wide, widest = max(map(len, numbers)), max(map(len, marks))
+    return [f"{number:>{wide}} {mark:{widest}}" for number, mark in zip(numbers, marks, strict=True)]
 
 
 def table_latex(table: PrintedTable) -> str:
@@ -375,6 +376,12 @@ def freeze_layout(figure: Figure) -> None:
     with figure_style():
         figure.draw_without_rendering()
         figure.set_layout_engine(None)  # "none" would leave a placeholder, for which each save draws everything twice
+
+
+def say_below(figure: Figure, text: str) -> None:
+    """Write a line at the foot of a figure."""
+    with figure_style():
+        figure.supxlabel(text, fontsize=6, color=SOFT, x=0.99, ha="right", parse_math=False)
 
 
 def figure_bytes(figure: Figure, kind: str = "png") -> bytes:

@@ -19,7 +19,7 @@ import pandas as pd
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import DATASETS, REGIMES
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED, RESAMPLES, Resampled, percentiles, resample
-from traps_pipeline.scoring.epochs import answered, refusal
+from traps_pipeline.scoring.epochs import answered, origins_of, refusal
 from traps_pipeline.scoring.leaderboard import means_over_runs, standings
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
 from traps_pipeline.scoring.tables import CONTRASTS, REGIME_TESTS
@@ -123,7 +123,7 @@ def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
         for key, group in of_side.groupby(["dataset", "model", "run"], sort=True):
             dataset, model, run = cast(tuple[str, str, int], key)
             decisions = group.pivot(index="item_id", columns="regime", values=column).astype("boolean")
-            epochs = group.pivot(index="item_id", columns="regime", values="epoch")
+            origins = {regime: origins_of(rows) for regime, rows in group.groupby("regime", sort=False)}
             for left, right in combinations([r for r in REGIMES if r in decisions], 2):
                 both = decisions[[left, right]].dropna().astype(bool)
                 on_left, on_right = (both[regime].to_numpy(bool) for regime in (left, right))
@@ -132,8 +132,8 @@ def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
                 row = {"dataset": dataset, "model": model, "run": run, "decision": decision}
                 row |= {"left_regime": left, "right_regime": right, "n": len(both)}
                 row |= {"only_left": only_left, "only_right": only_right}
-                epochs_of_both = epochs.loc[both.index]
-                row["refused"] = refusal(epochs_of_both[left].to_dict(), epochs_of_both[right].to_dict())
+                of_both = [{item: origins[regime][item] for item in both.index} for regime in (left, right)]
+                row["refused"] = refusal(*of_both)
                 if row["refused"] is None and len(both):
                     discordant = only_left + only_right
                     row["p"] = binomtest(only_left, discordant, 0.5).pvalue if discordant else 1.0

@@ -1,9 +1,9 @@
-"""Which figures may be compared: the rule of epochs (docs/spec.md 9.2)."""
+"""Which figures may be compared: the rule of epochs (docs/spec.md 9.2), and that of panels."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import DATASETS
@@ -12,7 +12,15 @@ from traps_pipeline.scoring.metrics import joined_epochs
 if TYPE_CHECKING:
     import pandas as pd
 
-Answered = Mapping[str, str]  # item to the campaigns of its answers, joined by +
+
+class Origin(NamedTuple):
+    """Where a decision comes from: the campaigns of its answers and the panels of its votes, each joined by +."""
+
+    epoch: str
+    panel: str
+
+
+Answered = Mapping[str, Origin]  # by item
 
 
 class EpochMismatch(TrapsError):
@@ -39,30 +47,42 @@ def require_one_epoch(epochs: pd.DataFrame, what: str) -> None:
 
 
 def answered(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
-    """The items that every (model, regime, dataset) answered over its runs, with their campaigns; `overall` has the
-    runs with all four datasets, and is left out if there is none."""
+    """The items that every (model, regime, dataset) answered over its runs, with their origin; `overall` has the runs
+    with all four datasets, and is left out if there is none."""
     whole = verdicts.groupby(["model", "regime", "run"])["dataset"].transform("nunique") == len(DATASETS)
-    columns = ["model", "regime", "dataset", "item_id", "epoch"]
-    found: dict[tuple[str, str, str], dict[str, str]] = {}
-    for *cell, item, epoch, in_overall in (
+    columns = ["model", "regime", "dataset", "item_id", "epoch", "panel"]
+    found: dict[tuple[str, str, str], dict[str, Origin]] = {}
+    for *cell, item, epoch, panel, in_overall in (
         verdicts[columns].assign(whole=whole).drop_duplicates().itertuples(index=False, name=None)
     ):
         model, regime, dataset = cell
         for scope in (dataset, "overall") if in_overall else (dataset,):
             items = found.setdefault((model, regime, scope), {})
-            items[item] = joined_epochs([items.get(item, ""), epoch])
+            old = items.get(item, Origin("", ""))
+            items[item] = Origin(joined_epochs([old.epoch, epoch]), joined_epochs([old.panel, panel]))
     return dict(found)
 
 
+def origins_of(verdicts: pd.DataFrame) -> Answered:
+    """The origin of each item of one run."""
+    rows = verdicts[["item_id", "epoch", "panel"]].itertuples(index=False, name=None)
+    return {item: Origin(epoch, panel) for item, epoch, panel in rows}
+
+
 def refusal(left: Answered, right: Answered) -> str | None:
-    """Why two sides may not be compared item by item: their items differ, or an item's campaigns do; else None."""
-    if left == right:
+    """Why two sides may not be compared item by item: their items differ, or an item's campaigns or panels do, or
+    panels are mixed; else None."""
+    panels = [sorted({origin.panel for origin in side.values()}) for side in (left, right)]
+    if left == right and all(len(names) < 2 and "+" not in "".join(names) for names in panels):
         return None
     alone = sorted(left.keys() ^ right.keys())
     if alone:
         return f"{_named(alone)} answered on one side alone; both sides of a contrast are of the same items"
-    mixed = sorted(item for item, epoch in left.items() if right[item] != epoch)
-    epochs = f"epoch {left[mixed[0]]} against epoch {right[mixed[0]]}"
+    mixed = sorted(item for item, origin in left.items() if right[item].epoch != origin.epoch)
+    if not mixed:
+        one, other = (" and ".join(names) for names in panels)
+        return f"judged by {one} on one side and by {other} on the other; figures of different panels are not compared"
+    epochs = f"epoch {left[mixed[0]].epoch} against epoch {right[mixed[0]].epoch}"
     return f"{_named(mixed)} of {epochs}; figures of different epochs are never put in one contrast"
 
 

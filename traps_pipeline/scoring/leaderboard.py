@@ -10,11 +10,11 @@ import pandas as pd
 
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED
-from traps_pipeline.scoring.metrics import BOUNDS, FIGURES, OUTCOMES, decision_counts, joined_epochs, mean
-from traps_pipeline.scoring.tables import INCOMPLETE_BELOW, LEADERBOARD
+from traps_pipeline.scoring.metrics import BOUNDS, BROKEN, COUNTED, FIGURES, decision_counts, joined_epochs, mean
+from traps_pipeline.scoring.tables import BROKEN_ABOVE, INCOMPLETE_BELOW, LEADERBOARD
 
 _RUN = ["model", "regime", "run"]
-_SUMMED = ["n_missing", "n_items", *OUTCOMES]
+_SUMMED = ["n_missing", "n_items", *COUNTED]
 
 
 def leaderboard(metrics: pd.DataFrame, intervals: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
@@ -38,9 +38,12 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     board["n_runs"] = groups["run"].nunique()
     board["n_pairs"] = groups["n_pairs"].max()
     board["epoch"] = groups["epoch"].agg(joined_epochs)
+    board["panel"] = groups["panel"].agg(joined_epochs)
     board["benchmark_version"] = groups["benchmark_version"].agg(_joined_versions)
     board["answered"] = board["n_answered"] / board["n_items"]
-    board["incomplete"] = _incomplete(board)
+    board["incomplete"] = _anywhere(cast(pd.Series, board["answered"] < INCOMPLETE_BELOW))
+    board["broken"] = board[[*BROKEN]].sum(axis=1) / board["n_items"]
+    board["is_broken"] = _anywhere(cast(pd.Series, board["broken"] > BROKEN_ABOVE))
     return board.reset_index()
 
 
@@ -82,15 +85,15 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     counts = cast(pd.DataFrame, whole[["n_pairs", *_SUMMED]].sum())
     overall = whole[[*FIGURES, *BOUNDS]].agg(mean).join(counts)
     overall["epoch"] = whole["epoch"].agg(joined_epochs)
+    overall["panel"] = whole["panel"].agg(joined_epochs)
     overall["benchmark_version"] = whole["benchmark_version"].agg(_joined_versions)
     return overall.reset_index().assign(dataset="overall")
 
 
-def _incomplete(board: pd.DataFrame) -> pd.Series:
-    """Whether too few items of an entry have a text, on `board`'s index ENTRY; for `overall`, any of its datasets."""
-    below = cast(pd.Series, board["answered"] < INCOMPLETE_BELOW)
-    anywhere = cast(pd.Series, below.groupby(level=["model", "regime"]).transform("any")).astype(bool)
-    return below | (anywhere & (board.index.get_level_values("dataset") == "overall"))
+def _anywhere(wrong: pd.Series) -> pd.Series:
+    """What is wrong with entries, on the index ENTRY; with `overall` also where it is wrong with any dataset."""
+    anywhere = cast(pd.Series, wrong.groupby(level=["model", "regime"]).transform("any")).astype(bool)
+    return wrong | (anywhere & (wrong.index.get_level_values("dataset") == "overall"))
 
 
 def _deviation(values: pd.Series) -> float:
@@ -98,7 +101,8 @@ def _deviation(values: pd.Series) -> float:
 
 
 def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
-    """rank, rank_low and rank_high of every row, on `board`'s index; null where there is no PECS."""
+    """rank, rank_low and rank_high of every row among those of its panel, on `board`'s index; null where there is no
+    PECS, and where the row is of several panels."""
     separable = contrasts.loc[
         (contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & contrasts["separable"]
     ]
@@ -108,13 +112,14 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
         wins[winner, row["left_regime"], row["dataset"]] += 1
         losses[loser, row["left_regime"], row["dataset"]] += 1
     entries = list(board[ENTRY].itertuples(index=False, name=None))
-    peers = board.groupby(["regime", "dataset"])["pecs"]
+    peers = board.groupby(["regime", "dataset", "panel"])["pecs"]
     ranks = {
         "rank": peers.rank(method="min", ascending=False),
         "rank_low": pd.Series([1 + losses[entry] for entry in entries], board.index),
         "rank_high": peers.transform("count") - pd.Series([wins[entry] for entry in entries], board.index),
     }
-    return pd.DataFrame(ranks).where(board["pecs"].notna()).astype("Int64")
+    ranked = board["pecs"].notna() & ~board["panel"].str.contains("+", regex=False)
+    return pd.DataFrame(ranks).where(ranked).astype("Int64")
 
 
 def _joined_versions(versions: pd.Series) -> str:

@@ -22,7 +22,8 @@ def leave_one_out(
     """LEAVE_ONE_OUT rows from VERDICTS and VOTES rows of the same cells, and the LEADERBOARD rows made from them.
 
     PECS by the two other judges is computed as PECS by the panel: per run, then averaged; overall over the four
-    datasets. The rows cover entries of the board, over the cells on which these judges (default: all) voted.
+    datasets. The rows cover entries of the board, over the cells on which these judges (default: all) voted. There are
+    none for a panel of one judge.
     """
     panel = board.rename(columns={"pecs": "pecs_panel", "n_missing": "n_missing_panel"})
     panel = panel.loc[:, [*ENTRY, "pecs_panel", "n_missing_panel"]]
@@ -43,6 +44,8 @@ def two_judge_verdicts(
     """Each judge, and the VERDICTS rows that the two others give without it. They decide an item where both votes are
     valid and agree; 1-1 is undecided. An item without an answer has no decision."""
     cast = ratings(votes, judges)
+    if len(cast.judges) < 2:
+        return
     verdicts = verdicts.merge(cast.answers[CELL].drop_duplicates(), on=CELL)
     (abstention, _), (correctness, _) = cast.on(verdicts, ABSTENTION), cast.on(verdicts, CORRECTNESS)
     for seat, judge in enumerate(cast.judges):

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 CELL = ["dataset", "model", "regime", "run"]
 FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
 BOUNDS = ["pecs_low", "pecs_high"]
-# The outcomes in each count of items. An item is answered if it has a text, even if the judges are undecided on it.
-OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), "n_empty": ("empty",), "n_errors": ("error", "malformed")}
+# The outcomes in each count of items. An item is answered if its answer is judged, even if the judges are undecided.
+BROKEN = {"n_empty": ("empty",), "n_truncated": ("truncated",), "n_degenerate": ("degenerate",)}
+OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN, "n_errors": ("error", "malformed")}
+COUNTED = [*OUTCOMES, "n_not_json"]
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
 # computed from these six counts.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
@@ -66,11 +68,12 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_B
     if len(datasets) > 1:
         raise ValueError(f"verdicts of several datasets {datasets}: score one dataset at a time")
     groups = _scoped(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
-    sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *OUTCOMES]].sum())
+    sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *COUNTED]].sum())
     sums["n_pairs"] = groups["pair_id"].nunique()
     sides = sides_of(datasets[0]) if datasets else ()
     sums["n_missing"] = len(sides) * sums["n_pairs"] - sums["complete"]
     sums["epoch"] = groups["epoch"].agg(joined_epochs)
+    sums["panel"] = groups["panel"].agg(joined_epochs)
     sums["benchmark_version"] = groups["benchmark_version"].agg(lambda versions: " + ".join(sorted(set(versions))))
     return sums.assign(**_figures(sums), **_bounds(sums), **_wilson(sums)).reset_index().loc[:, METRICS.names]
 
@@ -81,7 +84,7 @@ def mean(values: pd.Series) -> float:
 
 
 def joined_epochs(epochs: Iterable[str]) -> str:
-    """The distinct campaigns, sorted and joined by `+`; an input may itself be such a list."""
+    """The distinct campaigns or panels, sorted and joined by `+`; an input may itself be such a list."""
     return "+".join(sorted({part for epoch in set(epochs) for part in epoch.split("+") if part}))
 
 
@@ -93,8 +96,9 @@ def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, str]) -> pd.DataFram
     on_control = verdicts["side"].eq("control")
     complete = np.where(on_control, counts["correct_of"] & counts["false_abs_of"], counts["abs_rec_of"])
     outcomes = {name: verdicts["outcome"].isin(kinds).astype("int64") for name, kinds in OUTCOMES.items()}
-    flags = counts.assign(complete=complete, **outcomes)
-    items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "benchmark_version"]], flags], axis=1)
+    not_json = verdicts["is_json"].eq(False).astype("int64")
+    flags = counts.assign(complete=complete, **outcomes, n_not_json=not_json)
+    items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "panel", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]
     scopes += [prefix + ":" + verdicts[column].astype("str") for prefix, column in scoped_by.items()]
     return pd.concat([items.assign(scope=scope) for scope in scopes], ignore_index=True)

@@ -40,7 +40,7 @@ VISUAL = tuple(dataset for dataset in DATASETS if not is_ill_posed(dataset))
 WITH_CONTROLS, WITH_VOIDS = (*ANSWERABLE_ARMS, *PAIRED_ARMS), (*VOID_ARMS, *PAIRED_ARMS)
 FIGURES = ("acc_r", "abs_rec_r", "false_abs_r", "pecs", "pecs_r", "gap")
 INTERVALS = ("pecs_r", "gap")
-_ITEM = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "benchmark_version"]
+_ITEM = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]
 
 
 def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
@@ -100,6 +100,7 @@ def _row(items: pd.DataFrame, arms: Sequence[str], drawn: Drawn) -> dict[str, An
         "n_items": max(rows["item_id"].nunique() for _, rows in items.groupby("run")),
         "n_missing": _missing(items),
         "epoch": joined_epochs(items["epoch"]),
+        "panel": joined_epochs(items["panel"]),
         "benchmark_version": " + ".join(sorted(set(items["benchmark_version"]))),
         "refused": _refusal(items),
         "n_twins": max((n for _, n in twins), default=0),
@@ -150,8 +151,11 @@ def _missing(items: pd.DataFrame) -> int:
 
 
 def _refusal(items: pd.DataFrame) -> str | None:
-    """Why there is no gap between pairs and arms: they were answered in different campaigns (docs/spec.md 9.2)."""
+    """Why there is no gap between pairs and arms: they were answered in different campaigns (docs/spec.md 9.2), or
+    judged by different panels."""
     of_arms = items["dataset"].isin(ARMS)
+    if "+" in (panels := joined_epochs(items["panel"])):
+        return f"judged by {panels.replace('+', ' and ')}; figures of different panels are never put in one gap"
     pairs, arms = (joined_epochs(items.loc[chosen, "epoch"]) for chosen in (~of_arms, of_arms))
     if pairs == arms and "+" not in pairs:
         return None

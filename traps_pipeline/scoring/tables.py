@@ -10,6 +10,7 @@ from traps_pipeline.storage.tables import Table
 # the best PECS are at most 0.04 apart (if all are controls: 2 % of Acc and 2 % of FalseAbs), half the 95 % interval of
 # a middling model on 500 pairs (0.08); beyond that, which answers were lost may matter as much as which were sampled.
 INCOMPLETE_BELOW = 0.99
+BROKEN_ABOVE = 0.01  # a model that says nothing in more of its answers than this is marked
 
 Mean = Annotated[float | None, "mean over runs"]
 Deviation = Annotated[float | None, "population standard deviation over runs"]
@@ -31,8 +32,11 @@ class MetricsRow:
     n_missing: Annotated[int, "items (of 2 n_pairs; in an arm of one side of n_pairs) without an answer or a majority"]
     n_refused: Annotated[int, "items refused"]
     n_empty: Annotated[int, "items answered with no text"]
+    n_truncated: Annotated[int, "items whose text was cut off before an answer"]
+    n_degenerate: Annotated[int, "items answered with a text that says nothing: punctuation, repetition"]
+    n_not_json: Annotated[int, "items of the JSON regime answered with a text that is not the object asked for"]
     n_errors: Annotated[int, "items whose call failed"]
-    n_answered: Annotated[int, "items answered with a text, whole or truncated"]
+    n_answered: Annotated[int, "items with an answer"]
     acc: Annotated[float | None, "share of decided controls answered correctly"]
     abs_rec: Annotated[float | None, "share of decided voids abstained on"]
     false_abs: Annotated[float | None, "share of decided controls abstained on"]
@@ -50,6 +54,7 @@ class MetricsRow:
     false_abs_high: shared.Wilson
     abs_rec_low: shared.Wilson
     abs_rec_high: shared.Wilson
+    panel: shared.Panels
     epoch: shared.AnswerEpochs
     benchmark_version: shared.BenchmarkVersion
 
@@ -132,9 +137,14 @@ class LeaderboardRow:
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
     n_refused: Annotated[int, "items refused, over runs"]
     n_empty: Annotated[int, "items answered with no text, over runs"]
+    n_truncated: Annotated[int, "items whose text was cut off before an answer, over runs"]
+    n_degenerate: Annotated[int, "items answered with a text that says nothing, over runs"]
+    n_not_json: Annotated[int, "items of the JSON regime whose text is not the object asked for, over runs"]
     n_errors: Annotated[int, "items whose call failed, over runs"]
-    answered: Annotated[float, "share of items (2 a pair and run) answered with a text, whole or truncated"]
+    answered: Annotated[float, "share of items (2 a pair and run) with an answer"]
     incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]
+    broken: Annotated[float, "share of items whose text is empty, degenerate or truncated"]
+    is_broken: Annotated[bool, "whether broken is above 0.01; for overall, in any of its datasets"]
     acc: Mean
     acc_std: Deviation
     abs_rec: Mean
@@ -155,7 +165,10 @@ class LeaderboardRow:
     j_ci_high: Bootstrap
     pecs_ci_low: Bootstrap
     pecs_ci_high: Bootstrap
-    rank: Annotated[int | None, "by PECS among the models of this regime and dataset; equal values share a rank"]
+    rank: Annotated[
+        int | None,
+        "by PECS among the models of this regime, dataset and panel; equal values share a rank; null if of two panels",
+    ]
     rank_low: Annotated[
         int | None,
         "1 + the number of models whose PECS is higher by a paired contrast that is significant after correction",
@@ -167,6 +180,7 @@ class LeaderboardRow:
     pecs_low: Annotated[float, "mean over runs: pecs if every missing decision were the worst for the model"]
     pecs_high: Annotated[float, "mean over runs: pecs if every missing decision were the best for the model"]
     naive: Annotated[float | None, "acc x abs_rec, mean over runs"]
+    panel: shared.Panels
     epoch: shared.AnswerEpochs
     benchmark_version: shared.BenchmarkVersion
 
@@ -206,6 +220,7 @@ class RobustRow:
     ]
     twin_accuracy_std: Deviation
     n_twins: Annotated[int, "scenarios in which both are decided, in the run that has most"]
+    panel: shared.Panels
     epoch: shared.AnswerEpochs
     benchmark_version: shared.BenchmarkVersion
     refused: Annotated[str | None, "why there is no gap between pairs and arms"]
@@ -216,7 +231,7 @@ ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
 
 @dataclass(frozen=True, kw_only=True)
 class LeaveOneOutRow:
-    """A model under a regime on one dataset, or overall, scored by two of the three judges; 1-1 is undecided."""
+    """A model under a regime on one dataset, or overall, scored by the other two judges; 1-1 is undecided."""
 
     model: shared.Model
     regime: shared.Regime

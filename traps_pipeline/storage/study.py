@@ -145,7 +145,8 @@ class Study(BaseModel):
     benchmark: str = "released"
     scenarios: list[str] | None = Field(default=None, description="named scenarios; all if absent")
     per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
-    panel: str = "rules"
+    panel: str = Field(default="", description="who judges; nothing is judged until one is named")
+    judged_by_rules: bool = Field(default=False, description="rules may judge other models than reference models")
     epoch: str = Field(default="1", pattern=r"^[A-Za-z0-9._-]+$")
     budget_usd: float = Field(default=0.0, ge=0.0, description="for all calls over the network, ever")
     model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] = Field(

@@ -26,7 +26,7 @@ from traps_pipeline.files import replacing, sync_folder, write_bytes
 from traps_pipeline.models.answers import prepare_media, wanted_questions
 from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import ModelEntry, get_model
-from traps_pipeline.models.request import JUDGED, Outcome, OutcomeKind, Request
+from traps_pipeline.models.request import WITH_TEXT, Outcome, OutcomeKind, Request
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.rows import MOST_TOKENS
@@ -58,8 +58,8 @@ class Answer(BaseModel):
     def _text_goes_with_outcome(self) -> Answer:
         if self.outcome in ("error", "malformed"):
             raise ValueError("outcome: an error is no answer; remove the line, so that the item stays missing")
-        if (self.outcome in JUDGED) != bool((self.text or "").strip()):
-            needs = "needs a text" if self.outcome in JUDGED else "must have no text"
+        if (self.outcome in WITH_TEXT) != bool((self.text or "").strip()):
+            needs = "needs a text" if self.outcome in WITH_TEXT else "must have no text"
             raise ValueError(f"text: outcome {self.outcome!r} {needs}")
         return self
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.judges import require_panel
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.paths import ASSETS
@@ -32,6 +33,7 @@ class Experiment(BaseModel):
     regimes: list[str] = list(REGIMES)
     runs: list[Annotated[int, Field(ge=1)]] = [1]
     panel: str | None = None
+    judged_by_rules: bool | None = Field(default=None, description="let the panel `rules` judge any model")
     epoch: str | None = None
     budget_usd: float | None = Field(default=None, ge=0.0)
     model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] | None = None
@@ -64,7 +66,7 @@ class Experiment(BaseModel):
     def study(self) -> Study:
         """The study in a new workspace for this experiment."""
         fields = ("benchmark", "scenarios", "per_family", "panel", "epoch", "budget_usd", "model_budgets_usd")
-        fields += ("allow_unknown_prices", "mechanism")
+        fields += ("allow_unknown_prices", "mechanism", "judged_by_rules")
         values = {name: getattr(self, name) for name in fields}
         return Study(**{name: value for name, value in values.items() if value is not None})
 
@@ -73,6 +75,23 @@ class Experiment(BaseModel):
         """The experiment's datasets, models, regimes and runs, in the form that the study keeps."""
         values = {name: tuple(getattr(self, name)) for name in ("datasets", "models", "regimes", "runs")}
         return Asked(**values, mechanism=self.mechanism is not None)
+
+    def judged(self, study: Study | None, panel: str | None, *, judged_by_rules: bool = False) -> Study:
+        """The study with the panel that judges this experiment: the one that the command says, else the experiment's,
+        else an existing study's. study: None for a new one.
+
+        Raises TrapsError where none is named, where command and experiment name two, and where rules would judge
+        models that they are not made for although nobody said so.
+        """
+        base = study or self.study
+        if panel is not None and self.panel not in (None, panel):
+            raise TrapsError(
+                f"--panel {panel}: experiment {self.name} names the panel {self.panel!r}; edit one of them"
+            )
+        named = panel or (base.panel if study else self.panel) or self.panel or ""
+        by_rules = judged_by_rules or bool(self.judged_by_rules) or base.judged_by_rules
+        require_panel(named, self.models, judged_by_rules=by_rules)
+        return base.model_copy(update={"panel": named, "judged_by_rules": by_rules})
 
     def check_study(self, study: Study, path: Path) -> None:
         """Raises TrapsError if an existing study has another panel or epoch than this experiment asks for, or another

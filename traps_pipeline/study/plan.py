@@ -15,7 +15,7 @@ from traps_pipeline.judging.tables import VOTES
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answers import answer_request, is_prepared
 from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast
-from traps_pipeline.models.judges import PANEL_SIZE, JudgeEntry, load_panel
+from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.lineage import Lineage
@@ -30,6 +30,7 @@ from traps_pipeline.partitions import (
     sides_of,
 )
 from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import Experiment
@@ -68,15 +69,15 @@ class Plan:
     steered: Mapping[str, tuple[Count, Count]] = field(default_factory=dict)
 
 
-def make_plan(workspace: Workspace | None, experiment: Experiment) -> Plan:
-    """Count the calls of an experiment and forecast their cost; nothing is sent and nothing is made."""
-    calls, uncertain = _count_calls(workspace, experiment)
-    steered = _count_steered(workspace, experiment)
-    votes = sum(count.new for _, count in [*calls.values(), *steered.values()])
-    study = workspace.study if workspace else experiment.study
+def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study) -> Plan:
+    """Count the calls of an experiment and forecast their cost; nothing is sent and nothing is made. study: the
+    workspace's, or the one that a new workspace would have, with the panel that judges."""
     panel = load_panel(study.panel)
+    calls, uncertain = _count_calls(workspace, experiment, study)
+    steered = _count_steered(workspace, experiment, study)
+    votes = sum(count.new for _, count in [*calls.values(), *steered.values()])
     new: list[tuple[Entry, int]] = [(get_model(model), answers.new) for model, (answers, _) in calls.items()]
-    new += [(judge, votes // PANEL_SIZE) for judge in panel]
+    new += [(judge, votes // len(panel)) for judge in panel]
     new = [(entry, count) for entry, count in new if entry.backend == NETWORK]
     ledgers = [ledger.totals() for ledger in (workspace.answers, workspace.votes)] if workspace else []
     forecasts = [
@@ -91,18 +92,18 @@ def make_plan(workspace: Workspace | None, experiment: Experiment) -> Plan:
     return Plan(calls, uncertain, [*forecasts, replace(taken, participant="confabulation labels")], labels, steered)
 
 
-def _count_steered(workspace: Workspace | None, experiment: Experiment) -> dict[str, tuple[Count, Count]]:
+def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:
     """Calls for the answers of steered models, and for the panel's votes on them, by model."""
     settings, counts = experiment.mechanism, dict[str, tuple[Count, Count]]()
     if settings is None or settings.steering is None:
         return counts
-    scenarios = load_scenarios(workspace.study if workspace else experiment.study).values()
+    scenarios, seats = load_scenarios(study).values(), len(load_panel(study.panel))
     taxonomies = [datasets_of_category(scenario.category)[0] for scenario in scenarios]
     for model in settings.models:
         answers, votes = counts[model] = (Count(), Count())
         datasets = [name for name in experiment.datasets if name in DATASETS]
         for regime, by_side in count_answers(settings, model, datasets, Counter(taxonomies)).items():
-            wanted, ballots = by_side.total(), PANEL_SIZE * sum(len(tasks_for(s)) * n for s, n in by_side.items())
+            wanted, ballots = by_side.total(), seats * sum(len(tasks_for(s)) * n for s, n in by_side.items())
             folder, known = SteeredEvaluation(model, regime, 1).key, [0, 0]
             if workspace is not None:
                 known = [len(ledger.read(folder).settled) for ledger in (workspace.answers, workspace.votes)]
@@ -136,17 +137,16 @@ def _judged(lineage: Lineage, cells: Sequence[Cell]) -> bool:
 
 
 def _count_calls(
-    workspace: Workspace | None, experiment: Experiment
+    workspace: Workspace | None, experiment: Experiment, study: Study
 ) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
     plan = {model: (Count(), Count()) for model in experiment.models}
-    study = workspace.study if workspace else experiment.study
-    scenarios = load_scenarios(study).values()
+    scenarios, panel = load_scenarios(study).values(), load_panel(study.panel)
     known, lineage, uncertain = _KnownKeys(), Lineage(workspace) if workspace else None, set[str]()
     for cell in experiment.cells():
         answers, votes = plan[cell.evaluation.model]
         scenes = sum(cell.dataset in datasets_and_arms_of(s.category) for s in scenarios)
         sides = sides_of(cell.dataset)
-        items, votes_asked = len(sides) * scenes, PANEL_SIZE * sum(len(tasks_for(side)) for side in sides) * scenes
+        items, votes_asked = len(sides) * scenes, len(panel) * sum(len(tasks_for(side)) for side in sides) * scenes
         if workspace is None or lineage is None or not _items_current(lineage, cell.dataset):
             uncertain.add(cell.dataset)
             answers.add(items, 0)
@@ -165,7 +165,7 @@ def _count_calls(
         elif (cast := _fresh_rows(workspace, lineage, VOTES, cell)) is not None:
             votes.add(cast, cast)
         else:
-            ballots = {ballot.request.key for ballot in wanted_ballots(workspace, load_panel(study.panel), cell)}
+            ballots = {ballot.request.key for ballot in wanted_ballots(workspace, panel, cell)}
             votes.add(len(ballots), len(ballots & known.of(workspace.votes, cell.evaluation)))
     return plan, sorted(uncertain)
 

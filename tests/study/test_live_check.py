@@ -1,0 +1,113 @@
+"""What is wrong with a model or judge is named before anything is rendered or judged, and within half a minute."""
+
+from __future__ import annotations
+
+import datetime
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.conftest import KEY
+from tests.providers.server import Provider
+from traps_pipeline.models import api, registry
+from traps_pipeline.models.judges import JudgeEntry
+from traps_pipeline.models.registry import PROTOCOL, Account, Entry, ModelEntry, Prices
+from traps_pipeline.study.live_check import Live, check_live
+
+pytestmark = pytest.mark.slow
+NAME = "seer"
+Check = Callable[..., Live]
+
+
+@pytest.fixture
+def check(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Check:
+    """Checks an entry at the provider, or at another address, live; it takes less than 30 s."""
+
+    def checked(kind: type[Entry] = ModelEntry, address: str = "", key: str | None = KEY, **changes: Any) -> Live:
+        account = Account(key=key, base_url=address or f"{provider.url}/v1")
+        for module in (api, registry):
+            monkeypatch.setattr(module, "load_accounts", lambda: {"here": account})
+        fields: dict[str, Any] = {"id": NAME, "backend": "api", "account": "here", "provider_id": f"openai/{NAME}"}
+        fields |= {"prices": Prices(input=0, output=0, as_of=datetime.date(2026, 11, 1))}
+        if kind is ModelEntry:
+            fields |= {"params": {name: value for name, (_, value) in PROTOCOL.items()}}
+            fields |= {"media": {"profile": "images", "fps": 5, "most": 25}}
+        else:
+            fields |= {"params": {"temperature": 0.8, "max_tokens": 512}}
+        entry = kind.model_validate(fields | changes, context={"accounts": {"here": account}})
+        began = time.monotonic()
+        (live,) = check_live([entry])
+        assert time.monotonic() - began < 30
+        return live
+
+    return checked
+
+
+@pytest.mark.parametrize("profile", ["images", "video"])
+def test_a_model_that_answers_sees_and_keeps_to_the_schema_is_sound(check: Check, profile: str) -> None:
+    live = check(media={"profile": profile, "fps": 5, "most": 25})
+    assert (live.problems, live.notes) == ([], [])
+
+
+def test_a_dead_endpoint_is_named_with_its_address(check: Check) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"http://127.0.0.1:{free.getsockname()[1]}/v1"
+    (problem,) = check(address=address).problems
+    assert problem.startswith(f"nothing answers at {address}") and "start the server there" in problem
+
+
+def test_a_wrong_name_is_named_with_those_that_are_served(check: Check, provider: Provider) -> None:
+    provider.configure(served=["other", "third"])
+    (problem,) = check().problems
+    assert f"serves no '{NAME}'; it serves other, third" in problem
+    provider.configure(served=None, fault_by_model={NAME: "not_found"})  # a server without a list of models
+    assert f"knows no model '{NAME}'" in check().problems[0]
+
+
+def test_a_wrong_key_is_named_by_its_variable(check: Check, provider: Provider) -> None:
+    provider.configure(fault_by_model={NAME: "unauthorized"})
+    (problem,) = check().problems
+    assert problem.startswith(f"the key in {KEY} is not accepted")
+
+
+def test_a_model_that_ignores_images_is_named(check: Check, provider: Provider) -> None:
+    provider.configure(blind=[NAME])
+    (problem,) = check().problems
+    assert problem.startswith("it does not see the clip")
+
+
+def test_a_model_that_ignores_the_schema_is_named(check: Check, provider: Provider) -> None:
+    provider.configure(scripts={NAME: {"": "red and then blue"}})
+    (problem,) = check().problems
+    assert problem.startswith("it ignores the schema") and "json_schema: false" in problem
+
+
+def test_a_model_that_thinks_inline_is_named_and_sound_once_that_is_declared(check: Check, provider: Provider) -> None:
+    said = '<think>red, then blue</think>{"reason": "seen", "final_answer": "red and blue"}'
+    provider.configure(scripts={NAME: {"": said}})
+    (problem,) = check().problems
+    assert "inline_thinking: true" in problem
+    assert check(inline_thinking=True).problems == []
+
+
+def test_a_model_that_says_dots_is_named(check: Check, provider: Provider) -> None:
+    provider.configure(scripts={NAME: {"": "....."}})
+    assert any("'.....', which holds no word" in problem for problem in check().problems)
+
+
+def test_an_unknown_price_is_said(check: Check) -> None:
+    live = check(prices=None)
+    assert live.problems == [] and "price is unknown" in live.notes[0]
+
+
+def test_a_judge_votes_rightly_on_plain_answers_or_is_named(check: Check, provider: Provider) -> None:
+    assert check(JudgeEntry).problems == []
+    provider.configure(scripts={NAME: {"": "I would say that it abstains."}})
+    assert any("its vote on abstention does not meet the schema" in problem for problem in check(JudgeEntry).problems)
+    yes = '{"abstained": true, "confidence": "high", "reasoning": "r"}'
+    provider.configure(scripts={NAME: {"answer is: left": yes}})
+    assert any("its vote on abstention of the plain answer" in problem for problem in check(JudgeEntry).problems)
