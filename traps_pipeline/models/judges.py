@@ -23,6 +23,7 @@ from traps_pipeline.models.registry import (
     structured,
 )
 from traps_pipeline.paths import ASSETS
+from traps_pipeline.yamlfile import read_mapping
 
 JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZES = (1, 3)
