@@ -12,6 +12,7 @@ from pathlib import Path
 
 from traps_pipeline.errors import TrapsError
 
+PART = ".part"  # how the hidden names of unfinished files end
 _REMEDIES = {
     errno.ENOSPC: "free some space",
     errno.EDQUOT: "free some space, or raise the quota",
@@ -47,7 +48,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     block reads, passes as it is.
     """
     # No process, thread or machine that shares the folder draws the same name.
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:

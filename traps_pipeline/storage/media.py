@@ -27,9 +27,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, write_bytes, write_text
+from traps_pipeline.files import remedy, write_bytes
 from traps_pipeline.scenes.encode import ENCODER, DamagedClip, decode, encode
 from traps_pipeline.scenes.policies import FramePolicy
+from traps_pipeline.storage.lines import NOT_WHOLE, checked_line, read_checked
 
 Profile = Literal["video", "images", "frames"]
 MOST = 25  # frames an API model sees, docs/spec.md 3.1
@@ -161,17 +162,25 @@ class MediaStore:
         note = self._note(clip_digest, spec)
         if note in self._sound:
             return self._sound[note]
-        path = _file(note, spec.profile)
         try:
-            record = json.loads(note.read_text(encoding="utf-8"))
-            media = Media(profile=spec.profile, path=path, **record | {"times_s": tuple(record["times_s"])})
-            return media if path is None or path.stat().st_size == media.size_bytes else None
-        except (OSError, ValueError, TypeError, KeyError):
+            media = read_note(note)
+            return media if media.path is None or media.path.stat().st_size == media.size_bytes else None
+        except (OSError, ValueError):
             return None
 
     def _note(self, clip_digest: str, spec: MediaSpec) -> Path:
         """The small JSON that says what is prepared; written after it, so that it vouches for it."""
         return self.folder / clip_digest[:2] / f"{clip_digest}-{profile_digest(spec)[:16]}.json"
+
+
+def read_note(note: Path) -> Media:
+    """What a note says is prepared. Raises ValueError naming it where it is not what was written, or OSError."""
+    (line, *more) = [*read_checked(note)] or [None]
+    if line is None or more or not line.whole:
+        raise ValueError(f"{note}: {NOT_WHOLE}; delete it and run again: it is prepared anew")
+    record: dict[str, Any] = json.loads(line.content)
+    record.pop("sum")
+    return Media(**record | {"path": _file(note, record["profile"]), "times_s": tuple(record["times_s"])})
 
 
 def profile_digest(spec: MediaSpec) -> str:
@@ -237,8 +246,7 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
         sha256, size = _sha256(jpegs), len(data)
     times = tuple(sampled.times_s.tolist())
     media = Media(spec.profile, path, sha256, len(times), times, rate, size)
-    record = {name: value for name, value in asdict(media).items() if name not in ("profile", "path")}
-    write_text(note, json.dumps(record))
+    write_bytes(note, checked_line({name: value for name, value in asdict(media).items() if name != "path"}))
     return media
 
 

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from traps_pipeline.files import PART
+
 MIN_FREE_GB = 1.0
 SHOWN = 5  # damaged files of a kind that are named
+UNFINISHED_AFTER_S = 24 * 3600.0  # no file takes so long to write
 
 
 @dataclass(frozen=True)
@@ -60,10 +66,13 @@ def examine_files(workspace_root: Path) -> Iterator[Finding]:
         ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), _damaged_table),
         ("ledger", sorted((workspace.root / "ledger").rglob("*.jsonl*")), _damaged_lines),
         ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
+        ("media", sorted((workspace.root / "media").glob("*/*.json")), _damaged_media),
+        ("history", sorted(workspace.dagster_home.rglob("*.db")), _damaged_history),
     ):
         damaged = [said for path in files if (said := damage_of(path))]
         shown = "; ".join(damaged[:SHOWN]) + (f"; and {len(damaged) - SHOWN} more" if len(damaged) > SHOWN else "")
         yield Finding(not damaged, what, shown or f"{len(files)} files are what was written")
+    yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
 
 
 def _damaged_table(path: Path) -> str:
@@ -87,6 +96,38 @@ def _damaged_clip(path: Path) -> str:
     except DamagedClip as error:
         return str(error)
     return ""
+
+
+def _damaged_media(note: Path) -> str:
+    from traps_pipeline.scenes.encode import DamagedClip
+    from traps_pipeline.storage.media import payload, read_note
+
+    try:
+        media = read_note(note)
+        if media.path is not None:
+            payload(media)
+    except (DamagedClip, ValueError) as error:
+        return str(error)
+    return ""
+
+
+def _damaged_history(path: Path) -> str:
+    """A damaged history is no loss: it is put aside and begun anew when the next command opens it."""
+    try:
+        with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as opened:
+            (said,) = opened.execute("pragma quick_check(1)").fetchone()
+    except sqlite3.DatabaseError as error:
+        said = str(error)
+    return "" if said == "ok" else f"{path}: {said}; what counts stands in the tables"
+
+
+def _remove_unfinished(root: Path) -> str:
+    """Remove files that a killed run began and never finished; nothing reads them. A run may be writing young ones."""
+    old = [path for path in root.rglob(f".*{PART}") if time.time() - path.stat().st_mtime > UNFINISHED_AFTER_S]
+    size = sum(path.stat().st_size for path in old)
+    for path in old:
+        path.unlink(missing_ok=True)
+    return f"{len(old)} files of killed runs removed ({size / 1e6:.1f} MB)" if old else "no killed run left a file"
 
 
 def _finding(what: str, look: Callable[[], str]) -> Finding:
