@@ -46,6 +46,7 @@ metrics = stage(
     METRICS,
     _make_metrics,
     group=GROUP,
+    code="2",
     deps=[items, dg.AssetDep(verdicts, partition_mapping=by_dataset)],
     scheme=DATASET,
     needs={"verdicts": "some"},
