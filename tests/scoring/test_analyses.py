@@ -194,7 +194,8 @@ def test_sub_scenarios_average_runs_and_compare_regimes_and_datasets():
             scoped("sub_scenario:dice", "standard", "chaotic", 0.3, run=2),
             scoped("sub_scenario:dice", "guided", "chaotic", 0.5),
             scoped("sub_scenario:dice", "standard", "chaotic_ill_posed", 0.8),
-            scoped("label:red", "standard", "chaotic", 0.4),
+            scoped("label:dice/red", "standard", "chaotic", 0.4),
+            scoped("label:plinko/red", "standard", "chaotic", 0.4, acc=0.9),
             scoped("all", "standard", "chaotic", 0.4),
         ]
     )
@@ -202,7 +203,8 @@ def test_sub_scenarios_average_runs_and_compare_regimes_and_datasets():
     assert row[["abs_rec", "guided_abs_rec", "abs_rec_uplift", "textual_over_visual"]].tolist() == pytest.approx(
         [0.2, 0.5, 0.3, 4.0]
     )
-    assert accuracy_by_label(scoped_cells(metrics, "label"))[["label", "acc"]].values.tolist() == [["red", 0.5]]
+    table = accuracy_by_label(scoped_cells(metrics, "label"))
+    assert table[["sub_scenario", "label", "acc"]].values.tolist() == [["dice", "red", 0.5], ["plinko", "red", 0.9]]
 
 
 def test_both_sides_of_a_sub_scenarios_ratio_are_of_the_same_models():
@@ -218,13 +220,15 @@ def test_both_sides_of_a_sub_scenarios_ratio_are_of_the_same_models():
     row = sub_scenarios(scoped_cells(metrics, "sub_scenario")).iloc[0]
     assert row["textual_over_visual"] == pytest.approx(2.0)  # 0.5 / 0.1 is of two models over one
     assert row[["n_models", "ill_posed_n_models", "guided_n_models", "n_missing"]].tolist() == [1, 1, 0, 3]
-    labels = [scoped("label:red", "standard", "chaotic", 0.1, model=m, acc=a) for m, a in (("a", 0.4), ("b", np.nan))]
+    labels = [
+        scoped("label:dice/red", "standard", "chaotic", 0.1, model=m, acc=a) for m, a in (("a", 0.4), ("b", np.nan))
+    ]
     table = accuracy_by_label(scoped_cells(pd.DataFrame(labels), "label"))
     assert table[["acc", "n_models"]].values.tolist() == [[0.4, 1]]
 
 
 def test_runs_of_several_epochs_name_each_of_them_once():
-    runs = [scoped("label:red", "standard", "chaotic", 0.1, run=k, epoch=e) for k, e in ((1, "e1"), (2, "e1+e2"))]
+    runs = [scoped("label:dice/red", "standard", "chaotic", 0.1, run=k, epoch=e) for k, e in ((1, "e1"), (2, "e1+e2"))]
     assert scoped_cells(pd.DataFrame(runs), "label")["epoch"].tolist() == ["e1+e2"]
 
 

@@ -54,8 +54,7 @@ def test_the_oracle_scores_one_on_every_scope(rows, strategy):
         "category:b",
         "sub_scenario:a_sub",
         "sub_scenario:b_sub",
-        "label:yes",
-        "label:no",
+        *("label:a_sub/yes", "label:a_sub/no", "label:b_sub/yes", "label:b_sub/no"),
     }
     assert (metrics["pecs"] == 1.0).all()
 
@@ -133,11 +132,11 @@ def test_an_empty_denominator_makes_a_figure_null_and_what_depends_on_it(rows):
     assert no_correctness[["acc", "pecs", "naive"]].isna().all()
 
 
-def test_a_label_groups_both_sides_by_the_control_answer(rows):
+def test_a_label_groups_both_sides_by_the_control_answer_within_a_sub_scenario(rows):
     # Labels alternate: pairs 1 and 3 are `left`, pair 2 is `right`.
     pairs = [(True, False, True), (False, False, False), (True, False, False)]
     metrics = cell_metrics(rows(pairs, labels=("left", "right")))
-    left, right = one(metrics, scope="label:left"), one(metrics, scope="label:right")
+    left, right = (one(metrics, scope=f"label:hidden_sub/{name}") for name in ("left", "right"))
     assert (left.n_pairs, left.acc, left.abs_rec) == (2, 1.0, 0.5)
     assert (right.n_pairs, right.acc, right.abs_rec) == (1, 0.0, 0.0)
 

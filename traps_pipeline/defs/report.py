@@ -65,7 +65,7 @@ def _sheet(workspace: Workspace) -> Files:
     rows = workspace.tables.read_all(ITEMS, dataset=DATASETS)
     if rows.empty:
         raise TrapsError("contact_sheet: no items yet; materialize items first")
-    six = pairs_figure(six_pairs(rows), workspace.root, None, layout=PAGE)
+    six = pairs_figure(six_pairs(rows), workspace.root, None, 3, PAGE)
     sheets = {"contact_sheet.png": contact_sheet(rows, workspace.root), "six_pairs.png": figure_bytes(six)}
     return sheets | arms_sheets(rows, workspace.tables.read_all(ARMS), workspace.root)
 

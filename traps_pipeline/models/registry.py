@@ -35,7 +35,8 @@ JUDGE_PROTOCOL: Protocol = {
     "temperature": (("temperature",), 0.8),
     "max_tokens": (("max_tokens", "max_completion_tokens"), 512),
 }
-OTHER_WAIVERS = ("media", "reasoning", "json_schema")  # what the protocol sets besides parameters
+# What the protocol sets besides parameters. identifier: the name under which the provider serves the model.
+OTHER_WAIVERS = ("media", "reasoning", "json_schema", "identifier", "retries")
 NETWORK = "api"  # the backend that asks over the network
 LOCAL = "local"  # the backend that asks a checkpoint on this machine
 LOCAL_TIMEOUT_S = 24 * 3600.0

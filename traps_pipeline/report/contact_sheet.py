@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
 from traps_pipeline.scenes.encode import decode
 
@@ -35,15 +36,19 @@ class Layout:
     letters: int = 108
     questions: int = 2  # lines of each question at most
     ids: bool = True  # whether scenarios are named
+    moments: int = MOMENTS  # frames per clip
 
 
 # For a screen, and for the width of a printed page, on which no text may be smaller than 6 points.
-SCREEN, PAGE = Layout(), Layout(block=2.98, header=0.5, gap=0.4, dpi=300, size=6.5, letters=62, questions=2, ids=False)
+SCREEN = Layout()
+PAGE = Layout(
+    block=1.98, header=0.72, gap=0.28, dpi=300, size=6.5, letters=41, questions=4, ids=False, moments=3
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class SampledClip:
-    """Frames (MOMENTS, H, W, 3) uint8 at the control's times; those with index `known` or more lie after the clip's end
+    """Frames (moments, H, W, 3) uint8 at the control's times; those with index `known` or more lie after the clip's end
     (s)."""
 
     frames: np.ndarray
@@ -68,7 +73,7 @@ def pairs_figure(
     pairs = chosen_pairs(items, per_family)
     columns = min(columns, len(pairs))
     with figure_style():
-        blocks = [_moments(pair, root) for pair in pairs]
+        blocks = [_moments(pair, root, layout.moments) for pair in pairs]
         heights = [layout.block * _ratio(control) + layout.header + FOOTER_IN for control, _, _ in blocks]
         rows = [max(heights[k : k + columns]) for k in range(0, len(heights), columns)]
         width, height = columns * (layout.block + layout.gap), sum(rows) + 0.1
@@ -84,12 +89,13 @@ def pairs_figure(
 
 
 def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
-    """ITEMS rows of six visual pairs for a figure like the paper's: three of each taxonomy, of different categories
-    where possible, or fewer if there are fewer."""
+    """ITEMS rows of six visual pairs for a figure like the paper's: three of each taxonomy, no two of one sub-scenario
+    and of different categories where possible; fewer if there are fewer sub-scenarios."""
     visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
     chosen: list[str] = []
     for _, rows in visual.groupby("taxonomy", sort=True):
         pairs = rows.drop_duplicates("pair_id").sort_values(["category", "sub_scenario", "pair_id"])
+        pairs = pairs.drop_duplicates("sub_scenario")
         firsts = [*pairs.drop_duplicates("category")["pair_id"], *pairs["pair_id"]]
         chosen += list(dict.fromkeys(firsts))[:3]
     return visual.loc[visual["pair_id"].isin(chosen)]
@@ -98,9 +104,9 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 def chosen_pairs(items: pd.DataFrame, per_family: int | None) -> list[pd.DataFrame]:
     """The pairs to show, as frames of two rows indexed by side. Raises ValueError for none or more than 80."""
     whole = items.loc[items.groupby("pair_id")["side"].transform("nunique") == 2].sort_values(
-        by=["dataset", "sub_scenario", "pair_id"]
+        by=["dataset", "sub_scenario", "pair_id"], key=_in_order
     )
-    firsts = whole.drop_duplicates("pair_id").groupby(["dataset", "sub_scenario"], sort=True)["pair_id"]
+    firsts = whole.drop_duplicates("pair_id").groupby(["dataset", "sub_scenario"], sort=False)["pair_id"]
     ids = list(firsts.head(per_family) if per_family is not None else whole["pair_id"].unique())
     if not 0 < len(ids) <= MOST_PAIRS:
         raise ValueError(
@@ -110,11 +116,16 @@ def chosen_pairs(items: pd.DataFrame, per_family: int | None) -> list[pd.DataFra
     return [by_pair[pair_id].set_index("side") for pair_id in ids]
 
 
-def _moments(pair: pd.DataFrame, root: Path) -> tuple[SampledClip, SampledClip, np.ndarray]:
-    """Control, void and the times (MOMENTS,) in seconds, from the control's first frame to its last."""
+def _in_order(values: pd.Series) -> pd.Series:
+    """Datasets in the benchmark's order, occlusion first; other columns as they are."""
+    return values.map(DATASETS.index) if values.name == "dataset" else values
+
+
+def _moments(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
+    """Control, void and the times (moments,) in seconds, from the control's first frame to its last."""
     control, at = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
-    times = at[np.linspace(0, len(at) - 1, MOMENTS).round().astype(int)]
+    times = at[np.linspace(0, len(at) - 1, moments).round().astype(int)]
     return sampled(control, at, times), sampled(void, void_at, times), times
 
 
@@ -128,8 +139,8 @@ def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledCli
 
 def _ratio(clip: SampledClip) -> float:
     """Height over width of a pair's block of frames."""
-    _, height, width, _ = clip.frames.shape
-    return (2 * height + GAP) / (MOMENTS * width + (MOMENTS - 1) * GAP)
+    moments, height, width, _ = clip.frames.shape
+    return (2 * height + GAP) / (moments * width + (moments - 1) * GAP)
 
 
 def _draw_pair(
@@ -137,12 +148,12 @@ def _draw_pair(
 ) -> None:
     from matplotlib.patches import Rectangle
 
-    _, height, width, _ = control.frames.shape
-    canvas = np.full((2 * height + GAP, MOMENTS * width + (MOMENTS - 1) * GAP, 3), 255, np.uint8)
+    moments, height, width, _ = control.frames.shape
+    canvas = np.full((2 * height + GAP, moments * width + (moments - 1) * GAP, 3), 255, np.uint8)
     for row, (side, clip) in enumerate({"control": control, "void": void}.items()):
         top = row * (height + GAP)
         axes.text(-GAP, top + height / 2, side, rotation=90, ha="right", va="center", size=layout.size, weight="bold")
-        for k in range(MOMENTS):
+        for k in range(moments):
             left = k * (width + GAP)
             if k < clip.known:
                 canvas[top : top + height, left : left + width] = _fitted(clip.frames[k], height, width)

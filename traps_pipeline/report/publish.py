@@ -115,7 +115,7 @@ def _sheets(workspace: Workspace) -> Iterator[tuple[str, bytes]]:
             yield path.name, path.read_bytes()
     pairs = six_pairs(workspace.tables.read_all(ITEMS, dataset=DATASETS))
     if len(pairs) and all(workspace.resolve(clip).is_file() for clip in pairs["clip"]):
-        files = figure_files("six_pairs", pairs_figure(pairs, workspace.root, None, layout=SIX_PAIRS))
+        files = figure_files("six_pairs", pairs_figure(pairs, workspace.root, None, 3, SIX_PAIRS))
         yield from ((f"figures/{name}", content) for name, content in files.items())
 
 

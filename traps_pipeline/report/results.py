@@ -100,7 +100,7 @@ class Results:
     rates = Made("RATE_COLUMNS: visual and textual AbsRec under standard, one row per model and taxonomy (or pooled).")
     sub_scenarios = Made("SUB_COLUMNS: means over models, one row per sub-scenario.")
     sub_cells = Made("One row per (model, dataset, regime) and sub-scenario (column scope).")
-    labels = Made("Mean Acc over models by the control's answer: dataset, label, acc, n_pairs, n_models.")
+    labels = Made("Mean Acc over models by the control's answer: dataset, sub_scenario, label, acc, n_pairs, n_models.")
     agreement = Made(table=AGREEMENT)
     bias = Made(table=JUDGE_BIAS)
     leave_one_out = Made(table=LEAVE_ONE_OUT)

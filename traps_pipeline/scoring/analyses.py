@@ -57,7 +57,8 @@ def of_several_runs(rows: pd.DataFrame) -> pd.DataFrame:
 def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
     """Cells of the parts of datasets from METRICS rows, averaged over runs; the column `scope` names the part.
 
-    scope is `category`, `sub_scenario` or `label` (the control's answer). Columns as in `study_cells`, with scope.
+    scope is `category`, `sub_scenario` or `label` (the control's answer in a sub-scenario). Columns as in
+    `study_cells`, with scope.
     """
     parts = metrics["scope"].str.partition(":")
     rows = metrics.assign(scope=parts[2]).loc[parts[0] == scope]
@@ -303,7 +304,7 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
     """Mean Acc under standard by the control's answer, over the models that have an Acc, from `scoped_cells(metrics,
     "label")`.
 
-    Columns dataset, label, acc, n_pairs, n_models, n_missing (items of both sides, over these models).
+    Columns dataset, sub_scenario, label, acc, n_pairs, n_models, n_missing (items of both sides, over these models).
     """
     import pandas as pd
 
@@ -311,7 +312,9 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
     groups = rows.loc[rows["regime"] == "standard"].dropna(subset=["acc"]).groupby(["dataset", "scope"])
     columns = {"acc": groups["acc"].mean(), "n_pairs": groups["n_pairs"].max(), "n_models": groups["model"].nunique()}
     table = pd.DataFrame(columns | {"n_missing": groups["n_missing"].sum()})
-    return table.reset_index().rename(columns={"scope": "label"})
+    table = table.reset_index()
+    parts = table["scope"].astype("str").str.partition("/")
+    return table.assign(sub_scenario=parts[0], label=parts[2]).drop(columns="scope")
 
 
 # --- helpers ----------------------------------------------------------------------------------------------------------

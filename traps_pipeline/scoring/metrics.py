@@ -24,7 +24,12 @@ COUNTED = [*OUTCOMES, "n_not_json"]
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
 # computed from these six counts.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
-SCOPED_BY = {"category": "category", "sub_scenario": "sub_scenario", "label": "control_answer"}
+# The columns of each scope. A label belongs to a sub-scenario: the count 1 of one scene is not the bucket 1 of another.
+SCOPED_BY: Mapping[str, tuple[str, ...]] = {
+    "category": ("category",),
+    "sub_scenario": ("sub_scenario",),
+    "label": ("sub_scenario", "control_answer"),
+}
 
 
 def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
@@ -53,15 +58,15 @@ def pecs_of(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
     return acc * np.maximum(j, 0.0)
 
 
-def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, str] = SCOPED_BY) -> pd.DataFrame:
+def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]] = SCOPED_BY) -> pd.DataFrame:
     """METRICS rows of one dataset, from its VERDICTS rows (any models, regimes and runs).
 
-    There is one row per cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x` (the control's answer,
-    both sides of the pair); `scoped_by` (prefix to column) may name fewer. Figures are fractions; a figure whose
-    denominator is 0 is null, and so is every figure computed from it. `n_missing` counts the items, of 2 n_pairs (of
-    n_pairs where the dataset is an arm of one side), that lack a decision: abstained or correct on a control, abstained
-    on a void. BOUNDS show how far the missing decisions could move PECS; they are never null. Every share has its n and
-    its Wilson interval.
+    There is one row per cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x/y` (y: the control's answer
+    in the sub-scenario x; both sides of the pair); `scoped_by` (prefix to columns) may name fewer. Figures are
+    fractions; a figure whose denominator is 0 is null, and so is every figure computed from it. `n_missing` counts the
+    items, of 2 n_pairs (of n_pairs where the dataset is an arm of one side), that lack a decision: abstained or correct
+    on a control, abstained on a void. BOUNDS show how far the missing decisions could move PECS; they are never null.
+    Every share has its n and its Wilson interval.
     Raises ValueError when the verdicts are of several datasets, whose versions may differ (docs/spec.md 5.1).
     """
     datasets = sorted(verdicts["dataset"].unique())
@@ -88,7 +93,7 @@ def joined_epochs(epochs: Iterable[str]) -> str:
     return "+".join(sorted({part for epoch in set(epochs) for part in epoch.split("+") if part}))
 
 
-def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, str]) -> pd.DataFrame:
+def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]]) -> pd.DataFrame:
     """Every verdict with its counts, once for each scope that it belongs to: ((1 + len(scoped_by)) x items) rows."""
     import pandas as pd
 
@@ -100,7 +105,9 @@ def _scoped(verdicts: pd.DataFrame, scoped_by: Mapping[str, str]) -> pd.DataFram
     flags = counts.assign(complete=complete, **outcomes, n_not_json=not_json)
     items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "panel", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]
-    scopes += [prefix + ":" + verdicts[column].astype("str") for prefix, column in scoped_by.items()]
+    for prefix, columns in scoped_by.items():
+        parts = zip(*(verdicts[column].astype("str") for column in columns), strict=True)
+        scopes.append(pd.Series([f"{prefix}:{'/'.join(part)}" for part in parts], index=items.index))
     return pd.concat([items.assign(scope=scope) for scope in scopes], ignore_index=True)
 
 

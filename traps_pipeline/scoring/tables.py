@@ -27,7 +27,7 @@ class MetricsRow:
     model: shared.Model
     regime: shared.Regime
     run: shared.Run
-    scope: Annotated[str, "all, category:.., sub_scenario:.. or label:.. (the control's answer)"]
+    scope: Annotated[str, "all, category:.., sub_scenario:.. or label:../.. (the control's answer in a sub-scenario)"]
     n_pairs: Annotated[int, "pairs in scope"]
     n_missing: Annotated[int, "items (of 2 n_pairs; in an arm of one side of n_pairs) without an answer or a majority"]
     n_refused: Annotated[int, "items refused"]

@@ -47,7 +47,8 @@ class MediaSpec(BaseModel):
     """How a model is shown a clip: `media` of an entry of `assets/models.yaml`.
 
     profile: an mp4, separate JPEGs, or raw frames for a local model. Frames are a grid of fps a second, at most `most`,
-    or `uniform` evenly spaced ones. size: (width, height) in pixels to resize to.
+    or `uniform` evenly spaced ones. size: (width, height) in pixels to resize to. fit: a clip of another shape is
+    stretched to that size, or keeps its shape and is cropped on both sides.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -56,6 +57,7 @@ class MediaSpec(BaseModel):
     most: int = Field(default=MOST, ge=1)
     uniform: int | None = Field(default=None, ge=1)
     size: tuple[int, int] | None = None
+    fit: Literal["stretch", "crop"] = "stretch"
 
     @model_validator(mode="after")
     def _one_frame_policy(self) -> MediaSpec:
@@ -65,6 +67,8 @@ class MediaSpec(BaseModel):
             raise ValueError("most goes with fps; uniform says itself how many frames there are")
         if self.size is not None and min(self.size) < 1:
             raise ValueError(f"size is {self.size}; it is a width and a height in pixels")
+        if self.size is None and self.fit != "stretch":
+            raise ValueError(f"fit is {self.fit}; it goes with size")
         if self.profile == "video":
             self._check_video()
         return self
@@ -119,15 +123,24 @@ def sample(clip: Path, spec: MediaSpec) -> Frames:
     shown, times = decode(clip)
     chosen = pick(times, spec)
     clip_fps = round((len(times) - 1) / float(times[-1] - times[0]), 3) if len(times) > 1 else None
-    return Frames(resized(shown[chosen], spec.size), times[chosen], clip_fps)
+    return Frames(resized(shown[chosen], spec.size, spec.fit), times[chosen], clip_fps)
 
 
-def resized(frames: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
-    """Frames (N, H, W, 3) uint8 at another width and height; as they are for None."""
+def resized(
+    frames: np.ndarray, size: tuple[int, int] | None, fit: Literal["stretch", "crop"] = "stretch"
+) -> np.ndarray:
+    """Frames (N, H, W, 3) uint8 at another width and height; as they are for None. With fit `crop` they keep their
+    shape: they are resized until they cover the size, and the middle of them is kept."""
     import cv2
 
     if size is None or size == (frames.shape[2], frames.shape[1]):
         return frames
+    if fit == "crop":
+        height, width = frames.shape[1:3]
+        scale = max(size[0] / width, size[1] / height)
+        covering = max(size[0], round(width * scale)), max(size[1], round(height * scale))
+        left, top = (covering[0] - size[0]) // 2, (covering[1] - size[1]) // 2
+        return np.ascontiguousarray(resized(frames, covering)[:, top : top + size[1], left : left + size[0]])
     # Bit-exact, since the pixels are in the ledger key: other filters may differ between CPUs.
     return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_LINEAR_EXACT) for frame in frames])
 
@@ -185,7 +198,9 @@ def read_note(note: Path) -> Media:
 
 def profile_digest(spec: MediaSpec) -> str:
     """Digest of all that decides the bytes of a profile, the clip aside."""
-    made: dict[str, Any] = {"revision": _REVISION, "spec": spec.model_dump(mode="json")}
+    # A spec without `fit` has the digest that it had before there was one, so that nothing is prepared anew.
+    plain = {"fit"} if spec.fit == "stretch" else None
+    made: dict[str, Any] = {"revision": _REVISION, "spec": spec.model_dump(mode="json", exclude=plain)}
     if spec.profile == "video":
         made["encoder"] = ENCODER
     if spec.profile == "images":

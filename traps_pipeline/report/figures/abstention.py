@@ -31,8 +31,8 @@ PERCENT = (0, 25, 50, 75, 100)
 
 
 def visual_textual(results: Results) -> Figure:
-    """AbsRec on visual (x) against textual voids (y), one point per model and taxonomy; a second panel has the means by
-    family."""
+    """AbsRec on visual (x) against textual voids (y), one point per model, averaged over the taxonomies that it was
+    asked; a second panel has the means by family."""
     rates = results.rates
     if not len(rates):
         return not_run_figure("Visual against textual voids", results.why("rates"), PAGE_IN)
@@ -49,23 +49,26 @@ def visual_textual(results: Results) -> Figure:
 def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
     look = looks(rates["model"])
     axes.plot([0, 100], [0, 100], color=SOFT, linewidth=0.7, linestyle=(0, (4, 2.5)), zorder=1)
-    for row in rates.loc[rates["taxonomy"] != "pooled"].to_dict("records"):
+    for row in rates.loc[_averaged(rates)].to_dict("records"):
         colour, marker = look[row["model"]]
-        face = colour if row["taxonomy"] == "chaotic" else "white"
         axes.scatter(
-            100 * row["visual"], 100 * row["textual"], s=22, marker=marker, facecolors=face, edgecolors=colour,
+            100 * row["visual"], 100 * row["textual"], s=22, marker=marker, facecolors=colour, edgecolors=colour,
             linewidths=0.9, zorder=3, clip_on=False,
         )  # fmt: skip
     axes.set(xlim=(-3, 103), ylim=(-3, 103), xticks=PERCENT, yticks=PERCENT)
     axes.set(xlabel="AbsRec on visual voids, %", ylabel="AbsRec on textual voids, %", aspect="equal")
-    axes.set_title("hollow: occlusion, filled: chaotic", weight="normal", size=7)
+    axes.set_title("above the line: textual voids are noticed more", weight="normal", size=7)
+
+
+def _averaged(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
+    """Whether a row has both rates of its model pooled over taxonomies, or those of the one that it was asked."""
+    whole = rates.loc[rates["taxonomy"] == "pooled", "model"]
+    return rates["taxonomy"].eq("pooled") | ~rates["model"].isin(whole)
 
 
 def _draw_families(axes: Axes, rates: pd.DataFrame) -> None:
-    """Draw both rates as means over a family's models, pooled over taxonomies; a model that was asked one taxonomy
-    enters with that one."""
-    whole = rates.loc[rates["taxonomy"] == "pooled", "model"]
-    used = rates.loc[(rates["taxonomy"] == "pooled") | ~rates["model"].isin(whole)]
+    """Draw both rates as means over a family's models."""
+    used = rates.loc[_averaged(rates)]
     means = used.assign(family=used["model"].map(family_of)).groupby("family")[["visual", "textual"]].mean()
     names = [name for name in families() if name in means.index]
     at = np.arange(len(names))

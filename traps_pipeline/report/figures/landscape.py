@@ -1,4 +1,4 @@
-"""Models in the plane of Acc and J, with contours of PECS (docs/spec.md 10)."""
+"""Models in the plane of J and Acc, with contours of PECS (docs/spec.md 10)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def landscape(results: Results) -> Figure:
 
 
 def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
-    """Acc (x) against J (y) of every model with iso-PECS contours, one column wide.
+    """J (x) against Acc (y) of every model with iso-PECS contours, one column wide.
 
     points has the columns model, regime, acc, j, pecs, incomplete. A hollow marker is standard, a filled one guided, an
     arrow connects them, and a dot is json. The dashed line is the frontier under guided, a ring marks each family's
@@ -50,7 +50,7 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     """
     points = points.loc[points["acc"].notna() & points["j"].notna()]
     with figure_style():
-        figure = new_figure(COLUMN_IN, 3.7 + 0.9 * max(0.0, -min([0.0, *points["j"]])))
+        figure = new_figure(COLUMN_IN, 3.7)
         axes = figure.add_subplot()
         frame_plane(axes, points, f"Acc, {scope.lower()}")
         labels = merged_labels(_draw_models(axes, points), axes)
@@ -59,7 +59,7 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
         _draw_rings(axes, guided)
         _draw_key(figure)
         freeze_layout(figure)
-        place_labels(axes, labels, points.loc[:, ["acc", "j"]].to_numpy(float))
+        place_labels(axes, labels, points.loc[:, ["j", "acc"]].to_numpy(float))
     return figure
 
 
@@ -84,7 +84,7 @@ def reasoning(results: Results) -> Figure:
         panels[1].set_ylabel("")
         freeze_layout(figure)
         for axes, names, regime in zip(panels, labels, ("standard", "guided"), strict=True):
-            at = named.loc[named["regime"] == regime, ["acc", "j"]].to_numpy(float)
+            at = named.loc[named["regime"] == regime, ["j", "acc"]].to_numpy(float)
             place_labels(axes, merged_labels(names, axes), at)
     return figure
 
@@ -95,8 +95,8 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
     for model, rows in points.groupby("model", sort=True):
         colour, marker = look[str(model)]
         at = {
-            regime: (float(acc), float(j))
-            for regime, acc, j in zip(*(rows[c] for c in ("regime", "acc", "j")), strict=True)
+            regime: (float(j), float(acc))
+            for regime, j, acc in zip(*(rows[c] for c in ("regime", "j", "acc")), strict=True)
         }
         if "standard" in at and "guided" in at:
             axes.plot(*np.array([at["standard"], at["guided"]]).T, color=colour, linewidth=0, zorder=LINES)
@@ -121,11 +121,11 @@ def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
     steps, best = [], 0.0
     for acc, j in at:
         if j > best:
-            steps += [(acc, best), (acc, j)]
+            steps += [(best, acc), (j, acc)]
             best = j
     if steps:
         axes.plot(
-            *np.array([*steps, (axes.get_xlim()[0], best)]).T,
+            *np.array([*steps, (best, axes.get_ylim()[0])]).T,
             color=INK,
             linewidth=0.7,
             linestyle=(0, (4, 2.5)),
@@ -138,7 +138,7 @@ def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
     for family, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
         best = rows.loc[rows["pecs"].idxmax()]
         if family != "reference" and best["pecs"] > 0:
-            axes.scatter(best["acc"], best["j"], s=75, facecolors="none", edgecolors=INK, linewidths=0.7, zorder=6)
+            axes.scatter(best["j"], best["acc"], s=75, facecolors="none", edgecolors=INK, linewidths=0.7, zorder=6)
 
 
 def _draw_key(figure: Figure) -> None:
@@ -160,7 +160,7 @@ def _draw_key(figure: Figure) -> None:
 
 
 def _draw_chains(axes: Axes, points: pd.DataFrame, chains: list[list[str]]) -> list[Label]:
-    at = {row["model"]: (float(row["acc"]), float(row["j"])) for row in points.to_dict("records")}
+    at = {row["model"]: (float(row["j"]), float(row["acc"])) for row in points.to_dict("records")}
     look, labels = looks(at), []
     for chain in chains:
         shown = [model for model in chain if model in at and np.isfinite(at[model]).all()]

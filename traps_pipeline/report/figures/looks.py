@@ -44,19 +44,20 @@ def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
     return {m: (colours[m], MARKERS[alike[colours[m]].index(m) % len(MARKERS)]) for m in set(models)}
 
 
-def frame_plane(axes: Axes, points: pd.DataFrame, xlabel: str) -> None:
-    """Set the limits around points (columns acc and j), at least half of each axis, and draw contours of PECS."""
-    left, right = _limits(points.loc[:, "acc"], 0.0, 0.0)
-    low, high = _limits(points.loc[:, "j"], min([-0.08, *(points["j"] - 0.08)]), 0.3)
-    axes.set(xlim=(left - 0.03, right + 0.03), ylim=(low, high + 0.04), xlabel=xlabel, ylabel="J = AbsRec − FalseAbs")
-    axes.axhline(0, color="#98a2b3", linewidth=0.8, zorder=0.5)
+def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str) -> None:
+    """Set the limits around points (columns j and acc), at least half of each axis, and draw contours of PECS."""
+    low, high = _limits(points.loc[:, "acc"], 0.0, 0.0)
+    left, right = _limits(points.loc[:, "j"], min([-0.08, *(points["j"] - 0.08)]), 0.3)
+    axes.set(xlim=(left, right + 0.03), ylim=(low - 0.03, high + 0.03), xlabel="J = AbsRec − FalseAbs", ylabel=ylabel)
+    axes.axvline(0, color="#98a2b3", linewidth=0.8, zorder=0.5)
     edge: dict[str, Any] = {"annotation_clip": False, "va": "center", "color": SOFT, "size": 6}
     labelled = right + 0.05 * (right - left)
     for pecs in np.arange(1, 10) / 10:
-        acc = np.linspace(max(left, pecs / high), right, 200)
+        j = np.linspace(max(pecs / high, 1e-3), right, 200)
         if pecs / right <= high:
-            axes.plot(acc, pecs / acc, color=GRID, linewidth=0.6, zorder=0.4)
-            axes.annotate(f"{pecs:.1f}", (right, pecs / right), (labelled, pecs / right), **edge)
+            axes.plot(j, pecs / j, color=GRID, linewidth=0.6, zorder=0.4)
+            if pecs / right >= low:
+                axes.annotate(f"{pecs:.1f}", (right, pecs / right), (labelled, pecs / right), **edge)
     axes.annotate("PECS", (right, high), (labelled, high + 0.035), **edge)
 
 

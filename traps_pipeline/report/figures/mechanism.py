@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from traps_pipeline.mechanism import effects
-from traps_pipeline.mechanism.paths import PATH_SETS, TRANSFER_TYPES, path_name
-from traps_pipeline.partitions import DATASETS, SHORT, transfer_type
+from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
+from traps_pipeline.partitions import DATASETS, SHORT, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.mechanism import NO_MECHANISM, best_layers
 from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 COLOUR: dict[str, str] = dict(zip(DATASETS, COLOURS, strict=False))
 LINE: dict[str, Any] = dict(zip(DATASETS, ("-", "--", "-.", ":"), strict=True))
 MARKER: dict[str, str] = dict(zip(DATASETS, ("o", "s", "^", "D"), strict=True))
+FAMILY_COLOUR = {"occlusion": "#0072B2", "chaotic": "#C8102E"}  # of directions, in dose and response
+# The paper draws four key paths and does not name them. These cross the domains onto visual voids.
+KEY_PATHS = [(s, t) for s, t in TRANSFER if taxonomy_of(s) != taxonomy_of(t) and not is_ill_posed(t)]
+COSINE_SCALE = 0.6  # of the paper's heatmaps
 CROSSING = TRANSFER_TYPES[:3]
 SETS = {"transfer": "transfer", "within_domain": "within"}
 
@@ -32,11 +36,11 @@ def _why(results: Results, frame: pd.DataFrame) -> str:
     return NO_MECHANISM if results.is_study and not len(frame) else results.why("probes")
 
 
-def _legend(figure: Figure, *more: Line2D) -> None:
+def _legend(figure: Figure, *more: Line2D, colours: Mapping[str, str] = COLOUR) -> None:
     """Sources by colour and line, targets by marker, below the panels."""
     from matplotlib.lines import Line2D
 
-    sources = [Line2D([], [], color=COLOUR[d], linestyle=LINE[d], label=f"from {SHORT[d]}") for d in DATASETS]
+    sources = [Line2D([], [], color=colours[d], linestyle=LINE[d], label=f"from {SHORT[d]}") for d in DATASETS]
     targets = [
         Line2D([], [], color=SOFT, linestyle="none", marker=MARKER[d], markersize=3.5, label=f"to {SHORT[d]}")
         for d in DATASETS
@@ -50,6 +54,12 @@ def _key(label: str, face: str) -> Line2D:
     from matplotlib.lines import Line2D
 
     return Line2D([], [], color=SOFT, linestyle="none", marker="o", markersize=4, markerfacecolor=face, label=label)
+
+
+def _chance_key() -> Line2D:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=SOFT, linewidth=0.8, linestyle=(0, (4, 2.5)), label="chance")
 
 
 def _bar_key(label: str, width: float = 2.2, color: str = SOFT) -> Line2D:
@@ -113,7 +123,7 @@ def _shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
 
 def confabulated_strip(results: Results) -> Figure:
     """AUROC of every ordered pair on all samples (hollow) and on confabulated voids with their controls (filled), both
-    at the best layer of all samples; a bar is the median of the filled markers."""
+    at the best layer of all samples; the bar is the median of the model's filled markers, the dashed line is chance."""
     rows = best_layers(results.probes)
     if not len(rows) or rows.loc[:, "cf_value"].isna().all():
         why = "no dataset has confabulated voids" if len(rows) else _why(results, rows)
@@ -127,7 +137,7 @@ def confabulated_strip(results: Results) -> Figure:
             ax.set_title(plain(model)[:30], size=7.5)
         lowest = np.nanmin(rows[["best_value", "cf_value"]].to_numpy(float))
         axes[0].set(ylim=(min(0.45, lowest - 0.04), 1.03), ylabel="AUROC on the target")
-        _legend(figure, _key("all samples", "white"), _key("Cf→Cf", SOFT), _bar_key("median of Cf→Cf"))
+        _legend(figure, _key("all samples", "white"), _key("Cf→Cf", SOFT), _bar_key("median of Cf→Cf"), _chance_key())
     return figure
 
 
@@ -140,10 +150,8 @@ def _strip(ax: Axes, rows: pd.DataFrame) -> None:
             ax.plot([x, x], [row["best_value"], row["cf_value"]], color=COLOUR[row["source"]], linewidth=0.8)
             ax.plot(x, row["best_value"], linestyle="none", markerfacecolor="white", **style)
             ax.plot(x, row["cf_value"], linestyle="none", **style)
-        median = part["cf_value"].median()
-        if median == median:
-            ax.plot([place - 0.42, place + 0.42], [median, median], color=SOFT, linewidth=1.2, zorder=0.6)
-    ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
+    ax.axhline(float(np.nanmedian(rows["cf_value"].to_numpy(float))), color=SOFT, linewidth=1.4, zorder=0.6)
+    ax.axhline(0.5, color=SOFT, linewidth=0.8, linestyle=(0, (4, 2.5)), zorder=0.5)
     names = [crossing.replace("Cross-", "cross-\n") for crossing in CROSSING]
     ax.set_xticks(range(3), names)
     ax.set_xlim(-0.6, 2.6)
@@ -151,9 +159,10 @@ def _strip(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def dose_response(results: Results) -> Figure:
-    """Abstention against α on controls (+α) and voids (−α), for each model and each of its path sets, under guided
-    directions and guided inference if both were run. Grey is the mean over the paths with its 95 % interval from
-    resampled scenarios."""
+    """Abstention against α on controls (+α) and voids (−α), for each model and each of its path sets, along directions
+    of the standard prompt under guided inference if they were run. Directions of the occlusion family are blue, those
+    of the chaotic family red; of the transfer set, the four paths between the domains onto visual voids are strong and
+    the others faint. Grey is the mean over the paths with its 95 % interval from resampled scenarios."""
     rows = effects.paths(results.effects)
     rows = rows.loc[rows["kind"] == "void"]
     panels = _panels(rows)
@@ -168,7 +177,7 @@ def dose_response(results: Results) -> Figure:
         for pair, ((model, path_set), part) in zip(pairs, panels.items(), strict=False):
             for ax, side, sign in zip(pair, ("control", "void"), ("+α on controls", "−α on voids"), strict=True):
                 _mean_band(ax, _of_panel(results.shares, part, path_set, side))
-                _doses(ax, part, side)
+                _doses(ax, part, side, KEY_PATHS if path_set == "transfer" else STEERING_PATHS)
                 ax.set_title(f"{plain(model)[:20]}\n{sign}, {SETS[path_set]}", size=6.5)
                 ax.set_xlabel("α")
         for ax in pairs[len(panels) :].flat:
@@ -176,7 +185,8 @@ def dose_response(results: Results) -> Figure:
         for line in axes:
             line[0].set_ylabel("abstained, %")
         axes[0, 0].set_ylim(-4, 104)
-        _legend(figure, *([_bar_key("mean, 95 % by scenario")] if len(results.shares) else []))
+        more = [_bar_key("mean, 95 % by scenario")] if len(results.shares) else []
+        _legend(figure, *more, colours={d: FAMILY_COLOUR[taxonomy_of(d)] for d in DATASETS})
     return figure
 
 
@@ -193,10 +203,11 @@ def _mean_band(ax: Axes, shares: pd.DataFrame) -> None:
 
 
 def _panels(rows: pd.DataFrame) -> Mapping[tuple[str, str], pd.DataFrame]:
-    """Rows of each model and complete path set, under the most guided regimes of the model."""
+    """Rows of each model and complete path set, under guided inference with directions of the standard prompt, or the
+    regimes next to them that the model has."""
     found: dict[tuple[str, str], pd.DataFrame] = {}
     for model, of in rows.groupby("model", sort=False):
-        guided = (of["directions"] == "guided").astype(int) + 2 * (of["regime"] == "guided").astype(int)
+        guided = (of["directions"] == "standard").astype(int) + 2 * (of["regime"] == "guided").astype(int)
         of = of.loc[guided == guided.max()]
         for path_set, members in PATH_SETS.items():
             part = of.loc[[pair in members for pair in zip(of["source"], of["target"], strict=True)]]
@@ -205,20 +216,23 @@ def _panels(rows: pd.DataFrame) -> Mapping[tuple[str, str], pd.DataFrame]:
     return found
 
 
-def _doses(ax: Axes, part: pd.DataFrame, side: str) -> None:
+def _doses(ax: Axes, part: pd.DataFrame, side: str, strong: Collection[tuple[str, str]]) -> None:
     alphas = sorted(set(part["alpha"]))
     for key, line in part.groupby(["source", "target"], sort=False):
         source, target = str(key[0]), str(key[1])  # pyright: ignore[reportIndexIssue]
         line = line.sort_values("alpha")
+        key = (source, target) in strong
         ax.plot(
-            line["alpha"], 100 * line[side], color=COLOUR[source], linestyle=LINE[source], marker=MARKER[target],
-            markersize=3.5, linewidth=0.9, clip_on=False, label=path_name(source, target),
+            line["alpha"], 100 * line[side], color=FAMILY_COLOUR[taxonomy_of(source)], linestyle=LINE[source],
+            marker=MARKER[target], markersize=3.5, linewidth=1.2 if key else 0.7, alpha=1.0 if key else 0.45,
+            zorder=3 if key else 2, clip_on=False, label=path_name(source, target),
         )  # fmt: skip
     ax.set_xticks(alphas, [f"{alpha:g}" for alpha in alphas])
 
 
 def cosine_heatmaps(results: Results) -> Figure:
-    """Cosines of the four void directions at the steered layer, one panel per model (and VQA prompt), on one scale."""
+    """Cosines of the four void directions at the steered layer, one panel per model (and VQA prompt), on one scale of
+    ±0.6; the diagonal is 1 by definition, and a dash is a pair without a figure."""
     rows = results.cosines
     rows = rows.loc[rows["prompt"] == rows["other_prompt"]]
     if not len(rows):
@@ -235,14 +249,15 @@ def cosine_heatmaps(results: Results) -> Figure:
             ax.set_title(f"{plain(model)[:26]}\n{prompt} prompt" if several else plain(model)[:26], size=7)
         for ax in axes.flat[len(panels) :]:
             ax.set_axis_off()
-        figure.colorbar(images[-1], ax=list(axes.flat), label="cosine", shrink=0.85, aspect=25, pad=0.01)
+        figure.colorbar(images[-1], ax=list(axes.flat), label="cosine", shrink=0.85, aspect=25, pad=0.01, extend="both")
     return figure
 
 
 def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
     wide = part.pivot_table(index="dataset", columns="other_dataset", values="cosine")
-    values = wide.reindex(index=list(DATASETS), columns=list(DATASETS)).to_numpy(float)
-    image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1)
+    values = wide.reindex(index=list(DATASETS), columns=list(DATASETS)).to_numpy(float, copy=True)
+    np.fill_diagonal(values, np.nan)
+    image = ax.imshow(values, cmap="PuOr", vmin=-COSINE_SCALE, vmax=COSINE_SCALE)
     ax.set_facecolor("#f2f4f7")
     names = [SHORT[name] for name in DATASETS]
     ax.set_xticks(range(4), names)
@@ -250,7 +265,7 @@ def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
     for (row, column), value in np.ndenumerate(values):
-        colour = SOFT if np.isnan(value) else "white" if abs(value) > 0.6 else "black"
-        text = "–" if np.isnan(value) else f"{value:.2f}".replace("-", "−")
+        colour = SOFT if np.isnan(value) else "white" if abs(value) > 0.4 else "black"
+        text = "1" if row == column else "–" if np.isnan(value) else f"{value:.2f}".replace("-", "−")
         ax.text(column, row, text, ha="center", va="center", size=6, color=colour)
     return image

@@ -54,16 +54,15 @@ def hyperparameters(results: Results) -> list[PrintedTable]:
         Column("id", "Participant"), Column("role", "Role"), Column("temperature", "Temperature", "fraction", 2),
         Column("top_p", "Top-p", "fraction", 2), Column("max_tokens", "Tokens at most", "count"),
         Column("other", "Other parameters"), Column("concurrency", "At once", "count"),
-        Column("retries", "Retries", "count"), Column("waived", "Departs from the protocol in"),
+        Column("retries", "Retries", "count"), Column("waived", "Departs"),
     ]  # fmt: skip
-    title = (
-        "Hyperparameters"
-        if results.is_study
-        else "Hyperparameters of the paper’s models and judges, as registered here"
-    )
+    notes = ["departs: what is sent otherwise than the paper has it, and why"]
     return [
-        PrintedTable("hyperparameters", title, frame(rows, ["id"]), columns, why=results.why("cells"), dash="not sent")
-    ]
+        PrintedTable(
+            "hyperparameters", "Hyperparameters", frame(rows, ["id"]), columns, notes, results.why("cells"),
+            dash="not sent",
+        )
+    ]  # fmt: skip
 
 
 def _sent(entry: Entry, role: str) -> dict[str, Any]:
@@ -78,7 +77,7 @@ def _sent(entry: Entry, role: str) -> dict[str, Any]:
         "other": ", ".join(f"{name}: {_flat(value)}" for name, value in sorted(other.items())),
         "concurrency": entry.limits.concurrency,
         "retries": entry.limits.retries,
-        "waived": ", ".join(sorted(entry.waivers)),
+        "waived": "; ".join(f"{name}: {reason}" for name, reason in sorted(entry.waivers.items())),
     }
 
 

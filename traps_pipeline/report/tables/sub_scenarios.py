@@ -50,12 +50,13 @@ def chaotic_sub_scenarios(results: Results) -> list[PrintedTable]:
     rows = _sub_rows(results, "chaotic")
     labels = results.labels
     labels = titled(labels.loc[labels["dataset"].map(taxonomy_of) == "chaotic"])
-    columns = [DATASET, Column("label", "Ground truth"), Column("acc", "Acc %", "percent")]
+    columns = [
+        DATASET, Column("sub_scenario", "Sub-scenario"), Column("label", "Ground truth"),
+        Column("acc", "Acc %", "percent"),
+    ]  # fmt: skip
     notes = ["mean over models under standard"]
     if results.is_study:
         columns += [N, Column("n_models", "Models", "count"), MISSING]
-    else:
-        notes.append("from the paper's text, some of them approximate; epoch original")
     why = results.why("labels")
     title = "Accuracy by ground truth, chaotic"
     return [
