@@ -30,6 +30,7 @@ ROOMS = (
     "judging",
     "scoring",
     "mechanism",
+    "inside",
     "pocket",
     "report",
     "orchestration",

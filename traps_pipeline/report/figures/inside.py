@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -91,7 +92,7 @@ def gate_arrows(results: Results) -> Figure:
         return not_run_figure("Probe-gated abstention", absent, PAGE_IN)
     from matplotlib.lines import Line2D
 
-    regimes, colour = list(dict.fromkeys(rows["regime"])), dict(zip(_FEATURES, COLOURS, strict=False))
+    regimes, colour = list(dict.fromkeys(rows["regime"])), _colours(_FEATURES)
     rows = rows.assign(j=rows["abs_rec"] - rows["false_abs"], plain_j=rows["plain_abs_rec"] - rows["plain_false_abs"])
     with figure_style():
         figure = new_figure(PAGE_IN, 3.6)
@@ -108,11 +109,15 @@ def gate_arrows(results: Results) -> Figure:
     return figure
 
 
+def _colours(names: Sequence[str]) -> dict[str, str]:
+    return dict(zip(names, COLOURS, strict=False))
+
+
 def _arrows(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
     import pandas as pd
 
-    before = rows[["plain_acc", "plain_j"]].set_axis(["acc", "j"], axis=1)
-    frame_plane(ax, pd.concat([rows[["acc", "j"]], before], ignore_index=True), "Acc, overall")
+    points = pd.DataFrame({"acc": [*rows["acc"], *rows["plain_acc"]], "j": [*rows["j"], *rows["plain_j"]]})
+    frame_plane(ax, points, "Acc, overall")
     for row in rows.to_dict("records"):
         start, end = (row["plain_acc"], row["plain_j"]), (row["acc"], row["j"])
         arrow(ax, start, end, colour[row["features"]])
@@ -129,7 +134,7 @@ def _risk(ax: Axes, rows: pd.DataFrame, regime: str, colour: dict[str, str]) -> 
         elif features in colour:
             ax.plot(curve["coverage"], curve["risk"], color=colour[str(features)], linewidth=1.1)
     ax.set(xlabel="coverage: share answered", ylabel="risk: share of answers that are wrong", xlim=(0, 1))
-    ax.set_ylim(-0.02, max(0.5, float(rows["risk"].max()) + 0.05) if len(rows) else 1)
+    ax.set_ylim(-0.02, max(0.5, *rows["risk"]) + 0.05 if len(rows) else 1)
     ax.set_title(f"risk and coverage, {regime}", size=7.5)
 
 
@@ -137,7 +142,7 @@ def patching(results: Results) -> Figure:
     """Indirect effect of each group of positions at each layer of the residual stream, for patches from the void into
     the control and back; 1 is the whole difference of the outcome."""
     rows = results.patching
-    rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual")]
+    rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
     if not len(rows):
         absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
         return not_run_figure("Activation patching", absent, PAGE_IN)
@@ -188,7 +193,7 @@ def doses_among_nulls(results: Results) -> Figure:
     from matplotlib.lines import Line2D
 
     cells = list(dict.fromkeys(zip(rows["model"], rows["directions"], rows["regime"], strict=True)))
-    colour = dict(zip(NULLS, COLOURS, strict=False))
+    colour = _colours(NULLS)
     with figure_style():
         figure = new_figure(PAGE_IN, 0.7 + 1.7 * len(cells))
         axes = figure.subplots(len(cells), 4, squeeze=False, sharey=True, sharex=True)
