@@ -20,6 +20,7 @@ from traps_pipeline.report.writing import (
     PAGE_IN,
     SOFT,
     figure_style,
+    fraction,
     new_figure,
     not_run_figure,
     plain,
@@ -178,14 +179,14 @@ def _effects(ax: Axes, part: pd.DataFrame) -> Any:
         for (row, column), value in np.ndenumerate(values):
             if value == value:
                 shade = "white" if abs(value) > 0.6 else "black"
-                text = f"{value:.2f}".replace("-", "−")
-                ax.text(column, row, text, ha="center", va="center", size=6, color=shade)
+                ax.text(column, row, fraction(value, 2), ha="center", va="center", size=6, color=shade)
     return image
 
 
 def doses_among_nulls(results: Results) -> Figure:
     """Abstention of each dataset's controls (+) and voids (−) along its own direction, by dose in units of the class
-    gap; at the largest dose, a dot for every draw of each null that is orthogonal to the direction."""
+    gap. Right of the line: the nulls, which are orthogonal to the direction, at the largest dose, added on controls (+)
+    and subtracted on voids (−); a larger dot stands for more draws."""
     rows = results.own_effects
     if not len(rows):
         absent = why(results, rows) if results.is_study else "the paper has no such nulls"
@@ -204,7 +205,7 @@ def doses_among_nulls(results: Results) -> Figure:
                 ax.set_title(f"{SHORT[dataset]}, {directions}→{regime}", size=7)
             line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")
         for ax in axes[-1]:
-            ax.set_xlabel("dose, class gaps")
+            ax.set_xlabel("dose in class gaps | nulls", size=7)
         axes[0, 0].set_ylim(-6, 106)
         handles = [Line2D([], [], color=INK, marker="o", markersize=3.5, label="+ on controls")]
         handles += [Line2D([], [], color=SOFT, marker="s", markersize=3.5, linestyle="--", label="− on voids")]
@@ -226,7 +227,10 @@ def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
             drawn = of.loc[(of["kind"] == null) & (of["dose"] > 0)]
             if not len(drawn):
                 continue
-            at = float(drawn["gaps"].iloc[0]) + 0.07 * (place + 1) + (0.3 if side == "void" else 0)
+            top = float(drawn["gaps"].iloc[0])
+            at = top * (1.25 + 0.14 * place + (0.55 if side == "void" else 0))
             counts = (100 * drawn["abstention"].astype(float)).round(6).value_counts()
-            ax.scatter([at] * len(counts), counts.index, s=4 + 3 * counts.to_numpy(), color=colour[null],
-                       marker=marker, alpha=0.75, linewidths=0, clip_on=False)  # fmt: skip
+            ax.scatter([at] * len(counts), counts.index, s=3 + 1.6 * counts.to_numpy(), color=colour[null],
+                       marker=marker, linewidths=0, clip_on=False)  # fmt: skip
+            ax.axvline(1.12 * top, color=GRID, linewidth=0.7, zorder=0)
+            ax.set_xticks([0, top / 2, top, 1.39 * top, 1.94 * top], ["0", f"{top / 2:g}", f"{top:g}", "+", "−"])
