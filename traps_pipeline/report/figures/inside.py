@@ -93,7 +93,8 @@ def gate_arrows(results: Results) -> Figure:
         return not_run_figure("Probe-gated abstention", absent, PAGE_IN)
     from matplotlib.lines import Line2D
 
-    regimes, colour = list(dict.fromkeys(rows["regime"])), _colours(_FEATURES)
+    regimes = [name for name in ("standard", "guided") if name in set(rows["regime"])]
+    colour = _colours(_FEATURES)
     rows = rows.assign(j=rows["abs_rec"] - rows["false_abs"], plain_j=rows["plain_abs_rec"] - rows["plain_false_abs"])
     with figure_style():
         figure = new_figure(PAGE_IN, 3.6)
@@ -104,7 +105,7 @@ def gate_arrows(results: Results) -> Figure:
             ax.set_title(f"{regime}, {plain(' and '.join(dict.fromkeys(part['model'])))[:30]}", size=7.5)
         _risk(panels[-1], results.risk_coverage, regimes[-1], colour)
         handles = [Line2D([], [], color=colour[f], marker="o", markersize=4, label=f"gate on {f}") for f in
-                   dict.fromkeys(rows["features"])]  # fmt: skip
+                   _FEATURES if f in set(rows["features"])]  # fmt: skip
         handles += [Line2D([], [], color=INK, marker="o", markerfacecolor="white", linestyle="none", label="no gate")]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
