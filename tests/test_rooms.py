@@ -31,6 +31,7 @@ ROOMS = (
     "judging",
     "scoring",
     "mechanism",
+    "inside",
     "pocket",
     "report",
     "orchestration",

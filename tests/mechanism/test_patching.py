@@ -51,14 +51,24 @@ def test_all_positions_give_the_source_and_a_patch_with_itself_nothing(family: F
 
 
 def test_without_the_deepstack_features_all_positions_do_not_give_the_source() -> None:
-    """What `_patch_inputs` is for: with the target's own features behind the site, the effect is not 1."""
-    of, target, source, tokens, *_ = pair("qwen3-vl")
-    assert target.inputs["deepstack_visual_embeds"] is not None
-    own = {"deepstack_visual_embeds": target.inputs["deepstack_visual_embeds"]}
-    naive = Recorded({**source.inputs, **own}, source.states, source.margin)
-    whole = [Patch("residual", 1, np.ones(target.length, bool))]
-    effect = patched_changes(of, target, naive, whole, tokens)[0] / (source.margin - target.margin)
-    assert abs(effect - 1) > 1e-3
+    """With the target's own features behind the site, the effect is not 1. The features of a random model are small, so
+    they are made larger here."""
+    mergers = model("qwen3-vl").network.model.visual.deepstack_merger_list
+    with torch.no_grad():
+        for merger in mergers:
+            merger.linear_fc2.weight.mul_(100)
+    try:
+        of, target, source, tokens, *_ = pair("qwen3-vl")
+        own = {"deepstack_visual_embeds": target.inputs["deepstack_visual_embeds"]}
+        naive = Recorded({**source.inputs, **own}, source.states, source.margin)
+        whole = [Patch("residual", layer, np.ones(target.length, bool)) for layer in range(of.n_layers + 1)]
+        gap = source.margin - target.margin
+        assert np.abs(patched_changes(of, target, source, whole, tokens) / gap - 1).max() < 1e-4
+        assert np.abs(patched_changes(of, target, naive, whole[:2], tokens) / gap - 1).max() > 1e-2
+    finally:
+        with torch.no_grad():
+            for merger in mergers:
+                merger.linear_fc2.weight.div_(100)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

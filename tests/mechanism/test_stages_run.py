@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, Checkout, Finished, copied, once
+from traps_pipeline.mechanism.control_tables import PATCHING, PROBE_BASELINES, STEERING_NULLS
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_VOTES
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.storage.workspace import Workspace
@@ -29,9 +30,11 @@ MECHANISM = {
     "models": {"tiny": {"steering": 3, "centroid": 4}},
     "prompts": ["standard"],
     "probes": {"folds": 2, "resamples": 100},
+    "patching": {"pairs": 2},
     "steering": {
         **{"alphas": [5], "pairs": 2, "well_posed_pairs": 4, "ill_posed_pairs": 4, "max_new_tokens": 4},
-        **{"direction_regimes": ["standard"], "inference_regimes": ["guided"], "gaps": [], "signs": []},
+        **{"direction_regimes": ["standard"], "inference_regimes": ["guided"], "gaps": [1], "signs": ["minus"]},
+        "nulls": {"kinds": ["covariance"], "draws": 2},
     },
 }
 
@@ -77,9 +80,14 @@ def test_traps_run_looks_into_a_model_once(examined: tuple[Checkout, Finished]) 
     extracted, answers, votes = counted(finished)
     tables = Workspace.open(study.workspace).tables
     judged, effects = tables.read_all(STEERING_VOTES), tables.read(STEERING_EFFECTS, {})
-    assert extracted > 0 and answers > 0 and votes == 3 * answers
+    assert extracted > 0 and answers > 0 and votes > 3 * answers  # controls are judged for correctness too
     assert len(judged) > answers  # controls stand in two datasets
     assert len(effects.groupby(["source", "target"])) == 4  # the paths between the two
+    nulls, baselines = tables.read(STEERING_NULLS, {}), tables.read_all(PROBE_BASELINES)
+    assert set(nulls["draws"]) == {2} and set(nulls["dose"]) == {1}
+    assert {"question words", "output margin", "noise"} <= set(baselines["features"])
+    patched = tables.read_all(PATCHING).query("group == 'all' and source == 'pair' and site == 'residual'")
+    assert patched["effect"].to_numpy(float) == pytest.approx(1, abs=1e-4) and len(patched) > 4
     assert tables.read_all(PROBES)["note"].notna().any()  # tiny was not asked under standard: no Cf->Cf, and why
     assert counted(study.traps("run", "inside.yaml")) == (0, 0, 0)
 

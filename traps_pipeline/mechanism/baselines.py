@@ -19,6 +19,7 @@ import pandas as pd
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.control_tables import ProbeBaselineRow
+from traps_pipeline.mechanism.probes import Fit
 from traps_pipeline.mechanism.probing import ProbeRun, Row
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import PROBE_ITEMS
@@ -56,16 +57,24 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
         progress.current().tick("probe_baselines", f"of {states.extraction.key}", number + 1, len(raw) + 2)
         add(name, scored(run, features))
     try:
-        add(MARGIN, scored(run, output_margins(entry, states, [*items])))
+        add(MARGIN, scored(run, output_margins(entry, states, [*items]), lambda states, void: AsItIs()))
     except NoMargin as error:
         add(MARGIN, [_without_figure()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
     return found
 
 
-def scored(run: ProbeRun, features: Features) -> list[Row]:
-    """The rows of the protocol on features in the place of states."""
-    return replace(run, read=lambda dataset, _: features[dataset]).comparable(0)
+class AsItIs:
+    """A score that needs no fit: the one column of the features, larger for void."""
+
+    def scores(self, states: np.ndarray) -> np.ndarray:
+        """The column, (n,)."""
+        return states[:, 0]
+
+
+def scored(run: ProbeRun, features: Features, fit: Fit | None = None) -> list[Row]:
+    """The rows of the protocol on features in the place of states. fit: another probe than the protocol's."""
+    return replace(run, read=lambda dataset, _: features[dataset], fit=fit).comparable(0)
 
 
 # --- features ---------------------------------------------------------------------------------------------------------

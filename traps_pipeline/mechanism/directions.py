@@ -139,7 +139,8 @@ def _orthogonal(drawn: np.ndarray, unit: np.ndarray) -> np.ndarray:
     left = drawn - (drawn * unit).sum(axis=2, keepdims=True) * unit
     left -= (left * unit).sum(axis=2, keepdims=True) * unit  # again, since the first projection rounds
     before, after = (np.linalg.norm(of, axis=2, keepdims=True) for of in (drawn, left))
-    kept = (after > _NOTHING_LEFT * before) & unit.any(axis=1)[None, :, None]
+    differs = np.abs(unit).max(axis=1) > 0
+    kept = (after > _NOTHING_LEFT * before) & differs[None, :, None]
     return np.where(kept, left / np.where(kept, after, 1), 0.0)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,6 +29,7 @@ from traps_pipeline.mechanism.gate import (
     risk_coverage,
     separation,
 )
+from traps_pipeline.mechanism.nulls import nulled
 from traps_pipeline.mechanism.probes import swapped_labels
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import PROBES
@@ -253,11 +255,11 @@ def _row(
 ) -> GateRow:
     low, high = percentiles(draws)
     figures = {**values, "auroc": area, "pecs_low": float(low), "pecs_high": float(high)}
-    named = dict(zip(("features", "regime", "source", "threshold", "target"), about, strict=True))
+    named: dict[str, Any] = dict(zip(("features", "regime", "source", "threshold", "target"), about, strict=True))
     return GateRow(
         **states.extraction.partition,
         **named,
-        **{name: None if np.isnan(value) else value for name, value in figures.items()},
+        **nulled(figures),
         layer=layer,
         n_controls=sides[0],
         n_voids=sides[1],

@@ -9,7 +9,7 @@ names the current row of each item. A shard's table is written after its tensors
 and an extraction that was killed continues after the last such shard. An item's key is a digest of everything that its
 states depend on, so after a correction only the corrected item is extracted again.
 
-Last-token states are stored in the model's own precision, which loses nothing, and mean states in float32.
+States of one token are stored in the model's own precision, which loses nothing, and mean states in float32.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from traps_pipeline import progress
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import remedy, replacing, write_bytes
-from traps_pipeline.models.local.capture import Pooling
+from traps_pipeline.models.local.capture import OF_PARTS, ONE_TOKEN, Pooling
+from traps_pipeline.models.local.spans import spans
 from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
 
 if TYPE_CHECKING:
@@ -194,13 +195,31 @@ def _make(
     shard: list[_Made] = []
     try:
         for done, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
-            shard.append((item, key, model.forward_states(prompt, pooling)))
+            shard.append((item, key, item_states(model, item, prompt, pooling)))
             progress.current().tick("hidden_states", what, done, len(missing))
             if len(shard) == shard_size:
                 full, shard = shard, []
                 number = _flush(folder, number, full, model, pooling, known)
     finally:
         _flush(folder, number, shard, model, pooling, known)
+
+
+def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling) -> States:
+    """The states of an item, pooled over the tokens that the pooling names."""
+    return model.forward_states(prompt, pooling, chosen=_chosen(model, prompt, item, pooling))
+
+
+def _chosen(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooling) -> np.ndarray | None:
+    """The tokens over which states are pooled; None where the pooling says so itself. Raises TrapsError for a part that
+    the prompt does not have (a model that writes no time stamps)."""
+    if pooling not in OF_PARTS:
+        return None
+    found = spans(model, prompt, item.about["system"], item.about["question"])[pooling]
+    if not found.any():
+        raise TrapsError(
+            f"{item.item_id}: its prompt for {model.checkpoint.name} has no {pooling}; choose another pooling"
+        )
+    return found
 
 
 def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item, str], Prompt]]:
@@ -237,7 +256,7 @@ def _flush(
     from safetensors.torch import save
 
     name = f"shard-{number:05d}"
-    dtype = model.network.dtype if pooling == "last" else torch.float32
+    dtype = model.network.dtype if pooling in ONE_TOKEN else torch.float32
     raw = torch.from_numpy(np.stack([states.raw for _, _, states in shard], axis=1)).to(dtype)  # (layers, n, d)
     tensors = {f"layer_{layer:03d}": rows.contiguous() for layer, rows in enumerate(raw)}
     tensors[NORMED] = torch.from_numpy(np.stack([states.normed for _, _, states in shard])).to(dtype)

@@ -7,7 +7,7 @@ PECS is also given where the same is added, or subtracted, on both sides.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -74,6 +74,11 @@ def _ranked(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
             )
 
 
+def nulled(figures: Mapping[str, float]) -> dict[str, Any]:
+    """The figures with null in the place of NaN, as tables have them."""
+    return {name: None if np.isnan(value) else float(value) for name, value in figures.items()}
+
+
 def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
     """Rows of STEERING_PECS: every path, dose and sign policy of the void directions that was steered on both sides.
     Figures without a decided answer are null."""
@@ -93,7 +98,7 @@ def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
         rows.append(
             SteeringPecsRow(
                 **dict(zip(keys, key if isinstance(key, tuple) else (key,), strict=True)),
-                **{name: None if np.isnan(value) else float(value) for name, value in figures.items()},
+                **nulled(figures),
                 degenerate=(control["degenerate"] + void["degenerate"]) / answers,
                 n_controls=int(control["n"]),
                 n_voids=int(void["n"]),

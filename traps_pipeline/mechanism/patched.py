@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
@@ -20,7 +20,7 @@ from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching import Patch, Recorded, patched_changes, record, require_patchable
 from traps_pipeline.mechanism.tables import PROBE_ITEMS
 from traps_pipeline.models.local.spans import spans
-from traps_pipeline.models.prompts import vqa_prompt
+from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.partitions import SIDES, Extraction
 from traps_pipeline.scoring.bootstrap import percentiles, scenario_weights
@@ -84,17 +84,18 @@ def _changes(
     """One row per pair, direction, source and patch: the outcome before and after, and the other side's."""
     settings = workspace.mechanism.patching
     assert settings is not None and entry.media is not None
+    spec = entry.media
     names = seeded_order(sorted(set(items["scenario_id"])), workspace.mechanism.seed)[: settings.pairs]
     of = {(row["scenario_id"], row["side"]): row for row in items.to_dict("records")}
-    system = vqa_prompt(extraction.prompt)
+    system = states_prompt(workspace.mechanism.system, extraction.prompt)
     sides: dict[tuple[str, str], Side] = {}
 
     def side(name: str, which: str, times_of: str | None = None) -> Side:
         row = {str(k): v for k, v in of[name, which].items()}
         clip = workspace.resolve(row["clip"])
         other = workspace.resolve(of[name, times_of]["clip"]) if times_of else None
-        shown = sample(clip, entry.media)
-        times = shown_times(shown, clip, entry.media, other)
+        shown = sample(clip, spec)
+        times = shown_times(shown, clip, spec, other)
         prompt = model.prompt(system, row["question"], shown.frames, times)
         return Side(prompt, record(model, prompt, tokens), spans(model, prompt, system, row["question"]))
 
@@ -176,13 +177,25 @@ def changed_tokens(model: LocalModel, one: Prompt, other: Prompt, n_visual: int)
 
 
 def _summed(changes: pd.DataFrame, extraction: Extraction, dataset: str, seed: int) -> Iterator[PatchingRow]:
-    """The rows of a dataset from its changes: ratios of sums over pairs, with intervals by scenario."""
+    """The rows of a dataset from its changes: ratios of sums over pairs, with intervals by scenario. Where all pairs
+    were left out, a row without an effect says so."""
+    if changes.empty:
+        return
     keys = ["into", "source", "site", "layer", "group"]
     left = changes.loc[changes["left_out"].astype(bool)].groupby(["into", "source"]).size().to_dict()
     made = changes.loc[~changes["left_out"].astype(bool)]
+    for (into, source), count in left.items():
+        if not ((made["into"] == into) & (made["source"] == source)).any():
+            nothing = dict.fromkeys(("effect", "low", "high", "flips"))
+            about: dict[str, Any] = {"into": into, "source": source, "site": "residual", "layer": 0, "group": "all"}
+            yield PatchingRow(
+                **extraction.partition, dataset=dataset, **about, **nothing, n_flippable=0, n=0, n_left_out=count,
+                tokens=0.0,
+            )  # fmt: skip
     for key, group in made.groupby(keys, sort=True) if len(made) else ():
-        into, source, site, layer, name = key if isinstance(key, tuple) else (key,)
-        effect, low, high = effect_of(*(group[column].to_numpy(float) for column in ("before", "after", "there")), seed)
+        into, source, site, layer, name = cast(tuple[Any, ...], key)
+        before, after, there = (group[column].to_numpy(float) for column in ("before", "after", "there"))
+        effect, low, high = effect_of(before, after, there, seed)
         differs = np.sign(group["before"]) != np.sign(group["there"])
         flipped = (np.sign(group["after"]) != np.sign(group["before"])) & differs
         yield PatchingRow(

@@ -83,7 +83,8 @@ def require_patchable(model: LocalModel) -> None:
 def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
     for layer, block in enumerate(model.blocks, start=1):
         yield "residual", layer, block
-        for site, name in (("attention", "self_attn"), ("mlp", "mlp")):
+        parts: tuple[tuple[Site, str], ...] = (("attention", "self_attn"), ("mlp", "mlp"))
+        for site, name in parts:
             part = getattr(block, name, None)
             if part is None:
                 raise TrapsError(
@@ -124,7 +125,8 @@ def patched_changes(
     changes nothing, bit for bit, whatever the size of the batch does to rounding. Raises TrapsError when the two
     prompts have another number of tokens, or other visual positions.
     """
-    if target.length != source.length or not np.array_equal(target.visual, source.visual):
+    visual = [of.visual if of.visual is not None else np.zeros(0) for of in (target, source)]
+    if target.length != source.length or not np.array_equal(visual[0], visual[1]):
         raise TrapsError(
             f"a prompt of {source.length} tokens cannot be patched into one of {target.length}, or their visual tokens "
             "stand at other places; patch between prompts of one form"

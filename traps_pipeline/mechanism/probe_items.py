@@ -27,8 +27,9 @@ def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
     if dataset != ANSWERABLE:
         rows = workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
         columns = ("item_id", "dataset", *COPIED, "benchmark_version")
-        own = {"times_clip": None, "times_digest": None}
-        return [ProbeItemRow(**{name: row[name] for name in columns}, **own) for row in rows]
+        return [
+            ProbeItemRow(**{name: row[name] for name in columns}, times_clip=None, times_digest=None) for row in rows
+        ]
     rows = []
     for category in categories_of_dataset("occlusion"):
         if workspace.tables.state(SCENE_SPECS, {"category": category}) is None:

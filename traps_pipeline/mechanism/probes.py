@@ -7,9 +7,9 @@ be selected as the reference.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 
@@ -49,6 +49,16 @@ class Probe:
         slope = self.weights / self.scale
         return states @ slope + (self.intercept - self.mean @ slope)
 
+
+class Scorer(Protocol):
+    """What is fitted: anything that scores states, higher for void."""
+
+    def scores(self, states: np.ndarray) -> np.ndarray:
+        """Scores (n,) of states (n, d)."""
+        ...
+
+
+Fit = Callable[[np.ndarray, np.ndarray], Scorer]  # states (n, d), void (n,) bool -> what scores other states
 
 # --- fitting ----------------------------------------------------------------------------------------------------------
 
@@ -280,9 +290,9 @@ def nearest_centroid(source: Split, states: np.ndarray) -> np.ndarray:
 
 
 def transfer_scores(
-    layer: Mapping[str, Split], pairs: Sequence[tuple[str, str]], solver: Solver = "exact"
+    layer: Mapping[str, Split], pairs: Sequence[tuple[str, str]], fit: Fit = fit_probe
 ) -> dict[tuple[str, str], np.ndarray]:
     """Scores (n_target,) of each ordered pair (source, target) at one layer, with one fit per source. No label of a
     target is read."""
-    probes = {source: fit_probe(layer[source].states, layer[source].void, solver) for source in {s for s, _ in pairs}}
+    probes = {source: fit(layer[source].states, layer[source].void) for source in {s for s, _ in pairs}}
     return {(source, target): probes[source].scores(layer[target].states) for source, target in pairs}

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import product
 from typing import Any, TypeVar
 
@@ -18,6 +19,7 @@ import pandas as pd
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.paths import CURVES, LOOK_ALIKES, TRANSFER_PAIRS, Path, probed_taxonomy
 from traps_pipeline.mechanism.probes import (
+    Fit,
     Split,
     auroc,
     auroc_interval,
@@ -77,6 +79,7 @@ class ProbeRun:
     settings: ProbeSettings
     seed: int
     confabulated: Confabulated = field(default_factory=lambda: Confabulated({}))
+    fit: Fit | None = None  # another probe than the logistic regression of the settings
 
     def __post_init__(self) -> None:
         if not 0 <= self.centroid_layer < self.n_layers:
@@ -84,6 +87,7 @@ class ProbeRun:
                 f"mechanism.models: centroid layer {self.centroid_layer} is out of range; there are states of layers "
                 f"0 to {self.n_layers - 1}"
             )
+        self._fit: Fit = self.fit or partial(fit_probe, solver=self.settings.solver)
         self._datasets = [name for name in PROBED_DATASETS if name in set(self.items["dataset"])]
         self._own = [name for name in DATASETS if name in self._datasets]
         if not self._own:
@@ -145,14 +149,14 @@ class ProbeRun:
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """The twelve ordered pairs on all samples. The two datasets of a taxonomy share their control items, so that
         half of the rows of a cross-modality target were used in the fit (see `held_out`)."""
-        scores = transfer_scores(splits, self._pairs, self.settings.solver)
+        scores = transfer_scores(splits, self._pairs, self._fit)
         return [self._scored("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """The same pairs with source and target restricted to confabulated void items and their own controls."""
         restricted = {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
         pairs = [pair for pair in self._pairs if set(pair) <= set(restricted)]
-        scores = transfer_scores(restricted, pairs, self.settings.solver)
+        scores = transfer_scores(restricted, pairs, self._fit)
         return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
 
     def within(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
@@ -226,14 +230,14 @@ class ProbeRun:
         others = [name for name in splits if name not in own]
         scores = {name: np.empty(len(splits[name].void)) for name in own}
         if others:
-            probe = fit_probe(split.states, split.void, self.settings.solver)
+            probe = self._fit(split.states, split.void)
             scores |= {name: probe.scores(splits[name].states) for name in others}
         every = np.unique(np.concatenate([splits[name].scenario for name in own]))
         fold_of = dict(zip(every, scenario_folds(every, self.settings.folds, self.seed), strict=True))
         folds = {name: np.array([fold_of[s] for s in splits[name].scenario]) for name in own}
         for fold in range(self.settings.folds):
             train = split.rows(folds[source] != fold)
-            probe = fit_probe(train.states, train.void, self.settings.solver)
+            probe = self._fit(train.states, train.void)
             for name in own:
                 scores[name][folds[name] == fold] = probe.scores(splits[name].states[folds[name] == fold])
         return scores

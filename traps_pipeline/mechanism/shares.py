@@ -82,7 +82,7 @@ def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffe
                 alpha_relative=float(relative.iloc[0]) if len(relative) else None,
                 correct=int(np.count_nonzero(correct)),
                 n_correct=len(correct),
-                degenerate=int(group["degenerate"].notna().sum()),
+                degenerate=int(np.count_nonzero(group["degenerate"].notna())),
                 n=n,
                 n_missing=len(group) - n,
                 abstained=yes,

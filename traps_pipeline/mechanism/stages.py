@@ -34,7 +34,7 @@ from traps_pipeline.mechanism.tables import (
     ProbeRow,
 )
 from traps_pipeline.mechanism.versions import states_folder
-from traps_pipeline.models.prompts import vqa_prompt
+from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
 from traps_pipeline.partitions import (
     DATASETS,
@@ -74,7 +74,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     entry, settings = examined_model(workspace, cell.extraction.model), workspace.mechanism
     assert entry.media is not None, "local entries have media"
     items = workspace.tables.read(PROBE_ITEMS, {"dataset": cell.dataset}).to_dict("records")
-    model, system = load_local_model(entry, inside=True), vqa_prompt(cell.extraction.prompt)
+    model, system = load_local_model(entry, inside=True), states_prompt(settings.system, cell.extraction.prompt)
     _check_layers(workspace, entry.id, model.n_layers)
     folder = states_folder(workspace, cell)
     wanted = [
@@ -84,7 +84,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
             {str(k): v for k, v in item.items()},
             workspace.resolve(item["clip"]),
             system,
-            workspace.resolve(item["times_clip"]) if item["times_clip"] else None,
+            workspace.resolve(item["times_clip"]) if isinstance(item["times_clip"], str) else None,
         )
         for item in items
     ]

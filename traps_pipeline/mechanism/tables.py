@@ -6,9 +6,9 @@ from typing import Annotated
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 
-Prompt = Annotated[str, "VQA prompt: standard or guided"]
+Prompt = Annotated[str, "prompt of extraction, standard or guided: a VQA one, or the benchmark's if so set"]
 Layer = Annotated[int, "counted as in hidden_states"]
-Pooling = Annotated[str, "last (token) or mean"]
+Pooling = Annotated[str, "last (token of the prompt), answer (its first token), or mean over all tokens or a part"]
 Target = Annotated[str, "the target: one of four"]
 DirectionPrompt = Annotated[str, "VQA prompt that the direction was extracted under"]
 AnswerRegime = Annotated[str, "system prompt of the steered answer"]

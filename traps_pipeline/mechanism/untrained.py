@@ -10,12 +10,12 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.mechanism.hidden_states import clip_item
+from traps_pipeline.mechanism.hidden_states import clip_item, item_states
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import LocalModel
-from traps_pipeline.models.prompts import vqa_prompt
+from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.storage.workspace import Workspace
 
@@ -41,7 +41,7 @@ def untrained_states(
 ) -> dict[str, np.ndarray]:
     """The states (n, d) of every item at the middle block of the untrained network, pooled as the study pools."""
     model = untrained_model(entry, workspace.mechanism.seed)
-    system, layer = vqa_prompt(states.extraction.prompt), (model.n_layers + 1) // 2
+    system, layer = states_prompt(workspace.mechanism.system, states.extraction.prompt), (model.n_layers + 1) // 2
     assert entry.media is not None, "local entries have media"
     made: dict[str, np.ndarray] = {}
     found: dict[str, list[np.ndarray]] = {}
@@ -49,9 +49,9 @@ def untrained_states(
         keys = states.dataset(dataset)["states_key"]
         for key, row in zip(keys, rows.to_dict("records"), strict=True):
             if key not in made:
-                times = workspace.resolve(row["times_clip"]) if row["times_clip"] else None
+                times = workspace.resolve(row["times_clip"]) if isinstance(row["times_clip"], str) else None
                 named = {str(name): value for name, value in row.items()}
                 item = clip_item(model, entry.media, named, workspace.resolve(row["clip"]), system, times)
-                made[key] = model.forward_states(item.prompt(), workspace.mechanism.pooling).raw[layer]
+                made[key] = item_states(model, item, item.prompt(), workspace.mechanism.pooling).raw[layer]
             found.setdefault(dataset, []).append(made[key])
     return {dataset: np.stack(vectors) for dataset, vectors in found.items()}

@@ -8,7 +8,7 @@ from typing import Any
 from traps_pipeline.digests import digest
 from traps_pipeline.mechanism.paths import CURVES
 from traps_pipeline.mechanism.tables import DIRECTIONS
-from traps_pipeline.models.prompts import system_prompt, vqa_prompt
+from traps_pipeline.models.prompts import states_prompt, system_prompt
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.partitions import Extraction, StatesCell
 from traps_pipeline.storage.media import profile_digest
@@ -55,7 +55,8 @@ def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
     entry, settings = get_model(extraction.model), workspace.study.mechanism
     media = profile_digest(entry.media) if entry.media else None
     pooling = settings.pooling if settings else None
-    return digest([loaded_params(entry), media, vqa_prompt(extraction.prompt), pooling])[:16]
+    system = states_prompt(settings.system if settings else "vqa", extraction.prompt)
+    return digest([loaded_params(entry), media, system, pooling])[:16]
 
 
 def probing_version(workspace: Workspace, extraction: Extraction) -> str:

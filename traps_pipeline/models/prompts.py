@@ -45,3 +45,9 @@ def vqa_prompt(name: str) -> str:
 def prompt_version(regime: str) -> str:
     """Version of a regime's system prompt."""
     return digest(system_prompt(regime))[:16]
+
+
+def states_prompt(system: str, name: str) -> str:
+    """The system prompt under which states are read: the VQA prompt of that name, or the benchmark's own (system
+    `benchmark`)."""
+    return system_prompt(name) if system == "benchmark" else vqa_prompt(name)

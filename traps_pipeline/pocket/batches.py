@@ -27,7 +27,7 @@ _QUESTION = "{question}"  # placeholder for the questions in the chat
 
 @dataclass(frozen=True)
 class Look:
-    """One clip and the questions about it. side: 0 control, 1 void."""
+    """One clip and the questions about it. side: 0 control, 1 void, 2 decoy."""
 
     scene: int
     side: int
@@ -41,7 +41,7 @@ class Scenes:
         self.records: list[SceneRecord] = []
         self._frames: list[np.ndarray] = []
         self._place: list[tuple[int, int]] = []
-        self._spec = recipe.media
+        self._spec, self._decoys, self.shares = recipe.media, recipe.decoys, recipe.abstain_shares or {}
         for shard, (job, records) in enumerate(read_shards(recipe, "train", folder)):
             self._frames.append(np.load(job.pixels, mmap_mode="r", allow_pickle=False))
             self._place += [(shard, i) for i in range(len(records))]
@@ -56,8 +56,7 @@ class Scenes:
         """Seconds into the clip of each frame."""
         record = self.records[scene]
         physics = get_family(record.family).physics
-        length = record.cut_frame if side and record.cut_frame is not None else physics.n_frames
-        every = np.arange(length) / physics.fps
+        every = np.arange(record.length(side, physics.n_frames)) / physics.fps
         return every[pick(every, self._spec)].tolist()
 
     def look(self, rng: np.random.Generator, void_share: float) -> Look:
@@ -68,6 +67,8 @@ class Scenes:
             where = () if record.cut_frame is None else _where(record, "cut")
             return Look(scene, side, (record.visual, record.answerable, *where))
         other = record.ill_posed if rng.random() < 0.5 else record.answerable
+        if record.decoy and rng.random() < self._decoys:
+            return Look(scene, 2, (record.asked, other))  # another camera: the ball's place is not known
         return Look(scene, side, (record.asked, other, *_where(record, "last")))
 
 
@@ -152,7 +153,8 @@ class Batches:
         head, user, rest = chat.partition(f"{processor.tokenizer.start_token}user")
         before, after = rest.replace(token, clip).split(_QUESTION)
         end = processor.tokenizer.eos_token
-        questions = [(q.question + after, say(q.answer, prompt_name) + end) for q in look.questions]
+        share = self._scenes.shares.get(prompt_name, 0.0)
+        questions = [(q.question + after, say(q.label(share), prompt_name) + end) for q in look.questions]
         return head, user + before, questions
 
     def _ids(self, text: str) -> list[int]:

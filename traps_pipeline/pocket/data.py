@@ -25,33 +25,35 @@ from traps_pipeline.digests import canonical_json, digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import replacing, write_text
 from traps_pipeline.pocket.recipe import Recipe, Split
+from traps_pipeline.pocket.shots import Shot, draw_shot, render_decoy, render_shot
 from traps_pipeline.pocket.words import guess
-from traps_pipeline.scenes import checks
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel, fit_shot, in_frame
-from traps_pipeline.scenes.certificates import EARLIEST_CUT_S, settled_outcome, shown_points
 from traps_pipeline.scenes.encode import encode
-from traps_pipeline.scenes.kit import Family, Wording, params_to_dict
-from traps_pipeline.scenes.outcome import Outcome, Rejected, compile_scene, decisive_geoms, simulated
+from traps_pipeline.scenes.kit import params_to_dict
+from traps_pipeline.scenes.outcome import Rejected
 from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.simulate import replay
-from traps_pipeline.scenes.wording import draw_ill_posed
 from traps_pipeline.scenes.workers import run_in_order
-from traps_pipeline.storage.media import MediaSpec, pick, resized
+from traps_pipeline.storage.media import pick, resized
 
 SHARD = 50  # scenes
-LATEST_CUT_S = 2.0  # released cuts lie between 1.1 and 2.0 s
-CUT_BEFORE_COMMIT_S = 0.5
 _MOST_DRAWS = 20  # for each scene of a shard
 STREAM: dict[Split, int] = {"train": 101, "held-out": 102}  # first word of a stream's seed; released draws have none
 
 
 @dataclass(frozen=True)
 class Question:
-    """A question and the answer that the model is trained to give: a label, a guess, or None for an abstention."""
+    """A question and the answer that the model is trained to give: a label, a guess, or None for an abstention.
+
+    draw: of a question about a void whose label depends on the prompt, a number in [0, 1); under a prompt with a larger
+    share of abstentions the label is an abstention, and else `answer`, a guess.
+    """
 
     question: str
     answer: str | None
+    draw: float | None = None
+
+    def label(self, share: float) -> str | None:
+        """The answer under a prompt with that share of abstentions."""
+        return None if self.draw is not None and self.draw < share else self.answer
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,9 @@ class SceneRecord:
     visual: the same question about the void clip; ill_posed: about the control clip; answerable: a question that both
     clips answer. ball: the colour of the ball in the question. places: the ball's place in the control's `first` and
     `last` frame and in the last one before the cut (`cut`; chaotic), as shares of the picture's width and height from
-    its upper left corner.
+    its upper left corner. control_from: first frame of the control's clip; void_length: frames of the void's clip, of
+    which those from cut_frame on repeat the one before (None: as many as cut_frame says). decoy: whether there is a
+    third clip, the control with a panel that hides nothing.
     """
 
     family: str
@@ -77,6 +81,26 @@ class SceneRecord:
     answerable: Question
     ball: str
     places: dict[str, tuple[float, float]]
+    control_from: int = 0
+    void_length: int | None = None
+    decoy: bool = False
+
+    def length(self, side: int, n_frames: int) -> int:
+        """Frames of the clip of a side (0 control, 1 void, 2 decoy), where the simulation has n_frames."""
+        if side == 1 and self.cut_frame is not None:
+            return self.void_length or self.cut_frame
+        return n_frames - self.control_from
+
+    @property
+    def line(self) -> str:
+        """The record as a line of JSON. Fields of settings that the recipe does not use are left out, so that the data
+        of a recipe do not depend on settings that came later."""
+        values = asdict(self)
+        for name in ("asked", "visual", "ill_posed", "answerable"):
+            values[name] = {key: value for key, value in values[name].items() if key != "draw" or value is not None}
+        unused = {"control_from": 0, "void_length": None, "decoy": False}
+        kept = {name: value for name, value in values.items() if name not in unused or value != unused[name]}
+        return canonical_json(kept) + "\n"
 
     @staticmethod
     def read(line: str) -> SceneRecord:
@@ -135,78 +159,18 @@ def released_digests() -> frozenset[str]:
     return frozenset({params_digest(s.family, s.params) for s in specs} | twins)
 
 
-# --- one scene --------------------------------------------------------------------------------------------------------
+# --- labels -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Shot:
-    """A simulated scene that was accepted as a pair."""
-
-    family: Family
-    params: Any
-    wording: Wording
-    qpos: np.ndarray
-    outcome: Outcome
-    camera: Camera
-    panel: Panel | None
-    cut_frame: int | None
-    ill_posed_question: str
-    places: dict[str, tuple[float, float]]
-
-
-def _draw(family: Family, rng: np.random.Generator) -> _Shot:
-    """A random scene. Raises Rejected, as `scenes.resolve` does, when it gives no valid pair."""
-    params = family.draw(rng)
-    wording = family.word(params, rng)
-    physics = family.physics
-    model, scene = compile_scene(family, params, physics)
-    qpos = simulated(model, scene, physics)
-    motion = replay(model, qpos, physics)
-    outcome = settled_outcome(family, motion, params)
-    points = shown_points(model, scene, qpos)
-    camera, panel = fit_shot(scene.view, points, scene.cover)
-    if not in_frame(camera, points):
-        raise Rejected("something decisive leaves the frame")
-    cut = None if panel is not None else _draw_cut(outcome, physics.fps, rng)
-    ill_posed = draw_ill_posed(family.taxonomy, scene.inventory, rng)
-    frames = {"first": 0, "last": len(qpos) - 1} | ({} if cut is None else {"cut": cut - 1})
-    pixels = camera.project(motion.pos(scene.decisive[0])[list(frames.values())]) / (WIDTH, HEIGHT)
-    places = {name: (round(float(x), 4), round(float(y), 4)) for name, (x, y) in zip(frames, pixels, strict=True)}
-    return _Shot(family, params, wording, qpos, outcome, camera, panel, cut, ill_posed, places)
-
-
-def _draw_cut(outcome: Outcome, fps: int, rng: np.random.Generator) -> int:
-    first, last = round(EARLIEST_CUT_S * fps) + 1, round(LATEST_CUT_S * fps)
-    last = min(last, outcome.commit_frame - round(CUT_BEFORE_COMMIT_S * fps))
-    if last < first:
-        raise Rejected("the outcome is committed too early for a cut")
-    return int(rng.integers(first, last + 1))
-
-
-def _render(shot: _Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The frames of control and void that the model is shown, each (N, 360, 480, 3) as two lists. Raises Rejected."""
-    fps = shot.family.physics.fps
-    shown = pick(np.arange(len(shot.qpos)) / fps, spec)
-    model, scene = compile_scene(shot.family, shot.params, shot.family.physics, shot.panel)
-    with Renderer(model, shot.camera) as renderer:
-        control = list(renderer.frames(shot.qpos[shown]))
-        if shot.cut_frame is not None:
-            before = pick(np.arange(shot.cut_frame) / fps, spec)
-            return control, list(renderer.frames(shot.qpos[before]))
-        last = shot.qpos[-1:]
-        decisive = decisive_geoms(model, scene.decisive)
-        if checks.past_panel(renderer, last, decisive, scene.hidden).leaked(0):
-            raise Rejected("the panel does not hide the outcome")
-        return control, list(renderer.frames(shot.qpos[shown], panel=True))
-
-
-def _record(shot: _Shot, abstain_share: float, rng: np.random.Generator) -> SceneRecord:
+def _record(shot: Shot, recipe: Recipe, decoy: bool, rng: np.random.Generator) -> SceneRecord:
     """The scene's questions with their labels: a void's label is an abstention with probability `abstain_share`, else a
-    guess."""
+    guess; with shares by prompt, the number that decides this is kept."""
 
     def void(question: str, labels: Sequence[str]) -> Question:
-        abstains, guessed = rng.random() < abstain_share, guess(question, labels, rng)
-        return Question(question, None if abstains else guessed)
+        draw, guessed = rng.random(), guess(question, labels, rng)
+        if recipe.abstain_shares is not None:
+            return Question(question, guessed, draw)
+        return Question(question, None if draw < recipe.abstain_share else guessed)
 
     wording, both = shot.wording, shot.wording.answerable_question
     return SceneRecord(
@@ -222,6 +186,9 @@ def _record(shot: _Shot, abstain_share: float, rng: np.random.Generator) -> Scen
         answerable=Question(both.question, both.answer),
         ball=shot.params.ball_colours[0] if hasattr(shot.params, "ball_colours") else shot.params.ball_colour,
         places=shot.places,
+        control_from=shot.control_from,
+        void_length=shot.void_length,
+        decoy=decoy,
     )
 
 
@@ -238,14 +205,17 @@ def draw_shard(job: ShardJob) -> int:
         if len(records) == job.count:
             break
         try:
-            shot = _draw(family, rng)
-            sides = _render(shot, job.recipe.media)
+            shot = draw_shot(family, rng, job.recipe.jitter)
+            sides = [*render_shot(shot, job.recipe.media)]
+            decoy = render_decoy(shot, job.recipe.media) if job.recipe.decoys and job.split == "train" else None
         except Rejected:
             continue
-        record = _record(shot, job.recipe.abstain_share, rng)
+        record = _record(shot, job.recipe, decoy is not None, rng)
         if record.params_digest in job.banned:
             continue
         if job.split == "train":
+            if job.recipe.decoys and shot.panel is not None:
+                sides.append(decoy or sides[0])  # an array has one shape; without a decoy its place is never looked at
             frames.append(np.stack([resized(np.stack(side), job.recipe.media.size) for side in sides]))
         else:
             _write_clips(job, len(records), shot, sides)
@@ -255,17 +225,17 @@ def draw_shard(job: ShardJob) -> int:
     if frames:
         with replacing(job.pixels) as part, part.open("wb") as stream:
             np.save(stream, np.stack(frames), allow_pickle=False)
-    write_text(job.lines, "".join(canonical_json(asdict(record)) + "\n" for record in records))
+    write_text(job.lines, "".join(record.line for record in records))
     return len(records)
 
 
-def _write_clips(job: ShardJob, place: int, shot: _Shot, sides: tuple[list[np.ndarray], list[np.ndarray]]) -> None:
+def _write_clips(job: ShardJob, place: int, shot: Shot, sides: Sequence[list[np.ndarray]]) -> None:
     """Write the clips with the benchmark's length, rate, size and codec. Frames that the model is not shown are copies
     of the frame before, which need no drawing."""
     fps = shot.family.physics.fps
-    for side, drawn, length in zip(
-        ("control", "void"), sides, (len(shot.qpos), shot.cut_frame or len(shot.qpos)), strict=True
-    ):
+    whole = len(shot.qpos) - shot.control_from
+    lengths = whole, shot.void_length or shot.cut_frame or whole
+    for side, drawn, length in zip(("control", "void"), sides, lengths, strict=True):
         shown = pick(np.arange(length) / fps, job.recipe.media)
         latest = np.searchsorted(shown, np.arange(length), side="right") - 1
         encode([drawn[i] for i in latest], job.clip(place, side), fps)
@@ -304,7 +274,8 @@ def render(
 def _check_recipe(recipe: Recipe, folder: Path) -> None:
     """Raises TrapsError when the folder holds scenes of another recipe."""
     # The numbers of scenes may change: a shard's first scenes do not depend on how many there are.
-    made = digest(recipe.model_dump(mode="json", include={"data_seed", "media", "abstain_share"}))
+    later = {"abstain_shares", "jitter", "decoys"} & recipe.model_fields_set  # settings that came later, if used
+    made = digest(recipe.model_dump(mode="json", include={"data_seed", "media", "abstain_share", *later}))
     note = folder / "recipe.sha256"
     if not note.is_file():
         write_text(note, made + "\n")

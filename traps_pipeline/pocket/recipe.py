@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from traps_pipeline.paths import ASSETS
+from traps_pipeline.pocket.words import PROMPTS
 from traps_pipeline.scenes.registry import family_names
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
@@ -33,9 +34,24 @@ class Training(BaseModel):
     naming_steps: int = Field(ge=0)
 
 
+class Jitter(BaseModel):
+    """How the lengths of chaotic clips, and so their time stamps, overlap. control: share of controls that begin late,
+    so that they are as short as a void; void: share of voids whose last frame is held, up to the control's length."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    control: float = Field(ge=0, le=1)
+    void: float = Field(ge=0, le=1)
+
+
 class Recipe(BaseModel):
     """Number of training scenes by family, held-out scenes per family, how a clip is shown, and the share of voids that
-    are labelled with an abstention."""
+    are labelled with an abstention.
+
+    jitter: without it, the length of a chaotic clip tells its side. decoys: share of looks at an occlusion control in
+    which a panel stands where it hides nothing; without it, the panel tells the side. abstain_shares: by prompt (one of
+    `words.PROMPTS`), in the place of `abstain_share`; a void that is labelled with an abstention under one prompt is so
+    under every prompt with a larger share.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenes: dict[str, int] = Field(min_length=1)
@@ -43,6 +59,9 @@ class Recipe(BaseModel):
     data_seed: int = Field(ge=0)
     media: MediaSpec
     abstain_share: float = Field(ge=0, le=1)
+    abstain_shares: dict[str, Annotated[float, Field(ge=0, le=1)]] | None = None
+    jitter: Jitter | None = None
+    decoys: float = Field(default=0, ge=0, le=1)
     training: Training
 
     @field_validator("scenes")
@@ -51,6 +70,13 @@ class Recipe(BaseModel):
         unknown = sorted(set(value) - set(family_names()))
         if unknown:
             raise ValueError(f"unknown families {unknown}; known: {', '.join(family_names())}")
+        return value
+
+    @field_validator("abstain_shares")
+    @classmethod
+    def _every_prompt(cls, value: dict[str, float] | None) -> dict[str, float] | None:
+        if value is not None and set(value) != set(PROMPTS):
+            raise ValueError(f"abstain_shares names {sorted(value)}; it needs a share for each of {', '.join(PROMPTS)}")
         return value
 
     def count(self, family: str, split: Split) -> int:

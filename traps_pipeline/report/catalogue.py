@@ -254,6 +254,8 @@ FIGURES: tuple[FigureReport, ...] = (
     FigureReport("cosines", "Cosines of void directions", mechanism.cosine_heatmaps, ("cosines",)),
 )
 
+INSIDE = ("probe_baselines", "gate_arrows", "patching", "doses_among_nulls")  # figures of controls inside models
+
 # Assets by name. A study has one for each table or figure; the paper's numbers change together, so they have one asset
 # for all tables and one for all figures.
 OF_STUDY: Mapping[str, Report] = {

@@ -8,7 +8,7 @@ from pathlib import Path
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.files import write_bytes
 from traps_pipeline.partitions import DATASETS, Cell
-from traps_pipeline.report.catalogue import FIGURES, RECOMPUTED, TABLES
+from traps_pipeline.report.catalogue import FIGURES, INSIDE, RECOMPUTED, TABLES
 from traps_pipeline.report.contact_sheet import PAGE as SIX_PAIRS
 from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
 from traps_pipeline.report.items import FOLDER, addresses, write_item_pages
@@ -54,7 +54,9 @@ def _chapters(
 ) -> list[tuple[str, list[Card]]]:
     paper = PublishedResults()
     figures = []
-    for report in FIGURES:
+    # A study that looked inside models leads with what can refute its claims.
+    first = INSIDE if study.mechanism else ()
+    for report in sorted(FIGURES, key=lambda report: report.name not in first):
         paths = [(r.source, path) for r in (study, paper) for path in [report.path(r)] if path in pictures]
         blocks = [picture_block(source, pictures[path]) for source, path in paths]
         figures.append(Card(f"figure-{report.name}", report.title, blocks))

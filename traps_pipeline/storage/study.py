@@ -99,7 +99,12 @@ class MechanismSettings(BaseModel):
     probes: ProbeSettings = ProbeSettings()
     gate: GateSettings = GateSettings()
     patching: PatchingSettings | None = Field(default=None, description="null: nothing is patched")
-    pooling: Literal["last", "mean"] = Field(default="last", description="of tokens; the paper does not say which")
+    system: Literal["vqa", "benchmark"] = Field(
+        default="vqa", description="system prompts of extraction: the short VQA ones, or the benchmark's own"
+    )
+    pooling: Literal["last", "answer", "mean", "visual", "stamps", "question"] = Field(
+        default="last", description="of tokens; the paper does not say which"
+    )
     steering: SteeringSettings | None = SteeringSettings()
     seed: int = 20260101
 

@@ -15,7 +15,11 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.nn import Module
 
-Pooling = Literal["last", "mean"]
+# last: the prompt's last token. answer: the first token of the model's own answer. mean: all tokens of the prompt. The
+# others: the mean over the tokens of that part (`spans`).
+Pooling = Literal["last", "answer", "mean", "visual", "stamps", "question"]
+OF_PARTS: tuple[Pooling, ...] = ("visual", "stamps", "question")
+ONE_TOKEN: tuple[Pooling, ...] = ("last", "answer")
 
 
 @dataclass
@@ -31,29 +35,34 @@ def first_tensor(output: Any) -> Tensor:
     return output[0] if isinstance(output, tuple) else output
 
 
-def pool(states: Tensor, pooling: Pooling) -> Tensor:
-    """(1, T, d) to (d,): of the last token, in the model's precision, or the mean over all tokens, in float32.
+def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tensor:
+    """(1, T, d) to (d,): of the last token, in the model's precision, or the mean over all tokens, or over those that a
+    mask (T,) chooses, in float32.
 
     A copy: a view would keep the whole tensor alive.
     """
     if len(states) != 1:
         raise ValueError(f"{len(states)} prompts in one pass: states are taken one prompt at a time")
-    return states[0, -1].clone() if pooling == "last" else states[0].float().mean(dim=0)
+    if pooling in ONE_TOKEN:
+        return states[0, -1].clone()
+    return (states[0] if chosen is None else states[0, chosen.to(states.device)]).float().mean(dim=0)
 
 
 @contextmanager
-def capturing(blocks: Iterator[Module], norm: Module, pooling: Pooling) -> Iterator[Captured]:
+def capturing(
+    blocks: Iterator[Module], norm: Module, pooling: Pooling, chosen: Tensor | None = None
+) -> Iterator[Captured]:
     """Keep the pooled states of forward passes made inside; the hooks are gone afterwards, whatever happens."""
     kept = Captured()
 
     def embeddings(_: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        kept.raw.append(pool(args[0] if args else kwargs["hidden_states"], pooling))
+        kept.raw.append(pool(args[0] if args else kwargs["hidden_states"], pooling, chosen))
 
     def block(_: Module, __: Any, output: Any) -> None:
-        kept.raw.append(pool(first_tensor(output), pooling))
+        kept.raw.append(pool(first_tensor(output), pooling, chosen))
 
     def last(_: Module, __: Any, output: Any) -> None:
-        kept.normed = pool(first_tensor(output), pooling)
+        kept.normed = pool(first_tensor(output), pooling, chosen)
 
     with ExitStack() as hooks:
         for number, module in enumerate(blocks):

@@ -180,15 +180,39 @@ class LocalModel:
         with torch.inference_mode():
             return self.network.base_model(**self._placed(prompt.inputs), use_cache=False)
 
-    def forward_states(self, prompt: Prompt, pooling: Pooling = "last", steering: Steers | None = None) -> States:
-        """The hidden states of every layer, of one prompt: batch size 1, so that in 16 bits no other prompt matters."""
-        with _steered(steering, self), capturing(iter(self.blocks), self.norm, pooling) as kept:
-            self.forward(prompt)
-        assert kept.normed is not None and len(kept.raw) == self.n_layers + 1
+    def forward_states(
+        self,
+        prompt: Prompt,
+        pooling: Pooling = "last",
+        steering: Steers | None = None,
+        chosen: np.ndarray | None = None,
+    ) -> States:
+        """The hidden states of every layer, of one prompt: batch size 1, so that in 16 bits no other prompt matters.
+
+        chosen: for poolings over a part of the prompt, its tokens (T,) bool. `answer` generates the first token of the
+        greedy answer, and takes the state at it.
+        """
         import torch
 
+        mask = None if chosen is None else torch.from_numpy(chosen)
+        if pooling == "answer":
+            prompt = self._answered(prompt, steering)
+        with _steered(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as kept:
+            self.forward(prompt)
+        assert kept.normed is not None and len(kept.raw) == self.n_layers + 1
         rows = torch.stack([row.float() for row in (*kept.raw, kept.normed)]).cpu().numpy()
         return States(rows[:-1], rows[-1])
+
+    def _answered(self, prompt: Prompt, steering: Steers | None) -> Prompt:
+        """The prompt with the first token of its greedy answer behind it."""
+        import torch
+
+        token = self.generate([prompt], 1, steering=steering)[0].tokens[0]
+        inputs = dict(prompt.inputs)
+        for name in prompt.sequences:
+            more = {"input_ids": token, "attention_mask": 1}.get(name, 0)  # else: of no modality
+            inputs[name] = torch.cat([inputs[name], inputs[name].new_full((1, 1), more)], dim=1)
+        return Prompt(prompt.text, inputs)
 
     # --- answers ------------------------------------------------------------------------------------------------------
 

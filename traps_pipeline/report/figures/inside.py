@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from traps_pipeline.report.writing import (
     PAGE_IN,
     SOFT,
     figure_style,
+    fraction,
     new_figure,
     not_run_figure,
     plain,
@@ -91,7 +93,8 @@ def gate_arrows(results: Results) -> Figure:
         return not_run_figure("Probe-gated abstention", absent, PAGE_IN)
     from matplotlib.lines import Line2D
 
-    regimes, colour = list(dict.fromkeys(rows["regime"])), dict(zip(_FEATURES, COLOURS, strict=False))
+    regimes = [name for name in ("standard", "guided") if name in set(rows["regime"])]
+    colour = _colours(_FEATURES)
     rows = rows.assign(j=rows["abs_rec"] - rows["false_abs"], plain_j=rows["plain_abs_rec"] - rows["plain_false_abs"])
     with figure_style():
         figure = new_figure(PAGE_IN, 3.6)
@@ -102,17 +105,21 @@ def gate_arrows(results: Results) -> Figure:
             ax.set_title(f"{regime}, {plain(' and '.join(dict.fromkeys(part['model'])))[:30]}", size=7.5)
         _risk(panels[-1], results.risk_coverage, regimes[-1], colour)
         handles = [Line2D([], [], color=colour[f], marker="o", markersize=4, label=f"gate on {f}") for f in
-                   dict.fromkeys(rows["features"])]  # fmt: skip
+                   _FEATURES if f in set(rows["features"])]  # fmt: skip
         handles += [Line2D([], [], color=INK, marker="o", markerfacecolor="white", linestyle="none", label="no gate")]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
 
 
+def _colours(names: Sequence[str]) -> dict[str, str]:
+    return dict(zip(names, COLOURS, strict=False))
+
+
 def _arrows(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
     import pandas as pd
 
-    before = rows[["plain_acc", "plain_j"]].set_axis(["acc", "j"], axis=1)
-    frame_plane(ax, pd.concat([rows[["acc", "j"]], before], ignore_index=True), "Acc, overall")
+    points = pd.DataFrame({"acc": [*rows["acc"], *rows["plain_acc"]], "j": [*rows["j"], *rows["plain_j"]]})
+    frame_plane(ax, points, "Acc, overall")
     for row in rows.to_dict("records"):
         start, end = (row["plain_acc"], row["plain_j"]), (row["acc"], row["j"])
         arrow(ax, start, end, colour[row["features"]])
@@ -129,7 +136,7 @@ def _risk(ax: Axes, rows: pd.DataFrame, regime: str, colour: dict[str, str]) -> 
         elif features in colour:
             ax.plot(curve["coverage"], curve["risk"], color=colour[str(features)], linewidth=1.1)
     ax.set(xlabel="coverage: share answered", ylabel="risk: share of answers that are wrong", xlim=(0, 1))
-    ax.set_ylim(-0.02, max(0.5, float(rows["risk"].max()) + 0.05) if len(rows) else 1)
+    ax.set_ylim(-0.02, max(0.5, *rows["risk"]) + 0.05 if len(rows) else 1)
     ax.set_title(f"risk and coverage, {regime}", size=7.5)
 
 
@@ -137,7 +144,7 @@ def patching(results: Results) -> Figure:
     """Indirect effect of each group of positions at each layer of the residual stream, for patches from the void into
     the control and back; 1 is the whole difference of the outcome."""
     rows = results.patching
-    rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual")]
+    rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
     if not len(rows):
         absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
         return not_run_figure("Activation patching", absent, PAGE_IN)
@@ -173,14 +180,14 @@ def _effects(ax: Axes, part: pd.DataFrame) -> Any:
         for (row, column), value in np.ndenumerate(values):
             if value == value:
                 shade = "white" if abs(value) > 0.6 else "black"
-                text = f"{value:.2f}".replace("-", "−")
-                ax.text(column, row, text, ha="center", va="center", size=6, color=shade)
+                ax.text(column, row, fraction(value, 2), ha="center", va="center", size=6, color=shade)
     return image
 
 
 def doses_among_nulls(results: Results) -> Figure:
     """Abstention of each dataset's controls (+) and voids (−) along its own direction, by dose in units of the class
-    gap; at the largest dose, a dot for every draw of each null that is orthogonal to the direction."""
+    gap. Right of the line: the nulls, which are orthogonal to the direction, at the largest dose, added on controls (+)
+    and subtracted on voids (−); a larger dot stands for more draws."""
     rows = results.own_effects
     if not len(rows):
         absent = why(results, rows) if results.is_study else "the paper has no such nulls"
@@ -188,7 +195,7 @@ def doses_among_nulls(results: Results) -> Figure:
     from matplotlib.lines import Line2D
 
     cells = list(dict.fromkeys(zip(rows["model"], rows["directions"], rows["regime"], strict=True)))
-    colour = dict(zip(NULLS, COLOURS, strict=False))
+    colour = _colours(NULLS)
     with figure_style():
         figure = new_figure(PAGE_IN, 0.7 + 1.7 * len(cells))
         axes = figure.subplots(len(cells), 4, squeeze=False, sharey=True, sharex=True)
@@ -199,7 +206,7 @@ def doses_among_nulls(results: Results) -> Figure:
                 ax.set_title(f"{SHORT[dataset]}, {directions}→{regime}", size=7)
             line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")
         for ax in axes[-1]:
-            ax.set_xlabel("dose, class gaps")
+            ax.set_xlabel("dose in class gaps | nulls", size=7)
         axes[0, 0].set_ylim(-6, 106)
         handles = [Line2D([], [], color=INK, marker="o", markersize=3.5, label="+ on controls")]
         handles += [Line2D([], [], color=SOFT, marker="s", markersize=3.5, linestyle="--", label="− on voids")]
@@ -221,7 +228,10 @@ def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
             drawn = of.loc[(of["kind"] == null) & (of["dose"] > 0)]
             if not len(drawn):
                 continue
-            at = float(drawn["gaps"].iloc[0]) + 0.07 * (place + 1) + (0.3 if side == "void" else 0)
+            top = float(drawn["gaps"].iloc[0])
+            at = top * (1.25 + 0.14 * place + (0.55 if side == "void" else 0))
             counts = (100 * drawn["abstention"].astype(float)).round(6).value_counts()
-            ax.scatter([at] * len(counts), counts.index, s=4 + 3 * counts.to_numpy(), color=colour[null],
-                       marker=marker, alpha=0.75, linewidths=0, clip_on=False)  # fmt: skip
+            ax.scatter([at] * len(counts), counts.index, s=3 + 1.6 * counts.to_numpy(), color=colour[null],
+                       marker=marker, linewidths=0, clip_on=False)  # fmt: skip
+            ax.axvline(1.12 * top, color=GRID, linewidth=0.7, zorder=0)
+            ax.set_xticks([0, top / 2, top, 1.39 * top, 1.94 * top], ["0", f"{top / 2:g}", f"{top:g}", "+", "−"])

@@ -23,7 +23,8 @@ SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "−
 
 def why(results: Results, frame: pd.DataFrame) -> str:
     """The reason why a frame of a study has no rows."""
-    return NO_MECHANISM if results.is_study and not len(frame) else results.why("probes")
+    asked = len(results.probes) or not results.is_study
+    return results.why("probes") if asked or len(frame) else NO_MECHANISM
 
 
 def few(rows: pd.DataFrame, *counts: str) -> list[str]:

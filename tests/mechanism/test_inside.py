@@ -1,0 +1,152 @@
+"""The researcher's API, and its page in docs, which runs as it is written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from sklearn.linear_model import LogisticRegression
+from sklearn.preprocessing import StandardScaler
+
+from tests.conftest import ROOT
+from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_verdicts
+from traps_pipeline import inside
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism import stages
+from traps_pipeline.mechanism.baselines import output_margins
+from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.margin import abstention_tokens
+from traps_pipeline.mechanism.probe_items import probe_items
+from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS
+from traps_pipeline.models.local.adapter import load_local_model
+from traps_pipeline.models.prompts import vqa_prompt
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.partitions import ANSWERABLE, DATASETS, TIME_SWAPPED, Extraction, StatesCell
+from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.slow
+STANDARD = Extraction("tiny", "standard")
+
+
+@pytest.fixture(scope="module")
+def entry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModelEntry]:
+    with pytest.MonkeyPatch.context() as patch:
+        made = tiny_entry(tmp_path_factory.mktemp("tiny") / "checkpoint")
+        register(patch, made)
+        yield made
+
+
+@pytest.fixture(scope="module")
+def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    workspace = make_study(tmp_path_factory.mktemp("study"))
+    for dataset in (*DATASETS, ANSWERABLE, TIME_SWAPPED):
+        workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
+        cell = StatesCell(dataset, STANDARD)
+        workspace.tables.write(HIDDEN_STATES, cell.partition, stages.extract_states(workspace, cell)[0], {})
+    workspace.tables.write(DIRECTIONS, STANDARD.partition, stages.direction_rows(workspace, STANDARD), {})
+    write_verdicts(workspace, "chaotic", {f"plinko-{n}": n < 2 for n in range(PAIRS)})
+    return workspace
+
+
+def test_the_page_runs_as_it_is_written(study: Workspace) -> None:
+    page = (ROOT / "docs" / "inside.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    code = "\n".join(blocks).replace('".workspaces/mechanism"', repr(str(study.root))).replace('"pocket"', '"tiny"')
+    assert len(blocks) >= 6
+    names: dict[str, object] = {}
+    exec(compile(code, "docs/inside.md", "exec"), names)
+    assert not torch.equal(names["pushed"], names["plain"])  # type: ignore[arg-type]
+
+
+def test_states_stand_beside_their_items_and_verdicts(study: Workspace) -> None:
+    states = inside.load(study.root, "tiny", layer=2, datasets=["chaotic", "occlusion"])
+    own = StoredStates.of(study, STANDARD)
+    assert (states.X[: 2 * PAIRS] == own.read("chaotic", 2)).all() and len(states.X) == 4 * PAIRS
+    judged = states.where("dataset == 'chaotic' and void").items.set_index("scenario_id")["abstained_standard"]
+    assert judged.astype(bool).to_dict() == {f"plinko-{n}": n < 2 for n in range(PAIRS)}
+    assert states.where(states.void).items["side"].unique().tolist() == ["void"]
+    with pytest.raises(TrapsError, match="no hidden states of decoy"):
+        inside.load(study.root, "tiny", layer=2, datasets=["decoy"])
+
+
+def test_states_probes_and_margins_equal_plain_transformers_and_scikit_learn(
+    study: Workspace, entry: ModelEntry
+) -> None:
+    """An independent re-implementation: the library's own hidden_states, StandardScaler and LogisticRegression, and
+    logits of whole passes."""
+    model, own = load_local_model(entry), StoredStates.of(study, STANDARD)
+    items = study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"}).set_index("item_id")
+    assert entry.media is not None
+    vectors, margins, tokens = [], [], abstention_tokens(model)
+    for name in own.dataset("chaotic")["item_id"]:
+        shown = sample(study.resolve(items.loc[name, "clip"]), entry.media)
+        prompt = model.prompt(vqa_prompt("standard"), items.loc[name, "question"], shown.frames, shown.times_s)
+        with torch.no_grad():
+            out = model.network(**prompt.inputs, output_hidden_states=True)
+        vectors.append(out.hidden_states[2][0, -1].numpy())
+        chance = torch.softmax(out.logits[0, -1].double(), 0)
+        chance[model.network.generation_config.suppress_tokens or []] = 0
+        margins.append(float(torch.log(chance[tokens].sum()) - torch.log(chance.sum() - chance[tokens].sum())))
+    assert (np.stack(vectors) == own.read("chaotic", 2)).all()
+    assert output_margins(entry, own, ["chaotic"])["chaotic"][:, 0] == pytest.approx(margins, abs=1e-4)
+    void = (own.dataset("chaotic")["side"] == "void").to_numpy()
+    scaled = StandardScaler().fit(np.stack(vectors).astype(float))
+    plain = LogisticRegression(solver="newton-cg", tol=1e-12, max_iter=10_000).fit(scaled.transform(vectors), void)
+    other = inside.load(study, "tiny", layer=2, datasets=["occlusion"])
+    ours = inside.fit_probe(own.read("chaotic", 2), void).scores(other.X)
+    assert ours == pytest.approx(plain.decision_function(scaled.transform(other.X.astype(float))), abs=1e-5)
+
+
+def test_a_direction_of_the_api_steers_as_the_stages_do(study: Workspace, entry: ModelEntry) -> None:
+    model = load_local_model(entry)
+    push = inside.direction(study, "tiny", "chaotic", layer=2)
+    prompt = model.prompt("Look.", "Which?", np.full((2, 32, 32, 3), 90, np.uint8), [0.0, 1.0])
+    theirs = model.generate([prompt], 4, None, Steering(push.vector, 2, (3.0,)))[0]
+    with push.apply(model.network, 3.0):
+        ours = model.generate([prompt], 4)[0]
+    plain = (
+        model.network.get_decoder()
+        .layers[1]
+        .register_forward_hook(
+            lambda module, args, output: (
+                output + 3.0 * torch.from_numpy(push.vector)
+            )  # a block of this class returns a tensor
+        )
+    )
+    own = model.network.generate(**prompt.inputs, max_new_tokens=4, do_sample=False)[0, prompt.n_tokens :].tolist()
+    plain.remove()
+    assert ours.tokens == theirs.tokens and [*ours.tokens] == own[: len(ours.tokens)]
+    before = model.forward_states(prompt).raw
+    with push.apply(model, 0.0, how="clamp"):
+        clamped = model.forward_states(prompt).raw
+    assert abs(clamped[2] @ push.vector) < 1e-4 < abs(before[2] @ push.vector)
+    with push.apply(model, 1.0, how="project out"):
+        assert model.forward_states(prompt).raw[2] == pytest.approx(clamped[2], abs=1e-5)
+    score = type("Score", (), {"scores": staticmethod(lambda states: np.zeros(len(states)))})()
+    for threshold, changed in ((1.0, False), (-1.0, True)):
+        with push.apply(model, 5.0, when=(score, threshold)):
+            assert (model.forward_states(prompt).raw[2] != before[2]).any() == changed
+    with push.apply(model, 5.0, positions=lambda states: torch.zeros(states.shape[:2], dtype=torch.bool)):
+        assert (model.forward_states(prompt).raw == before).all()
+    assert (model.forward_states(prompt).raw == before).all()  # every hook is gone
+    for wrong, message in (({"how": "mine"}, "no intervention"), ({"gaps": 1.0}, "and not both")):
+        with pytest.raises(TrapsError, match=message), push.apply(model, 1.0, **wrong):
+            pass
+    with pytest.raises(TrapsError, match="no block 9"), inside.Direction(push.vector, 9).apply(model, 1.0):
+        pass
+
+
+def test_erasure_leaves_nothing_that_a_linear_probe_can_use_and_changes_little_else() -> None:
+    rng = np.random.default_rng(0)
+    void = np.arange(60) % 2 == 1
+    states = rng.normal(size=(60, 8)) * rng.lognormal(size=8)
+    states[void, :2] += 5
+    gone = inside.erased(states, void)
+    assert np.abs(gone[void].mean(axis=0) - gone[~void].mean(axis=0)).max() < 1e-9
+    assert np.linalg.matrix_rank(gone - gone.mean(axis=0)) == 7
+    assert np.abs(LogisticRegression().fit(gone, void).coef_).max() < 1e-4

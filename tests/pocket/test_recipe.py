@@ -1,0 +1,118 @@
+"""Settings of a recipe that take shortcuts out of the pocket model's data: what the data then are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from traps_pipeline.pocket.batches import Scenes
+from traps_pipeline.pocket.data import Question, SceneRecord, draw_shard, shard_jobs
+from traps_pipeline.pocket.recipe import Jitter, Recipe, load_recipe
+from traps_pipeline.pocket.words import PROMPTS
+from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.vision import colour_mask
+
+pytestmark = pytest.mark.slow
+SHARES = {"standard": 0.1, "guided": 0.9, "json": 0.5, "vqa_standard": 0.1, "vqa_guided": 0.9}
+FEW = 6
+
+
+def recipe(**settings: object) -> Recipe:
+    counts = {"plinko": FEW, "drop_split": FEW}
+    return load_recipe().model_copy(update={"scenes": counts, "held_out": 1, **settings})
+
+
+def drawn(made: Recipe, folder: Path) -> dict[str, list[SceneRecord]]:
+    for job in shard_jobs(made, "train", folder):
+        draw_shard(job)
+    return {
+        job.family: [SceneRecord.read(line) for line in job.lines.read_text().splitlines()]
+        for job in shard_jobs(made, "train", folder)
+    }
+
+
+@pytest.fixture(scope="module")
+def planted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recipe, Path, dict[str, list[SceneRecord]]]:
+    made = recipe(jitter=Jitter(control=0.5, void=0.5), decoys=0.5, abstain_shares=SHARES)
+    folder = tmp_path_factory.mktemp("planted")
+    return made, folder, drawn(made, folder)
+
+
+def test_lengths_of_chaotic_clips_overlap(planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]]) -> None:
+    made, folder, records = planted
+    scenes, n_frames = Scenes(made, folder), get_family("plinko").physics.n_frames
+    lengths = {side: [record.length(side, n_frames) for record in records["plinko"]] for side in (0, 1)}
+    assert any(record.control_from for record in records["plinko"])
+    assert any(record.void_length for record in records["plinko"])
+    assert min(lengths[0]) < max(lengths[1])  # neither side is always the longer one
+    for number, record in enumerate(scenes.records):
+        if record.family != "plinko":
+            continue
+        for side in (0, 1):
+            last = (record.length(side, n_frames) - 1) / get_family("plinko").physics.fps
+            assert scenes.times(number, side) == [0.0, pytest.approx(last)]
+        assert record.cut_frame is not None
+        if record.void_length:
+            assert record.cut_frame < record.void_length <= n_frames
+
+
+def test_a_jittered_control_still_ends_with_its_outcome(
+    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
+) -> None:
+    """The last frame of a control is the simulation's last one, whenever the clip begins."""
+    made, folder, _ = planted
+    scenes = Scenes(made, folder)
+    late = [n for n, record in enumerate(scenes.records) if record.control_from]
+    assert late
+    for number in late:
+        record, last = scenes.records[number], scenes.frames(number, 0)[-1]
+        x, y = (round(share * size) for share, size in zip(record.places["last"], (128, 96), strict=True))
+        assert colour_mask(last[max(0, y - 6) : y + 6, max(0, x - 6) : x + 6], record.ball).any()
+
+
+def test_a_decoy_shows_a_panel_and_the_outcome(planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]]) -> None:
+    made, folder, records = planted
+    scenes, rng = Scenes(made, folder), np.random.default_rng(0)
+    with_decoy = [n for n, record in enumerate(scenes.records) if record.decoy]
+    assert with_decoy and not any(record.decoy for record in records["plinko"])
+    for number in with_decoy:
+        assert np.abs(scenes.frames(number, 2).astype(int) - scenes.frames(number, 0)).max() > 40
+        assert scenes.times(number, 2) == scenes.times(number, 0)
+    looks = [scenes.look(rng, made.training.void_share) for _ in range(400)]
+    decoys = [look for look in looks if look.side == 2]
+    assert decoys and all(scenes.records[look.scene].decoy for look in decoys)
+    assert all(look.questions[0].answer in scenes.records[look.scene].labels for look in decoys)
+
+
+def test_the_label_of_a_void_depends_on_the_prompt_and_nothing_else_does(
+    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
+) -> None:
+    _, _, records = planted
+    every = [record for of in records.values() for record in of]
+    for record in every:
+        assert record.visual.draw is not None and record.visual.answer in record.labels
+        assert record.asked.draw is None and record.asked.label(0.99) == record.asked.answer
+        said = {prompt: record.visual.label(SHARES[prompt]) for prompt in PROMPTS}
+        assert said["standard"] == said["vqa_standard"] and said["guided"] == said["vqa_guided"]
+        if said["standard"] is None:
+            assert said["json"] is None and said["guided"] is None  # shares are nested
+    assert Question("?", "left", 0.5).label(0.9) is None and Question("?", "left", 0.5).label(0.1) == "left"
+
+
+def test_settings_that_are_not_used_leave_the_data_as_they_were(tmp_path: Path) -> None:
+    plain = recipe(scenes={"plinko": 1})
+    (job,) = shard_jobs(plain, "train", tmp_path)
+    draw_shard(job)
+    line = json.loads(job.lines.read_text())
+    assert not {"control_from", "void_length", "decoy"} & set(line) and set(line["visual"]) == {"question", "answer"}
+    assert np.load(job.pixels).shape[1] == 2
+
+
+def test_a_share_for_every_prompt_is_needed() -> None:
+    values = load_recipe().model_dump()
+    with pytest.raises(ValidationError, match="needs a share for each of"):
+        Recipe.model_validate(values | {"abstain_shares": {"standard": 0.1}})

@@ -1,0 +1,327 @@
+"""For researchers: a study's states as arrays, its directions as context managers, its protocol for any probe.
+
+    from traps_pipeline import inside
+
+    states = inside.load(".workspaces/mechanism", "pocket", layer=3)   # states.X, states.void, states.items
+    figures = inside.protocol(".workspaces/mechanism", "pocket", layer=3, fit=inside.mean_difference)
+    with inside.direction(".workspaces/mechanism", "pocket", "occlusion", layer=3).apply(network, gaps=-1):
+        network.generate(...)                                          # a plain transformers model
+
+docs/inside.md walks through this; a test runs that page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.mechanism.probes import Fit, Probe, Scorer, fit_probe, standardiser
+from traps_pipeline.mechanism.probing import ProbeRun
+from traps_pipeline.mechanism.stages import saved_directions
+from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.models.registry import get_model
+from traps_pipeline.partitions import Cell, Evaluation, Extraction
+from traps_pipeline.storage.study import ProbeSettings
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    from torch import Tensor
+    from torch.nn import Module
+
+Where = str | Path | Workspace
+REGIMES = ("standard", "guided", "json")
+
+
+def _workspace(where: Where) -> Workspace:
+    return where if isinstance(where, Workspace) else Workspace.open(Path(where))
+
+
+# --- states -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """States with what belongs to them. X: (n, d) float32. items: n rows with item_id, dataset, scenario_id, side,
+    sub_scenario, void, and for each regime with verdicts abstained_REGIME and correct_REGIME (null where there is
+    none)."""
+
+    X: np.ndarray
+    items: pd.DataFrame
+
+    @property
+    def void(self) -> np.ndarray:
+        """Whether each item is a void, (n,) bool."""
+        return self.items["void"].to_numpy(bool)
+
+    def where(self, chosen: Any) -> Loaded:
+        """The items that a mask (n,) or a query on `items` chooses."""
+        mask = self.items.eval(chosen) if isinstance(chosen, str) else chosen
+        mask = np.asarray(mask, bool)
+        return Loaded(self.X[mask], self.items.loc[mask].reset_index(drop=True))
+
+
+def load(
+    workspace: Where,
+    model: str,
+    *,
+    layer: int | Literal["normed"],
+    prompt: str = "standard",
+    datasets: Sequence[str] | None = None,
+) -> Loaded:
+    """The states of a study's items at one layer (0: embeddings; `normed`: the last one after the final norm), joined
+    with the verdicts of run 1. datasets: some of those that have states; all by default.
+
+    Raises TrapsError when the study has no such states, model, layer or dataset.
+    """
+    opened = _workspace(workspace)
+    states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
+    there = [*dict.fromkeys(states.items["dataset"])]
+    unknown = sorted(set(datasets or ()) - set(there))
+    if unknown:
+        raise TrapsError(f"no hidden states of {unknown[0]}; the study has {', '.join(there)}")
+    parts, vectors = list[pd.DataFrame](), list[np.ndarray]()
+    for dataset in datasets or there:
+        items = pd.DataFrame(
+            states.dataset(dataset)[["item_id", "dataset", "scenario_id", "side", "sub_scenario"]]
+        ).reset_index(drop=True)
+        items["void"] = items["side"] == "void"
+        for regime in REGIMES:
+            items = items.merge(
+                _verdicts(opened, Cell(dataset, Evaluation(model, regime, 1))), on="item_id", how="left"
+            )
+        parts.append(items)
+        vectors.append(states.read(dataset, layer))
+    joined = pd.concat(parts, ignore_index=True)
+    return Loaded(np.concatenate(vectors), joined.dropna(axis=1, how="all"))
+
+
+def _verdicts(workspace: Workspace, cell: Cell) -> pd.DataFrame:
+    names = ["abstained", "correct"]
+    regime = cell.evaluation.regime
+    if workspace.tables.state(VERDICTS, cell.partition) is None:
+        rows = pd.DataFrame({"item_id": pd.Series(dtype=object)} | {n: pd.Series(dtype="boolean") for n in names})
+    else:
+        rows = pd.DataFrame(workspace.tables.read(VERDICTS, cell.partition)[["item_id", *names]])
+    return rows.rename(columns={name: f"{name}_{regime}" for name in names})
+
+
+# --- probes -----------------------------------------------------------------------------------------------------------
+
+
+def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
+    """The probe whose weights are the difference of the sides' standardised means; 0 lies half-way between them."""
+    mean, scale = standardiser(np.asarray(states, float))
+    standard = (states - mean) / scale
+    sides = standard[void].mean(axis=0), standard[~void].mean(axis=0)
+    weights = sides[0] - sides[1]
+    return Probe(mean, scale, weights, float(-(sides[0] + sides[1]) @ weights / 2))
+
+
+def from_sklearn(make: Callable[[], Any]) -> Fit:
+    """A probe of any scikit-learn classifier or pipeline; make: returns a new one. Scores are its decision function, or
+    the log-odds of its probabilities."""
+
+    def fit(states: np.ndarray, void: np.ndarray) -> Scorer:
+        return _Estimator(make().fit(states, void))
+
+    return fit
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimator:
+    fitted: Any
+
+    def scores(self, states: np.ndarray) -> np.ndarray:
+        if hasattr(self.fitted, "decision_function"):
+            return np.asarray(self.fitted.decision_function(states), float)
+        chance = np.clip(self.fitted.predict_proba(states)[:, 1], 1e-12, 1 - 1e-12)
+        return np.log(chance / (1 - chance))
+
+
+def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
+    """States (n, d) from which no linear classifier can tell the sides: the smallest change, in the metric of the
+    states' own covariance, after which both sides have the same mean (least-squares concept erasure, LEACE, of Belrose
+    et al. 2023, for one binary concept)."""
+    states = np.asarray(states, float)
+    centred, label = states - states.mean(axis=0), void - void.mean()
+    left, size, right = np.linalg.svd(centred, full_matrices=False)
+    kept = size > size[0] * max(states.shape) * np.finfo(float).eps
+    whitened = left[:, kept]  # rows have unit covariance up to a factor
+    towards = whitened.T @ label
+    towards /= np.linalg.norm(towards)
+    return states - np.outer(whitened @ towards, (towards * size[kept]) @ right[kept])
+
+
+def protocol(
+    workspace: Where,
+    model: str,
+    *,
+    layer: int,
+    fit: Fit = fit_probe,
+    prompt: str = "standard",
+    change: Callable[[np.ndarray], np.ndarray] = lambda states: states,
+) -> pd.DataFrame:
+    """The study's own protocol for another probe: the rows that the table `probe_baselines` has for its baselines, with
+    the same items, folds, splits by scenario and intervals.
+
+    fit: states (n, d) and void (n,) to anything with `scores` (`fit_probe`, `mean_difference`, `from_sklearn`, your
+    own). change: a change of the states of a dataset, (n, d) to (n, k). Columns: analysis, source, target, value
+    (AUROC), low, high, n_voids, n_controls.
+    """
+    opened = _workspace(workspace)
+    states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
+    mechanism = opened.study.mechanism
+    settings = mechanism.probes if mechanism else ProbeSettings()
+    read = lambda dataset, _: change(states.read(dataset, layer))  # noqa: E731 - a name would say no more
+    run = ProbeRun(states.items, read, 1, 0, settings, mechanism.seed if mechanism else 0, fit=fit)
+    columns = ["analysis", "source", "target", "value", "low", "high", "n_voids", "n_controls"]
+    return pd.DataFrame(run.comparable(0), columns=pd.Index(columns))
+
+
+# --- interventions ----------------------------------------------------------------------------------------------------
+
+Change = Callable[["Tensor", "Tensor", float], "Tensor"]  # states (.., d), unit direction (d,), amount -> states
+
+
+def _add(states: Tensor, unit: Tensor, amount: float) -> Tensor:
+    return states + amount * unit
+
+
+def _project_out(states: Tensor, unit: Tensor, amount: float) -> Tensor:
+    return states - amount * (states @ unit)[..., None] * unit
+
+
+def _clamp(states: Tensor, unit: Tensor, amount: float) -> Tensor:
+    return states + (amount - states @ unit)[..., None] * unit
+
+
+# By name: add `amount` times the direction; take out that share of the part along it; set that part to `amount`.
+INTERVENTIONS: dict[str, Change] = {"add": _add, "project out": _project_out, "clamp": _clamp}
+
+
+@dataclass(frozen=True, eq=False)
+class Direction:
+    """A direction at a layer of a model. vector: (d,), of any length but 0. layer: 1 to the number of blocks, counted
+    as in hidden_states. gap: the distance between the sides' means along it, for doses in that unit."""
+
+    vector: np.ndarray
+    layer: int
+    gap: float | None = None
+
+    @contextmanager
+    def apply(
+        self,
+        model: Any,
+        amount: float | None = None,
+        *,
+        gaps: float | None = None,
+        how: str = "add",
+        site: Literal["residual", "attention", "mlp"] = "residual",
+        positions: Callable[[Tensor], Tensor] | None = None,
+        when: tuple[Scorer, float] | None = None,
+    ) -> Iterator[None]:
+        """Change a model's passes inside the context; the hook is gone afterwards, whatever happens.
+
+        model: a transformers model, or one of ours. amount: in the model's own unit, or gaps: in class gaps. how: a key
+        of INTERVENTIONS. positions: of states (rows, T, d), a mask (rows, T) of what is changed; all by default (with a
+        cache, T is 1 after the prompt). when: a probe on states of this very layer and a threshold: a row is changed
+        only if the score of its last token is above it. Raises TrapsError for a layer or width that the model lacks.
+        """
+        block, width = _block(model, self.layer)
+        change = INTERVENTIONS.get(how)
+        unit = np.asarray(self.vector, np.float32)
+        length = float(np.linalg.norm(unit))
+        if change is None:
+            raise TrapsError(f"no intervention {how!r}; there are {', '.join(INTERVENTIONS)}")
+        if unit.shape != (width,) or not np.isfinite(unit).all() or not length:
+            raise TrapsError(
+                f"the direction has shape {unit.shape}, but states of this model are {width} finite numbers"
+            )
+        if (amount is None) == (gaps is None):
+            raise TrapsError("give amount, or gaps, and not both")
+        if gaps is not None and self.gap is None:
+            raise TrapsError("this direction has no class gap; give amount, or take a direction of `inside.direction`")
+        dose = float(amount) if amount is not None else float(gaps or 0) * float(self.gap or 0)
+        module = block if site == "residual" else getattr(block, {"attention": "self_attn", "mlp": "mlp"}[site])
+        hook = _hook(change, unit / length, dose, positions, when)
+        handle = module.register_forward_hook(hook, prepend=True)
+        try:
+            yield
+        finally:
+            handle.remove()
+
+    def __neg__(self) -> Direction:
+        """The reverse direction."""
+        return replace(self, vector=-self.vector)
+
+
+def _block(model: Any, layer: int) -> tuple[Module, int]:
+    network = getattr(model, "network", model)
+    decoder = network.get_decoder() if hasattr(network, "get_decoder") else None
+    blocks = getattr(decoder, "layers", None)
+    if blocks is None:
+        raise TrapsError(f"{type(network).__name__} has no get_decoder().layers, so no block can be changed in it")
+    if not 1 <= layer <= len(blocks):
+        raise TrapsError(f"no block {layer}; {type(network).__name__} has blocks 1 to {len(blocks)}")
+    return blocks[layer - 1], int(network.config.get_text_config().hidden_size)
+
+
+def _hook(
+    change: Change,
+    unit: np.ndarray,
+    dose: float,
+    positions: Callable[[Tensor], Tensor] | None,
+    when: tuple[Scorer, float] | None,
+) -> Callable[[Any, Any, Any], Any]:
+    import torch
+
+    chosen_rows: Tensor | None = None
+
+    def hook(_: Any, __: Any, output: Any) -> Any:
+        nonlocal chosen_rows
+        states = output[0] if isinstance(output, tuple) else output
+        along = torch.from_numpy(unit).to(states.device, states.dtype)
+        made = change(states, along, dose)
+        if positions is not None:
+            made = torch.where(positions(states).to(states.device)[..., None], made, states)
+        if when is not None:
+            # Decided once, at the prompt: a row of a cached pass (one token) keeps the prompt's decision.
+            if states.shape[1] > 1 or chosen_rows is None or len(chosen_rows) != len(states):
+                score = when[0].scores(states[:, -1].float().cpu().numpy())
+                chosen_rows = torch.from_numpy(np.asarray(score) > when[1])
+            made = torch.where(chosen_rows.to(states.device)[:, None, None], made, states)
+        return (made, *output[1:]) if isinstance(output, tuple) else made
+
+    return hook
+
+
+def direction(
+    workspace: Where,
+    model: str,
+    dataset: str,
+    *,
+    layer: int,
+    prompt: str = "standard",
+    kind: str = "void",
+    draw: int = 0,
+) -> Direction:
+    """A saved direction of a study: the void direction of a dataset, or a draw of one of its nulls, with the class gap.
+
+    Raises TrapsError when the study has no such direction.
+    """
+    found: Mapping[str, Any] = saved_directions(_workspace(workspace), Extraction(get_model(model).id, prompt))
+    if dataset not in found or kind not in found[dataset].vectors:
+        there = ", ".join(f"{name} ({', '.join(of.vectors)})" for name, of in found.items())
+        raise TrapsError(f"no {kind} direction of {dataset}; the study has {there or 'none'}")
+    of = found[dataset]
+    if not 0 <= layer < of.n_layers or not 0 <= draw < len(of.vectors[kind]):
+        raise TrapsError(f"no draw {draw} at layer {layer}: layers are 0 to {of.n_layers - 1}")
+    return Direction(of.vectors[kind][draw][layer], layer, float(of.gaps[layer]))
