@@ -20,6 +20,7 @@ from playwright.sync_api import Page, sync_playwright
 
 from tests.conftest import EXPERIMENT, Checkout
 from tests.foreign_page import CHROMIUM, QUIET
+from tests.pages import until
 
 pytestmark = pytest.mark.slow
 TOKEN = "token-of-a-reviewer-0123"
@@ -142,7 +143,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
             page.keyboard.press("End")
             page.keyboard.press("Control+a")
             page.keyboard.type("What happens, in your words?")
-            page.wait_for_function("document.getElementById('preview').textContent.includes('3 items')")
+            until(page, "document.getElementById('preview').textContent.includes('3 items')")
             page.keyboard.press("Escape")
             page.keyboard.press("w")
             page.keyboard.press("Control+a")
@@ -154,7 +155,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
             page.keyboard.press("Tab")
             page.keyboard.press("Control+a")
             page.keyboard.type("How heavy is it?")
-            page.wait_for_function("document.getElementById('preview').textContent.includes('1 items')")
+            until(page, "document.getElementById('preview').textContent.includes('1 items')")
             page.keyboard.press("Escape")
             press(page, "c")
             eighth = page.locator("h1").inner_text()
@@ -164,7 +165,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
             assert page.locator("#progress").inner_text() == "10 of 12 reviewed"
             page.goto(f"http://127.0.0.1:{server.port}/scenario/{eighth}?queue=all")
             page.keyboard.press("u")  # the discarded one is back, and not reviewed
-            page.wait_for_function("document.querySelector('.lead b').textContent === 'not reviewed'")
+            until(page, "document.querySelector('.lead b').textContent === 'not reviewed'")
             press(page, "d")
             page.goto(f"http://127.0.0.1:{server.port}/done")
             told = page.locator("section").first.inner_text()

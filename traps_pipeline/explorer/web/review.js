@@ -115,7 +115,8 @@ async function decide(action) {
       return;
     }
     await post("/decide", { action, changes: found, why, seen: SHOWN.seen });
-    if (action === "add") said.textContent = "Added. A run makes it in every study that holds all scenarios, or names it.";
+    if (action === "add")
+      said.textContent = "Added. A run makes it in every study that holds all scenarios, or names it.";
     else leave(SHOWN.after);
   } catch (error) {
     said.textContent = error.message;
@@ -140,7 +141,8 @@ const KEYS = {
   e: open_changes,
   w: () => field("why").focus(),
 };
-for (const name of ["keep", "correct", "discard", "add", "undo"]) field(name).addEventListener("click", () => decide(name));
+for (const name of ["keep", "correct", "discard", "add", "undo"])
+  field(name).addEventListener("click", () => decide(name));
 field("before").addEventListener("click", KEYS.p);
 field("after").addEventListener("click", KEYS.n);
 document.addEventListener("keydown", (event) => {
