@@ -220,7 +220,7 @@ def test_a_comparison_counts_what_differs_and_tests_it_as_the_tables_do(site: Si
         assert numbers == [int((left & right).sum()), *only, int((~left & ~right).sum())]
         assert p == printed(binomtest(only[0], sum(only), 0.5).pvalue)
         key = ["kind", "dataset", "figure", "left_model", "left_regime", "right_model"]
-        found = differences.set_index(key).loc["models", "chaotic", "pecs", "oracle", "standard", "random-50"].iloc[0]
+        found = differences.set_index(key).loc["models", "chaotic", "pecs", "oracle", "standard", "random-50"]
         line = next(line for line in cells(page, "differences") if line[:2] == ["Chaotic", "PECS"])
         assert line[2:4] == [
             fraction(found["difference"]),
