@@ -76,8 +76,8 @@ def reviewing(study: Checkout, who: str) -> Iterator[Server]:
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == f"open {server.address}\n"
-        until = time.monotonic() + 60
-        while time.monotonic() < until:
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
             with socket.socket() as probe:
                 if probe.connect_ex(("127.0.0.1", port)) == 0:
                     break
@@ -100,15 +100,15 @@ def a_page() -> Iterator[tuple[Page, list[str]]]:
         page, problems = browser.new_page(viewport={"width": 1280, "height": 1000}), list[str]()
         page.on("console", lambda message: problems.append(message.text))
         page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on(
-            "request", lambda r: None if r.url.startswith(("http://127.0.0.1:", "data:,")) else problems.append(r.url)
-        )
+        own = ("http://127.0.0.1:", "data:,", "blob:http://127.0.0.1:")  # blob: a clip that is held in memory
+        page.on("request", lambda r: None if r.url.startswith(own) else problems.append(r.url))
         yield page, problems
         browser.close()
 
 
 def press(page: Page, *keys: str) -> None:
-    """Press keys one after another; then another page has been reached."""
+    """Press keys one after another as soon as they are heard; then another page has been reached."""
+    until(page, "document.documentElement.dataset.ready === '1'")
     before = page.url
     for key in keys:
         page.keyboard.press(key)
@@ -128,6 +128,8 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
             for _ in range(4):
                 press(page, "k")
             assert page.locator("#progress").inner_text() == "5 of 12 reviewed"
+            page.wait_for_load_state("networkidle")
+            assert problems == []
             server.kill()
         kept = decisions(study)
         assert [each["action"] for each in kept] == ["keep"] * 5

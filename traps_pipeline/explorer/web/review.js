@@ -155,3 +155,4 @@ document.addEventListener("keydown", (event) => {
   event.preventDefault();
   return act();
 });
+document.documentElement.dataset.ready = "1"; // from here on keys are heard
