@@ -19,6 +19,7 @@ from scipy.stats import binomtest
 
 from tests.conftest import Checkout
 from tests.foreign_page import CHROMIUM, QUIET
+from tests.pages import until
 from tests.report.test_items import row, write_cell
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.explorer.site import write_site
@@ -70,7 +71,7 @@ class Visit:
             self.page.evaluate("hash => { location.hash = hash; dispatchEvent(new Event('hashchange')); }", view)
         else:
             self.page.goto(self.address + view)
-        self.page.wait_for_function("document.documentElement.dataset.shown")
+        until(self.page, "document.documentElement.dataset.shown")
         return self.page
 
 
@@ -98,7 +99,7 @@ def visit(browser: Browser, address: str, width: int = 1280) -> Iterator[Visit]:
     """A new page at an address; at the end it must have said nothing and asked for nothing outside."""
     page = browser.new_page(viewport={"width": width, "height": 900})
     problems: list[str] = []
-    inside = address.rpartition("/")[0], "data:,"
+    inside = address.rpartition("/")[0], "data:,", "blob:"  # a clip that is held in memory
     page.on("console", lambda message: problems.append(message.text))
     page.on("pageerror", lambda error: problems.append(str(error)))
     page.on("dialog", lambda dialog: problems.append(dialog.message))
@@ -219,7 +220,7 @@ def test_a_comparison_counts_what_differs_and_tests_it_as_the_tables_do(site: Si
         assert numbers == [int((left & right).sum()), *only, int((~left & ~right).sum())]
         assert p == printed(binomtest(only[0], sum(only), 0.5).pvalue)
         key = ["kind", "dataset", "figure", "left_model", "left_regime", "right_model"]
-        found = differences.set_index(key).loc["models", "chaotic", "pecs", "oracle", "standard", "random-50"].iloc[0]
+        found = differences.set_index(key).loc["models", "chaotic", "pecs", "oracle", "standard", "random-50"]
         line = next(line for line in cells(page, "differences") if line[:2] == ["Chaotic", "PECS"])
         assert line[2:4] == [
             fraction(found["difference"]),
@@ -243,16 +244,16 @@ def test_a_confabulation_is_found_in_three_clicks_and_its_clips_play_in_step(
         page.wait_for_selector(".panel h3 .chip")
         assert page.locator(".panel h3 .chip").inner_text() == "Confabulated"
         assert page.locator(".panel .text").count() == 2
-        page.wait_for_function("document.querySelectorAll('video').length >= 1")
-        page.wait_for_function("[...document.querySelectorAll('video')].every(video => video.readyState >= 2)")
+        until(page, "document.querySelectorAll('video').length >= 1")
+        until(page, "[...document.querySelectorAll('video')].every(video => video.readyState >= 2)")
         times = "[...document.querySelectorAll('.control video, .void video')].map(video => video.currentTime)"
         page.get_by_role("button", name="one frame on").click()
         page.keyboard.press("Escape")
         assert "frame 2 of" in page.locator("output").inner_text()
-        page.wait_for_function(f"{times}.every(time => time > 0)")
+        until(page, f"{times}.every(time => time > 0)")
         assert len({round(time, 4) for time in page.evaluate(times)}) == 1
         page.get_by_role("button", name="Play").click()
-        page.wait_for_function(f"{times}[0] > 0.5")
+        until(page, f"{times}[0] > 0.5")
         page.get_by_role("button", name="Pause").click()
         playing = page.evaluate(times)
         assert max(playing) - min(playing) <= 3 / 10  # three frames, while two cores decode
@@ -271,12 +272,11 @@ def test_filters_and_search_find_exactly_what_the_tables_hold(site: Site, browse
         page.get_by_label("Side").select_option("void")
         page.get_by_label("Answer").select_option("answered")
         fits = rows["model"].eq("random-50") & rows["side"].eq("void") & rows["abstained"].eq(False)
-        page.wait_for_function("!location.hash.includes('page') && location.hash.includes('decision')")
-        page.wait_for_function(f"document.querySelector('.status').textContent.startsWith('{fits.sum()} of')")
-        page.get_by_label("Text").fill("The Answer is: LEFT")
+        until(page, f"document.querySelector('.status').textContent.startsWith('{fits.sum()} of')")
+        page.get_by_role("searchbox").fill("The Answer is: LEFT")
         page.keyboard.press("Enter")
         wanted = int((fits & rows["text"].str.contains("the answer is: left", case=False, regex=False)).sum())
-        page.wait_for_function("/ mention /.test(document.querySelector('.status').textContent)")
+        until(page, "/ mention /.test(document.querySelector('.status').textContent)")
         assert page.locator(".status").inner_text() == f"{wanted} of {fits.sum()} answers mention “The Answer is: LEFT”"
         assert page.locator(".answer mark").count() == min(wanted, 25)
 
@@ -294,16 +294,16 @@ def test_the_keyboard_reaches_a_pair_and_moves_through_its_neighbours(site: Site
                 break
         listed = page.locator(".answer a").all_inner_texts()
         page.keyboard.press("Enter")
-        page.wait_for_function(f"document.querySelector('h1').textContent === '{listed[0]}'")
+        until(page, f"document.querySelector('h1').textContent === '{listed[0]}'")
         assert page.evaluate("document.activeElement.tagName") == "H1"
-        page.wait_for_function("[...document.querySelectorAll('video')].every(video => video.readyState >= 2)")
+        until(page, "[...document.querySelectorAll('video')].every(video => video.readyState >= 2)")
         page.keyboard.press("ArrowRight")
         page.keyboard.press("ArrowRight")
         assert "frame 3 of" in page.locator("output").inner_text()
         page.keyboard.press("]")
-        page.wait_for_function(f"document.querySelector('h1').textContent === '{listed[1]}'")
+        until(page, f"document.querySelector('h1').textContent === '{listed[1]}'")
         page.keyboard.press("[")
-        page.wait_for_function(f"document.querySelector('h1').textContent === '{listed[0]}'")
+        until(page, f"document.querySelector('h1').textContent === '{listed[0]}'")
 
 
 @pytest.mark.parametrize("width", [390, 1280])
@@ -327,7 +327,7 @@ def test_text_of_a_model_is_text_wherever_it_is_shown(browser: Browser, tmp_path
         assert page.locator("main script, main img, main iframe").count() == 0
         for view in ("#/answers", "#/answers?q=desrever"):
             page = visited.go(view)
-            page.wait_for_function("document.querySelector('.excerpt .untrusted')")
+            until(page, "document.querySelector('.excerpt .untrusted')")
             assert AS_SHOWN[40:] in page.locator(".excerpt").first.inner_text()  # from a little before what was found
             assert page.locator("main script, main img").count() == 0
         assert page.locator("mark").inner_text() == "desrever"

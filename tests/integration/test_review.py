@@ -20,6 +20,7 @@ from playwright.sync_api import Page, sync_playwright
 
 from tests.conftest import EXPERIMENT, Checkout
 from tests.foreign_page import CHROMIUM, QUIET
+from tests.pages import until
 
 pytestmark = pytest.mark.slow
 TOKEN = "token-of-a-reviewer-0123"
@@ -75,8 +76,8 @@ def reviewing(study: Checkout, who: str) -> Iterator[Server]:
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == f"open {server.address}\n"
-        until = time.monotonic() + 60
-        while time.monotonic() < until:
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
             with socket.socket() as probe:
                 if probe.connect_ex(("127.0.0.1", port)) == 0:
                     break
@@ -99,15 +100,15 @@ def a_page() -> Iterator[tuple[Page, list[str]]]:
         page, problems = browser.new_page(viewport={"width": 1280, "height": 1000}), list[str]()
         page.on("console", lambda message: problems.append(message.text))
         page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on(
-            "request", lambda r: None if r.url.startswith(("http://127.0.0.1:", "data:,")) else problems.append(r.url)
-        )
+        own = ("http://127.0.0.1:", "data:,", "blob:http://127.0.0.1:")  # blob: a clip that is held in memory
+        page.on("request", lambda r: None if r.url.startswith(own) else problems.append(r.url))
         yield page, problems
         browser.close()
 
 
 def press(page: Page, *keys: str) -> None:
-    """Press keys one after another; then another page has been reached."""
+    """Press keys one after another as soon as they are heard; then another page has been reached."""
+    until(page, "document.documentElement.dataset.ready === '1'")
     before = page.url
     for key in keys:
         page.keyboard.press(key)
@@ -127,6 +128,8 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
             for _ in range(4):
                 press(page, "k")
             assert page.locator("#progress").inner_text() == "5 of 12 reviewed"
+            page.wait_for_load_state("networkidle")
+            assert problems == []
             server.kill()
         kept = decisions(study)
         assert [each["action"] for each in kept] == ["keep"] * 5
@@ -142,7 +145,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
             page.keyboard.press("End")
             page.keyboard.press("Control+a")
             page.keyboard.type("What happens, in your words?")
-            page.wait_for_function("document.getElementById('preview').textContent.includes('3 items')")
+            until(page, "document.getElementById('preview').textContent.includes('3 items')")
             page.keyboard.press("Escape")
             page.keyboard.press("w")
             page.keyboard.press("Control+a")
@@ -154,7 +157,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
             page.keyboard.press("Tab")
             page.keyboard.press("Control+a")
             page.keyboard.type("How heavy is it?")
-            page.wait_for_function("document.getElementById('preview').textContent.includes('1 items')")
+            until(page, "document.getElementById('preview').textContent.includes('1 items')")
             page.keyboard.press("Escape")
             press(page, "c")
             eighth = page.locator("h1").inner_text()
@@ -164,7 +167,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
             assert page.locator("#progress").inner_text() == "10 of 12 reviewed"
             page.goto(f"http://127.0.0.1:{server.port}/scenario/{eighth}?queue=all")
             page.keyboard.press("u")  # the discarded one is back, and not reviewed
-            page.wait_for_function("document.querySelector('.lead b').textContent === 'not reviewed'")
+            until(page, "document.querySelector('.lead b').textContent === 'not reviewed'")
             press(page, "d")
             page.goto(f"http://127.0.0.1:{server.port}/done")
             told = page.locator("section").first.inner_text()

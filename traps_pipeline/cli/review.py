@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 
-from traps_pipeline.cli.command import OK, Commands, load_definitions, open_workspace, whole
+from traps_pipeline.cli.command import OK, Commands, open_workspace, whole
 from traps_pipeline.errors import TrapsError
 
 TOKEN_VARIABLE = "TRAPS_REVIEW_TOKEN"
@@ -31,7 +31,6 @@ def review(arguments: argparse.Namespace) -> int:
     given = arguments.token or os.environ.get(TOKEN_VARIABLE)
     token = token_for(arguments.host, given, danger="decide about the benchmark's items", variable=TOKEN_VARIABLE)
     workspace = open_workspace(arguments)
-    load_definitions()
     opened = Review(workspace, arguments.who.strip())
     _ = opened.specs  # a study without scenes is told before the address is
     serve(review_app(opened), arguments.host, arguments.port, token, command="traps review")

@@ -11,12 +11,13 @@ from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.storage.workspace import Workspace
 
-QueueName = Literal["unreviewed", "judges", "models", "all"]
+QueueName = Literal["unreviewed", "judges", "models", "alike", "all"]
 QUEUES: tuple[QueueName, ...] = get_args(QueueName)
 MEANINGS: Mapping[QueueName, str] = {
     "unreviewed": "not reviewed yet",
     "judges": "judges disagree, the most first",
     "models": "models disagree on the control, the most first",
+    "alike": "control clips look alike, the most first",
     "all": "all scenarios",
 }
 
@@ -32,12 +33,21 @@ def flags(workspace: Workspace) -> pd.DataFrame:
     return pd.DataFrame({"judges": split, "models": share * (1 - share)}).fillna(0.0)
 
 
-def queue(name: QueueName, scenarios: Sequence[str], reviewed: frozenset[str], found: pd.DataFrame) -> list[str]:
-    """The scenarios of a queue, in order. A scenario that is reviewed leaves every queue but `all`."""
+def queue(
+    name: QueueName,
+    scenarios: Sequence[str],
+    reviewed: frozenset[str],
+    found: pd.DataFrame,
+    alike: Mapping[str, float],
+) -> list[str]:
+    """The scenarios of a queue, in order. A scenario that is reviewed leaves every queue but `all`. found: `flags`;
+    alike: by scenario, how far the one that looks most alike is."""
     if name == "all":
         return list(scenarios)
     left = [each for each in scenarios if each not in reviewed]
     if name == "unreviewed":
         return left
+    if name == "alike":
+        return sorted((each for each in left if each in alike), key=lambda each: (alike[each], each))
     scores = found[name].to_dict() if len(found) else {}
     return sorted((each for each in left if scores.get(each, 0) > 0), key=lambda each: (-scores[each], each))

@@ -20,6 +20,7 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.explorer.cost import Touched, touched
+from traps_pipeline.explorer.duplicates import Comparison
 from traps_pipeline.explorer.queue import MEANINGS, QUEUES, QueueName, flags, queue
 from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script
 from traps_pipeline.models.tables import RESPONSES
@@ -87,6 +88,15 @@ class Review:
         return flags(self.workspace)
 
     @cached_property
+    def comparison(self) -> Comparison:
+        """Which control clips look alike; it begins when the queue of these is opened."""
+        there = {
+            id_: self.workspace.resolve(row["path"]) for (id_, side), row in self.clips.items() if side == "control"
+        }
+        clips = {id_: path for id_, path in sorted(there.items()) if path.is_file()}
+        return Comparison(clips, {id_: str(spec["family"]) for id_, spec in self.specs.items()})
+
+    @cached_property
     def observed(self) -> dict[str, str]:
         """What the observer answered under the first regime that it was asked, by item."""
         rows = self.workspace.tables.read_all(RESPONSES, ["item_id", "model", "regime", "run", "text"])
@@ -106,7 +116,8 @@ class Review:
 
     def queue(self, name: QueueName) -> list[str]:
         """See `queue.queue`."""
-        return queue(name, list(self.specs), self.reviewed(), self.flags)
+        alike = {id_: each.distance for id_, each in self.comparison.found.items()}
+        return queue(name, list(self.specs), self.reviewed(), self.flags, alike)
 
     def decide(self, sent: Decision) -> None:
         """Append a decision. Raises NotThere, Refused and Conflict."""
@@ -172,6 +183,7 @@ class Review:
         spec, waiting = self.spec(scenario_id), self.queue(name)
         decisions = decisions_on(scenario_id)
         place = waiting.index(scenario_id) if scenario_id in waiting else -1
+        alike = self.comparison.found.get(scenario_id)
         items = {side: f"{spec['taxonomy']}:{scenario_id}:{side}" for side in ("control", "void")}
         shown = {
             "scenario_id": scenario_id,
@@ -179,6 +191,7 @@ class Review:
             "queue": name,
             "fps": self.clips.get((scenario_id, "control"), {}).get("fps"),
             "clips": [side for side in ("control", "void", "twin") if (scenario_id, side) in self.clips],
+            "alike": alike.scenario_id if alike else "",
             "before": waiting[place - 1] if place > 0 else "",
             "after": next((each for each in waiting[place + 1 :] if each != scenario_id), ""),
             "params": json.loads(spec["params"]),
@@ -197,6 +210,7 @@ class Review:
             labels=", ".join(spec["labels"]),
             certificate=[words for _, words in certificate_phrases(json.loads(spec["evidence"]))],
             observed={side: self.observed.get(item, "not asked") for side, item in items.items()},
+            alike=(alike, self.specs[alike.scenario_id]["question"]) if alike else None,
             decisions=decisions,
             is_reviewed=is_reviewed(decisions),
             queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},
@@ -212,6 +226,7 @@ class Review:
             "review_done.html.j2",
             touched=self.summary(),
             queue=name,
+            comparing=self.comparison.progress if name == "alike" else "",
             queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},
             reviewed=len(self.reviewed() & set(self.specs)),
             total=len(self.specs),
@@ -258,6 +273,8 @@ def review_app(review: Review) -> FastAPI:
 
     @app.get("/")
     def start(queue: QueueName = "unreviewed") -> Response:
+        if queue == "alike":
+            review.comparison.start()
         waiting = review.queue(queue)
         return RedirectResponse(f"/scenario/{waiting[0]}?queue={queue}" if waiting else f"/done?queue={queue}", 303)
 

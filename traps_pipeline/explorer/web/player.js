@@ -1,16 +1,36 @@
 // Clips that play in step: one clock, one frame at a time.
 
+const HELD = []; // addresses of clips in memory, until the next player takes their place
+
+// The address of a clip. From a web host it is read whole, since some hosts send no part of a file, and a browser can
+// then not step through it; a page on `file:` may not read it, and need not.
+async function addressOf(path) {
+  if (!location.protocol.startsWith("http")) return path;
+  try {
+    const answer = await fetch(path);
+    if (!answer.ok) return path;
+    HELD.push(URL.createObjectURL(await answer.blob()));
+    return HELD.at(-1);
+  } catch {
+    return path; // the element says that it cannot be played
+  }
+}
+
 // clips: [{title, path, note}]; path is null where the folder has no such clip. fps: frames a second.
 function player(clips, fps, hasClips) {
   const videos = [];
+  for (const held of HELD.splice(0)) URL.revokeObjectURL(held);
   const figures = clips.map(({ title, path, note, kind }) => {
     const video = path
-      ? h("video", { src: path, muted: true, playsinline: true, preload: "auto", "aria-label": title, tabindex: "-1" })
+      ? h("video", { muted: true, playsinline: true, preload: "auto", "aria-label": title, tabindex: "-1" })
       : null;
     const absent = hasClips
       ? "This clip is not in the folder."
       : "The clips were left out of this folder; `traps site` without --without-clips puts them in.";
-    if (video) videos.push(video);
+    if (video) {
+      videos.push(video);
+      addressOf(path).then((found) => video.setAttribute("src", found));
+    }
     return h(
       "figure",
       { class: `clip ${kind}` },

@@ -11,6 +11,10 @@ const clips = SHOWN.clips.map((side) => {
   const [title, note] = SHOWN.captions[side].split(/: (.*)/s);
   return { title, note, path, kind: side };
 });
+if (SHOWN.alike) {
+  const path = `/clip/${encodeURIComponent(SHOWN.alike)}/control`;
+  clips.splice(2, 0, { title: "Looks alike", note: `control of ${SHOWN.alike}`, path, kind: "twin" });
+}
 const shownPlayer = player(clips, SHOWN.fps, true);
 field("clips").append(shownPlayer.element);
 
@@ -111,7 +115,8 @@ async function decide(action) {
       return;
     }
     await post("/decide", { action, changes: found, why, seen: SHOWN.seen });
-    if (action === "add") said.textContent = "Added. A run makes it in every study that holds all scenarios, or names it.";
+    if (action === "add")
+      said.textContent = "Added. A run makes it in every study that holds all scenarios, or names it.";
     else leave(SHOWN.after);
   } catch (error) {
     said.textContent = error.message;
@@ -136,7 +141,8 @@ const KEYS = {
   e: open_changes,
   w: () => field("why").focus(),
 };
-for (const name of ["keep", "correct", "discard", "add", "undo"]) field(name).addEventListener("click", () => decide(name));
+for (const name of ["keep", "correct", "discard", "add", "undo"])
+  field(name).addEventListener("click", () => decide(name));
 field("before").addEventListener("click", KEYS.p);
 field("after").addEventListener("click", KEYS.n);
 document.addEventListener("keydown", (event) => {
@@ -149,3 +155,4 @@ document.addEventListener("keydown", (event) => {
   event.preventDefault();
   return act();
 });
+document.documentElement.dataset.ready = "1"; // from here on keys are heard

@@ -1,0 +1,89 @@
+"""Near duplicates: scenarios of a family whose control clips look alike."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from traps_pipeline.scenes.encode import DamagedClip, decode
+
+PLACES = (0.0, 0.5, 1.0)  # of the frames that are compared, as shares of the clip
+SIDE = 16  # a frame gives SIDE x SIDE bits: whether a pixel of the reduced frame is brighter than the one on its left
+ALIKE_BELOW = 0.1  # share of differing bits below which two scenarios are worth a look
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """The scenario that looks most alike, and the share of bits in which the two differ."""
+
+    scenario_id: str
+    distance: float
+
+
+def fingerprint(clip: Path) -> np.ndarray:
+    """The difference hash of a clip's first, middle and last frame: (3 * SIDE * SIDE,) bool. Raises DamagedClip."""
+    import cv2
+
+    frames, _ = decode(clip)
+    bits = []
+    for place in PLACES:
+        grey = cv2.cvtColor(frames[round(place * (len(frames) - 1))], cv2.COLOR_RGB2GRAY)
+        small = cv2.resize(grey, (SIDE + 1, SIDE), interpolation=cv2.INTER_AREA)
+        bits.append(small[:, 1:] > small[:, :-1])
+    return np.concatenate([each.ravel() for each in bits])
+
+
+def neighbours(prints: Mapping[str, np.ndarray], families: Mapping[str, str]) -> dict[str, Neighbour]:
+    """For each scenario that has others of its family, the nearest of them."""
+    found = {}
+    for family in sorted(set(families.values())):
+        names = sorted(name for name in prints if families[name] == family)
+        if len(names) < 2:
+            continue
+        table = np.array([prints[name] for name in names])
+        for k, name in enumerate(names):
+            distances = (table != table[k]).mean(axis=1)
+            distances[k] = np.inf
+            nearest = int(np.argmin(distances))
+            found[name] = Neighbour(names[nearest], float(distances[nearest]))
+    return found
+
+
+class Comparison:
+    """The neighbours of all scenarios, found in the background from the first time that they are asked for: decoding
+    700 clips takes a minute. clips: control clips by scenario; one that cannot be read is left out."""
+
+    def __init__(self, clips: Mapping[str, Path], families: Mapping[str, str]) -> None:
+        self._clips, self._families = clips, families
+        self._prints: dict[str, np.ndarray] = {}
+        self._found: dict[str, Neighbour] | None = None
+        self._lock, self._has_begun = threading.Lock(), False
+
+    def start(self) -> None:
+        """Begin, unless it has begun."""
+        with self._lock:
+            if not self._has_begun:
+                self._has_begun = True
+                threading.Thread(target=self._compare, daemon=True).start()
+
+    def _compare(self) -> None:
+        for name, clip in self._clips.items():
+            try:
+                self._prints[name] = fingerprint(clip)
+            except DamagedClip:
+                continue  # the run that looks at it next names it
+        self._found = neighbours(self._prints, self._families)
+
+    @property
+    def progress(self) -> str:
+        """How far it is, in words; empty once it is done."""
+        return "" if self._found is not None else f"{len(self._prints)} of {len(self._clips)} clips are compared"
+
+    @property
+    def found(self) -> Mapping[str, Neighbour]:
+        """The neighbours that look alike, once all are compared; empty until then."""
+        return {name: each for name, each in (self._found or {}).items() if each.distance < ALIKE_BELOW}
