@@ -257,8 +257,8 @@ def _seen(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: list[str]) 
         counted = clip.prompt_tokens - blank.prompt_tokens
     if counted is not None and counted <= 0:
         return [
-            f"it does not see the clip: {clip.prompt_tokens} prompt tokens with it and {blank.prompt_tokens} without; is "
-            f"this a model that sees, and is `{entry.media.profile if entry.media else ''}` what its server takes?"
+            f"it does not see the clip: {clip.prompt_tokens} prompt tokens with it and {blank.prompt_tokens} without; "
+            f"is this a model that sees, and is `{entry.media.profile if entry.media else ''}` what its server takes?"
         ]
     if not named and counted is None:
         return ["it does not see the clip: it names no colour of one that is red and then blue, nor counts its tokens"]
