@@ -40,6 +40,7 @@ class Experiment(BaseModel):
     model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] | None = None
     allow_unknown_prices: bool | None = None
     mechanism: MechanismSettings | None = Field(default=None, description="local models to read and steer")
+    canary: bool = Field(default=False, description="ask twenty fixed items again in each epoch")
     own: Own = Field(default=Own(), description="models, judges and panels that the file itself describes")
 
     @model_validator(mode="before")
