@@ -17,6 +17,7 @@ EXPERIMENT = """
 name: with-arms
 models: [oracle, any-rule]
 regimes: [standard]
+panel: rules
 epoch: small
 scenarios: [hidden_race-0001, plinko-0001]
 datasets:

@@ -185,7 +185,9 @@ def whole_benchmark(study: Checkout, folder: Path) -> Checkout:
     for path in (study.root / "scene_specs" / "released").glob("*.jsonl"):
         if path.stem not in ("domino_chain", "hidden_race"):
             path.unlink()
-    (folder / "whole.yaml").write_text("name: whole\nmodels: [oracle]\nregimes: [standard]\ndatasets: [occlusion]\n")
+    (folder / "whole.yaml").write_text(
+        "name: whole\npanel: rules\nmodels: [oracle]\nregimes: [standard]\ndatasets: [occlusion]\n"
+    )
     shutil.copytree(study.workspace / "clips", folder / "whole" / "clips")
     return Checkout(study.root, folder / "whole")
 

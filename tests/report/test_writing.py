@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -132,3 +133,11 @@ def test_files_have_the_same_bytes_on_a_second_build():
     assert [content[:4] for content in files.values()] == [b"%PDF", b"<?xm", b"\x89PNG"]
     assert b"CreationDate" not in files["f.pdf"]
     assert b"<dc:date>" not in files["f.svg"]
+
+
+def test_a_long_latex_table_breaks_over_pages_and_a_short_one_floats():
+    long = PrintedTable("t", "Title", pd.DataFrame({"model": ["m"] * 41}), [Column("model", "Model")])
+    text = table_files(long)["t.tex"].decode()
+    assert text.count(r"\begin{longtable}") == 1 and r"\endhead" in text and r"\begin{table}" not in text
+    short = replace(long, rows=long.rows.iloc[:40])
+    assert r"\begin{table}[t]" in table_files(short)["t.tex"].decode()

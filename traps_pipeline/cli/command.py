@@ -86,9 +86,11 @@ def open_workspace(arguments: argparse.Namespace) -> Workspace:
 def entered(workspace: Workspace) -> Workspace:
     """The workspace, after it was set in the environment, so that the partition keys here and in child processes are
     those of its study."""
+    from traps_pipeline.models.own import forget
     from traps_pipeline.storage.workspace import VARIABLE
 
     os.environ[VARIABLE] = str(workspace.root)
+    forget()  # the workspace may have models of its own
     os.environ.setdefault("DAGSTER_HOME", str(workspace.dagster_home))
     return workspace
 

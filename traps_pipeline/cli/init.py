@@ -32,6 +32,7 @@ def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
 
     Raises TrapsError if the existing study differs from the one that the experiment needs.
     """
+    from traps_pipeline.models.own import keep
     from traps_pipeline.storage.workspace import Workspace
 
     root, by_rules = root_of(arguments), arguments.judged_by_rules
@@ -51,6 +52,7 @@ def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
     if asked != workspace.study.experiments:
         workspace = workspace.allow(experiments=asked)
     entered(workspace)
+    keep(workspace.root)
     from traps_pipeline.orchestration.run import dagster_history
 
     with dagster_history(workspace):  # opened once here, so that several processes may use it afterwards

@@ -68,6 +68,11 @@ def run(arguments: argparse.Namespace) -> int:
         f"\n{asked.asked} answers asked ({asked.cached} from the ledger), {voted.asked} votes asked "
         f"({voted.cached} from the ledger), {frames} frames rendered, {clock(outcome.seconds)} min"
     )
+    if experiment.canary and not problems:
+        from traps_pipeline.study.canary import ask_canary, changes_text
+
+        with reporting(TerminalProgress()):
+            print(changes_text(ask_canary(workspace, experiment.models)))
     if experiment.mechanism is not None:
         states, steered, judged = (
             total.get(stage, Tally()) for stage in ("hidden_states", "steering", "steering_votes")

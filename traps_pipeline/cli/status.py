@@ -6,7 +6,7 @@ import argparse
 
 from traps_pipeline.cli.command import OK, Commands, experiment_of, load_definitions, open_workspace
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.terminal import text_table
+from traps_pipeline.terminal import plain, text_table
 
 SHOWN = 8  # stale partitions that are listed for a stage
 
@@ -15,7 +15,9 @@ def add(commands: Commands) -> None:
     """Add `traps status` and `traps why`."""
     parser = commands.add("status", status, "list fresh, stale and missing partitions, with the reasons")
     parser.add_argument("experiment", nargs="?")
-    parser = commands.add("why", why, "say which answers to an item are valid and which will be asked again")
+    parser = commands.add(
+        "why", why, "show an item, its answers and votes, and say which answers are valid and which will be asked again"
+    )
     parser.add_argument("item", help="dataset:scenario:side")
 
 
@@ -58,5 +60,5 @@ def why(arguments: argparse.Namespace) -> int:
     from traps_pipeline.study.why import why as explain
 
     for line in explain(open_workspace(arguments), arguments.item):
-        print(line)
+        print(plain(line))
     return OK

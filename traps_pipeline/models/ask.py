@@ -353,6 +353,8 @@ class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
 
     def _interrupt(self, by: signal.Signals) -> None:
         if self._stop.is_set():
+            # What is cancelled now is in the ledger or stands in the journal: how it ends is nobody's news.
+            self._loop.set_exception_handler(lambda *_: None)
             self._loop.call_soon_threadsafe(self._cancel)
             end = threading.Timer(END_S, os._exit, (INTERRUPTED,))  # whatever still holds the process then
             end.daemon = True

@@ -12,6 +12,7 @@ from pydantic import model_validator
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models import own
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import (
     JUDGE_PROTOCOL,
@@ -21,6 +22,7 @@ from traps_pipeline.models.registry import (
     is_reference,
     read_entries,
     structured,
+    with_own,
 )
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.yamlfile import read_mapping
@@ -68,12 +70,15 @@ class JudgeEntry(Entry):
         return JUDGE_PROTOCOL
 
 
+@own.keeps
 @cache
 def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
     """Judges by id. Raises TrapsError naming judge and field."""
-    return read_entries(path, "judges", JudgeEntry)
+    found = read_entries(path, "judges", JudgeEntry)
+    return with_own(found, "judges", JudgeEntry) if path == JUDGES_FILE else found
 
 
+@own.keeps
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     """The judges of a panel: three, or one. Raises TrapsError naming the file and what is wrong."""
@@ -97,7 +102,7 @@ def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
     panels = read_mapping(path).get("panels")
     if not isinstance(panels, dict):
         raise TrapsError(f"{path}: must hold a mapping `panels:`")
-    return panels
+    return {**panels, **own.together().panels} if path == JUDGES_FILE else panels
 
 
 def how_to_name_a_panel(path: Path = JUDGES_FILE) -> str:

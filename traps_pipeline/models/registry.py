@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationIn
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models import own
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
 from traps_pipeline.partitions import Evaluation, check_slug
 from traps_pipeline.paths import ASSETS
@@ -257,20 +258,37 @@ def read_entries(path: Path, key: str, kind: type[_Entry]) -> dict[str, _Entry]:
     context = {"accounts": load_accounts()}
     found: dict[str, _Entry] = {}
     for number, raw in enumerate(entries, start=1):
-        name = raw.get("id", "?") if isinstance(raw, dict) else "?"
-        entry = parse_yaml_model(kind, raw, path, f"{key.rstrip('s')} {number} ({name})", context)
-        if entry.id in found:
-            raise TrapsError(f"{path}: {key.rstrip('s')} {number}: id {entry.id!r} occurs twice")
-        found[entry.id] = entry
+        _add(found, kind, raw, path, f"{key.rstrip('s')} {number}", context)
     return found
 
 
+def _add(
+    found: dict[str, _Entry], kind: type[_Entry], raw: Any, path: Path, what: str, context: Mapping[str, Any]
+) -> None:
+    name = raw.get("id", "?") if isinstance(raw, dict) else "?"
+    entry = parse_yaml_model(kind, raw, path, f"{what} ({name})", context)
+    if entry.id in found:
+        raise TrapsError(f"{path}: {what}: id {entry.id!r} occurs twice, here or in {MODELS_FILE.parent}")
+    found[entry.id] = entry
+
+
+def with_own(found: dict[str, _Entry], key: own.Kind, kind: type[_Entry]) -> dict[str, _Entry]:
+    """Entries of a registry, followed by those that the experiment and the workspace add."""
+    context = {"accounts": load_accounts()}
+    for path, raw in own.entries(key):
+        _add(found, kind, raw, path, f"own {key.rstrip('s')}", context)
+    return found
+
+
+@own.keeps
 @cache
 def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
     """Models by id, in file order. Raises TrapsError naming entry and field."""
-    return read_entries(path, "models", ModelEntry)
+    found = read_entries(path, "models", ModelEntry)
+    return with_own(found, "models", ModelEntry) if path == MODELS_FILE else found
 
 
+@own.keeps
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     """Accounts by name. Raises TrapsError naming account and field."""
@@ -278,6 +296,8 @@ def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     accounts = data.get("accounts", {}) if isinstance(data, dict) else None
     if not isinstance(accounts, dict):
         raise TrapsError(f"{path}: `accounts:` must be a mapping of names")
+    if path == MODELS_FILE:
+        accounts = {**accounts, **own.accounts()}
     return {name: parse_yaml_model(Account, raw or {}, path, f"account {name}") for name, raw in accounts.items()}
 
 
@@ -335,6 +355,7 @@ def is_reference(model_id: str) -> bool:
     return model_id in known and known[model_id].backend in ("reference", "observer", "rule")
 
 
+@own.keeps
 @cache
 def local_models() -> tuple[str, ...]:
     """Models whose hidden states can be read, in file order."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+import pandas as pd
+
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.files import write_bytes
 from traps_pipeline.partitions import DATASETS, Cell
@@ -27,7 +29,7 @@ from traps_pipeline.report.tables.audited import audit_table
 from traps_pipeline.report.writing import Behind, environment, figure_files, table_files
 from traps_pipeline.storage.workspace import Workspace
 
-PAGE, MARKDOWN, INDEX = "report.html", "leaderboard.md", "index.html"
+PAGE, MARKDOWN, METRICS, INDEX = "report.html", "leaderboard.md", "metrics.jsonl", "index.html"
 SHEETS = {
     "shortcuts.png": "How well one cue alone separates control from void (0.5 is chance)",
     "contact_sheet.png": "Pairs: control above, void below",
@@ -46,7 +48,13 @@ def report_files(study: StudyResults, cells: Sequence[Cell], pictures: Pictures)
     landscape = FIGURES[0]
     first = {landscape.title: pictures[landscape.path(study)]} if landscape.path(study) in pictures else {}
     page = report_html(study.board, first, _chapters(study, address, pictures), address, robust=study.robust)
-    return {PAGE: page.encode(), MARKDOWN: leaderboard_markdown(study.board, study.robust).encode()}
+    markdown = leaderboard_markdown(study.board, study.robust)
+    return {PAGE: page.encode(), MARKDOWN: markdown.encode(), METRICS: metrics_lines(study.board).encode()}
+
+
+def metrics_lines(board: pd.DataFrame) -> str:
+    """LEADERBOARD rows as JSON lines, which experiment trackers read; a figure that is null is null there."""
+    return str(board.to_json(orient="records", lines=True, double_precision=15))
 
 
 def _chapters(

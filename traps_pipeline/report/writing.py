@@ -29,6 +29,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 STYLE = ASSETS / "figures.mplstyle"
 NONE = "–"  # a cell without a number
 NOT_RUN = "not run"
+LONG = 40  # rows of a LaTeX table that fit on a page
 TABLE_KINDS = ("parquet", "csv", "tex", "md")
 FIGURE_KINDS = ("pdf", "svg", "png")
 
@@ -245,7 +246,8 @@ def _with_marks(column: Column, records: Sequence[Mapping[str, Any]]) -> list[st
 
 
 def table_latex(table: PrintedTable) -> str:
-    """A floating `table` environment with booktabs rules (`\\usepackage{booktabs}`); notes stand in the caption."""
+    """A floating `table` environment with booktabs rules (`\\usepackage{booktabs}`), or for more than LONG rows a
+    `longtable`, which breaks over pages (`\\usepackage{longtable}`); notes stand in the caption."""
     import pandas as pd
 
     parts = [table.title, *([table.lead] if table.lead else []), *table.remarks]
@@ -258,8 +260,7 @@ def table_latex(table: PrintedTable) -> str:
         hrules=True,
         caption=caption,
         label=f"tab:{table.name}",
-        position="t",
-        position_float="centering",
+        **({"environment": "longtable"} if len(cells) > LONG else {"position": "t", "position_float": "centering"}),
         column_format="l" if table.absence else "".join("r" if c.is_number else "l" for c in table.columns),
     )
     return str(text)

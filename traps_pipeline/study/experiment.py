@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.judges import require_panel
+from traps_pipeline.models.own import Own, use
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
 from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.paths import ASSETS
@@ -39,6 +40,24 @@ class Experiment(BaseModel):
     model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] | None = None
     allow_unknown_prices: bool | None = None
     mechanism: MechanismSettings | None = Field(default=None, description="local models to read and steer")
+    canary: bool = Field(default=False, description="ask twenty fixed items again in each epoch")
+    own: Own = Field(default=Own(), description="models, judges and panels that the file itself describes")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _what_the_file_describes_is_its_own(cls, data: Any) -> Any:
+        """A model may be named or described; `judges`, `panels` and `accounts` describe what no registry has."""
+        if not isinstance(data, dict):
+            return data
+        if "own" in data:
+            raise ValueError("own: describe models under `models`, and judges under `judges`")
+        rest = {name: value for name, value in data.items() if name not in ("accounts", "judges", "panels")}
+        described = {name: data[name] for name in ("accounts", "judges", "panels") if name in data}
+        models = data.get("models")
+        if isinstance(models, list):
+            described["models"] = [one for one in models if isinstance(one, dict)]
+            rest["models"] = [one.get("id", "?") if isinstance(one, dict) else one for one in models]
+        return rest | {"own": described}
 
     @field_validator("datasets")
     @classmethod
@@ -136,6 +155,7 @@ def load_experiment(name: str) -> Experiment:
             "file"
         )
     experiment = parse_yaml_model(Experiment, read_yaml(path), path)
+    use(experiment.own, path)
     with within(path):
         for model in experiment.models:
             get_model(model)

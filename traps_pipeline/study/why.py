@@ -8,18 +8,26 @@ from typing import Any
 
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VOTES
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.partitions import REGIMES, Evaluation
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.partitions import REGIMES, Cell, Evaluation
+from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 
 def why(workspace: Workspace, item_id: str) -> Iterator[str]:
     """For every evaluation that has asked the item: whether its answer is still valid, or which component of the key
-    changed. Raises TrapsError for an unknown item."""
+    changed, with the answer and its votes. Before them the item's question and clip. Raises TrapsError for an unknown
+    item."""
     dataset = item_id.split(":")[0]
     current = _current_item(workspace, dataset, item_id)
     n_asked = 0
+    if current is not None:
+        yield f"question: {current['question']}"
+        yield f"ground truth: {current['ground_truth'] if current['side'] == 'control' else 'none, it is void'}"
+        yield f"clip: {workspace.resolve(current['clip'])}"
     for model, entry in load_models().items():
         for regime in REGIMES:
             for run in range(1, entry.runs + 1):
@@ -30,12 +38,31 @@ def why(workspace: Workspace, item_id: str) -> Iterator[str]:
                 n_asked += 1
                 wanted = answer_request(workspace, entry, current, evaluation) if current else None
                 yield f"{evaluation.key}: {_explain(rows, wanted.components if wanted else None)}"
+                yield from _judged(workspace, Cell(dataset, evaluation), item_id)
     if current is None and not n_asked:
         raise TrapsError(
             f"item {item_id!r} is unknown; an item is dataset:scenario:side, e.g. occlusion:domino_chain-0001:void"
         )
     if not n_asked:
         yield "no model has been asked this item"
+
+
+def _judged(workspace: Workspace, cell: Cell, item_id: str) -> Iterator[str]:
+    """The answer to an item as its table has it, and the votes on it."""
+    for answer in _rows_of(workspace, RESPONSES, cell, item_id):
+        said = _short(answer["text"]) if answer["text"] else answer["error"] or ""
+        yield f"    {answer['outcome']}: {said}"
+    for vote in _rows_of(workspace, VOTES, cell, item_id):
+        decision = vote["abstained"] if vote["task"] == "abstention" else vote["correct"]
+        word = "invalid" if not vote["valid"] else "yes" if decision else "no"
+        yield f"    {vote['judge']} on {vote['task']}: {word} ({vote['rationale'] or vote['invalid_reason']})"
+
+
+def _rows_of(workspace: Workspace, table: Table, cell: Cell, item_id: str) -> list[dict[str, Any]]:
+    if workspace.tables.state(table, cell.partition) is None:
+        return []
+    rows = workspace.tables.read(table, cell.partition)
+    return rows.loc[rows["item_id"] == item_id].to_dict("records")
 
 
 def _about(row: Mapping[str, Any]) -> Any:

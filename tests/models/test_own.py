@@ -1,0 +1,108 @@
+"""Models and judges of one's own in four lines of an experiment, kept in its workspace."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models import own
+from traps_pipeline.models.judges import load_panel, panel_id
+from traps_pipeline.models.registry import account_of, get_model, load_models
+from traps_pipeline.storage.workspace import VARIABLE
+from traps_pipeline.study.experiment import load_experiment
+
+MINE = """\
+name: mine
+models:
+  - id: my-model
+    base_url: http://127.0.0.1:8000/v1
+    served_name: org/Model-7B
+    media: images
+regimes: [standard]
+"""
+JUDGES = """\
+judges:
+  - {id: judge-a, base_url: "http://127.0.0.1:8001/v1", served_name: a}
+panels: {one: [judge-a]}
+panel: one
+"""
+
+
+@pytest.fixture(autouse=True)
+def forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No workspace, and afterwards no entries of a test."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    yield
+    monkeypatch.undo()
+    own.use(own.Own(), Path("none"))
+
+
+def written(tmp_path: Path, text: str) -> str:
+    (tmp_path / "mine.yaml").write_text(text)
+    return str(tmp_path / "mine.yaml")
+
+
+def test_a_model_is_four_lines_and_the_protocol_fills_in_the_rest(tmp_path: Path) -> None:
+    assert load_experiment(written(tmp_path, MINE)).models == ["my-model"]
+    entry = get_model("my-model")
+    assert entry.provider_id == "openai/org/Model-7B"
+    assert entry.params == {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
+    assert entry.media is not None and (entry.media.profile, entry.media.fps, entry.media.most) == ("images", 5, 25)
+    assert entry.prices is not None and entry.prices.cost(10**6, 10**6) == 0  # a server on this machine sends no bill
+    assert (account_of(entry).base_url, account_of(entry).key) == ("http://127.0.0.1:8000/v1", None)
+    assert list(load_models())[-1] == "my-model"  # behind the registry's, so that partition keys keep their order
+
+
+def test_elsewhere_the_price_is_unknown_until_it_is_given_and_a_departure_from_the_protocol_needs_its_reason(
+    tmp_path: Path,
+) -> None:
+    text = MINE.replace("http://127.0.0.1:8000", "https://example.org")
+    load_experiment(written(tmp_path, text))
+    assert get_model("my-model").prices is None
+    with pytest.raises(TrapsError, match=r"own model \(my-model\): .*temperature is 0, the protocol has 0.8"):
+        load_experiment(written(tmp_path, text.replace("media: images", "media: images\n    params: {temperature: 0}")))
+
+
+def test_a_panel_of_one_judge_of_ones_own_has_a_version(tmp_path: Path) -> None:
+    assert load_experiment(written(tmp_path, MINE + JUDGES)).panel == "one"
+    (judge,) = load_panel("one")
+    assert judge.params == {"temperature": 0.8, "max_tokens": 512}
+    first = panel_id("one")
+    assert first.startswith("one@")
+    load_experiment(written(tmp_path, MINE + JUDGES.replace("served_name: a}", "served_name: b}")))
+    assert panel_id("one") != first
+
+
+def test_the_workspace_keeps_what_an_experiment_brought(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    load_experiment(written(tmp_path, MINE))
+    own.keep(tmp_path)
+    own.use(own.Own(), Path("none"))
+    with pytest.raises(TrapsError, match="unknown model 'my-model'"):
+        get_model("my-model")
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    own.forget()
+    assert get_model("my-model").provider_id == "openai/org/Model-7B"
+    newer = MINE.replace("Model-7B", "Model-8B") + JUDGES
+    load_experiment(written(tmp_path, newer))
+    own.keep(tmp_path)
+    own.use(own.Own(), Path("none"))
+    assert get_model("my-model").provider_id == "openai/org/Model-8B" and len(load_panel("one")) == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("    media: images\n", "", "media: say what your server takes of a clip: `images`"),
+        ("media: images", "media: pictures", r"own model \(my-model\): media.profile"),
+        ("id: my-model", "id: oracle", "id 'oracle' occurs twice"),
+        ("id: my-model", "id: My Model", r"own model \(My Model\): id: .*must match"),
+        ("served_name", "served", r"own model \(my-model\): served: Extra inputs"),
+        ("  - id: my-model\n    base_url", "  - base_url", "each entry has an `id`"),
+    ],
+)
+def test_a_wrong_entry_of_ones_own_is_named_with_its_field(tmp_path: Path, old: str, new: str, complaint: str) -> None:
+    with pytest.raises(TrapsError, match=complaint):
+        load_experiment(written(tmp_path, MINE.replace(old, new)))
