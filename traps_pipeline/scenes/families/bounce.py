@@ -72,6 +72,7 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.block("end", (end, end + 0.02), (-side - rim, side), over, p.table_colour)
     stage.block("board", (0, end + 0.02), (side, side + 0.015), (0, top), p.board_colour)
     stage.ball("ball", (-p.table_m + 1.3 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
+    stage.mark("wall", "wall")
     return stage.scene(
         p,
         decisive=["ball"],

@@ -110,6 +110,7 @@ def build(p: Params, physics: Physics) -> Scene:
         back=top,
         front=FLOOR_M + 0.45 * r,
     )
+    stage.mark("basket", (sum(p.pen_m) / 2, DEPTH_M), p.basket_colour)  # between its two places
     return stage.scene(
         p,
         decisive=["ball"],

@@ -105,6 +105,8 @@ def build(p: Params, physics: Physics) -> Scene:
         size = (p.board_m / 2, DEPTH_M - 0.005, 0.008)
         board = stage.slab(f"board_{name}", middle, size, p.board_colour, falls_rad=-sign * slope)
         Surface(0.002, sliding=0.4, solref=SOFT).on(board)
+    stage.mark("cup", "cup_floor")
+    stage.mark("funnel", (0.6 * rim, DEPTH_M), p.board_colour)
     return stage.scene(
         p,
         decisive=["ball"],

@@ -92,6 +92,8 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.ball("ball", (-d * p.start_m, 0, track + r), r, p.ball_colour, speed=d * p.speed_m_s)
 
     covered = stage.box(board, (front[0], back), (0, p.chute_m + 0.02))
+    for side in ("left", "right"):
+        stage.mark(f"{side} bin", f"bin_{side}")
     return stage.scene(
         p,
         decisive=["ball"],

@@ -84,6 +84,7 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.block("front_rail", (lip, end), (-side - rim, -side), (0, FLOOR_M + 0.3 * r), p.slide_colour)
     stage.block("board", (cut, end + 0.02), (side, side + 0.015), (0, high), p.board_colour)
     stage.ball("ball", (-p.ledge_m + 1.2 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
+    stage.mark("barrier", "barrier")
     return stage.scene(
         p,
         decisive=["ball"],
@@ -92,6 +93,7 @@ def build(p: Params, physics: Physics) -> Scene:
         in_view=[stage.box((-p.ledge_m, end), deep, (0, high))],
         things=[f"{p.ball_colour} ball", f"{p.barrier_colour} barrier", "slide", "tray", f"{p.kicker_colour} kicker"],
         also=["ramp", "board"],
+        shown_by={"ramp": ["slide"]},
     )
 
 
