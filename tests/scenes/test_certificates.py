@@ -123,7 +123,8 @@ def test_another_hidden_element_is_not_the_scene_of_the_trajectory(race: Release
 
 def test_a_twin_that_differs_in_what_is_seen_is_no_twin(race: Released) -> None:
     assert race.spec.twin.params is not None
-    seen = race.spec.twin.params | {"deck_colour": "purple"}
+    other = next(colour for colour in ("wood", "grey") if colour != race.spec.twin.params["deck_colour"])
+    seen = race.spec.twin.params | {"deck_colour": other}
     twin = race.spec.twin.model_copy(update={"params": seen})
     assert "more, or in less, than the hidden element" in failures(race, altered(race.spec, twin=twin))["twin"]
 

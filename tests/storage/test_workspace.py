@@ -32,7 +32,8 @@ def test_a_created_workspace_opens_with_its_study(tmp_path: Path) -> None:
         "format": FORMAT,
         "benchmark": "released",
         "per_family": 2,
-        "panel": "rules",
+        "panel": "",  # an experiment or the command names it
+        "judged_by_rules": False,
         "epoch": "2026-11",
         "budget_usd": 12.5,
         "model_budgets_usd": {},
