@@ -55,6 +55,8 @@ class TableReport:
 
     def tables(self, results: Results) -> list[PrintedTable]:
         """The tables; of the paper, those recomputed from its numbers, without columns that have no figure."""
+        if not results.is_study and not self.recomputed:
+            return []
         said = [results.judged_by] if _is_judged(self.reads) else []
         shown = ((t, printed(results, t.rows, t.columns)) for t in self.make(results))
         made = [replace(table, columns=columns, notes=[*said, *table.notes]) for table, columns in shown]
