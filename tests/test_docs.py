@@ -23,7 +23,10 @@ SECTION = re.compile(rf'([\w./-]+\.md)`?,?\s[ #]*(?:sections? )?("[^"\n]+"|{NUMB
 PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join(FOLDERS[:-1])})/[\w./-]*\.(?:md|py|yaml|csv|txt|png)\b")
 MODULE = re.compile(r"(?<![\w./<>-])[\w/]+\.py\b")
 LINK = re.compile(r"\[[^]\n]*\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
-PAPER_IN = ("README.md", "docs/spec.md", "assets/published/README.md", "traps_pipeline/report/templates/report.html.j2")
+PAPER_IN = (
+    "README.md", "docs/spec.md", "assets/published/README.md", "traps_pipeline/report/templates/report.html.j2",
+    "assets/prompts/README.md",
+)  # fmt: skip
 
 
 @cache
@@ -73,3 +76,14 @@ def test_the_paper_has_one_name_everywhere() -> None:
     for name in PAPER_IN:
         text = " ".join((ROOT / name).read_text().replace("\n> ", " ").split())
         assert [part for part in (paper["title"], authors, "COLM 2026", paper["url"]) if part not in text] == [], name
+
+
+def test_the_verbatim_prompts_carry_the_licence_of_the_papers_release() -> None:
+    listed = (ROOT / "assets/prompts/README.md").read_text()
+    rows = [row for row in listed.splitlines() if row.startswith("|") and ".txt" in row]
+    whose = {name: "verbatim" in row for row in rows for name in re.findall(r"\w+\.txt", row)}
+    assert set(whose) == {path.name for path in (ROOT / "assets/prompts").glob("*.txt")}
+    assert [name for name, verbatim in whose.items() if not verbatim] == ["judge_confabulation.txt"]
+    for name in ("assets/prompts/README.md", "LICENSE-DATA", "README.md", "docs/limits.md"):
+        text = " ".join((ROOT / name).read_text().split())
+        assert "CC BY-NC 4.0" in text or "non-commercial" in text, name

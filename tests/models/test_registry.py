@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import get_model, load_models
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import REGIMES, Evaluation
@@ -79,3 +80,26 @@ def test_every_model_regime_and_run_is_one_evaluation_model_outermost() -> None:
     assert [(e.model, e.regime, e.run) for e in found] == expected
     assert Evaluation("oracle", "json", 2) not in found  # one run: no run2 key
     assert Evaluation("random-50", "json", 3) in found
+
+
+def test_every_departure_of_an_entry_of_the_paper_is_a_waiver() -> None:
+    refused, preview = {"temperature", "top_p"}, {"identifier"}
+    departing = {
+        "gemini-3.1-pro": preview,
+        "gemini-3.1-pro-r-low": preview,
+        "qwen3-vl-think": {"json_schema"},
+        **dict.fromkeys(("gpt-5-pro", "gpt-5-high", "gpt-5-medium", "gpt-5-mini"), refused),
+        "gpt-5-nr": refused | {"reasoning"},  # the paper has an effort of none
+        "gemma-4-e4b": {"media"},  # 10 frames for 32
+        "llava-next-video-7b": {"media"},
+    }
+    of_the_paper = [one for one in load_models().values() if one.groups.group in ("main", "replication")]
+    assert len(of_the_paper) == 16
+    assert {one.id: set(one.waivers) for one in of_the_paper if one.waivers} == departing
+    # The paper retries no judge; a judge whose name differs says so.
+    judges = {one.id: set(one.waivers) for one in load_panel("paper")}
+    assert judges == {
+        "judge-gemini-3-flash": {"identifier", "retries"},
+        "judge-qwen3-vl-instruct": {"retries"},
+        "judge-claude-opus-4.6": {"retries"},
+    }

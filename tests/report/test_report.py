@@ -13,7 +13,7 @@ import pytest
 
 from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
 from traps_pipeline.report.arms_sheet import FRAME_IN, GAP_IN, arms_sheets
-from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet
+from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet, six_pairs
 from traps_pipeline.report.figures.labels import Label, merged_labels
 from traps_pipeline.report.figures.landscape import landscape_figure
 from traps_pipeline.report.leaderboard import leaderboard_markdown, leaderboard_text, leaderboards
@@ -411,6 +411,26 @@ def test_a_contact_sheet_takes_the_first_pairs_of_each_sub_scenario(tmp_path):
     assert [p.at["void", "scenario_id"] for p in chosen_pairs(items, None)] == ["dice-0", "plinko-0", "plinko-1"]
     with pytest.raises(ValueError, match="1 to 80 pairs, not 0"):
         chosen_pairs(items[items["side"] == "control"], 1)
+
+
+def test_six_pairs_are_of_six_sub_scenarios_occlusion_first(tmp_path):
+    scenes = {"chaotic": ("plinko-0", "plinko-1", "dice-0", "seesaw-0"), "occlusion": ("race-0", "chain-0", "chain-1")}
+    items = pd.concat(
+        pd.DataFrame(pair_rows(scene, tmp_path, frames=2, kept=2, dataset=name)).assign(
+            taxonomy=name, category=scene[:4]
+        )
+        for name, of in scenes.items()
+        for scene in of
+    )
+    chosen = chosen_pairs(six_pairs(items), None)
+    # Three of the chaotic ones; the second chain is no further family, so occlusion has two.
+    assert [pair.at["void", "scenario_id"] for pair in chosen] == [
+        "chain-0",
+        "race-0",
+        "dice-0",
+        "plinko-0",
+        "seesaw-0",
+    ]
 
 
 def test_the_sheet_of_arms_takes_the_scenario_with_most_arms_and_draws_a_row_a_clip(tmp_path):

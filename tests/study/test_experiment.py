@@ -92,3 +92,20 @@ def test_rules_judge_reference_models_and_others_only_where_somebody_says_so(tmp
         mine.judged(None, None)
     assert mine.judged(None, None, judged_by_rules=True).judged_by_rules
     assert mine.judged(Study(panel="rules", judged_by_rules=True), None).panel == "rules"
+
+
+def test_the_paper_experiment_holds_the_behavioural_and_the_mechanistic_half() -> None:
+    paper = load_experiment("paper")
+    # Sixteen models on four datasets under three regimes; fifteen of them in three runs, the greedy one in one.
+    assert len(paper.models) == 16 and len(paper.cells()) == (15 * 3 + 1) * 3 * 4
+    inside = paper.mechanism
+    assert inside is not None and inside.steering is not None and inside.pooling == "last"
+    assert {name: layers.steering for name, layers in inside.models.items()} == {
+        "qwen3-vl-8b": 20,
+        "gemma-4-e4b": 35,
+        "llava-next-video-7b": 28,
+    }
+    assert inside.models["gemma-4-e4b"].sweep == (1, 17)  # and 35, which is steered anyway
+    assert (inside.steering.alphas, inside.steering.pairs) == ((2, 5, 10), 50)
+    assert (inside.steering.well_posed_pairs, inside.steering.ill_posed_pairs) == (100, 50)
+    assert inside.steering.direction_regimes == inside.steering.inference_regimes == ("standard", "guided")

@@ -131,6 +131,22 @@ shortcuts = _report(
 )
 
 
+def _cases(workspace: Workspace) -> Files:
+    from traps_pipeline.report.cases import cases_files
+
+    return cases_files(workspace, clips="..")
+
+
+cases = _report(
+    "cases",
+    _cases,
+    "What the paper describes in words, in this study's own answers side by side: inverted calibration, voids that "
+    "guided prompting flips, visual against textual voids, thinking against not thinking.",
+    deps=["items", "responses", "verdicts"],
+    kinds=["html", "csv"],
+)
+
+
 # --- tables and figures of the catalogue ------------------------------------------------------------------------------
 
 
@@ -185,6 +201,17 @@ report_page = _report(
     _page,
     "The report: leaderboard, figures and tables beside the paper's, every number linked to its items (HTML that opens "
     "from disk); the leaderboard as Markdown.",
-    deps=["items", "responses", "votes", "verdicts", "leaderboard", "robust", "contact_sheet", "shortcuts", *PRINTED],
+    deps=[
+        "items",
+        "responses",
+        "votes",
+        "verdicts",
+        "leaderboard",
+        "robust",
+        "contact_sheet",
+        "shortcuts",
+        "cases",
+        *PRINTED,
+    ],
     kinds=["html"],
 )

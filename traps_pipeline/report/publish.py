@@ -10,6 +10,7 @@ import pandas as pd
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.files import write_bytes
 from traps_pipeline.partitions import DATASETS, Cell
+from traps_pipeline.report.cases import cases_files
 from traps_pipeline.report.catalogue import FIGURES, INSIDE, RECOMPUTED, TABLES
 from traps_pipeline.report.contact_sheet import PAGE as SIX_PAIRS
 from traps_pipeline.report.contact_sheet import pairs_figure, six_pairs
@@ -107,6 +108,9 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
         write_bytes(target / path, content)
         written.append(path)
         pictures |= {path: content} if path.endswith(".png") else {}
+    for path, content in cases_files(workspace, clips=None).items():
+        write_bytes(target / path, content)
+        written.append(path)
     cells = write_item_pages(workspace, target / FOLDER, clips=None)
     say(f"items of {len(cells)} cells")
     pages = report_files(study, cells, pictures)

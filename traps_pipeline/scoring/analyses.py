@@ -313,8 +313,8 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
     columns = {"acc": groups["acc"].mean(), "n_pairs": groups["n_pairs"].max(), "n_models": groups["model"].nunique()}
     table = pd.DataFrame(columns | {"n_missing": groups["n_missing"].sum()})
     table = table.reset_index()
-    parts = table["scope"].astype("str").str.partition("/")
-    return table.assign(sub_scenario=parts[0], label=parts[2]).drop(columns="scope")
+    parts = [str(scope).partition("/") for scope in table["scope"]]
+    return table.assign(sub_scenario=[p[0] for p in parts], label=[p[2] for p in parts]).drop(columns="scope")
 
 
 # --- helpers ----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,54 @@
+"""The table of the paper's items names files and tests that exist, and every departure says where it is told."""
+
+from __future__ import annotations
+
+import ast
+from functools import cache
+
+import pytest
+
+from tests.paper_items import PAGE, ROOT, STATUSES, items, page
+
+ITEMS = items()
+
+
+@cache
+def tests_of(path: str) -> set[str]:
+    """The names of the tests in a file; those that are skipped or expected to fail are none."""
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    found = [node for node in tree.body if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    marked = {node.name for node in found for mark in node.decorator_list if {"skip", "xfail"} & _names(mark)}
+    return {node.name for node in found if node.name.startswith("test_")} - marked
+
+
+def _names(node: ast.AST) -> set[str]:
+    return {part.attr for part in ast.walk(node) if isinstance(part, ast.Attribute)}
+
+
+def test_the_215_items_are_numbered_in_order() -> None:
+    assert [int(row["n"]) for row in ITEMS] == list(range(1, 216))
+    assert {row["status"] for row in ITEMS} <= set(STATUSES)
+
+
+@pytest.mark.parametrize("row", ITEMS, ids=lambda row: row["n"])
+def test_an_items_place_and_test_exist(row: dict[str, str]) -> None:
+    assert not row["place"] or (ROOT / row["place"]).is_file()
+    path, _, name = row["test"].partition("::")
+    assert not row["test"] or name in tests_of(path)
+    if row["status"] == "there":
+        assert row["place"] and row["test"]
+    else:
+        assert row["note"]
+
+
+def test_a_departure_says_where_a_reader_is_told() -> None:
+    untold = [
+        row["n"]
+        for row in ITEMS
+        if row["status"] == "departs" and not any(word in row["note"] for word in ("docs/", "waiver", "says", "here"))
+    ]
+    assert not untold
+
+
+def test_the_page_is_what_the_data_give() -> None:
+    assert PAGE.read_text(encoding="utf-8") == page()
