@@ -2,7 +2,8 @@
 steering shows it again for every direction and dose.
 
 Only classes whose features come clip by clip are remembered (Qwen3-VL); others run as they are. A clip is known by the
-bytes of its pixels and its grid, so that a re-rendered clip is another one.
+bytes of its pixels and its grid, so that a re-rendered clip is another one. Whoever changes the weights of a vision
+tower in memory must give the model a new `ClipMemory`.
 """
 
 from __future__ import annotations
