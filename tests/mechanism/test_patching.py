@@ -12,6 +12,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching import SITES, Patch, Recorded, patched_changes, record, require_patchable
 from traps_pipeline.models.local.adapter import LocalModel, Prompt
+from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.spans import PARTS, spans
 
 pytestmark = pytest.mark.slow
@@ -57,6 +58,7 @@ def test_without_the_deepstack_features_all_positions_do_not_give_the_source() -
     with torch.no_grad():
         for merger in mergers:
             merger.linear_fc2.weight.mul_(100)
+    model("qwen3-vl").clips = ClipMemory()  # what is remembered is of other weights
     try:
         of, target, source, tokens, *_ = pair("qwen3-vl")
         own = {"deepstack_visual_embeds": target.inputs["deepstack_visual_embeds"]}
@@ -69,6 +71,7 @@ def test_without_the_deepstack_features_all_positions_do_not_give_the_source() -
         with torch.no_grad():
             for merger in mergers:
                 merger.linear_fc2.weight.div_(100)
+        model("qwen3-vl").clips = ClipMemory()
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -206,7 +206,9 @@ def _make(
 
 def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling) -> States:
     """The states of an item, pooled over the tokens that the pooling names."""
-    return model.forward_states(prompt, pooling, chosen=_chosen(model, prompt, item, pooling))
+    chosen = _chosen(model, prompt, item, pooling)
+    with model.remembering_clips():
+        return model.forward_states(prompt, pooling, chosen=chosen)
 
 
 def _chosen(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooling) -> np.ndarray | None:

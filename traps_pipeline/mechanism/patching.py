@@ -111,6 +111,7 @@ def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int]) -> Recorded
         hooks.callback(decoder.register_forward_pre_hook(keep_inputs, with_kwargs=True).remove)
         for site, layer, module in _sites(model):
             hooks.callback(module.register_forward_hook(partial(keep, site, layer)).remove)
+        hooks.enter_context(model.remembering_clips())
         last = model.forward(prompt).last_hidden_state[:, -1]
         states["residual", 0] = inputs["inputs_embeds"][0].clone()
         return Recorded(inputs, states, float(first_token_margins(model, last, tokens)[0]))

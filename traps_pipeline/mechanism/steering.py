@@ -270,7 +270,8 @@ class SteeredBackend(LocalBackend):
                 vectors = np.stack([self._vectors[steering["direction"]] for steering in along])
                 hook = Steering(vectors, group, tuple(float(steering["alpha"]) for steering in along))
             most = requests[0].params["max_new_tokens"]
-            made = model.generate(prompts, most, None, hook, stopped=batch.abandoned.is_set)
+            with model.remembering_clips():
+                made = model.generate(prompts, most, None, hook, stopped=batch.abandoned.is_set)
             for number, one in zip(numbers, made, strict=True):
                 counts = (one.prompt_tokens, one.completion_tokens)
                 outcomes[number] = outcome(one.text, one.finish_reason, *counts, model.served_model)

@@ -15,6 +15,7 @@ from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.local.capture import Pooling, capturing
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
+from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompts import Prompt, batches, collate
 from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
@@ -70,6 +71,7 @@ class LocalModel:
         self.dtype, self.quantisation = params.dtype, params.quantisation
         self.blocks, self.norm = _decoder_parts(network, checkpoint.name)
         self.n_layers, self.d_model = len(self.blocks), int(network.config.get_text_config().hidden_size)
+        self.clips = ClipMemory()
         self._processing = Lock()  # tokenizers are not for several threads at once
         network.generation_config = self._plain_generation()
 
@@ -170,6 +172,10 @@ class LocalModel:
                 f"({text[:200]!r}); give `params.template` the variables it wants, or the checkpoint another template"
             )
         return text
+
+    def remembering_clips(self) -> AbstractContextManager[None]:
+        """Inside, the vision tower sees each clip once (`clips`)."""
+        return self.clips.remembering(self.network)
 
     # --- hidden states ------------------------------------------------------------------------------------------------
 

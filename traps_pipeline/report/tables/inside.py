@@ -75,6 +75,7 @@ def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
 
     keys = ["model", "prompt", "analysis", "source", "target"]
     rows = results.baselines
+    probe = (probe if len(rows) else probe.head(0)).astype({"prompt": object})
     wide = rows.pivot_table(index=keys, columns="features", values="value", observed=True)
     wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise"])).reset_index()
     noise = rows.loc[rows["features"] == "noise", [*keys, "spread"]].rename(columns={"spread": "noise_spread"})
