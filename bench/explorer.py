@@ -29,7 +29,7 @@ from traps_pipeline.benchmark.specs import build_specs
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.explorer.site import write_site
 from traps_pipeline.judging.tables import VERDICTS, VOTES
-from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.judging.verdicts import ITEM_COLUMNS, RESPONSE_COLUMNS, decide
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import CATEGORIES, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.scenes.encode import encode, frames_digest
@@ -112,7 +112,7 @@ def made_study(folder: Path, models: int) -> Workspace:
         for dataset in DATASETS:
             cell = Cell(dataset, evaluation)
             responses, votes = _cell(items.loc[items["dataset"] == dataset], cell, seed=number)
-            own = decide(items, responses, votes)
+            own = decide(items[ITEM_COLUMNS], responses[RESPONSE_COLUMNS], votes)
             for table, rows in ((RESPONSES, responses), (VOTES, votes), (VERDICTS, own)):
                 _write(workspace, table, cell.partition, rows)
             verdicts.append(own)
@@ -278,12 +278,12 @@ def measure(site: Path, pairs: list[tuple[str, str]], say: Callable[[str, float,
         page.evaluate(PAINTED, ".answers .answer")
         changes = [
             ("choice-outcome", "confabulated"), ("choice-side", "void"), ("choice-regime", "guided"),
-            ("choice-model", "model-07"), ("choice-dataset", "chaotic"), ("choice-outcome", ""), ("choice-model", ""),
+            ("choice-model", "model-01"), ("choice-dataset", "chaotic"), ("choice-outcome", ""), ("choice-model", ""),
             ("choice-dataset", ""), ("choice-side", ""), ("choice-regime", ""),
         ]  # fmt: skip
         say("a further filter, slowest", max(page.evaluate(FILTERED, list(each)) for each in changes), 100, "ms")
         chosen = random.Random(1).sample(pairs, 30)
-        address = "#/pair/{}/{}?model=model-03&regime=standard&run=1&model2=model-12&regime2=guided&run2=2"
+        address = "#/pair/{}/{}?model=model-00&regime=standard&run=1&model2=model-01&regime2=guided&run2=2"
         times = [page.evaluate(PAIR, address.format(*pair)) for pair in chosen]
         say("a pair page, median", statistics.median(times), 300, "ms")
         say("a pair page, slowest of 30", max(times), 300, "ms")
@@ -296,7 +296,7 @@ def measure(site: Path, pairs: list[tuple[str, str]], say: Callable[[str, float,
         say("memory after the search", memory_mb(), 600, "MB")
         for hash_, what in (
             ("#/matrix", "families x models"),
-            ("#/model/model-03", "a model's page"),
+            ("#/model/model-01", "a model's page"),
             ("#/compare", "compare"),
         ):
             page.goto("about:blank")
