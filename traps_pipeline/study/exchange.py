@@ -13,7 +13,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.models.answers import prepare_media, wanted_questions
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.participants import ledger_row
-from traps_pipeline.models.registry import Entry, ModelEntry, get_model, load_models
+from traps_pipeline.models.registry import Entry, ModelEntry, account_of, get_model, load_models
 from traps_pipeline.models.request import WITH_TEXT, Outcome, OutcomeKind, Request
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell, Evaluation
@@ -223,10 +223,19 @@ def _wanted_votes(workspace: Workspace, experiment: Experiment) -> Iterator[tupl
         yield from ((cell, ballot.request) for ballot in wanted_ballots(workspace, panel, cell))
 
 
+def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
+    if outcome.cost_usd is None:
+        return outcome
+    return replace(outcome, cost_usd=outcome.cost_usd * account_of(entry).batch_price)
+
+
 def _import_batch(
     workspace: Workspace, ledger: Ledger, entries: Mapping[str, Entry], wanted: Mapping[str, Request], path: Path
 ) -> Imported:
-    found = [_Stored(*pair, 0.0) for pair in outcomes_of(entries, wanted, read_batch(path, wanted))]
+    found = [
+        _Stored(request, _at_batch_price(entries[request.participant], outcome), 0.0)
+        for request, outcome in outcomes_of(entries, wanted, read_batch(path, wanted))
+    ]
     new = asyncio.run(_store(workspace, ledger, found))
     failed = sum(one.outcome.kind in ("error", "malformed") for one in found)
     return Imported(new, len(found) - new - failed, failures([one.outcome for one in found]))
