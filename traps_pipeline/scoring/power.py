@@ -1,9 +1,9 @@
 """How precise a study will be before it is run: the width of PECS's interval, and the difference that can be found.
 
 The delta method on PECS = Acc x (AbsRec - FalseAbs) of each dataset, for answers that are drawn independently. An
-answer that abstains is not correct, so the two shares of the controls exclude each other. The overall figure is the mean over
-datasets. Runs ask the same scenarios again and are not counted. Two datasets of one taxonomy share their clips: where
-answers to them go together, intervals are wider than this.
+answer that abstains is not correct, so the two shares of the controls exclude each other. The overall figure is the
+mean over datasets. Runs ask the same scenarios again and are not counted. Two datasets of one taxonomy share their
+clips: where answers to them go together, intervals are wider than this.
 """
 
 from __future__ import annotations
