@@ -45,7 +45,7 @@ def filled(table: Table[Row], **values: Any) -> Row:
 def make_study(root: Path) -> Workspace:
     """A workspace with clips, scene_specs, videos and items of four scenarios a taxonomy."""
     settings = MechanismSettings.model_validate(SETTINGS)
-    workspace = Workspace.create(root / "study", Study(mechanism=settings, scenarios=["a"]))
+    workspace = Workspace.create(root / "study", Study(panel="rules", mechanism=settings, scenarios=["a"]))
     rng, clips = np.random.default_rng(0), {}
     for taxonomy, category in CATEGORY.items():
         names = [f"{category}-{n}" for n in range(PAIRS)]

@@ -28,7 +28,7 @@ def test_without_experience_the_registrys_estimates_stand() -> None:
     assert low == pytest.approx((2875 + 4000) / 1e6)
     assert expected == pytest.approx((2875 + 10_000) / 1e6)
     assert high == pytest.approx((2500 + 1500 + 200 + 80_000) / 1e6)
-    assert seen.minutes == pytest.approx(240 * 10 / 24 / 60)
+    assert seen.minutes == pytest.approx(240 * (4 + 1000 / 60) / 24 / 60)  # at 60 tokens a second after 4 s
 
 
 def test_experience_comes_before_estimates() -> None:

@@ -155,3 +155,22 @@ except TrapsError as error:
     assert raised == "(356, 400)"
     assert "200 connections at once need 456 open files, and this shell allows 400" in refused
     assert "`ulimit -n 456`" in refused
+
+
+def test_five_connections_in_a_row_that_are_not_made_over_twelve_seconds_stop_a_model_and_name_its_address(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [1000.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    breaker = Breaker("m", "http://127.0.0.1:8000/v1")
+    for _ in range(24):  # all connections at once, while the server is started again
+        breaker.no_connection()
+    now[0] += 11
+    breaker.no_connection()
+    breaker.connected()  # it is back
+    now[0] += 100
+    for _ in range(5):
+        breaker.no_connection()
+    now[0] += 12
+    with pytest.raises(Stopped, match=r"m is stopped: 6 connections in a row to http://127\.0\.0\.1:8000/v1 were not"):
+        breaker.no_connection()

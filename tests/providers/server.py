@@ -203,15 +203,16 @@ _ASKS_COLOURS = "which two colours does the clip show"
 
 
 def _colours(clips: Sequence[Json]) -> tuple[str, ...]:
-    """The strongest colour of the first and of the last frame of OpenAI's images or of its video."""
+    """The strongest colour of the first and of the last frame of images or of a video."""
     import cv2
     import numpy as np
 
     frames = list[Any]()
     for clip in clips:
+        inline = _either(clip, "inlineData") or {}  # Gemini's
         uri = (clip.get("image_url") or clip.get("video_url") or {}).get("url", "")
-        data = base64.b64decode(uri.partition(",")[2])
-        if "video" not in uri[:16]:
+        data = base64.b64decode(inline.get("data") or uri.partition(",")[2])
+        if "video" not in uri[:16] and "video" not in str(_either(inline, "mimeType")):
             frames.append(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
             continue
         with tempfile.NamedTemporaryFile(suffix=".mp4") as file:

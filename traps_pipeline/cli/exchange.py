@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from traps_pipeline.cli.command import OK, Commands, experiment_of, open_workspace
+
+if TYPE_CHECKING:
+    from traps_pipeline.study.exchange import Imported
 
 
 def add(commands: Commands) -> None:
@@ -13,9 +18,18 @@ def add(commands: Commands) -> None:
     text = "write an experiment's missing calls and their media to a folder"
     parser = commands.noun("requests", "export calls to be made elsewhere").add("export", export_calls, text)
     parser.add_argument("experiment")
-    parser.add_argument("--out", type=Path, required=True, help="folder of requests.jsonl and media/")
+    parser.add_argument("--out", type=Path, required=True, help="folder of requests.jsonl and media/, or of batches/")
+    parser.add_argument("--batch", action="store_true", help="write the providers' own batch files, with media inline")
 
-    text = "import answers (JSON lines by key) into the ledger"
+    noun = commands.noun("votes", "have judges asked in batches")
+    parser = noun.add("export", export_votes, "write the votes that are missing as the judges' batch files")
+    parser.add_argument("experiment")
+    parser.add_argument("--out", type=Path, required=True, help="folder of batches/")
+    parser = noun.add("import", import_cast, "import a provider's batch of votes into the ledger")
+    parser.add_argument("experiment")
+    parser.add_argument("file", type=Path)
+
+    text = "import answers (JSON lines by key, or a provider's batch) into the ledger"
     parser = commands.noun("answers", "import answers from elsewhere").add("import", import_given, text)
     parser.add_argument("experiment")
     parser.add_argument("file", type=Path)
@@ -23,9 +37,12 @@ def add(commands: Commands) -> None:
 
 def export_calls(arguments: argparse.Namespace) -> int:
     """See `traps requests export --help`."""
-    from traps_pipeline.study.exchange import REQUESTS, export_requests
+    from traps_pipeline.study.exchange import REQUESTS, export_request_batches, export_requests
 
     experiment = experiment_of(arguments)
+    if arguments.batch:
+        files, count = export_request_batches(open_workspace(arguments), experiment, arguments.out.absolute())
+        return _exported(files, count, f"traps answers import {arguments.experiment}")
     count = export_requests(open_workspace(arguments), experiment, arguments.out.absolute())
     print(f"{count} requests in {arguments.out / REQUESTS}")
     print(f"next: have them answered, then traps answers import {arguments.experiment} ANSWERS.jsonl")
@@ -36,7 +53,37 @@ def import_given(arguments: argparse.Namespace) -> int:
     """See `traps answers import --help`."""
     from traps_pipeline.study.exchange import import_answers
 
-    imported = import_answers(open_workspace(arguments), experiment_of(arguments), arguments.file)
-    print(f"{imported.new} answers imported, {imported.known} were there already")
+    experiment = experiment_of(arguments)
+    return _imported(import_answers(open_workspace(arguments), experiment, arguments.file), arguments, "answers")
+
+
+def export_votes(arguments: argparse.Namespace) -> int:
+    """See `traps votes export --help`."""
+    from traps_pipeline.study.exchange import export_vote_batches
+
+    experiment = experiment_of(arguments)
+    files, count = export_vote_batches(open_workspace(arguments), experiment, arguments.out.absolute())
+    return _exported(files, count, f"traps votes import {arguments.experiment}")
+
+
+def import_cast(arguments: argparse.Namespace) -> int:
+    """See `traps votes import --help`."""
+    from traps_pipeline.study.exchange import import_votes
+
+    experiment = experiment_of(arguments)
+    return _imported(import_votes(open_workspace(arguments), experiment, arguments.file), arguments, "votes")
+
+
+def _exported(files: Sequence[Path], count: int, command: str) -> int:
+    for file in files:
+        print(file)
+    print(f"{count} calls in {len(files)} files\nnext: have them answered, then {command} RESULTS.jsonl for each file")
+    return OK
+
+
+def _imported(imported: Imported, arguments: argparse.Namespace, what: str) -> int:
+    print(f"{imported.new} {what} imported, {imported.known} were there already")
+    if imported.failed:
+        print(f"failed and still missing: {imported.failed}")
     print(f"next: traps run {arguments.experiment}")
     return OK

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from traps_pipeline.cli.command import (
@@ -51,7 +51,8 @@ def plan(arguments: argparse.Namespace) -> int:
     headings = ("model", "answers", "known", "new", "votes", "known", "new")
     print(text_table(headings, [_plan_row(name, counts) for name, counts in [*rows.items(), ("all", total)]]))
     if planned.forecasts:
-        _print_forecasts(planned.forecasts)
+        _print_forecasts(planned.forecasts, planned.minutes)
+    _print_precision(planned.pairs)
     if planned.uncertain:
         print(
             f"This is an upper bound: the items of {', '.join(planned.uncertain)} are missing or outdated, so all of "
@@ -64,11 +65,23 @@ def _plan_row(name: str, counts: tuple[Count, Count]) -> list[str]:
     return [name, *(f"{number:,}" for count in counts for number in (count.wanted, count.known, count.new))]
 
 
-def _print_forecasts(forecasts: Sequence[Forecast]) -> None:
+def _print_precision(pairs: Mapping[str, int]) -> None:
+    from traps_pipeline.scoring.power import Shares, precision
+
+    if any(pairs.values()):
+        found, middling = precision([*pairs.values()]), Shares()
+        print(
+            f"\nprecision with {sum(pairs.values()):,} pairs: a model with Acc {middling.acc:.0%}, AbsRec "
+            f"{middling.abs_rec:.0%}, FalseAbs {middling.false_abs:.0%} (PECS {middling.pecs:.2f}) gets a 95 % "
+            f"interval of PECS about {found.width:.3f} wide; of two models with unrelated answers a difference of "
+            f"{found.difference:.3f} is found in 80 % of studies"
+        )
+
+
+def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     """Print tokens, dollars and minutes of the new calls over the network; the sum leaves out unknown prices."""
     known = [row.dollars for row in forecasts if row.dollars is not None]
     total = (sum(d[0] for d in known), sum(d[1] for d in known), sum(d[2] for d in known))
-    longest = max(row.minutes for row in forecasts)
     calls = sum(row.calls for row in forecasts)
     rows = [
         (
@@ -80,9 +93,12 @@ def _print_forecasts(forecasts: Sequence[Forecast]) -> None:
         )
         for row in forecasts
     ]
-    rows.append(("all, side by side", f"{calls:,}", "", *_dollars(total), f"{longest:,.0f}"))
+    rows.append(("all: models, then judges", f"{calls:,}", "", *_dollars(total), f"{minutes:,.0f}"))
     headings = ("over the network", "new calls", "M tokens in, out", "USD low", "expected", "high", "minutes")
     print(f"\n{text_table(headings, rows)}")
+    in_batches = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
+    if in_batches < total[1]:
+        print(f"expected if all calls are made in batches (traps requests export --batch): USD {in_batches:,.2f}")
     if len(known) < len(forecasts):
         unknown = ", ".join(row.participant for row in forecasts if row.dollars is None)
         print(f"price unknown, not in the sum: {unknown}")

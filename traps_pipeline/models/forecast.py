@@ -13,7 +13,8 @@ from traps_pipeline.models.registry import Entry, ModelEntry, load_accounts
 from traps_pipeline.storage.ledger import AVERAGED, Totals
 
 TYPICAL_TEXT_BYTES = 1500  # system prompt, question and, for a judge, the answer
-TYPICAL_LATENCY_S = 10.0
+# Until the ledger holds a call: seconds to the first token of an answer about a clip, and completion tokens a second.
+FIRST_TOKEN_S, TOKENS_A_S = 4.0, 60.0
 TYPICAL_BYTES_A_TOKEN = 4
 LOW_SHARE = 0.4  # of the expected completion: what a terse model takes
 
@@ -37,6 +38,7 @@ class Forecast:
     completion_tokens: int
     dollars: tuple[float, float, float] | None
     minutes: float
+    batch_price: float = 1.0  # of a call in a batch, relative to a live one
 
 
 def experience(totals: Iterable[Totals]) -> Experience:
@@ -58,9 +60,9 @@ def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
         cost = entry.prices.cost
         low, expected = cost(prompt, LOW_SHARE * completion), cost(prompt, completion)
         dollars = (calls * low, calls * expected, calls * max(expected, cost(most_prompt, entry.max_tokens)))
-    return Forecast(
-        entry.id, calls, round(calls * prompt), round(calls * completion), dollars, _minutes(entry, calls, seen, prompt)
-    )
+    minutes = _minutes(entry, calls, seen, prompt, completion)
+    batch_price = load_accounts()[str(entry.account)].batch_price
+    return Forecast(entry.id, calls, round(calls * prompt), round(calls * completion), dollars, minutes, batch_price)
 
 
 def _media_tokens(entry: Entry) -> int:
@@ -69,9 +71,10 @@ def _media_tokens(entry: Entry) -> int:
     return entry.tokens_per_frame * (entry.media.uniform or entry.media.most)
 
 
-def _minutes(entry: Entry, calls: int, seen: Experience, prompt_tokens: float) -> float:
+def _minutes(entry: Entry, calls: int, seen: Experience, prompt_tokens: float, completion_tokens: float) -> float:
     """Minutes at the entry's concurrency and its account's pace, whichever is slower."""
-    minutes = [calls * (seen.latency_s or TYPICAL_LATENCY_S) / entry.limits.concurrency / 60]
+    latency_s = seen.latency_s or FIRST_TOKEN_S + completion_tokens / TOKENS_A_S
+    minutes = [calls * latency_s / entry.limits.concurrency / 60]
     account = load_accounts()[str(entry.account)]
     if account.requests_per_minute:
         minutes.append(calls / account.requests_per_minute)

@@ -69,6 +69,9 @@ class Account(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     key: str | None = Field(default=None, pattern=r"^[A-Z][A-Z0-9_]*$", description="environment variable of the key")
     base_url: str | None = Field(default=None, description="of an OpenAI-compatible endpoint")
+    batch_price: float = Field(
+        default=1.0, gt=0, le=1, description="price of a call in a batch, relative to a live one"
+    )
     requests_per_minute: int | None = Field(default=None, ge=1)
     tokens_per_minute: int | None = Field(default=None, ge=1)
 

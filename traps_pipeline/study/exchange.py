@@ -11,9 +11,9 @@ import json
 import secrets
 import shutil
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,18 @@ from traps_pipeline import progress
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import replacing, sync_folder, write_bytes
+from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.models.answers import prepare_media, wanted_questions
+from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.participants import ledger_row
-from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.models.registry import Entry, ModelEntry, account_of, get_model, load_models
 from traps_pipeline.models.request import WITH_TEXT, Outcome, OutcomeKind, Request
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.ledger import Ledger, settles
 from traps_pipeline.storage.rows import MOST_TOKENS
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.study.batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.study.experiment import Experiment
 from traps_pipeline.terminal import plain
 from traps_pipeline.yamlfile import explain, read_lines
@@ -74,10 +78,27 @@ class Answer(BaseModel):
 
 @dataclass(frozen=True)
 class Imported:
-    """The result of an import: the numbers of new answers, and of answers that the ledger had already."""
+    """The result of an import: the numbers of new answers, and of answers that the ledger had already; the calls that
+    failed, in words, which stay missing."""
 
     new: int
     known: int
+    failed: str = ""
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """What came of a request, with the seconds that it took."""
+
+    request: Request
+    outcome: Outcome
+    latency_s: float
+
+    @property
+    def evaluation(self) -> Evaluation:
+        """The evaluation in whose ledger it stands."""
+        about = self.request.about
+        return Evaluation(str(about["model"]), str(about["regime"]), int(about["run"]))
 
 
 def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> int:
@@ -151,13 +172,73 @@ def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> 
     prepare_media(workspace, cells)
     requests = [question.request for cell in cells for question in wanted_questions(workspace, cell)]
     wanted = {request.key: request for request in requests}
+    if is_batch(path):
+        return _import_batch(workspace, workspace.answers, load_models(), wanted, path)
     answers = checked_answers(path, wanted)
-    by_evaluation: defaultdict[Evaluation, list[Answer]] = defaultdict(list)
-    for key, answer in answers.items():
-        about = wanted[key].about
-        by_evaluation[Evaluation(str(about["model"]), str(about["regime"]), int(about["run"]))].append(answer)
-    new = asyncio.run(_store(workspace, by_evaluation, wanted))
+    found = [
+        _Stored(wanted[key], answer.as_outcome(get_model(wanted[key].participant)), answer.latency_s)
+        for key, answer in answers.items()
+    ]
+    new = asyncio.run(_store(workspace, workspace.answers, found))
     return Imported(new, len(answers) - new)
+
+
+def export_request_batches(workspace: Workspace, experiment: Experiment, out: Path) -> tuple[list[Path], int]:
+    """Write the experiment's missing requests as the providers' batch files (`study.batch`); the files, and the number
+    of calls."""
+    prepare_media(workspace, _cells(workspace, experiment))
+    missing: dict[str, list[Request]] = {}
+    for request in _missing(workspace, experiment):
+        missing.setdefault(request.participant, []).append(request)
+    return export_batches({name: (get_model(name), requests) for name, requests in missing.items()}, out)
+
+
+def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path) -> tuple[list[Path], int]:
+    """Write the votes that are missing on the experiment's answers as the judges' batch files; the files, and the
+    number of calls. Raises TrapsError where answers are missing."""
+    missing: dict[str, list[Request]] = {}
+    known: dict[Evaluation, set[str]] = {}
+    for cell, request in _wanted_votes(workspace, experiment):
+        if cell.evaluation not in known:
+            known[cell.evaluation] = {*workspace.votes.read(cell.evaluation.key).settled}
+        if request.key not in known[cell.evaluation]:
+            missing.setdefault(request.participant, []).append(request)
+    judges = load_judges()
+    return export_batches({name: (judges[name], requests) for name, requests in missing.items()}, out)
+
+
+def import_votes(workspace: Workspace, experiment: Experiment, path: Path) -> Imported:
+    """Import a batch of votes into their ledger; `traps run` then makes tables from them. Raises TrapsError as
+    `import_answers` does."""
+    wanted = {request.key: request for _, request in _wanted_votes(workspace, experiment)}
+    return _import_batch(workspace, workspace.votes, load_judges(), wanted, path)
+
+
+def _wanted_votes(workspace: Workspace, experiment: Experiment) -> Iterator[tuple[Cell, Request]]:
+    panel = load_panel(workspace.study.panel)
+    cells = [cell for cell in _cells(workspace, experiment) if workspace.tables.state(RESPONSES, cell.partition)]
+    if not cells:
+        raise TrapsError(f"{workspace.root}: no answers yet; make responses first (traps run ... --until responses)")
+    for cell in cells:
+        yield from ((cell, ballot.request) for ballot in wanted_ballots(workspace, panel, cell))
+
+
+def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
+    if outcome.cost_usd is None:
+        return outcome
+    return replace(outcome, cost_usd=outcome.cost_usd * account_of(entry).batch_price)
+
+
+def _import_batch(
+    workspace: Workspace, ledger: Ledger, entries: Mapping[str, Entry], wanted: Mapping[str, Request], path: Path
+) -> Imported:
+    found = [
+        _Stored(request, _at_batch_price(entries[request.participant], outcome), 0.0)
+        for request, outcome in outcomes_of(entries, wanted, read_batch(path, wanted))
+    ]
+    new = asyncio.run(_store(workspace, ledger, found))
+    failed = sum(one.outcome.kind in ("error", "malformed") for one in found)
+    return Imported(new, len(found) - new - failed, failures([one.outcome for one in found]))
 
 
 def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answer]:
@@ -183,25 +264,25 @@ def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answ
     return answers
 
 
-async def _store(
-    workspace: Workspace, answers: Mapping[Evaluation, list[Answer]], wanted: Mapping[str, Request]
-) -> int:
+async def _store(workspace: Workspace, ledger: Ledger, found: Sequence[_Stored]) -> int:
     """Store what the ledger does not hold, all of it or nothing: it is written beside the ledger first and then moved
-    in, which takes no more space; how many."""
-    ledger, new = workspace.answers, 0
+    in, which takes no more space; the number of new answers. A failed call is stored, too, and is asked again."""
+    new, by_evaluation = 0, defaultdict[Evaluation, list[_Stored]](list)
+    for one in found:
+        by_evaluation[one.evaluation].append(one)
     staged = Ledger(ledger.root / f"importing-{secrets.token_hex(4)}", ledger.kind)
     async with AsyncExitStack() as locks:
-        for evaluation in sorted(answers):
+        for evaluation in sorted(by_evaluation):
             await locks.enter_async_context(ledger.lock(evaluation.key, progress.current().note))
         try:
-            for evaluation, mine in answers.items():
-                known, entry = ledger.read(evaluation.key).settled, get_model(evaluation.model)
+            for evaluation, mine in by_evaluation.items():
+                known = ledger.read(evaluation.key).settled
                 with staged.writer(evaluation.key) as writer:
-                    for answer in mine:
-                        if answer.key not in known:
-                            outcome, new = answer.as_outcome(entry), new + 1
-                            row = ledger_row(wanted[answer.key], outcome, 1, answer.latency_s, workspace.study.epoch)
+                    for one in mine:
+                        if one.request.key not in known:
+                            row = ledger_row(one.request, one.outcome, 1, one.latency_s, workspace.study.epoch)
                             writer.append(*row)
+                            new += settles(row[0])
             # What stands beside rows goes first: a row without its reasoning would be taken for one that has none.
             for path in sorted(staged.root.rglob("*.jsonl*"), key=lambda path: path.suffix == ".jsonl"):
                 target = ledger.root / path.relative_to(staged.root)

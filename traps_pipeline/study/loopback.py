@@ -8,13 +8,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import repeat
 from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.registry import Account, Entry, load_accounts
-from traps_pipeline.models.request import Request, TransientError
+from traps_pipeline.models.request import MALFORMED, Outcome, Request, TransientError
 from traps_pipeline.progress import Progress, reporting
 from traps_pipeline.study.wire_body import WireBody
 
@@ -40,17 +41,22 @@ class _Notes(Progress):
         self.texts.append(text)
 
 
+_CAUGHT = (400, b'{"error": {"message": "caught", "type": "invalid_request_error", "code": 400}}')
+
+
 @contextmanager
-def _listening() -> Iterator[tuple[str, list[WireBody]]]:
-    """A server on this machine: its address and the requests that reach it. Each is answered with a final 400."""
+def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple[str, list[WireBody]]]:
+    """A server on this machine: its address and the requests that reach it. Each gets the next of these answers, a
+    status and JSON, or a final 400."""
     caught: list[WireBody] = []
+    given = repeat(_CAUGHT) if answers is None else answers
 
     class Catcher(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             raw = self.rfile.read(int(self.headers.get("content-length") or 0))
             caught.append(WireBody(self.command, self.path, dict(self.headers), raw))
-            answer = b'{"error": {"message": "caught", "type": "invalid_request_error", "code": 400}}'
-            self.send_response(400)
+            status, answer = next(given, _CAUGHT)
+            self.send_response(status)
             self.send_header("content-type", "application/json")
             self.send_header("content-length", str(len(answer)))
             self.end_headers()
@@ -80,6 +86,25 @@ def _no_proxy(host: str) -> Iterator[None]:
     finally:
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[int, bytes]]) -> list[Outcome]:
+    """The outcome of each request if its provider answered it with this status and JSON."""
+    account = load_accounts()[str(entry.account)]
+    with _listening(iter(answers)) as (address, _), reporting(_Notes()):
+        loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)
+        backend = ApiBackend(entry, loopback)
+
+        async def read(request: Request) -> Outcome:
+            try:
+                return await backend.ask(request)
+            except TransientError as error:
+                return Outcome("malformed" if error.kind == MALFORMED else "error", error=error.kind, raw=error.raw)
+
+        async def read_all() -> list[Outcome]:
+            return [await read(request) for request in requests]  # one after the other: answers come in order
+
+        return asyncio.run(read_all())
 
 
 def render(entry: Entry, requests: Sequence[Request]) -> list[WireBody | str]:

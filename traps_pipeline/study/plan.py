@@ -60,13 +60,22 @@ class Plan:
     """The calls of an experiment. calls: answers and votes by model. uncertain: datasets whose items are not current;
     since their items may change, all of their calls are counted as new, which is an upper bound. forecasts: tokens,
     dollars and minutes of the new calls over the network, by model and judge. labels: calls to the confabulation judge;
-    None if the study's panel has none. steered: answers of steered models and votes on them, by model."""
+    None if the study's panel has none. steered: answers of steered models and votes on them, by model. pairs: how many
+    there are, by dataset."""
 
     calls: Mapping[str, tuple[Count, Count]]
     uncertain: Sequence[str]
     forecasts: Sequence[Forecast]
     labels: Count | None
     steered: Mapping[str, tuple[Count, Count]] = field(default_factory=dict)
+    pairs: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def minutes(self) -> float:
+        """Of all calls: models are asked side by side, and then judges."""
+        models = [row.minutes for row in self.forecasts if row.participant in self.calls]
+        judges = [row.minutes for row in self.forecasts if row.participant not in self.calls]
+        return max(models, default=0.0) + max(judges, default=0.0)
 
 
 def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study) -> Plan:
@@ -79,6 +88,12 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study)
     new: list[tuple[Entry, int]] = [(get_model(model), answers.new) for model, (answers, _) in calls.items()]
     new += [(judge, votes // len(panel)) for judge in panel]
     new = [(entry, count) for entry, count in new if entry.backend == NETWORK]
+    of_category = Counter(s.category for s in load_scenarios(study).values())
+    pairs = {
+        dataset: sum(n for category, n in of_category.items() if dataset in datasets_of_category(category))
+        for dataset in DATASETS
+        if dataset in experiment.datasets
+    }
     ledgers = [ledger.totals() for ledger in (workspace.answers, workspace.votes)] if workspace else []
     forecasts = [
         forecast(entry, count, experience(totals[entry.id] for totals in ledgers if entry.id in totals))
@@ -86,10 +101,11 @@ def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study)
     ]
     judge = load_protocol().judge(study.panel)
     if judge is None:
-        return Plan(calls, uncertain, forecasts, None, steered)
+        return Plan(calls, uncertain, forecasts, None, steered, pairs)
     labels = _count_labels(workspace, experiment, judge)
     taken = forecast(judge, labels.new, Experience(prompt_tokens=LABEL_TOKENS))
-    return Plan(calls, uncertain, [*forecasts, replace(taken, participant="confabulation labels")], labels, steered)
+    forecasts.append(replace(taken, participant="confabulation labels"))
+    return Plan(calls, uncertain, forecasts, labels, steered, pairs)
 
 
 def _count_steered(workspace: Workspace | None, experiment: Experiment, study: Study) -> dict[str, tuple[Count, Count]]:

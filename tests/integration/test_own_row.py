@@ -1,0 +1,61 @@
+"""A row of one's own: a model and judges described in the experiment, a model that says dots, a panel that changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import SMALL, Checkout
+from tests.providers.server import Provider
+from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.slow
+
+
+def experiment(study: Checkout, url: str, panel: str) -> Path:
+    """Two models and three judges at a server, in four lines each or fewer."""
+    judges = "".join(f'  - {{id: judge-{k}, base_url: "{url}/v1"}}\n' for k in "abc")
+    scenarios = SMALL.read_text()[SMALL.read_text().index("scenarios:") :]
+    path = study.root / "own.yaml"
+    path.write_text(
+        "name: own\nmodels:\n"
+        f'  - {{id: seer, base_url: "{url}/v1", served_name: org/Seer-7B, media: images}}\n'
+        f'  - {{id: dots, base_url: "{url}/v1", media: images}}\n'
+        f"judges:\n{judges}panels: {{three: [judge-a, judge-b, judge-c], one: [judge-a]}}\npanel: {panel}\n"
+        f"regimes: [standard]\ndatasets: [occlusion]\n{scenarios}"
+    )
+    return path
+
+
+def board(study: Checkout) -> dict[str, dict[str, object]]:
+    rows = Workspace.open(study.workspace).tables.read(LEADERBOARD, {})
+    own = rows.loc[rows["model"].isin(["seer", "dots"]) & (rows["dataset"] == "occlusion")]
+    return {row["model"]: row for row in own.to_dict("records")}
+
+
+def test_a_model_that_says_dots_is_broken_and_not_modest_and_a_changed_panel_makes_exactly_its_own_stale(
+    unasked: Checkout, provider: Provider
+) -> None:
+    provider.configure(scripts={"dots": {"fall": "....."}})  # to every question about dominoes
+    finished = unasked.score(experiment(unasked, provider.url, "three"))
+    # The study's other experiments are not run; a panel other than the study's is a contradiction.
+    assert finished.code == 1 and "panel is 'rules', experiment own has 'three'" in finished.err
+    path = experiment(unasked, provider.url, "three")
+    finished = unasked.traps("run", path, "--panel", "three", "--until", "leaderboard")
+    assert finished.code == 0, finished.err
+    rows = board(unasked)
+    assert all(str(row["panel"]).startswith("three@") for row in rows.values())
+    assert rows["dots"]["is_broken"] and not rows["seer"]["is_broken"]
+    assert rows["dots"]["n_degenerate"] == rows["dots"]["n_missing"] and float(str(rows["dots"]["broken"])) > 0.2
+
+    path = experiment(unasked, provider.url, "one")
+    assert unasked.traps("init", path, "--panel", "one").code == 0
+    status = unasked.traps("status", "own").out.splitlines()
+    stale = {line.split()[0] for line in status if len(line.split()) == 4 and line.split()[2] not in ("0", "stale")}
+    assert {"votes", "verdicts", "metrics", "leaderboard"} <= stale and not {"responses", "items", "videos"} & stale
+    again = unasked.traps("run", path, "--until", "leaderboard")
+    assert again.code == 0, again.err
+    assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}  # judge-a has voted before
+    assert all(str(row["panel"]).startswith("one@") for row in board(unasked).values())
