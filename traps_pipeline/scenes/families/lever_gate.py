@@ -77,6 +77,7 @@ def build(p: Params, physics: Physics) -> Scene:
     stage.block("axle", *axle, "grey", solid=False)
     _add_lever(stage, p, side)
     stage.ball("ball", (-p.run_m + 1.2 * r, 0, top + r), r, p.ball_colour, speed=p.speed_m_s)
+    stage.mark("gate", (p.gate_at_m, side), p.gate_colour)  # below its place on the lever, open or shut
     return stage.scene(
         p,
         decisive=["ball"],

@@ -86,6 +86,7 @@ def build(p: Params, physics: Physics) -> Scene:
     high, covered = p.deck_m + 2 * r + 0.01, (p.mouth_m, end + WALL_M)
     across = (outer[0] - 0.01, outer[1] + 0.5 * high)
     highest = ramp.at(p.ramp_m)
+    stage.mark("box", "box_floor")
     return stage.scene(
         p,
         decisive=["ball"],
@@ -94,6 +95,7 @@ def build(p: Params, physics: Physics) -> Scene:
         in_view=[stage.box(covered, outer, deck), stage.box((highest[0], 0), deep, (0, highest[2]))],
         things=[f"{p.ball_colour} ball", f"{p.box_colour} box", "ramp", "deck"],
         also=["end"],
+        shown_by={"end": ["box"]},
     )
 
 
