@@ -22,6 +22,7 @@ MOST_YAML_BYTES, MOST_LINE_BYTES = 4 * 2**20, 4 * 2**20
 MOST_DEPTH, MOST_NODES, MOST_ALIASES = 40, 200_000, 200
 MOST_SAID = 300  # characters of a complaint
 _TAG = "tag:yaml.org,2002:"
+_STRINGS, _BRACKETS = re.compile(r'"(?:[^"\\]|\\.)*"'), re.compile(r"[\[{]+|[\]}]+")
 
 
 class _Strict(yaml.SafeLoader):
@@ -171,11 +172,14 @@ def _finite(text: str) -> float:
 
 
 def _depth(line: str) -> int:
-    """How deep brackets are nested at most; those inside strings count too, which no real line comes near with."""
+    """How deep brackets are nested at most; those inside strings do not count."""
     depth = most = 0
-    for char in re.sub(r'"(?:[^"\\]|\\.)*"', "", line):
-        depth += (char in "[{") - (char in "]}")
-        most = max(most, depth)
+    for run in _BRACKETS.findall(_STRINGS.sub("", line)):
+        if run[0] in "[{":
+            depth += len(run)
+            most = max(most, depth)
+        else:
+            depth -= len(run)
     return most
 
 
