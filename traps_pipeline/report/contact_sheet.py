@@ -42,7 +42,7 @@ class Layout:
 # For a screen, and for the width of a printed page, on which no text may be smaller than 6 points.
 SCREEN = Layout()
 PAGE = Layout(
-    block=1.98, header=0.72, gap=0.28, dpi=300, size=6.5, letters=41, questions=4, ids=False, moments=3
+    block=1.98, header=0.86, gap=0.28, dpi=300, size=6.5, letters=41, questions=4, ids=False, moments=3
 )  # fmt: skip
 
 
@@ -187,7 +187,8 @@ def draw_pair(
 
 
 def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
-    """Draw scenario and ground truth in bold, and the question below them; also the void's question if it differs."""
+    """Draw scenario and ground truth in bold (without ids the truth below), and the question below them; also the
+    void's question if it differs."""
     by_side = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
     same = by_side["control"] == by_side["void"]
     questions = [by_side["control"]] if same else [f"{side}: {question}" for side, question in by_side.items()]
@@ -195,8 +196,11 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **fit)]
     truth = pair.at["control", "ground_truth"]
     scenario, sub_scenario, dataset = (pair.at["control", c] for c in ("scenario_id", "sub_scenario", "dataset"))
-    title = f"{sub_scenario} ({dataset})   ground truth: {truth}"
-    title = f"{scenario}   {title}" if layout.ids else title
+    title = f"{sub_scenario} ({dataset})"
+    if layout.ids:
+        title = f"{scenario}   {title}   ground truth: {truth}"
+    else:  # a narrow block has the truth on a line of its own
+        lines.append(f"ground truth: {truth}")
     place: dict[str, Any] = {
         "xycoords": "axes fraction",
         "textcoords": "offset points",
