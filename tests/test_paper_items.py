@@ -13,7 +13,7 @@ ITEMS = items()
 
 
 @cache
-def tests_of(path: str) -> set[str]:
+def names_in(path: str) -> set[str]:
     """The names of the tests in a file; those that are skipped or expected to fail are none."""
     tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
     found = [node for node in tree.body if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
@@ -34,7 +34,7 @@ def test_the_215_items_are_numbered_in_order() -> None:
 def test_an_items_place_and_test_exist(row: dict[str, str]) -> None:
     assert not row["place"] or (ROOT / row["place"]).is_file()
     path, _, name = row["test"].partition("::")
-    assert not row["test"] or name in tests_of(path)
+    assert not row["test"] or name in names_in(path)
     if row["status"] == "there":
         assert row["place"] and row["test"]
     else:

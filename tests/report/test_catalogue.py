@@ -177,7 +177,7 @@ def test_the_published_leaderboard_is_the_papers():
     first = RECOMPUTED["overall"].cells[0]
     assert first[:3] == ["gemini-3.1-pro-r-low", "guided", "0.568"]
     assert first[-2:] == ["1354", "3"]
-    assert "mixed epochs (ch_ip: original; else corrected)" in RECOMPUTED["overall"].notes
+    assert "mixed epochs (ch_ip: original and verification; else corrected)" in RECOMPUTED["overall"].notes
     assert len(RECOMPUTED["overall"].rows) == 14 * 3
     assert len(RECOMPUTED["replication_overall"].rows) == 2 * 3
 
@@ -189,7 +189,7 @@ def test_the_published_analyses_are_the_papers():
     gaps = {row[0]: row for row in RECOMPUTED["visual_textual"].cells}
     assert gaps["gpt-5-mini"][4:7] == ["0.0", "9.1", "∞"]
     assert any("22 of 64 cells" in note for note in RECOMPUTED["pecs_naive"].notes)
-    assert BY_NAME["composition"].cells[-1] == ["", "Total", "", "1,404", ""]
+    assert BY_NAME["composition"].cells[-1] == ["Total", "", "", "1,404", ""]
     assert RECOMPUTED["frontier"].rows.query("regime == 'guided'")["model"].tolist() == [
         "gemini-3.1-pro",
         "gemini-3.1-pro-r-low",

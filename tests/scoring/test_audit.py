@@ -46,7 +46,7 @@ def test_a_defect_is_counted_once_and_a_declared_difference_is_not_a_defect(find
     assert findings["statement"].is_unique
     about = findings[findings["statement"].str.contains("alpha 0")]
     assert list(about.loc[about["verdict"] == "differs", "statement"].str.partition(":")[0]) == [
-        "steer-control", "steer-alpha0-families", "steer-alpha0-gemma", "sweep-alpha0",
+        "steer-control", "steer-void", "steer-alpha0-families", "steer-alpha0-gemma", "sweep-alpha0",
     ]  # fmt: skip
     declared = findings[findings["verdict"] == "declared"]
     assert declared["published"].tolist() == ["25", "39"]

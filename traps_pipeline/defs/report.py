@@ -137,6 +137,19 @@ def _cases(workspace: Workspace) -> Files:
     return cases_files(workspace, clips="..")
 
 
+def _worked_example(workspace: Workspace) -> Files:
+    from traps_pipeline.report.worked_example import worked_example
+    from traps_pipeline.report.writing import figure_bytes
+
+    return {"worked_example.png": figure_bytes(worked_example(workspace))}
+
+
+worked_example = _report(
+    "worked_example",
+    _worked_example,
+    "One pair with a model's answer to each side, how the panel read it, and the verdict.",
+    deps=["items", "responses", "votes", "verdicts"],
+)
 cases = _report(
     "cases",
     _cases,
@@ -210,6 +223,7 @@ report_page = _report(
         "robust",
         "contact_sheet",
         "shortcuts",
+        "worked_example",
         "cases",
         *PRINTED,
     ],

@@ -42,7 +42,7 @@ class Layout:
 # For a screen, and for the width of a printed page, on which no text may be smaller than 6 points.
 SCREEN = Layout()
 PAGE = Layout(
-    block=1.98, header=0.72, gap=0.28, dpi=300, size=6.5, letters=41, questions=4, ids=False, moments=3
+    block=1.98, header=0.86, gap=0.28, dpi=300, size=6.5, letters=41, questions=4, ids=False, moments=3
 )  # fmt: skip
 
 
@@ -73,8 +73,8 @@ def pairs_figure(
     pairs = chosen_pairs(items, per_family)
     columns = min(columns, len(pairs))
     with figure_style():
-        blocks = [_moments(pair, root, layout.moments) for pair in pairs]
-        heights = [layout.block * _ratio(control) + layout.header + FOOTER_IN for control, _, _ in blocks]
+        blocks = [moments_of(pair, root, layout.moments) for pair in pairs]
+        heights = [layout.block * ratio_of(control) + layout.header + FOOTER_IN for control, _, _ in blocks]
         rows = [max(heights[k : k + columns]) for k in range(0, len(heights), columns)]
         width, height = columns * (layout.block + layout.gap), sum(rows) + 0.1
         figure = new_figure(width, height, layout.dpi, layout=None)
@@ -82,9 +82,9 @@ def pairs_figure(
             row, column = divmod(k, columns)
             left = column * (layout.block + layout.gap) + 0.8 * layout.gap
             top = height - 0.1 - sum(rows[:row]) - layout.header
-            tall = layout.block * _ratio(block[0])
+            tall = layout.block * ratio_of(block[0])
             axes = figure.add_axes((left / width, (top - tall) / height, layout.block / width, tall / height))
-            _draw_pair(axes, pair, *block, layout)
+            draw_pair(axes, pair, *block, layout)
     return figure
 
 
@@ -121,7 +121,7 @@ def _in_order(values: pd.Series) -> pd.Series:
     return values.map(DATASETS.index) if values.name == "dataset" else values
 
 
-def _moments(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
+def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
     """Control, void and the times (moments,) in seconds, from the control's first frame to its last."""
     control, at = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
@@ -137,15 +137,16 @@ def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledCli
     return SampledClip(frames[nearest], int((times < end - step / 4).sum()), end)
 
 
-def _ratio(clip: SampledClip) -> float:
+def ratio_of(clip: SampledClip) -> float:
     """Height over width of a pair's block of frames."""
     moments, height, width, _ = clip.frames.shape
     return (2 * height + GAP) / (moments * width + (moments - 1) * GAP)
 
 
-def _draw_pair(
+def draw_pair(
     axes: Axes, pair: pd.DataFrame, control: SampledClip, void: SampledClip, times: np.ndarray, layout: Layout
 ) -> None:
+    """Draw what `moments_of` gives of a pair: its frames with their times, below the words of `pair`."""
     from matplotlib.patches import Rectangle
 
     moments, height, width, _ = control.frames.shape
@@ -186,7 +187,8 @@ def _draw_pair(
 
 
 def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
-    """Draw scenario and ground truth in bold, and the question below them; also the void's question if it differs."""
+    """Draw scenario and ground truth in bold (without ids the truth below), and the question below them; also the
+    void's question if it differs."""
     by_side = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
     same = by_side["control"] == by_side["void"]
     questions = [by_side["control"]] if same else [f"{side}: {question}" for side, question in by_side.items()]
@@ -194,8 +196,11 @@ def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     lines = [line for question in questions for line in textwrap.wrap(question, layout.letters, **fit)]
     truth = pair.at["control", "ground_truth"]
     scenario, sub_scenario, dataset = (pair.at["control", c] for c in ("scenario_id", "sub_scenario", "dataset"))
-    title = f"{sub_scenario} ({dataset})   ground truth: {truth}"
-    title = f"{scenario}   {title}" if layout.ids else title
+    title = f"{sub_scenario} ({dataset})"
+    if layout.ids:
+        title = f"{scenario}   {title}   ground truth: {truth}"
+    else:  # a narrow block has the truth on a line of its own
+        lines.append(f"ground truth: {truth}")
     place: dict[str, Any] = {
         "xycoords": "axes fraction",
         "textcoords": "offset points",

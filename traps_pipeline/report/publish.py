@@ -33,6 +33,7 @@ from traps_pipeline.storage.workspace import Workspace
 PAGE, MARKDOWN, METRICS, INDEX = "report.html", "leaderboard.md", "metrics.jsonl", "index.html"
 SHEETS = {
     "shortcuts.png": "How well one cue alone separates control from void (0.5 is chance)",
+    "worked_example.png": "Worked example: a pair, the answers, the panel’s reading, the verdicts",
     "contact_sheet.png": "Pairs: control above, void below",
     "arms_occlusion.png": "Arms of a scenario with a panel",
     "arms_chaotic.png": "Arms of a scenario with a cut",

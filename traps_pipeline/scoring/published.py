@@ -34,8 +34,7 @@ def as_printed(name: str) -> pd.DataFrame:
 
 def published_rows(name: str, /, **where: object) -> list[dict[str, Any]]:
     """The rows of one published file as numbers and texts; where: values that the wanted rows have in these columns."""
-    rows: list[dict[str, Any]] = _read(name).to_dict("records")  # pyright: ignore[reportAssignmentType]
-    return [row for row in rows if all(row[column] == value for column, value in where.items())]
+    return [dict(row) for row in _records(name) if all(row[column] == value for column, value in where.items())]
 
 
 def published_digest() -> str:
@@ -64,6 +63,11 @@ def published_overall() -> pd.DataFrame:
     rows = published("overall")
     shares = {share: rows[printed] / 100 for share, printed in _RENAMED.items()}
     return rows.loc[:, ["model", "regime"]].assign(**shares, pecs=rows["pecs"])
+
+
+@cache
+def _records(name: str) -> list[dict[str, Any]]:
+    return _read(name).to_dict("records")  # pyright: ignore[reportReturnType]
 
 
 @cache

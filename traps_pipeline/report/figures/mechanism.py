@@ -249,7 +249,7 @@ def cosine_heatmaps(results: Results) -> Figure:
             ax.set_title(f"{plain(model)[:26]}\n{prompt} prompt" if several else plain(model)[:26], size=7)
         for ax in axes.flat[len(panels) :]:
             ax.set_axis_off()
-        figure.colorbar(images[-1], ax=list(axes.flat), label="cosine", shrink=0.85, aspect=25, pad=0.01, extend="both")
+        figure.colorbar(images[-1], ax=list(axes.flat), label="cosine", shrink=0.85, aspect=25, pad=0.01)
     return figure
 
 

@@ -1,0 +1,109 @@
+"""The worked example: one pair with a model's answer to each side, how the panel read it, and the verdict."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.tables import VERDICTS, VOTES
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.report.contact_sheet import Layout, draw_pair, moments_of, ratio_of
+from traps_pipeline.report.writing import PAGE_IN, figure_style, new_figure, not_run_figure, plain
+from traps_pipeline.scoring.analyses import models_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from traps_pipeline.storage.workspace import Workspace
+
+SCENE = "seesaw_sorter"  # of the paper's example
+FRAMES = Layout(block=3.0, header=0.62, gap=0.4, dpi=300, size=6.5, letters=64, questions=2, moments=3)
+WORDS_IN, LETTERS, MOST_LINES = 3.1, 66, 6  # of the column of words beside the frames
+
+
+def worked_example(workspace: Workspace) -> Figure:
+    """The figure of the pair that `chosen_example` takes from a study's verdicts under standard."""
+    verdicts = workspace.tables.read_all(VERDICTS, None, dataset=("occlusion", "chaotic"), regime="standard")
+    chosen = chosen_example(verdicts)
+    if chosen is None:
+        return not_run_figure("Worked example", "no pair has both answers judged under standard", PAGE_IN)
+    cell = Cell(chosen["dataset"], Evaluation(chosen["model"], "standard", int(chosen["run"])))
+    tables = workspace.tables
+    items = tables.read(ITEMS, {"dataset": cell.dataset})
+    pair = items.loc[items["pair_id"] == chosen["pair_id"]].set_index("side")
+    answers = {row["item_id"]: row for row in tables.read(RESPONSES, cell.partition).to_dict("records")}
+    votes = tables.read_all(VOTES, None, **cell.partition).to_dict("records")
+    rows = {row["item_id"]: row for row in verdicts.to_dict("records") if row["model"] == chosen["model"]}
+    words = {}
+    for side in ("control", "void"):
+        item = str(pair.at[side, "item_id"])
+        on_item = [vote for vote in votes if vote["item_id"] == item]
+        words[side] = reading(str(answers[item]["text"] or ""), on_item, rows[item])
+    return example_figure(pair, words, workspace.root, str(chosen["model"]))
+
+
+def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
+    """The control's VERDICTS row of a pair whose control was answered rightly and whose void was decided; None if there
+    is none. Seesaws come first, then models that are no reference strategy, then voids abstained on."""
+    decided = verdicts.dropna(subset=["abstained"])
+    voids = {
+        (row["pair_id"], row["model"], row["run"]): bool(row["abstained"])
+        for row in decided.loc[decided["side"] == "void"].to_dict("records")
+    }
+    references = models_of(group="reference")
+    controls = [
+        row
+        for row in decided.loc[decided["side"] == "control"].to_dict("records")
+        if row["correct"] is True and not row["abstained"] and (row["pair_id"], row["model"], row["run"]) in voids
+    ]
+
+    def place(row: Mapping[Any, Any]) -> tuple[Any, ...]:
+        abstained = voids[row["pair_id"], row["model"], row["run"]]
+        rank = row["sub_scenario"] != SCENE, row["model"] in references, not abstained
+        return *rank, row["pair_id"], row["model"], row["run"]
+
+    return min(controls, key=place, default=None)
+
+
+def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[Any, Any]) -> list[str]:
+    """The lines beside the frames of a side: the answer, the judges' reading of it, and the verdict."""
+    valid = [vote for vote in votes if vote["valid"]]
+    on_abstention = [vote for vote in valid if vote["task"] == "abstention"]
+    abstained = sum(bool(vote["abstained"]) for vote in on_abstention)
+    read = f"{abstained} of {len(on_abstention)} judges read an abstention"
+    values = [str(vote["extracted_value"]) for vote in valid if vote["task"] == "correctness"]
+    if values:
+        read += f"; they extract {', '.join(dict.fromkeys(values))}"
+    outcome = "abstained" if verdict["abstained"] else "answered"
+    if verdict["side"] == "control":
+        outcome += ", correct" if verdict["correct"] else ", wrong"
+    else:
+        outcome += ", as it should" if verdict["abstained"] else ", though the outcome cannot be known"
+    return [f"Answer: {answer}", f"Reading: {read}.", f"Verdict: {outcome}."]
+
+
+def example_figure(pair: pd.DataFrame, words: Mapping[str, Sequence[str]], root: Path, model: str) -> Figure:
+    """Frames of control and void at the left, the lines of `words` by side at the right; one page wide.
+
+    pair: ITEMS columns of both sides, indexed by side; clips lie under root.
+    """
+    with figure_style():
+        block = moments_of(pair, root, FRAMES.moments)
+        tall = FRAMES.block * ratio_of(block[0])
+        height = tall + FRAMES.header + 0.35
+        figure = new_figure(PAGE_IN, height, FRAMES.dpi, layout=None)
+        left, bottom = 0.8 * FRAMES.gap, height - FRAMES.header - tall - 0.05
+        axes = figure.add_axes((left / PAGE_IN, bottom / height, FRAMES.block / PAGE_IN, tall / height))
+        draw_pair(axes, pair, *block, FRAMES)
+        x = (left + FRAMES.block + 0.25) / PAGE_IN
+        figure.text(x, (bottom + tall + 0.12) / height, plain(model), size=7, weight="bold", parse_math=False)
+        for side, top in (("control", bottom + tall), ("void", bottom + tall / 2 - 0.03)):
+            fit: dict[str, Any] = {"max_lines": MOST_LINES, "placeholder": " …"}
+            lines = [line for part in words[side] for line in textwrap.wrap(plain(part), LETTERS, **fit)]
+            figure.text(x, top / height, "\n".join(lines), size=6.2, va="top", linespacing=1.25, parse_math=False)
+    return figure
