@@ -46,7 +46,8 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class Gates:
-    """A kind of features with the gates that use it. features: dataset -> (n, d), or by layer for states."""
+    """A kind of features with the sources of the gates that use it. by_layer: by layer of the states (-1 for other
+    features), then by dataset, (n, d)."""
 
     name: str
     by_layer: Mapping[int, Mapping[str, np.ndarray]]
