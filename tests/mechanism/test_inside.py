@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from sklearn.linear_model import LogisticRegression
@@ -16,12 +17,14 @@ from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write
 from traps_pipeline import inside
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism import stages
-from traps_pipeline.mechanism.baselines import output_margins
+from traps_pipeline.mechanism.baselines import RAW, output_margins
+from traps_pipeline.mechanism.gate import SOURCES
+from traps_pipeline.mechanism.gating import curve_rows, gate_rows
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS
+from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import ModelEntry
@@ -139,6 +142,23 @@ def test_a_direction_of_the_api_steers_as_the_stages_do(study: Workspace, entry:
             pass
     with pytest.raises(TrapsError, match="no block 9"), inside.Direction(push.vector, 9).apply(model, 1.0):
         pass
+
+
+def test_a_gate_is_made_from_states_and_verdicts_that_exist(study: Workspace, entry: ModelEntry) -> None:
+    study.tables.write(PROBES, STANDARD.partition, stages.probe_rows(study, STANDARD), {})
+    states = StoredStates.of(study, STANDARD)
+    rows = pd.DataFrame(gate_rows(study, entry, states))
+    assert set(rows["regime"]) == {"standard"} and set(rows["threshold"]) == {"mid", "J", "conformal"}
+    assert set(rows.query("features == 'states'")["source"]) == set(SOURCES)
+    controls = {*RAW, "output margin", "shuffled labels", "states"}
+    assert set(rows.query("source == 'other datasets'")["features"]) == controls
+    voids = rows.query("target == 'chaotic'")
+    assert set(voids["plain_abs_rec"]) == {0.5}  # the verdicts: two of four voids
+    assert (voids["abs_rec"] >= 0.5).all()  # a gate only adds abstentions
+    never = rows.query("threshold == 'conformal' and target == 'chaotic'")
+    assert (never["abs_rec"] == 0.5).all() and (never["expected_false_abs"] == 0).all()  # too few controls for 5 %
+    curve = pd.DataFrame(curve_rows(study, entry, states)).query("features == 'no gate'").iloc[0]
+    assert (curve["coverage"], curve["risk"], curve["n"]) == (2 / 32, 1.0, 2)  # two answered voids of 32 items
 
 
 def test_erasure_leaves_nothing_that_a_linear_probe_can_use_and_changes_little_else() -> None:

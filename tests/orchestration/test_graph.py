@@ -85,7 +85,10 @@ def test_what_can_cost_money_is_marked() -> None:
         "confabulation",
         "steering_votes",
     }
-    assert {s.name for s in GRAPH.stages if s.cost == "machine"} == {"hidden_states", "patching", "steering"}
+    assert {s.name for s in GRAPH.stages if s.cost == "machine"} == {
+        *("hidden_states", "steering"),
+        *("probe_baselines", "gate", "risk_coverage", "patching"),
+    }
 
 
 def test_an_unknown_stage_is_answered_with_the_known_ones() -> None:

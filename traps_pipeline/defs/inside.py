@@ -65,6 +65,7 @@ probe_baselines = stage(
     scheme=EXTRACTION,
     needs={"hidden_states": "some"},
     kinds=["parquet", "scikitlearn"],
+    cost="machine",  # the output margin needs the model's head
     wants=lambda wanted, key: Extraction.parse(key).prompt == PROBE_PROMPT,
 )
 
@@ -110,9 +111,25 @@ _OF_GATE = [
     probing_settings,
 ]
 _SOME_STATES: dict[str, Need] = {"hidden_states": "some", "verdicts": "some"}
-gate = stage(GATE, _make_gate, group=GROUP, deps=_OF_GATE, scheme=EXTRACTION, needs=_SOME_STATES, wants=_gated)
+gate = stage(
+    GATE,
+    _make_gate,
+    group=GROUP,
+    deps=_OF_GATE,
+    scheme=EXTRACTION,
+    needs=_SOME_STATES,
+    wants=_gated,
+    cost="machine",
+)
 risk_coverage = stage(
-    RISK_COVERAGE, _make_curves, group=GROUP, deps=_OF_GATE, scheme=EXTRACTION, needs=_SOME_STATES, wants=_gated
+    RISK_COVERAGE,
+    _make_curves,
+    group=GROUP,
+    deps=_OF_GATE,
+    scheme=EXTRACTION,
+    needs=_SOME_STATES,
+    wants=_gated,
+    cost="machine",
 )
 
 

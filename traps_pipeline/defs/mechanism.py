@@ -115,6 +115,7 @@ probe_items = stage(
     PROBE_ITEMS,
     _make_probe_items,
     group=GROUP,
+    code="2",
     deps=[
         dg.AssetDep(items, partition_mapping=to_keys(DATASET, PROBED, _probed_from)),
         dg.AssetDep(scene_specs, partition_mapping=_OCCLUSION),
@@ -174,6 +175,7 @@ probes = stage(
     PROBES,
     _make_probes,
     group=GROUP,
+    code="2",
     deps=[
         dg.AssetDep(hidden_states, partition_mapping=by_extraction),
         dg.AssetDep(verdicts, partition_mapping=_ANSWERED),
@@ -198,6 +200,7 @@ directions = stage(
     DIRECTIONS,
     _make_directions,
     group=GROUP,
+    code="2",
     deps=[dg.AssetDep(hidden_states, partition_mapping=by_extraction), probing_settings],
     scheme=EXTRACTION,
     needs={"hidden_states": "some"},
@@ -238,6 +241,7 @@ steering = stage(
     STEERING_TABLE,
     collect=_collect_steering,
     group=GROUP,
+    code="2",
     deps=[
         dg.AssetDep(items, partition_mapping=by_dataset),
         dg.AssetDep(directions, partition_mapping=dg.AllPartitionMapping()),
@@ -262,6 +266,7 @@ steering_votes = stage(
     STEERING_VOTES,
     collect=_collect_steering_votes,
     group=GROUP,
+    code="2",
     deps=[dg.AssetDep(items, partition_mapping=by_dataset), steering, judges],
     scheme=STEERING,
     cost="money",
@@ -297,7 +302,7 @@ def _make_shares(workspace: Workspace, _: None) -> Made:
 
 _SOME: dict[str, Need] = {"steering": "some", "steering_votes": "some"}
 _ABOVE = [steering, steering_votes]
-steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, deps=_ABOVE, needs=_SOME, wants=steers)
+steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, code="2", deps=_ABOVE, needs=_SOME, wants=steers)
 
 
-steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, deps=_ABOVE, needs=_SOME, wants=steers)
+steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="2", deps=_ABOVE, needs=_SOME, wants=steers)

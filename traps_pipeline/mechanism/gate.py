@@ -75,6 +75,13 @@ def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[st
     return {MID: float(mid), J: float(cuts[int(np.argmax(gained))]), CONFORMAL: conformal}
 
 
+def sources_of_gate(source: str, target: str, there: Sequence[str] = DATASETS) -> list[str]:
+    """The datasets that a gate of SOURCES is fitted on for a target, of those that a study has."""
+    if source == OTHER_DATASETS:
+        return [name for name in there if name != target]
+    return [name for name in there if source in (OTHER_FAMILIES, f"one:{name}")]
+
+
 def decide(
     items: Items, source: str, target: str, *, folds: int, seed: int, false_abs: float, solver: Solver = "exact"
 ) -> Decisions:
@@ -87,12 +94,7 @@ def decide(
     """
     wanted = items.table["dataset"].to_numpy(str)
     scored = np.flatnonzero(wanted == target)
-    if source == OTHER_DATASETS:
-        inside = np.isin(wanted, [name for name in DATASETS if name != target])
-    elif source == OTHER_FAMILIES:
-        inside = np.isin(wanted, DATASETS)
-    else:
-        inside = wanted == source.removeprefix("one:")
+    inside = np.isin(wanted, sources_of_gate(source, target))
     if not inside.any():
         raise TrapsError(f"a gate from {source} has no items; extract the hidden states of its datasets first")
     groups = items.table["family" if source == OTHER_FAMILIES else "scenario_id"].to_numpy(str)

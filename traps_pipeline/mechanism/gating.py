@@ -28,14 +28,16 @@ from traps_pipeline.mechanism.gate import (
     families,
     risk_coverage,
     separation,
+    sources_of_gate,
 )
 from traps_pipeline.mechanism.nulls import nulled
+from traps_pipeline.mechanism.paths import probed_taxonomy
 from traps_pipeline.mechanism.probes import swapped_labels
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import PROBES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.partitions import DATASETS, Cell, Evaluation
-from traps_pipeline.scoring.bootstrap import percentiles, scenario_weights
+from traps_pipeline.scoring.bootstrap import TAXONOMIES, percentiles, scenario_weights
 from traps_pipeline.storage.workspace import Workspace
 
 STATES, SHUFFLED, UNTRAINED, NO_GATE = "states", "shuffled labels", "untrained model", "no gate"
@@ -46,7 +48,8 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class Gates:
-    """A kind of features with the gates that use it. features: dataset -> (n, d), or by layer for states."""
+    """A kind of features with the sources of the gates that use it. by_layer: by layer of the states (-1 for other
+    features), then by dataset, (n, d)."""
 
     name: str
     by_layer: Mapping[int, Mapping[str, np.ndarray]]
@@ -152,7 +155,10 @@ def _decisions(
     settings, seed = workspace.mechanism, workspace.mechanism.seed
     about = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
     made: dict[tuple[str, str], tuple[Decisions, int]] = {}
+    there = [name for name in DATASETS if name in set(table["dataset"])]
     for source, target in product(gates.sources, dict.fromkeys(table["dataset"])):
+        if not sources_of_gate(source, str(target), there):
+            continue  # a study of some datasets has the gates that these allow
         # To a target that is no dataset of pairs all four datasets are others, as they are to other families.
         layer = best.get(f"{source}:{target}", best.get(source, best[OTHER_FAMILIES]))
         layer = layer if layer in gates.by_layer else -1
@@ -210,7 +216,9 @@ def _rows(
         draws: list[np.ndarray] = []
         for target, (decisions, layer) in made.items():
             scenario, index = pd.factorize(names[decisions.place])
-            weight = scenario_weights(len(index), resamples, [seed, 0])[:, scenario]
+            # The datasets of a taxonomy share their resamples, and taxonomies do not.
+            drawn_by = [seed, TAXONOMIES.index(probed_taxonomy(target))]
+            weight = scenario_weights(len(index), resamples, drawn_by)[:, scenario]
             outcome = outcomes[target]
             gate = decisions.score > decisions.threshold[threshold]
             gated = outcome.gated(gate)

@@ -13,12 +13,14 @@ from traps_pipeline.models.local.checkpoint import download_command, find_checkp
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompts import Prompt
 from traps_pipeline.models.local.settings import Quantisation
+from traps_pipeline.models.local.spans import spans
 from traps_pipeline.models.local.tiny import Family, build_tiny
 from traps_pipeline.models.registry import LOCAL, ModelEntry, load_models
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.storage.media import MediaSpec, sample
 
 _SPEC = MediaSpec(profile="frames", uniform=4)
+_SYSTEM, _QUESTION = "You are asked about a video.", "Does it grow brighter?"
 # Vision towers of tiny checkpoints are too narrow for NF4 on a CPU; no library quantises the head.
 _NF4_SKIP = ("model.visual", "lm_head")
 
@@ -34,7 +36,7 @@ def _prompt(model: LocalModel, folder: Path) -> Prompt:
     clip = folder / "clip.mp4"
     encode([np.full((64, 96, 3), shade, np.uint8) for shade in range(40, 200, 20)], clip, fps=10)
     shown = sample(clip, _SPEC)
-    return model.prompt("You are asked about a video.", "Does it grow brighter?", shown.frames, shown.times_s)
+    return model.prompt(_SYSTEM, _QUESTION, shown.frames, shown.times_s)
 
 
 def check_family(family: Family, folder: Path) -> str:
@@ -54,9 +56,11 @@ def check_family(family: Family, folder: Path) -> str:
     wrong = [layer for layer, (a, b) in enumerate(zip(states, own, strict=True)) if (a != b[0, -1].numpy()).any()]
     if wrong:
         raise TrapsError(f"hooked states differ from the library's own at layers {wrong}; install the pinned versions")
+    parts = spans(model, prompt, _SYSTEM, _QUESTION)
     return (
         f"{type(model.network).__name__} saved and reloaded, a clip answered ({answer.completion_tokens} tokens), "
-        f"{len(own)} hooked states equal the library's own"
+        f"{len(own)} hooked states equal the library's own, {int(parts['visual'].sum())} visual tokens and "
+        f"{int(parts['stamps'].sum())} of time stamps located"
     )
 
 

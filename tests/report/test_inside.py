@@ -1,0 +1,154 @@
+"""Tables and figures of controls inside models, from rows worked out by hand."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import ClassVar
+
+import pandas as pd
+import pytest
+
+from traps_pipeline.mechanism.control_tables import GATE, PATCHING, PROBE_BASELINES, RISK_COVERAGE, STEERING_NULLS
+from traps_pipeline.mechanism.effects import own_effects
+from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS
+from traps_pipeline.partitions import DATASETS
+from traps_pipeline.report.catalogue import FIGURES, INSIDE
+from traps_pipeline.report.results import Makers, Results
+from traps_pipeline.report.tables import inside
+from traps_pipeline.report.writing import PrintedTable
+from traps_pipeline.storage.tables import Table
+
+ABOUT = {"model": "m", "prompt": "standard", "epoch": "e"}
+
+
+def frame(table: Table, *rows: dict[str, object]) -> pd.DataFrame:
+    return pd.DataFrame([ABOUT | row for row in rows]).reindex(columns=pd.Index(table.names))
+
+
+def probes() -> pd.DataFrame:
+    sides = {"n_voids": 16, "n_controls": 16, "layer": 3, "source_best": True, "own_best": True}
+    rows = [
+        {"analysis": a, "source": s, "target": t, "value": 0.98, "low": 0.79, "high": 1.0} | sides
+        for s, t, a in (("chaotic", "chaotic", "held_out"), ("chaotic", "occlusion", "transfer"),
+                        ("chaotic", "chaotic_time_swapped", "time_swapped"))
+    ]  # fmt: skip
+    return frame(PROBES, *rows, rows[0] | {"layer": 1, "source_best": False, "value": 0.2})
+
+
+def baselines() -> pd.DataFrame:
+    rows = []
+    for analysis, target in (("held_out", "chaotic"), ("time_swapped", "chaotic_time_swapped")):
+        for features, value in (("time stamps", 1.0), ("output margin", 0.9), ("noise", 0.5)):
+            row = {"analysis": analysis, "source": "chaotic", "target": target, "features": features, "value": value}
+            rows.append(row | {"spread": 0.1 if features == "noise" else None})
+    return frame(PROBE_BASELINES, *rows)
+
+
+def gate() -> pd.DataFrame:
+    figures = {"acc": 0.8, "false_abs": 0.1, "abs_rec": 0.9, "pecs": 0.64, "pecs_low": 0.5, "pecs_high": 0.7}
+    plain = {"plain_acc": 0.9, "plain_false_abs": 0.0, "plain_abs_rec": 0.5, "plain_pecs": 0.45}
+    at = {"regime": "guided", "source": "other datasets", "threshold": "mid", "layer": 3, "expected_false_abs": 0.05}
+    row = at | figures | plain | {"n_controls": 64, "n_voids": 64}
+    kinds = product(("states", "question words"), ("all", "chaotic"))
+    rows = [row | {"features": features, "target": target} for features, target in kinds]
+    decoys = at | {"features": "states", "target": "decoy", "false_abs": 0.4, "n_controls": 8, "n_voids": 0}
+    return frame(GATE, *rows, decoys)
+
+
+def curves() -> pd.DataFrame:
+    point = {"regime": "guided", "coverage": 0.5, "risk": 0.2, "n": 5}
+    return frame(RISK_COVERAGE, *(point | {"features": name} for name in ("states", "no gate")))
+
+
+def patching() -> pd.DataFrame:
+    row = {"dataset": "chaotic", "into": "control", "site": "residual", "layer": 0, "group": "stamps"}
+    row |= {"low": 0.9, "high": 1.1, "n": 6, "n_left_out": 1, "tokens": 6.0}
+    return frame(PATCHING, row | {"source": "pair", "effect": 0.99}, row | {"source": "same side", "effect": 0.01})
+
+
+def nulls() -> pd.DataFrame:
+    row = {"directions": "standard", "regime": "guided", "target": "chaotic", "layer": 3, "unit": "gap", "dose": 1.0}
+    row |= {"side": "control", "null": "isotropic", "effect": 0.8, "null_mean": 0.1, "null_lowest": 0.0}
+    return frame(STEERING_NULLS, row | {"null_highest": 0.3, "draws": 20, "n_at_least": 0, "p": 1 / 21, "n": 5})
+
+
+def effects() -> pd.DataFrame:
+    along = {"directions": "standard", "regime": "guided", "source": "chaotic", "target": "chaotic", "layer": 3}
+    doses = (("alpha", 0.0, 0.0), ("alpha", 10.0, 10.0), ("gap", 0.0, 0.0), ("gap", 1.0, 200.0))
+    kinds = (("void", 0), ("isotropic", 0), ("isotropic", 1))
+    rows = [
+        along
+        | {"kind": kind, "draw": draw, "side": side, "unit": unit, "dose": dose, "alpha": alpha}
+        | {"signs": "label", "abstention": dose / 10, "n": 5}
+        for (kind, draw), side, (unit, dose, alpha) in product(kinds, ("control", "void"), doses)
+    ]
+    return frame(STEERING_EFFECTS, *rows)
+
+
+class Made(Results):
+    """Results with rows of every control."""
+
+    source, is_study = "made up", True
+    makers: ClassVar[Makers] = {
+        "probes": lambda _: probes(),
+        "baselines": lambda _: baselines(),
+        "gate": lambda _: gate(),
+        "risk_coverage": lambda _: curves(),
+        "patching": lambda _: patching(),
+        "nulls": lambda _: nulls(),
+        "own_effects": lambda _: own_effects(effects()),
+    }
+
+
+def cells(table: PrintedTable) -> list[dict[str, str]]:
+    headings = [column.heading for column in table.columns]
+    return [dict(zip(headings, row, strict=True)) for row in table.cells]
+
+
+def test_probes_stand_beside_their_baselines_at_the_sources_own_layer() -> None:
+    beside, look_alikes = inside.probe_baselines(Made())
+    own, across = cells(beside)
+    assert (own["Path"], own["Layer"], own["States"], own["from"]) == ("ch→ch", "3", "0.980", "0.790")
+    assert (own["Time stamps"], own["Output margin"], own["Noise"]) == ("1.000", "0.900", "0.500 ± 0.100")
+    assert across["Path"] == "ch→oc" and across["Time stamps"] == "–"
+    (row,) = cells(look_alikes)
+    assert (row["Items"], row["Time stamps"]) == ("frame times of the other side", "1.000")
+
+
+def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
+    sources, controls, answerable = inside.gate(Made())
+    assert [row["Target"] for row in cells(sources)] == ["all", "ch"]
+    assert [(row["Features"], row["PECS, gated"]) for row in cells(controls)] == [
+        ("states", "0.640"),
+        ("question words", "0.640"),
+    ]
+    (row,) = cells(answerable)
+    assert (row["Abstained on %"], row["n"]) == ("40.0", "8") and row["Items"].startswith("decoy")
+
+
+def test_few_answers_are_marked_and_p_is_printed() -> None:
+    nulls, _ = inside.steering_nulls(Made())
+    (row,) = cells(nulls)
+    assert (row["Effect, points"], row["p"], row["Draws"]) == ("80.0 †", "0.048", "20")
+    assert any(note.startswith("†") for note in nulls.notes)
+    (patched,) = inside.patching(Made())
+    (row,) = cells(patched)
+    assert (row["Indirect effect"], row["Same side"], row["Other times"], row["Left out"]) == (
+        "0.990 †",
+        "0.010",
+        "–",
+        "1",
+    )
+
+
+def test_doses_are_in_units_of_the_class_gap() -> None:
+    own = Made().own_effects
+    assert sorted(set(own["gaps"])) == pytest.approx([0.0, 0.05, 1.0])  # alpha 10 of a gap of 200
+    assert set(own["target"]) == {"chaotic"} <= set(DATASETS)
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_a_figure_is_drawn_from_them(name: str) -> None:
+    report = next(report for report in FIGURES if report.name == name)
+    axes = report.make(Made()).axes
+    assert axes and any(ax.has_data() for ax in axes)
