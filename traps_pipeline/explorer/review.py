@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from datetime import date
 from functools import cached_property
 from itertools import count
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -84,7 +85,7 @@ class Review:
 
     @cached_property
     def flags(self) -> Any:
-        """See `queue.flags`; as the study was when the review began."""
+        """`queue.flags` of the study as it was when the review began."""
         return flags(self.workspace)
 
     @cached_property
@@ -101,7 +102,8 @@ class Review:
         """What the observer answered under the first regime that it was asked, by item."""
         rows = self.workspace.tables.read_all(RESPONSES, ["item_id", "model", "regime", "run", "text"])
         own = rows.loc[rows["model"] == "observer"].sort_values(["item_id", "regime", "run"])
-        return own.dropna(subset=["text"]).drop_duplicates("item_id").set_index("item_id")["text"].to_dict()
+        first = own.dropna(subset=["text"]).drop_duplicates("item_id")
+        return {str(item): str(text) for item, text in zip(first["item_id"], first["text"], strict=True)}
 
     def spec(self, scenario_id: str) -> Record:
         """The row of a scenario. Raises NotThere."""
@@ -253,7 +255,7 @@ class Review:
         _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(np.vstack(rows)[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])
         return jpeg.tobytes()
 
-    def clip(self, scenario_id: str, side: str) -> Any:
+    def clip(self, scenario_id: str, side: str) -> Path:
         """The file of a clip. Raises NotThere where the study has none."""
         row = self.clips.get((scenario_id, side))
         path = self.workspace.resolve(row["path"]) if row else None

@@ -147,9 +147,11 @@ function answerLine(found, row, words) {
   const pair = pairs[pairOf[item]];
   const [decision, kind] = decisionWords(info, items, decisions, row);
   const text = h("div", { class: "excerpt" }, "…");
-  answer(row).then(
-    (read) => text.replaceChildren(excerpt(read, words)),
-    (error) => text.replaceChildren(notice(error.message, "error")),
+  afterPaint(() =>
+    answer(row).then(
+      (read) => text.replaceChildren(excerpt(read, words)),
+      (error) => text.replaceChildren(notice(error.message, "error")),
+    ),
   );
   return h(
     "article",

@@ -61,3 +61,8 @@ function marked(text, found) {
   }
   return [...parts, text.slice(from)];
 }
+
+// Do something after what stands now was painted, so that reading files does not hold it up.
+function afterPaint(act) {
+  requestAnimationFrame(() => setTimeout(act));
+}

@@ -92,5 +92,6 @@ document.getElementById("skip").addEventListener("click", (event) => {
   event.preventDefault(); // its address would be taken for a view
   document.querySelector("main h1")?.focus();
 });
-// What every other view needs is read after the first one was painted.
-show().then(() => requestAnimationFrame(() => setTimeout(() => world().catch(() => null))));
+// What every other view needs is read after the first one was painted, when the browser has nothing else to do.
+const whenIdle = globalThis.requestIdleCallback || ((act) => setTimeout(act, 200));
+show().then(() => afterPaint(() => whenIdle(() => world().catch(() => null), { timeout: 1000 })));
