@@ -81,7 +81,7 @@ def test_bounds_of_a_cell_with_three_of_a_hundred_items_missing(rows):
     # 40 are right and 5 abstained on; of 48 voids 36 are abstained on.
     pairs = [(k < 40, 40 <= k < 45, k < 36) for k in range(47)]
     pairs += [(False, False, None), (False, False, None), (None, None, False)]
-    outcomes = ["answer"] * 98 + ["refused", "truncated"]
+    outcomes = ["answer"] * 98 + ["refused", "answer"]
     outcomes[2 * 47 + 1], outcomes[2 * 48 + 1] = "empty", "error"
     cell = one(cell_metrics(rows(pairs, outcomes=outcomes)), scope="all")
     assert (cell.n_pairs, cell.n_missing, cell.n_answered) == (50, 3, 97)
