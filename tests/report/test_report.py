@@ -489,3 +489,7 @@ def test_panels_have_tables_of_their_own_and_a_model_judged_by_rules_is_said_not
     for said in (leaderboard_text(both), leaderboard_markdown(both), report_html(both)):
         assert "Judged by rules, not comparable: pocket." in said
     assert "not comparable" not in leaderboard_text(both.loc[both["model"] == "oracle"])
+
+
+def test_a_panel_of_one_judge_is_marked():
+    assert "panel mine (version ab12, one judge" in leaderboard_text(board_of(board_row("m", panel="mine@ab12.1")))

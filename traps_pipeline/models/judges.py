@@ -32,6 +32,7 @@ PANEL_SIZES = (1, 3)
 RULE = "rule"  # the backend of the rule judges
 RULES_VERSION = 2  # of judging/rules.py; when it is raised, rule judges vote again
 RULES_PANEL = "rules"
+ONE_JUDGE = ".1"  # ends the id of a panel of one judge
 BY_RULES = "judged by rules, not comparable"
 Task = Literal["abstention", "correctness"]
 
@@ -136,8 +137,10 @@ def panel_version(panel: str) -> str:
 
 
 def panel_id(panel: str) -> str:
-    """What stands for a panel in the rows that it decided: its name and the version of its judges."""
-    return f"{panel}@{panel_version(panel)[:8]}"
+    """What stands for a panel in the rows that it decided: its name and the version of its judges, and a mark where it
+    is a single judge."""
+    alone = ONE_JUDGE if panel and len(load_panel(panel)) == 1 else ""
+    return f"{panel}@{panel_version(panel)[:8]}{alone}"
 
 
 def panel_names(panels: str) -> list[str]:

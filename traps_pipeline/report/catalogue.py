@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.models.judges import BY_RULES
 from traps_pipeline.report.figures import abstention, grids, landscape, mechanism
@@ -20,7 +20,7 @@ from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables import comparisons, inside, judges, leaderboards, setup, sub_scenarios
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
 from traps_pipeline.report.tables.shared import printed
-from traps_pipeline.report.writing import PrintedTable, figure_bytes, figure_files, say_below, table_files
+from traps_pipeline.report.writing import SOFT, PrintedTable, figure_bytes, figure_files, figure_style, table_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -109,7 +109,7 @@ class FigureReport:
         """The figure; where its numbers are not comparable it says so itself, since pictures lose their captions."""
         figure = self.make(results)
         if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
-            say_below(figure, BY_RULES)
+            _say_below(figure, BY_RULES)
         return figure
 
 
@@ -279,6 +279,16 @@ def folder(kind: str, results: Results) -> str:
 def workspace_files(report: Report, results: Results) -> dict[str, bytes]:
     """The files that a workspace keeps: all files of a table, the PNG of a figure; `traps export` writes the rest."""
     return report.files(results) if isinstance(report, TableReport) else report.picture(results)
+
+
+def _say_below(figure: Figure, text: str) -> None:
+    """Write a line at the foot of a figure, or along its right edge where its layout is frozen and the foot is full."""
+    look: dict[str, Any] = {"fontsize": 6, "color": SOFT, "parse_math": False}
+    with figure_style():
+        if figure.get_layout_engine() is not None:
+            figure.supxlabel(text, x=0.99, ha="right", **look)
+        else:
+            figure.text(0.995, 0.5, text, rotation=90, ha="right", va="center", **look)
 
 
 def _is_judged(reads: Sequence[str]) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.models.judges import BY_RULES, by_rules
+from traps_pipeline.models.judges import BY_RULES, ONE_JUDGE, by_rules
 from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, SHORT
 from traps_pipeline.report.tables.shared import (
     EPOCH,
@@ -166,7 +166,7 @@ def provenance(board: pd.DataFrame) -> str:
 def judged_by(board: pd.DataFrame) -> str:
     """A sentence that names the panels that judged, and says where their figures are not comparable."""
     panels = _distinct(board["panel"].unique(), "+")
-    names = [f"{name} (version {version})" for name, _, version in (panel.partition("@") for panel in panels)]
+    names = [_panel_in_words(panel) for panel in panels]
     several = len(panels) > 1
     said = f"Judged by the panel{'s' * several} {' and '.join(names) or NONE}"
     said += "; figures of different panels are not ranked or compared" * several
@@ -174,6 +174,12 @@ def judged_by(board: pd.DataFrame) -> str:
     others = sorted({model for panel, model in rows if by_rules(panel, model)})
     shown = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
     return f"{said}." + (f" {BY_RULES[0].upper()}{BY_RULES[1:]}: {shown}." if others else "")
+
+
+def _panel_in_words(panel: str) -> str:
+    name, _, version = panel.partition("@")
+    alone = ", one judge, so that nothing is known of agreement" if version.endswith(ONE_JUDGE) else ""
+    return f"{name} (version {version.removesuffix(ONE_JUDGE)}{alone})"
 
 
 def _distinct(values: Iterable[Any], separator: str) -> list[str]:

@@ -379,12 +379,6 @@ def freeze_layout(figure: Figure) -> None:
         figure.set_layout_engine(None)  # "none" would leave a placeholder, for which each save draws everything twice
 
 
-def say_below(figure: Figure, text: str) -> None:
-    """Write a line at the foot of a figure."""
-    with figure_style():
-        figure.supxlabel(text, fontsize=6, color=SOFT, x=0.99, ha="right", parse_math=False)
-
-
 def figure_bytes(figure: Figure, kind: str = "png") -> bytes:
     """The figure as a PDF, SVG or PNG file, without a date; the same bytes on every call."""
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {"Software": None}}
