@@ -107,6 +107,8 @@ def build(p: Params, physics: Physics) -> Scene:
     hidden_y = rough[1] + 1.8 * r + 0.03  # the ball that feels the rough board is behind the panel with its shadow
     high = p.track_m + 2 * r + 0.015
     _, back, top = ramps[0].at(p.ramp_m)
+    beside = half if p.azimuth_deg < 94 else -half  # where no ball rolls behind the flag
+    stage.mark("tray", (beside, p.tray_m), p.tray_colour)
     return stage.scene(
         p,
         decisive=BALLS,
@@ -115,6 +117,7 @@ def build(p: Params, physics: Physics) -> Scene:
         in_view=[stage.box(outer, (-WALL_M, foot), (0, high)), stage.box(outer, (back, back), (0, top))],
         things=[*(f"{colour} ball" for colour in p.colours), "left ramp", "right ramp", "tray"],
         also=["track", "foot"],
+        shown_by={"foot": ["tray"]},
         colours=[*p.colours, *p.track_colours],
     )
 

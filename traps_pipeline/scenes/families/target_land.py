@@ -92,6 +92,8 @@ def build(p: Params, physics: Physics) -> Scene:
         centre = (hinge + p.board_m / 2 * sin(angle), 0.0, p.mouth_m - p.board_m / 2 * cos(angle))
         board = stage.slab(f"board_{i}", centre, half, "wood", falls_rad=-angle)
         Surface(0.001, sliding=0.3, solref=SOFT).on(board)
+    for i, colour in enumerate(p.tray_colours):
+        stage.mark(f"{colour} tray", f"tray_{i}")
     return stage.scene(
         p,
         decisive=["ball"],
