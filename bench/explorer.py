@@ -112,7 +112,7 @@ def made_study(folder: Path, models: int) -> Workspace:
         for dataset in DATASETS:
             cell = Cell(dataset, evaluation)
             responses, votes = _cell(items.loc[items["dataset"] == dataset], cell, seed=number)
-            own = decide(items[ITEM_COLUMNS], responses[RESPONSE_COLUMNS], votes)
+            own = decide(items.loc[:, ITEM_COLUMNS], responses.loc[:, RESPONSE_COLUMNS], votes)
             for table, rows in ((RESPONSES, responses), (VOTES, votes), (VERDICTS, own)):
                 _write(workspace, table, cell.partition, rows)
             verdicts.append(own)

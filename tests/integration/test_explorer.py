@@ -68,7 +68,8 @@ class Visit:
         """Show a view of the page as it is open, and wait until it is there."""
         self.page.evaluate("delete document.documentElement.dataset.shown")
         if "#" in self.page.url and self.page.url.startswith(self.address):
-            self.page.evaluate("hash => { location.hash = hash; dispatchEvent(new Event('hashchange')); }", view)
+            again = "hash => location.hash === hash ? dispatchEvent(new Event('hashchange')) : (location.hash = hash)"
+            self.page.evaluate(again, view)
         else:
             self.page.goto(self.address + view)
         until(self.page, "document.documentElement.dataset.shown")
