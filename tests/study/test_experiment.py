@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
+from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.partitions import DATASETS, REGIMES, datasets_of_category
 from traps_pipeline.storage.study import Study
 from traps_pipeline.study.experiment import load_experiment
 
@@ -109,3 +111,14 @@ def test_the_paper_experiment_holds_the_behavioural_and_the_mechanistic_half() -
     assert (inside.steering.alphas, inside.steering.pairs) == ((2, 5, 10), 50)
     assert (inside.steering.well_posed_pairs, inside.steering.ill_posed_pairs) == (100, 50)
     assert inside.steering.direction_regimes == inside.steering.inference_regimes == ("standard", "guided")
+
+
+def test_the_lite_set_is_100_scenarios_of_each_taxonomy_with_every_family_in_its_share(tmp_path: Path) -> None:
+    lite = load_experiment(experiment(tmp_path, "scenarios: lite\n")).scenarios
+    assert lite is not None and len(set(lite)) == 200
+    released = load_released()
+    for taxonomy in ("occlusion", "chaotic"):
+        whole = Counter(spec.family for spec in released.values() if datasets_of_category(spec.category)[0] == taxonomy)
+        part = Counter(released[name].family for name in lite if released[name].family in whole)
+        assert sum(part.values()) == 100 and part.keys() <= whole.keys()
+        assert all(abs(part[family] - 100 * n / sum(whole.values())) <= 1 for family, n in whole.items())

@@ -17,6 +17,8 @@ from traps_pipeline.storage.study import Asked, MechanismSettings, Study
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml, within
 
 EXPERIMENTS = ASSETS / "experiments"
+LITE = "lite"  # the name of the set of 200 scenarios in LITE_FILE
+LITE_FILE = ASSETS / "lite.yaml"
 
 
 class Experiment(BaseModel):
@@ -58,6 +60,11 @@ class Experiment(BaseModel):
             described["models"] = [one for one in models if isinstance(one, dict)]
             rest["models"] = [one.get("id", "?") if isinstance(one, dict) else one for one in models]
         return rest | {"own": described}
+
+    @field_validator("scenarios", mode="before")
+    @classmethod
+    def _lite(cls, value: Any) -> Any:
+        return read_yaml(LITE_FILE)["scenarios"] if value == LITE else value
 
     @field_validator("datasets")
     @classmethod

@@ -62,7 +62,8 @@ def _rows_of(workspace: Workspace, table: Table, cell: Cell, item_id: str) -> li
     if workspace.tables.state(table, cell.partition) is None:
         return []
     rows = workspace.tables.read(table, cell.partition)
-    return rows.loc[rows["item_id"] == item_id].to_dict("records")
+    mine = rows.loc[rows["item_id"] == item_id].astype(object)
+    return mine.where(mine.notna(), None).to_dict("records")  # a null text is NaN in a frame
 
 
 def _about(row: Mapping[str, Any]) -> Any:
