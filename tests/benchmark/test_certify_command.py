@@ -93,7 +93,3 @@ def test_an_altered_record_is_named_with_the_certificate_it_loses(finished: Fini
 def test_an_untouched_record_passes_beside_altered_ones(finished: Finished) -> None:
     assert f"traps: {UNTOUCHED}" not in finished.err
     assert "1 of 8 scenarios certified" in finished.out
-
-
-def test_what_is_measured_and_not_judged_is_said(finished: Finished) -> None:
-    assert "referents: measured and not judged in 1 of them, which have no flags yet: bounce" in finished.out

@@ -42,7 +42,6 @@ def certify(arguments: argparse.Namespace) -> int:
     """See `traps certify --help`."""
     from traps_pipeline.benchmark.certificates import certify_all, family_table
     from traps_pipeline.paths import CHECKOUT, SCENE_SPECS
-    from traps_pipeline.scenes.certificates import UNMARKED
 
     folder = (arguments.specs or SCENE_SPECS).absolute()
     kept = CHECKOUT / ".workspaces" / "certificates"
@@ -59,10 +58,6 @@ def certify(arguments: argparse.Namespace) -> int:
         print(f"traps: {problem}", file=sys.stderr)
     passed = sum(verdict.passed for verdict in verdicts)
     print(f"{passed} of {len(verdicts)} scenarios certified")
-    unmarked = [verdict.family for verdict in verdicts if verdict.family in UNMARKED]
-    if unmarked:
-        families = ", ".join(sorted({*unmarked}))
-        print(f"referents: measured and not judged in {len(unmarked)} of them, which have no flags yet: {families}")
     return FAILED if problems else OK
 
 

@@ -37,22 +37,6 @@ LEGIBLE_PIXELS = 150.0  # of each decisive body at the end of the control
 REFERENT_PIXELS = 80.0  # of whatever a question names, in each frame of the void
 MOVING_S = 0.5  # so long a body must be seen moving that is hidden later
 MOVES_PX = 0.5  # from one frame to the next: less is at rest to the eye
-# Families whose records are still those of 0.1.0, without flags: what is seen of their referents is measured and stated
-# in each record, and not held against anything. To mark one: `stage.mark`, draw it anew, take it out of this set.
-UNMARKED = frozenset(
-    [
-        "bounce",
-        "catch",
-        "funnel",
-        "hidden_drop",
-        "launch",
-        "lever_gate",
-        "ramp_gap",
-        "ramp_race",
-        "target_land",
-        "tunnel_exit",
-    ]
-)
 SAME_START_S = 0.3  # so long any machine's physics agrees
 SAME_START_M = 0.005
 EARLIEST_CUT_S = 1.0  # the last frame that a cut void shows is not before this
@@ -454,8 +438,6 @@ def _body_of(model: mujoco.MjModel, geom: str) -> str:
 
 
 def _judge_referents(e: Evidence, claim: Claim) -> Judged:
-    if claim.family.name in UNMARKED and "referents" in e:
-        return  # stated in the record, and not promised
     if not e["referents"]:
         yield "the question names nothing that is in the scene"
     pixels, moving = e["referents_px"], e["referents_moving_s"]
@@ -473,8 +455,7 @@ REFERENTS = Certificate(
     f"flag where it stands or begins in every world, or is seen moving for {MOVING_S} s before it is hidden (the "
     f"record says which); some body is seen moving for {MOVING_S} s; of the pixels over which anything moves, the "
     "panel covers the stated share",
-    does_not_promise=f"that a person takes the flag for the thing; anything of {', '.join(sorted(UNMARKED))}: their "
-    "records have no flags yet, so that it is measured and not judged",
+    does_not_promise="that a person takes the flag for the thing",
     numbers=(
         Number("referents"),
         *(Number(name, compared=False) for name in ("referents_px", "referents_moving_s", "cause_moving_s")),

@@ -83,6 +83,8 @@ def build(p: Params, physics: Physics) -> Scene:
 
     side, across = end + WALL_M, (-2 * WALL_M - 0.01, depth + 2 * WALL_M)
     cover = stage.box((-side - 0.01, side), across, (0, roof + WALL_M), right=SHADOW_RIGHT * 0.15)
+    for name, side, colour in (("left", -1, p.left_colour), ("right", 1, p.right_colour)):
+        stage.mark(f"{name} exit", (side * wide, depth), colour)
     return stage.scene(
         p,
         decisive=["ball"],
@@ -94,6 +96,7 @@ def build(p: Params, physics: Physics) -> Scene:
         ],
         things=[f"{p.ball_colour} ball", f"{p.tunnel_colour} tunnel", "ramp", "upper end of the ramp"],
         also=["tray", "exit"],
+        shown_by={"tunnel": ["stem"]},
     )
 
 
