@@ -135,7 +135,8 @@ class StudyResults(Results):
     def panel(self) -> str:
         """The panel of all tables and figures that compare entries: the study's, where it decided any; else the first
         that did."""
-        found = sorted({*self.board["panel"]}, key=lambda name: ("+" in name, name))
+        decided = self.board if len(self.board) else self.tables.read_all(METRICS, ["panel"], dataset=DATASETS)
+        found = sorted({*decided["panel"]}, key=lambda name: ("+" in name, name))
         own = panel_id(self._panel)
         return own if own in found or not found else found[0]
 
