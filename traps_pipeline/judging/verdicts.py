@@ -80,7 +80,7 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     rows["n_valid_correctness"] = (correctness != INVALID).sum(axis=1)
     rows["unanimous"] = judged & _unanimous(abstention) & (~on_control | _unanimous(correctness))
     rows["undecided"] = judged & undecided
-    panels = votes.drop_duplicates(CELL).loc[:, [*CELL, "panel"]]
+    panels = votes.loc[:, [*CELL, "panel"]].drop_duplicates(CELL)
     return rows.merge(panels, on=CELL, how="left").loc[:, VERDICTS.names]
 
 
