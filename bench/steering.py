@@ -31,7 +31,7 @@ ROWS = 64  # of a shipped batch
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--model", default="pocket", help="a local model of the registry")
     parser.add_argument("--prompts", type=int, default=8)
     parser.add_argument("--directions", type=int, default=8)
