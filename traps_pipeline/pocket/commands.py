@@ -56,7 +56,7 @@ def train(recipe: Recipe, data: Path, out: Path, seed: int, *, workers: int | No
     weights = fit(recipe, data, out, seed, report=report)
     facts = {
         "seed": seed,
-        "recipe": digest(recipe.model_dump(mode="json")),
+        "recipe": digest(recipe.content()),
         "data": data_digest(recipe, "train", data),
         "weights": file_digest(weights / "model.safetensors"),
         "versions": {name: version(name) for name in ("mujoco", "tokenizers", "torch", "transformers")},

@@ -274,8 +274,8 @@ def render(
 def _check_recipe(recipe: Recipe, folder: Path) -> None:
     """Raises TrapsError when the folder holds scenes of another recipe."""
     # The numbers of scenes may change: a shard's first scenes do not depend on how many there are.
-    later = {"abstain_shares", "jitter", "decoys"} & recipe.model_fields_set  # settings that came later, if used
-    made = digest(recipe.model_dump(mode="json", include={"data_seed", "media", "abstain_share", *later}))
+    decisive = ("data_seed", "media", "abstain_share", "abstain_shares", "jitter", "decoys")
+    made = digest(recipe.content(*decisive))
     note = folder / "recipe.sha256"
     if not note.is_file():
         write_text(note, made + "\n")

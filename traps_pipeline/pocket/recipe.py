@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -63,6 +63,15 @@ class Recipe(BaseModel):
     jitter: Jitter | None = None
     decoys: float = Field(default=0, ge=0, le=1)
     training: Training
+
+    def content(self, *only: str) -> dict[str, Any]:
+        """The settings (only: these) for a digest. One that came later counts only where it is used, so that what was
+        made before it keeps its digest."""
+        unused = {"abstain_shares", "jitter", "decoys"} - self.model_fields_set
+        made = self.model_dump(mode="json", include={*only} or None, exclude=unused)
+        if "media" in made and self.media.fit == "stretch":
+            del made["media"]["fit"]
+        return made
 
     @field_validator("scenes")
     @classmethod

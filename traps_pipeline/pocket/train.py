@@ -154,7 +154,7 @@ def train(
     ]
     optimizer = torch.optim.AdamW(groups, lr=training.learning_rate, betas=(0.9, 0.98))
     batches = Batches(scenes, model, processor, training, seed)
-    identity = digest([recipe.model_dump(mode="json"), data_digest(recipe, "train", data), seed])
+    identity = digest([recipe.content(), data_digest(recipe, "train", data), seed])
     words = name_tokens(processor.tokenizer)
     state = _State(folder / "state.safetensors", model, optimizer, identity)
     step = state.load()
