@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.steering import (
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES, STEERING, STEERING_VOTES
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import WITH_TEXT
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, TIME_SWAPPED, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.parquet import Made
@@ -276,7 +276,7 @@ def steered(study: Workspace, entry: ModelEntry) -> Workspace:
     planned = count_answers(study.mechanism, "tiny", DATASETS, {"occlusion": PAIRS, "chaotic": PAIRS})
     assert planned["guided"].total() == sum(asked for _, asked in rows.values()) and set(planned) == {"guided"}
     votes = written(study, STEERING_VOTES, collect_steering_votes(study, cells))
-    judged = [[row for row in made.rows(STEERING) if row.outcome in JUDGED] for _, made in done]
+    judged = [[row for row in made.rows(STEERING) if row.outcome in WITH_TEXT] for _, made in done]
     tasks = [
         sum(len(tasks_for(row.side)) for row in rows) for rows in judged
     ]  # controls are judged for correctness too
@@ -321,7 +321,7 @@ def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, e
 def test_the_panel_judges_every_answer_with_a_text(steered: Workspace) -> None:
     answers, votes = steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES)
     keys = ["dataset", "source", "kind", "draw", "layer", "unit", "dose", "signs", "item_id"]
-    texts = answers.loc[answers["outcome"].isin(JUDGED), keys]
+    texts = answers.loc[answers["outcome"].isin(WITH_TEXT), keys]
     correctness = votes.query("task == 'correctness'")
     assert set(correctness["side"]) == {"control"} and correctness["correct"].notna().all()
     votes = votes.query("task == 'abstention'")

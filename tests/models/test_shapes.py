@@ -272,7 +272,7 @@ def test_a_call_that_never_left_costs_nothing(odd: Provider) -> None:
         account = Account(key=KEY, base_url=f"http://127.0.0.1:{closed.getsockname()[1]}/v1")
         with pytest.raises(TransientError) as raised:
             asyncio.run(ApiBackend(entry_of("m"), account).ask(request()))
-    assert (raised.value.kind, raised.value.billed) == ("connection", False)
+    assert (raised.value.kind, raised.value.billed) == ("unreachable", False)
 
 
 def test_words_of_a_provider_cannot_steer_a_terminal(odd: Provider, capsys: pytest.CaptureFixture[str]) -> None:

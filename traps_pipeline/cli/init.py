@@ -55,5 +55,7 @@ def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
     keep(workspace.root)
     from traps_pipeline.orchestration.run import dagster_history
 
-    with dagster_history(workspace):  # opened once here, so that several processes may use it afterwards
-        return workspace
+    if not (workspace.dagster_home / "dagster.yaml").exists():
+        with dagster_history(workspace):  # opened once here, so that several processes may use it afterwards
+            pass
+    return workspace

@@ -252,9 +252,10 @@ def _trace(row: Mapping[str, Any], field: str) -> Behind | None:
 def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.DataFrame:
     """One row per (model, regime), best first: its LEADERBOARD row of the dataset, PECS of the others, and marks. For
     an entry without a row of the dataset the counts are sums over all its rows."""
-    found = []
-    for _, rows in of_several_runs(board).groupby(["model", "regime"], sort=False):
-        by_dataset = {row["dataset"]: row for row in rows.to_dict("records")}
+    found, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
+    for row in of_several_runs(board).to_dict("records"):
+        entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row
+    for by_dataset in entries.values():
         main = by_dataset.get(dataset)
         counted = list(by_dataset.values()) if main is None else [main]
         entry: dict[str, Any] = {name: counted[0][name] for name in ("model", "regime")} | (main or {})
