@@ -128,16 +128,18 @@ def test_nothing_is_asked_that_no_experiment_of_the_study_names(study: Checkout)
 
 def test_a_changed_formula_makes_its_stage_and_then_what_hangs_on_it_stale(study: Checkout) -> None:
     path = study.root / "traps_pipeline" / "defs" / "scoring.py"
-    code, needs = path.read_text(), '    needs={"verdicts": "some"},'
-    assert needs in code
-    path.write_text(code.replace(needs, f'{needs}\n    code="2",', 1))
+    stages = path.read_text()
+    before, place, after = stages.partition('    needs={"verdicts": "some"},')
+    old = re.search(r'    code="(\d+)",\n$', before)  # of the stage metrics, which stands just above
+    assert place and old is not None
+    path.write_text(f'{before[: old.start()]}    code="99",\n{place}{after}')
     status = study.traps("status", EXPERIMENT).out
-    assert "its code has version 2 now, it was made by version 1" in status
+    assert f"its code has version 99 now, it was made by version {old[1]}" in status
     run = study.score(EXPERIMENT)
     assert run.code == 0, run.err
     assert run.counts() == {"answers": 0, "votes": 0, "frames": 0}
     assert "metrics: 4 partitions to do" in run.out
-    assert Workspace.open(study.workspace).tables.state(METRICS, {"dataset": "chaotic"}).code == "2"
+    assert Workspace.open(study.workspace).tables.state(METRICS, {"dataset": "chaotic"}).code == "99"
     assert "its code has version" not in study.traps("status", EXPERIMENT).out
 
 
