@@ -57,7 +57,13 @@ def decide(workspace: Workspace, at: Cell, failures: set[int], numbers: range) -
         abstained = None if number == numbers[-1] else number not in failures
         row = dict.fromkeys(VERDICTS.names, "x") | at.partition
         row |= {"item_id": f"{at.dataset}:s-{number:04d}:void", "side": "void", "abstained": abstained, "correct": None}
-        row |= {"n_valid": 3, "n_valid_correctness": 0, "unanimous": True, "undecided": abstained is None}
+        row |= {
+            "n_valid": 3,
+            "n_valid_correctness": 0,
+            "unanimous": True,
+            "undecided": abstained is None,
+            "is_json": None,
+        }
         rows.append(VerdictRow(**row))
     workspace.tables.write(VERDICTS, at.partition, rows, {})
 

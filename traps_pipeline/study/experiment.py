@@ -114,6 +114,10 @@ class Experiment(BaseModel):
             raise TrapsError(
                 f"--panel {panel}: experiment {self.name} names the panel {self.panel!r}; edit one of them"
             )
+        if panel is None and study is not None and study.panel and self.panel not in (None, study.panel):
+            raise TrapsError(
+                f"study.yaml: panel is {study.panel!r}, experiment {self.name} has {self.panel!r}; edit one of them"
+            )
         named = panel or (base.panel if study else self.panel) or self.panel or ""
         by_rules = judged_by_rules or bool(self.judged_by_rules) or base.judged_by_rules
         require_panel(named, self.models, judged_by_rules=by_rules)
