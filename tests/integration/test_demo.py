@@ -117,5 +117,5 @@ def test_status_calls_everything_fresh_and_plan_has_nothing_new(demo_study: Chec
         ("leaderboard", 1),
     ):
         assert re.search(rf"^{stage} +{partitions} +0 +0$", status, re.MULTILINE), status
-    plan = demo_study.traps("plan", "demo").out.splitlines()[-1].split()
-    assert plan == ["all", "3,456", "3,456", "0", "15,552", "15,552", "0"]
+    plan = demo_study.traps("plan", "demo").out
+    assert re.search(r"^all +3,456 +3,456 +0 +15,552 +15,552 +0$", plan, re.MULTILINE), plan
