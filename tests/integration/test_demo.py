@@ -18,7 +18,8 @@ from traps_pipeline.storage.workspace import Workspace
 pytestmark = pytest.mark.slow
 NOT_RUN = ("confabulation", "confabulation_prevalence", "judge_validation", "judge_robustness")  # empty, never zeros
 MECHANISM = ("probe_items", "hidden_states", "probes", "directions", "cosines", "steering", "steering_votes")
-MECHANISM += ("steering_effects", "steering_shares")
+MECHANISM += ("steering_effects", "steering_shares", "steering_nulls", "steering_pecs")
+MECHANISM += ("probe_baselines", "gate", "risk_coverage", "patching")
 ON_REQUEST = ("arms", "robust")  # an experiment names arms
 DEGENERATE = ("always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle")
 
