@@ -151,15 +151,16 @@ def meanwhile(stage, key, parent):
     told = {"changed": name_of(parent), "problems": problems, "told": len(undo), "why": status.reasons}
     return {"stage": stage.name, **told}
 
-# Nothing is gated here, since no experiment asks the tiny model.
-wanted = [stage for stage in graph.stages if stage.wanted(Wanted(workspace))]
+def made_above(stage):
+    key, versions = stage.wanted(Wanted(workspace))[0], Lineage(workspace)
+    return [(p, k) for p, keys in graph.parents(stage.name, key).items() for k in keys if versions.version(p, k)]
+
+# Nothing is gated here, since no experiment asks the tiny model; what is made from that has nothing above it.
+wanted = [stage for stage in graph.stages if stage.wanted(Wanted(workspace)) and made_above(stage)]
 print("STAGES", *(stage.name for stage in wanted))
 with dagster_history(workspace) as history:
     for stage in wanted:
-        key = stage.wanted(Wanted(workspace))[0]
-        versions = Lineage(workspace)
-        above = [(p, k) for p, keys in graph.parents(stage.name, key).items() for k in keys if versions.version(p, k)]
-        print("MADE", json.dumps(meanwhile(stage, key, above[-1])))
+        print("MADE", json.dumps(meanwhile(stage, stage.wanted(Wanted(workspace))[0], made_above(stage)[-1])))
 """
 
 
