@@ -1,5 +1,7 @@
 """The controls of the mechanism group: baselines of probes, the gate, nulls of steering, patching."""
 
+from typing import TYPE_CHECKING
+
 import dagster as dg
 
 from traps_pipeline.defs.evaluation import verdicts
@@ -23,7 +25,7 @@ from traps_pipeline.mechanism.control_tables import (
 )
 from traps_pipeline.mechanism.tables import STEERING_EFFECTS
 from traps_pipeline.mechanism.versions import patching_version
-from traps_pipeline.models.registry import local_models
+from traps_pipeline.models.registry import ModelEntry, local_models
 from traps_pipeline.orchestration.graph import Need
 from traps_pipeline.orchestration.schemes import CELL, EXTRACTION, by_extraction, these_keys
 from traps_pipeline.orchestration.stage import source, stage
@@ -31,6 +33,9 @@ from traps_pipeline.orchestration.wanted import PROBE_PROMPT, Wanted
 from traps_pipeline.partitions import DATASETS, PROBED_ARMS, Cell, Evaluation, Extraction
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    from traps_pipeline.mechanism.stored import StoredStates
 
 patching_settings = source(
     "patching_settings",
@@ -42,15 +47,20 @@ patching_settings = source(
 )
 
 
-def _make_baselines(workspace: Workspace, key: str) -> Made:
-    """The probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
-    from traps_pipeline.mechanism.baselines import baseline_rows
+def _examined(workspace: Workspace, key: str) -> "tuple[ModelEntry, StoredStates]":
+    """The model of an extraction, and its stored states."""
     from traps_pipeline.mechanism.stages import examined_model
     from traps_pipeline.mechanism.stored import StoredStates
 
     extraction = Extraction.parse(key)
-    entry = examined_model(workspace, extraction.model)
-    return Made(baseline_rows(workspace, entry, StoredStates.of(workspace, extraction)))
+    return examined_model(workspace, extraction.model), StoredStates.of(workspace, extraction)
+
+
+def _make_baselines(workspace: Workspace, key: str) -> Made:
+    """The probing protocol on raw inputs, on the model's output margin and on noise, in the place of states."""
+    from traps_pipeline.mechanism.baselines import baseline_rows
+
+    return Made(baseline_rows(workspace, *_examined(workspace, key)))
 
 
 probe_baselines = stage(
@@ -74,23 +84,15 @@ def _make_gate(workspace: Workspace, key: str) -> Made:
     """The model's figures before and after a probe on its states has turned answers into abstentions, beside gates on
     raw inputs, on the output margin and with shuffled labels."""
     from traps_pipeline.mechanism.gating import gate_rows
-    from traps_pipeline.mechanism.stages import examined_model
-    from traps_pipeline.mechanism.stored import StoredStates
 
-    extraction = Extraction.parse(key)
-    entry = examined_model(workspace, extraction.model)
-    return Made(gate_rows(workspace, entry, StoredStates.of(workspace, extraction)))
+    return Made(gate_rows(workspace, *_examined(workspace, key)))
 
 
 def _make_curves(workspace: Workspace, key: str) -> Made:
     """Risk against coverage as gates give up answers, over the four datasets."""
     from traps_pipeline.mechanism.gating import curve_rows
-    from traps_pipeline.mechanism.stages import examined_model
-    from traps_pipeline.mechanism.stored import StoredStates
 
-    extraction = Extraction.parse(key)
-    entry = examined_model(workspace, extraction.model)
-    return Made(curve_rows(workspace, entry, StoredStates.of(workspace, extraction)))
+    return Made(curve_rows(workspace, *_examined(workspace, key)))
 
 
 def _gated(wanted: Wanted, key: str) -> bool:
