@@ -21,16 +21,21 @@ from traps_pipeline.storage.workspace import Workspace
 pytestmark = pytest.mark.slow
 EVALUATIONS = 3 * 2 * 1  # models x regimes x runs of the small study
 
-# Dagster's own verdict on every partition, by the resolver behind its UI.
+# Dagster's own verdict on every partition, by the resolver behind its UI, once sources are observed as sensors do it.
 STALE = """
-import json, sys
+import json, os, sys
+from pathlib import Path
 import dagster as dg
 from dagster._core.definitions.data_version import CachingStaleStatusResolver
 from dagster._core.loader import LoadingContextForTest
 from traps_pipeline.definitions import defs
 from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.orchestration.history import History
+from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.storage.workspace import Workspace
 graph = defs.get_repository_def().asset_graph
 with dg.DagsterInstance.get() as instance:
+    History(instance, the_graph()).observe(Lineage(Workspace.open(Path(os.environ["TRAPS_WORKSPACE"]))))
     resolver = CachingStaleStatusResolver(instance, graph, LoadingContextForTest(instance))
     nodes = [(s.name, k) for s in the_graph().stages for k in the_graph().keys(s.name) if k is not None]
     found = {f"{s}/{k}": resolver.get_status(dg.AssetKey(s), k).value for s, k in nodes}

@@ -21,20 +21,20 @@ from traps_pipeline.models.budget import Journal
 
 pytestmark = pytest.mark.slow
 ITEMS = 48  # of the small study: 12 scenarios in two datasets, two sides
-MANY = "TRAPS_MANY_CALLS" in os.environ  # 864 calls in the place of 192, and five kills: for a release
+MANY = "TRAPS_MANY_CALLS" in os.environ  # 864 calls in the place of 288 and of 192, and five kills: for a release
 SAMPLING = "temperature: 0.8, top_p: 0.95, max_tokens: 8000"
 TRANSIENT = {
     "rate_limited": 0.03,
     "rate_limited_bare": 0.03,
     "server_error": 0.03,
     "overloaded": 0.02,
-    "hang": 0.005,
+    "hang": 0.004,  # each waits for its time-out
     "cut": 0.025,
     "wrong_content_type": 0.002,  # tried again once only
     "timeout_status": 0.01,
     "conflict": 0.01,
 }
-ENDINGS = {"empty": 0.005, "length": 0.005, "content_filter": 0.005, "thinking_exhausted": 0.005, "invalid_json": 0.005}
+ENDINGS = dict.fromkeys(("empty", "length", "content_filter", "thinking_exhausted", "invalid_json"), 0.01)
 
 
 def entry(name: str, profile: str, more: str = "prices: {input: 1.0, output: 10.0, as_of: 2026-11-01}") -> str:
@@ -45,7 +45,7 @@ def entry(name: str, profile: str, more: str = "prices: {input: 1.0, output: 10.
     provider_id: openai/{name}
     media: {{profile: {profile}, fps: 5, most: 25}}
     params: {{{SAMPLING}}}
-    limits: {{timeout_s: 4, backoff_s: 0.05}}
+    limits: {{timeout_s: 36, backoff_s: 0.05}}
     {more}
 """
 
@@ -87,14 +87,17 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_
 ) -> None:
     provider.configure(faults=TRANSIENT | ENDINGS, only_first_attempts=3, latency_s=0.02, seed=1)
     register(unasked, provider, entry("video-model", "video"), entry("image-model", "images"))
-    path = experiment(unasked, ["video-model", "image-model"], regimes=["standard", "guided", "json"], runs=[1, 2, 3])
+    runs = [1, 2, 3] if MANY else [1]
+    path = experiment(unasked, ["video-model", "image-model"], regimes=["standard", "guided", "json"], runs=runs)
     finished = ask(unasked, path, "--budget-usd", "500")
     assert finished.code == 0, finished.err
     rows, stats = responses(unasked), provider.stats()
-    assert len(rows) == len({(r["item_id"], r["model"], r["regime"], r["run"]) for r in rows}) == 2 * ITEMS * 9
+    assert (
+        len(rows) == len({(r["item_id"], r["model"], r["regime"], r["run"]) for r in rows}) == 2 * ITEMS * 3 * len(runs)
+    )
     outcomes = Counter(row["outcome"] for row in rows)
     assert outcomes.keys() == {"answer", "truncated", "empty", "refused"}
-    assert outcomes["answer"] > 0.95 * len(rows)
+    assert outcomes["answer"] > 0.9 * len(rows)
     for row in rows:
         assert (row["text"] is not None) == (row["outcome"] == "answer")
     texts = {row["text"] for row in rows if row["outcome"] == "answer"}
@@ -171,7 +174,7 @@ def test_only_what_decides_an_answer_is_asked_again(unasked: Checkout, provider:
     register(unasked, provider, entry("image-model", "images"))
     path = experiment(unasked, ["image-model"], regimes=["standard"], datasets=["chaotic", "chaotic_ill_posed"])
     assert ask(unasked, path, "--budget-usd", "10").counts()["answers"] == ITEMS / 2
-    quick = entry("image-model", "images").replace("timeout_s: 4", "timeout_s: 9, concurrency: 3")
+    quick = entry("image-model", "images").replace("timeout_s: 36", "timeout_s: 40, concurrency: 3")
     register(unasked, provider, quick.replace("input: 1.0", "input: 2.0"))
     assert ask(unasked, path).counts()["answers"] == 0
     unasked.correct("plinko-0001", question="In which numbered bucket, 1 to 7, does the ball end?")

@@ -192,7 +192,7 @@ with dg.DagsterInstance.get() as history:
 """
     begun = study.run(sys.executable, "-W", "ignore", "-c", code)
     assert begun.code == 0, begun.err
-    assert study.traps("status").code == 0
+    assert study.traps("run", EXPERIMENT, "--until", "items").code == 0
     states = """
 import dagster as dg
 with dg.DagsterInstance.get() as history:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, add_panel, experiment_of
@@ -109,15 +109,17 @@ def _preflight(workspace: Workspace, experiment: Experiment, stages: Collection[
 
     lineage, cells = Lineage(workspace), Wanted(workspace, experiment.name).cells
 
-    def behind(stage: str) -> dict[str, None]:
-        if stage not in stages:
-            return {}
-        models = (Cell.parse(key).evaluation.model for key in cells if lineage.status(stage, key).kind != "fresh")
-        return dict.fromkeys(models)
+    def behind(stage: str) -> Iterator[str]:
+        wanted = cells if stage in stages else ()
+        return (key for key in wanted if lineage.status(stage, key).kind != "fresh")
 
-    models = [entry for entry in map(get_model, behind("responses")) if entry.backend == NETWORK]
-    judges = load_panel(workspace.study.panel) if behind("votes") else ()
-    judges = [judge for judge in judges if judge.backend == NETWORK]
+    over_network = {name: entry for name in experiment.models if (entry := get_model(name)).backend == NETWORK}
+    panel = load_panel(workspace.study.panel) if "votes" in stages else ()
+    judges = [judge for judge in panel if judge.backend == NETWORK]
+    # Whether a cell is behind is looked up for the sake of what is over the network alone.
+    names = {Cell.parse(key).evaluation.model for key in behind("responses")} if over_network else set[str]()
+    models = [entry for name, entry in over_network.items() if name in names]
+    judges = judges if judges and any(behind("votes")) else []
     if not models and not judges:
         return
     found = preflight(workspace, models, judges)

@@ -29,15 +29,11 @@ def status(arguments: argparse.Namespace) -> int:
         raise TrapsError(
             f"{workspace.root}/study.yaml: has no experiment {experiment!r}; traps init {experiment} adds it"
         )
-    from traps_pipeline.orchestration.history import History
     from traps_pipeline.orchestration.lineage import Lineage
-    from traps_pipeline.orchestration.run import dagster_history
     from traps_pipeline.study.status import stage_statuses
 
     load_definitions()
     lineage = Lineage(workspace)
-    with dagster_history(workspace) as instance:
-        History(instance, lineage.graph).observe(lineage)  # so that Dagster's UI shows the same partitions stale
     rows = list(stage_statuses(workspace, lineage, experiment))
     counts = [(row.stage, row.fresh, len(row.stale), row.missing) for row in rows]
     lines = text_table(("stage", "fresh", "stale", "missing"), counts).splitlines()
