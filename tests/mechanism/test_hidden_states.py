@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from safetensors import safe_open
 from tests.local_models import FAMILIES, SIX_FRAMES, SYSTEM, Family, ask, clip, model, three_prompts
 from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.mechanism.hidden_states import Item, clip_item, extract, read_layer, read_record
+from traps_pipeline.mechanism.hidden_states import Item, clip_item, damage, extract, read_layer, read_record
 from traps_pipeline.models.local.adapter import LocalModel, Prompt
 from traps_pipeline.models.local.capture import pool
 
@@ -224,6 +225,38 @@ def test_a_damaged_shard_is_made_again_and_one_that_is_read_is_named(tmp_path: P
         read_layer(tmp_path, 1)
     assert extract(of, work(of), tmp_path, shard_size=2).n_new == 2
     assert len(read_layer(tmp_path, 1)[1]) == 5
+
+
+def test_a_flipped_bit_in_any_file_of_an_extraction_changes_no_state_unseen(tmp_path: Path) -> None:
+    of, places = model("qwen3-vl"), random.Random(1)
+    extract(of, work(of), tmp_path, shard_size=2)
+
+    def read() -> list[tuple[list[list[str]], bytes]]:
+        layers = [read_layer(tmp_path, layer) for layer in (*range(of.n_layers + 1), "normed")]
+        return [(ids.to_numpy().tolist(), states.tobytes()) for ids, states in layers]
+
+    sound, silent, named = read(), list[str](), 0
+    files = [tmp_path / "ids.parquet", *sorted(tmp_path.glob("shard-*.safetensors"))]
+    for file in files:
+        written = file.read_bytes()
+        for place in places.sample(range(8 * len(written)), 60):
+            flipped = bytearray(written)
+            flipped[place // 8] ^= 1 << place % 8
+            file.write_bytes(flipped)
+            try:
+                if read() != sound:
+                    silent.append(f"{file.name} bit {place}")
+            except TrapsError as error:
+                named += str(file) in str(error) or "no layer" in str(error)
+        file.write_bytes(written)
+    assert not silent and named > 200
+    table = tmp_path / "shard-00001.parquet"  # read only when an extraction goes on
+    flipped = bytearray(table.read_bytes())
+    flipped[len(flipped) // 3] ^= 1
+    table.write_bytes(flipped)
+    assert damage(table).startswith(str(table)) and not damage(tmp_path / "shard-00000.parquet")
+    assert extract(of, work(of), tmp_path, shard_size=2).n_new == 2
+    assert read() == sound
 
 
 def test_a_layer_that_is_not_there_is_refused(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.camera import Camera
-from traps_pipeline.scenes.clips import check_clip
+from traps_pipeline.scenes.clips import check_clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.encode import DamagedClip, decode, encode, frames_digest
 from traps_pipeline.scenes.kit import Physics
 from traps_pipeline.scenes.outcome import compile_scene
@@ -97,6 +97,22 @@ def test_a_clip_is_checked_by_size_and_digest(clip: Path) -> None:
     clip.unlink()
     with pytest.raises(DamagedClip, match=r"clip\.mp4: .*0 of"):
         check_clip(clip, digest, size)
+
+
+def test_a_flipped_bit_in_a_clips_note_is_never_believed(tmp_path: Path) -> None:
+    clip = tmp_path / "void.mp4"
+    save_clip(clip, frames(3), 10, leaked_pixels=0.25)
+    known, note = read_clip(clip), note_of(clip)
+    assert known is not None and (known.n_frames, known.fps, known.leaked_pixels) == (3, 10, 0.25)
+    written = note.read_bytes()
+    for place in range(8 * len(written)):
+        flipped = bytearray(written)
+        flipped[place // 8] ^= 1 << place % 8
+        note.write_bytes(flipped)
+        with pytest.raises(DamagedClip, match=r"void\.json: is not what was written .*delete it and run again"):
+            read_clip(clip)
+    note.unlink()
+    assert read_clip(clip) is None  # rendered anew
 
 
 def test_the_frames_digest_is_over_the_pixels_of_all_frames() -> None:

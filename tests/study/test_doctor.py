@@ -10,6 +10,7 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from traps_pipeline.cli import main
@@ -18,6 +19,7 @@ from traps_pipeline.models.budget import Journal
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.media import MediaSpec
+from traps_pipeline.storage.parquet import write_sealed
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -40,7 +42,7 @@ def test_each_damaged_file_is_named_by_itself(tmp_path: Path, capsys: pytest.Cap
         return main(["doctor", "--verify", "--workspace", str(tmp_path)]), capsys.readouterr().out
 
     code, told = verified()
-    assert code == 0 and told.count("ok  ") == 6, told
+    assert code == 0 and told.count("ok  ") == 7, told
     files = [path for kind in ("*.parquet", "*.jsonl*", "*.mp4") for path in tmp_path.rglob(kind)]
     assert len(files) == 5
     for path in files:
@@ -78,7 +80,9 @@ def test_a_damaged_note_file_and_history_are_named_and_what_killed_runs_left_is_
     code, told = verified()
     assert code == 0 and "1 files of killed runs removed" in told, told
     assert (old.exists(), young.exists()) == (False, True)
-    for path in (media.path, media.path.with_suffix(".json"), history):
+    states = workspace.root / "states" / "m" / "standard" / "occlusion" / "shard-00000.parquet"
+    write_sealed(states, pa.table({"item_id": ["a" * 300]}), {})
+    for path in (media.path, media.path.with_suffix(".json"), history, states):
         written = path.read_bytes()
         place = 100 if path == history else len(written) // 2  # of a history the first page, not the text of a row
         path.write_bytes(written[:place] + b"\0" * 100 + written[place + 100 :])

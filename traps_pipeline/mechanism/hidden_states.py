@@ -5,9 +5,10 @@
 
 A folder holds `shard-NNNNN.safetensors` (one key per layer, `layer_000` = embeddings, and `normed`), a `.parquet` file
 beside each shard (the item in each row, and the device that made it), and `ids.parquet`, which is written last and
-names the current row of each item. A shard's table is written after its tensors, so a shard with a table is complete,
-and an extraction that was killed continues after the last such shard. An item's key is a digest of everything that its
-states depend on, so after a correction only the corrected item is extracted again.
+names the current row of each item. Each file holds digests of its content, which are looked at when it is read. A
+shard's table is written after its tensors, so a shard with a table is complete, and an extraction that was killed
+continues after the last such shard. An item's key is a digest of everything that its states depend on, so after a
+correction only the corrected item is extracted again.
 
 States of one token are stored in the model's own precision, which loses nothing, and mean states in float32.
 """
@@ -15,6 +16,7 @@ States of one token are stored in the model's own precision, which loses nothing
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,13 +31,15 @@ import numpy as np
 from traps_pipeline import progress
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, replacing, write_bytes
+from traps_pipeline.files import remedy, write_bytes
 from traps_pipeline.models.local.capture import OF_PARTS, ONE_TOKEN, Pooling
 from traps_pipeline.models.local.spans import spans
 from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
+from traps_pipeline.storage.parquet import read_sealed, write_sealed
 
 if TYPE_CHECKING:
     import pandas as pd
+    import torch
 
     from traps_pipeline.models.local.adapter import LocalModel, Prompt, States
 
@@ -253,7 +257,7 @@ def _flush(
     """Write a shard, tensors first, and note where its items are; the next shard's number."""
     if not shard:
         return number
-    import pandas as pd
+    import pyarrow as pa
     import torch
     from safetensors.torch import save
 
@@ -262,23 +266,21 @@ def _flush(
     raw = torch.from_numpy(np.stack([states.raw for _, _, states in shard], axis=1)).to(dtype)  # (layers, n, d)
     tensors = {f"layer_{layer:03d}": rows.contiguous() for layer, rows in enumerate(raw)}
     tensors[NORMED] = torch.from_numpy(np.stack([states.normed for _, _, states in shard])).to(dtype)
-    write_bytes(folder / f"{name}.safetensors", save(tensors), durable=True)
-    rows = [(item.item_id, item.side, key) for item, key, _ in shard]
-    table = pd.DataFrame(rows, columns=["item_id", "side", "key"]).assign(device=model.device_name)
-    with replacing(folder / f"{name}.parquet", durable=True) as part:
-        table.to_parquet(part, index=False)
-    known.update({key: (name, row, model.device_name) for row, (_, _, key) in enumerate(rows)})
+    seals = {name: _seal_of(rows) for name, rows in tensors.items()}
+    write_bytes(folder / f"{name}.safetensors", save(tensors, metadata=seals), durable=True)
+    rows = [(item.item_id, item.side, key, model.device_name) for item, key, _ in shard]
+    columns = zip(("item_id", "side", "key", "device"), zip(*rows, strict=True), strict=True)
+    write_sealed(folder / f"{name}.parquet", pa.table({column: list(values) for column, values in columns}), {})
+    known.update({key: (name, row, device) for row, (_, _, key, device) in enumerate(rows)})
     return number + 1
 
 
 def _shards(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
     """The complete shards: name and table. Tensors without a table come from a killed run; `_sweep` removes them."""
-    import pandas as pd
-
     for path in sorted(folder.glob("shard-*.parquet")):
         try:
-            table = pd.read_parquet(path)
-            rows = len(_tensor(path.with_suffix(".safetensors"), NORMED))
+            table = read_sealed(path).to_pandas()
+            rows = _sound_rows(path.with_suffix(".safetensors"))
         except (OSError, ValueError, TrapsError) as error:
             progress.current().note(f"{path}: damaged ({error}); its items are extracted again")
             continue
@@ -295,20 +297,15 @@ def _write_ids(
 ) -> None:
     import pandas as pd
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     rows = [(item.item_id, item.side, key, *known[key]) for item, key in zip(items, keys, strict=True)]
     table = pa.Table.from_pandas(pd.DataFrame(rows, columns=list(_COLUMNS)), preserve_index=False)
-    table = table.replace_schema_metadata({_RECORD: json.dumps(record).encode()})
-    with replacing(folder / _IDS, durable=True) as part:
-        pq.write_table(table, part)
+    write_sealed(folder / _IDS, table, {_RECORD: json.dumps(record).encode()})
 
 
 def _ids(folder: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
-    import pyarrow.parquet as pq
-
     try:
-        table = pq.read_table(folder / _IDS)
+        table = read_sealed(folder / _IDS)
         record = json.loads((table.schema.metadata or {})[_RECORD])
     except FileNotFoundError:
         raise TrapsError(f"{folder}: hidden states are missing or not finished; materialize hidden_states") from None
@@ -333,11 +330,44 @@ def _tensor(file: Path, name: str) -> np.ndarray:
 
     try:
         with safe_open(file, framework="pt") as shard:
-            return shard.get_tensor(name).float().numpy()
+            tensor, seals = shard.get_tensor(name), shard.metadata()
+        if seals and seals.get(name) != _seal_of(tensor):  # shards of version 0.1.0 have none
+            raise OSError("it was altered")
+        return tensor.float().numpy()
     except (OSError, SafetensorError) as error:
         raise TrapsError(
             f"{file}: cannot be read ({error}); delete it, then `traps run` extracts its items again"
         ) from error
+
+
+def _sound_rows(file: Path) -> int:
+    """How many items a shard holds. Raises TrapsError unless every tensor of it is what was written."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(file, framework="pt") as shard:
+            names = [*shard.keys()]
+    except (OSError, SafetensorError) as error:
+        raise TrapsError(f"{file}: cannot be read ({error})") from error
+    rows = {len(_tensor(file, name)) for name in {*names, NORMED}}
+    if len(rows) > 1:
+        raise TrapsError(f"{file}: its tensors have {sorted(rows)} rows")
+    return rows.pop()
+
+
+def damage(file: Path) -> str:
+    """What is wrong with a file of an extraction (tensors or table), in words; empty where it is what was written."""
+    try:
+        _sound_rows(file) if file.suffix == ".safetensors" else read_sealed(file)
+    except (OSError, ValueError, TrapsError) as error:
+        return str(error) if str(file) in str(error) else f"{file}: cannot be read ({error})"
+    return ""
+
+
+def _seal_of(tensor: torch.Tensor) -> str:
+    import torch
+
+    return hashlib.sha256(tensor.contiguous().view(torch.uint8).numpy().data).hexdigest()
 
 
 def _sweep(folder: Path, needed: set[str]) -> None:

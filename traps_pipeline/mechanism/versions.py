@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.paths import CURVES
 from traps_pipeline.mechanism.tables import DIRECTIONS
 from traps_pipeline.models.prompts import states_prompt, system_prompt
@@ -33,13 +34,12 @@ def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
 
 def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
     """Whether the extraction of a partition was finished and all of its files still exist."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    from traps_pipeline.storage.parquet import read_sealed
 
     folder = states_folder(workspace, cell)
     try:
-        shards = set(pq.ParquetFile(folder / "ids.parquet").read(columns=["shard"])["shard"].to_pylist())
-    except (OSError, pa.ArrowException):
+        shards = set(read_sealed(folder / "ids.parquet")["shard"].to_pylist())
+    except (OSError, ValueError, KeyError, TrapsError):
         return False
     return all((folder / f"{shard}{ending}").is_file() for shard in shards for ending in (".safetensors", ".parquet"))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.digests import file_digest
+from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.files import write_text
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import Camera, Panel
@@ -46,6 +46,13 @@ class Clip:
         return self.n_frames / self.fps
 
 
+_SEAL = "seal"  # of a note: the digest of what else it says
+
+
+def _seal_of(clip: Clip) -> str:
+    return digest(asdict(clip))[:16]
+
+
 @dataclass(frozen=True)
 class Job:
     """A pair and its twin to render: record, trajectories (F, nq), and where the clips go."""
@@ -73,8 +80,12 @@ def read_clip(path: Path) -> Clip | None:
     if not path.is_file() or not note_of(path).is_file():
         return None
     try:
-        clip = Clip(**json.loads(note_of(path).read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
+        note = json.loads(note_of(path).read_text(encoding="utf-8"))
+        seal = note.pop(_SEAL, None)  # notes of version 0.1.0 have none
+        clip = Clip(**note)
+        if seal not in (None, _seal_of(clip)):
+            raise ValueError("it was altered")
+    except (ValueError, TypeError, AttributeError) as error:
         raise DamagedClip(f"{note_of(path)}: is not what was written ({error}); delete it and run again") from error
     check_clip(path, clip.file_sha256, clip.size_bytes)
     return clip
@@ -153,7 +164,7 @@ def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels:
     """Encode frames and write the note that vouches for them; returns how many there are."""
     encode(frames, path, fps)
     clip = Clip(file_digest(path), frames_digest(frames), len(frames), fps, path.stat().st_size, leaked_pixels)
-    write_text(note_of(path), json.dumps(asdict(clip)))
+    write_text(note_of(path), json.dumps(asdict(clip) | {_SEAL: _seal_of(clip)}))
     return len(frames)
 
 

@@ -96,20 +96,10 @@ class TableStore:
         with the version. Raises TrapsError when a row breaks the schema or a key repeats, and when the disk is full;
         the partition's former file then still stands. code is the version of what made the rows.
         """
-        import pyarrow.parquet as pq
-
         data = self._checked(table, partition, rows)
         version = content_version(data)
         state = State(version, dict(inputs), len(data), failed, code)
-        data = data.replace_schema_metadata({_FOOTER: json.dumps(asdict(state)).encode(), _SUM: _MARK + _ZEROS})
-        path = self.path(table, partition)
-        with replacing(path, durable=True) as part:
-            pq.write_table(data, part, compression="zstd")
-            content = part.read_bytes()
-            place = content.rfind(_MARK) + len(_MARK)
-            with part.open("r+b") as stream:
-                stream.seek(place)
-                stream.write(_sum_of(content))
+        write_sealed(self.path(table, partition), data, {_FOOTER: json.dumps(asdict(state)).encode()})
         return version
 
     def _checked(self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame) -> pa.Table:
@@ -230,6 +220,28 @@ class TableStore:
             raise TrapsError(f"{path}: not there yet; materialize {table.name} for this partition first") from None
         except (pa.ArrowException, OSError) as error:
             raise _unreadable(path, table, error) from error
+
+
+def write_sealed(path: Path, data: pa.Table, metadata: Mapping[bytes, bytes]) -> None:
+    """Write a Parquet file, whole or not at all, with metadata and the digest of its own bytes in its footer."""
+    import pyarrow.parquet as pq
+
+    with replacing(path, durable=True) as part:
+        pq.write_table(data.replace_schema_metadata({**metadata, _SUM: _MARK + _ZEROS}), part, compression="zstd")
+        content = part.read_bytes()
+        with part.open("r+b") as stream:
+            stream.seek(content.rfind(_MARK) + len(_MARK))
+            stream.write(_sum_of(content))
+
+
+def read_sealed(path: Path) -> pa.Table:
+    """A Parquet file if its bytes are what was written; one of version 0.1.0, which has no digest, is believed.
+
+    Raises TrapsError if they are not, FileNotFoundError, and OSError or ArrowException if it is no Parquet file.
+    """
+    import pyarrow.parquet as pq
+
+    return pq.ParquetFile(_sound_bytes(path)).read()
 
 
 def _sum_of(content: bytes) -> bytes:

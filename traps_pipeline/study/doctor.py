@@ -16,6 +16,7 @@ from pathlib import Path
 from traps_pipeline.files import PART
 
 MIN_FREE_GB = 1.0
+STATES = ("*.safetensors", "*.parquet")  # files of an extraction
 SHOWN = 5  # damaged files of a kind that are named
 UNFINISHED_AFTER_S = 24 * 3600.0  # no file takes so long to write
 
@@ -67,6 +68,11 @@ def examine_files(workspace_root: Path) -> Iterator[Finding]:
         ("ledger", sorted((workspace.root / "ledger").rglob("*.jsonl*")), _damaged_lines),
         ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
         ("media", sorted((workspace.root / "media").glob("*/*.json")), _damaged_media),
+        (
+            "states",
+            sorted(file for kind in STATES for file in (workspace.root / "states").rglob(kind)),
+            _damaged_states,
+        ),
         ("history", sorted(workspace.dagster_home.rglob("*.db")), _damaged_history),
     ):
         damaged = [said for path in files if (said := damage_of(path))]
@@ -109,6 +115,12 @@ def _damaged_media(note: Path) -> str:
     except (DamagedClip, ValueError) as error:
         return str(error)
     return ""
+
+
+def _damaged_states(path: Path) -> str:
+    from traps_pipeline.mechanism.hidden_states import damage
+
+    return damage(path)
 
 
 def _damaged_history(path: Path) -> str:
