@@ -1,7 +1,8 @@
 """When the first call of a run goes out: `traps run` on a ledger of 100,000 rows, from the command to the request's
-arrival at the server, and how much of that is imports; CPU seconds too, which a loaded machine does not stretch.
+arrival at the server, and how much of that is imports; CPU seconds too, which a loaded machine does not stretch. Then
+`traps plan` on the same ledger. The first of either reads every row once and keeps totals beside the segments.
 
-python bench/first_call.py [--rows 100000]
+python bench/first_call.py [--rows 100000]         (1600000: a large lab's year)
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def fill(root: Path, rows: int) -> None:
     asked = Evaluation("image-model", "standard", 1)
     evaluations = [asked, *(e for e in Wanted(None).evaluations if e.model != asked.model)]
     for start in range(0, rows, EVALUATION_ROWS):
-        evaluation = evaluations[start // EVALUATION_ROWS]
+        evaluation = evaluations[start // EVALUATION_ROWS % len(evaluations)]
         with Ledger(root, "answers").writer(evaluation.key) as writer:
             for n in range(start, min(start + EVALUATION_ROWS, rows)):
                 about = {
@@ -107,6 +108,11 @@ def main() -> None:
             process.communicate()
             print(f"run {run}: first call {first_s:.1f} s after the command ({first_cpu_s:.1f} s of CPU)", end="")
             print(f", {first_s - imports_s:.1f} s ({first_cpu_s - imports_cpu_s:.1f} s) without imports", flush=True)
+        for run in range(1, RUNS + 1):
+            began = time.perf_counter()
+            planned = study.traps("plan", path)
+            assert planned.code == 0, planned.err
+            print(f"plan {run}: {time.perf_counter() - began:.1f} s", flush=True)
 
 
 if __name__ == "__main__":
