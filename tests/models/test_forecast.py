@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
+from traps_pipeline.models import forecast as forecasts
 from traps_pipeline.models.forecast import Experience, experience, forecast
-from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.models.registry import Account, ModelEntry, get_model
 from traps_pipeline.storage.ledger import Totals
 
 
@@ -48,6 +49,21 @@ def test_experience_comes_before_estimates() -> None:
     seen = forecast(model(), 60, known)
     assert (seen.prompt_tokens, seen.completion_tokens) == (60 * 2000, 60 * 200)
     assert seen.minutes == pytest.approx(60 * 4 / 24 / 60)
+
+
+def test_calls_take_no_less_than_one_of_them_and_as_long_as_an_entry_says() -> None:
+    assert forecast(model(), 1, Experience(latency_s=90.0)).minutes == pytest.approx(1.5)
+    assert forecast(model(expected_latency_s=30.0), 48, Experience()).minutes == pytest.approx(1.0)  # two waves of 24
+    assert forecast(model(), 0, Experience()).minutes == 0
+
+
+def test_participants_of_an_account_share_its_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = {"gemini": Account(requests_per_minute=10)}
+    monkeypatch.setattr(forecasts, "load_accounts", lambda: slow)
+    rows = [forecast(model(), calls, Experience(latency_s=1.0)) for calls in (50, 30)]
+    assert [row.minutes for row in rows] == [pytest.approx(5), pytest.approx(3)]
+    assert forecasts.minutes_of(rows) == pytest.approx(8)
+    assert forecasts.minutes_of([]) == 0
 
 
 def test_an_unknown_price_stays_unknown() -> None:

@@ -96,7 +96,7 @@ class Config:
     completion; an attempt that its status does not refuse is billed, and one that is odd as the most that it may take.
     hang_s: when even the server gives up. served_suffix goes behind the model's name, as real ones answer with a date.
     blind: models that leave images and videos out, as a server of text models may; the others name the colours of a
-    clip that they are asked for. served: what the list of models holds.
+    clip that they are asked for. served: what the list of models holds, which comes with list_status.
     """
 
     latency_s: float = 0.0
@@ -114,6 +114,7 @@ class Config:
     usd_a_token: tuple[float, float] = (0.0, 0.0)
     blind: Sequence[str] = ()
     served: Sequence[str] | None = None
+    list_status: int = 200
 
     def __post_init__(self) -> None:
         unknown = ({*self.faults} | {*self.fault_by_model.values()}) - {*FAULTS, None}
@@ -689,7 +690,8 @@ class Server:
             record |= {"method": request.method, "path": request.path}
             record |= {"query": redacted(request.query), "headers": redacted(request.headers), "body": None}
         if request.method == "GET" and request.path.endswith("/models") and self._config.served is not None:
-            return json_reply({"object": "list", "data": [{"id": name} for name in self._config.served]})
+            listed = {"object": "list", "data": [{"id": name} for name in self._config.served]}
+            return json_reply(listed, self._config.list_status)
         known = api_of(request.path) if request.method == "POST" else None
         if known is None:
             return json_reply(error_body("chat", _UNKNOWN_PATH), 404)

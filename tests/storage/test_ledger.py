@@ -257,6 +257,12 @@ def test_rows_reach_the_disk_every_hundred_rows_or_half_second(
     assert len(fsyncs) == 5  # closing syncs
 
 
+def test_a_segment_to_which_nothing_was_written_asks_for_no_folder(ledger: Ledger) -> None:
+    with ledger.writer("m") as writer:  # of a cell whose answers are all broken: no judge is asked
+        writer.sync()
+    assert not ledger.folder("m").exists()
+
+
 def test_a_second_run_waits_and_says_who_holds_the_lock_until_that_one_is_killed(
     ledger: Ledger, tmp_path: Path
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import datetime
 import json
 import urllib.request
@@ -90,6 +91,43 @@ def test_a_round_trip_through_files_gives_the_outcomes_of_the_live_path(
     assert all(outcome.kind == "answer" and outcome.cost_usd for outcome in found.values())
 
 
+def inlined(value: Any, folder: Path) -> Any:
+    """A body with the media back in the place of their addresses, as whoever serves the folder would."""
+
+    def data(address: str) -> str:
+        assert address.startswith("https://here/media/")
+        return base64.b64encode((folder / address.rsplit("/", 1)[1]).read_bytes()).decode()
+
+    match value:
+        case str() if value.startswith("https://here/"):
+            return "data:image/jpeg;base64," + data(value)
+        case {"type": "url", "url": str(url)}:
+            return {"type": "base64", "media_type": "image/jpeg", "data": data(url)}
+        case {"file_data": {"mime_type": kind, "file_uri": uri}, **rest}:
+            return {"inline_data": {"mime_type": kind, "data": data(uri)}, **rest}
+        case dict():
+            return {key: inlined(each, folder) for key, each in value.items()}
+        case list():
+            return [inlined(each, folder) for each in value]
+        case _:
+            return value
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["openai", "openai/responses", "gemini", "anthropic"])
+def test_media_by_reference_are_the_media_that_are_inline(kind: str, entry_at: Entries, tmp_path: Path) -> None:
+    entry = entry_at(kind)
+    wanted = {"m": (entry, [*by_key(entry).values()])}
+    (inline,), _ = export_batches(wanted, tmp_path / "inline")
+    (referring,), _ = export_batches(wanted, tmp_path / "referring", "https://here/media/")
+    read = [json.loads(text) if kind == "anthropic" else [*map(json.loads, text.splitlines())]
+            for text in (inline.read_text(), referring.read_text())]  # fmt: skip
+    media = tmp_path / "referring" / "media"
+    assert inlined(read[1], media) == read[0] != read[1]
+    assert len([*media.iterdir()]) == 2  # the frames of two colours, each of them once
+    assert referring.stat().st_size < inline.stat().st_size / 2 and "base64" not in referring.read_text()
+
+
 @pytest.mark.slow
 def test_errors_and_expiries_are_typed_and_a_partial_batch_leaves_the_rest_missing(
     entry_at: Entries, tmp_path: Path
@@ -129,17 +167,50 @@ def test_a_line_that_is_not_wanted_or_not_known_is_named_and_nothing_is_imported
         read_batch(path, {"k": Request("m", "openai/m", {}, "", "", {})})
 
 
-def test_anthropics_results_are_read_by_their_type(tmp_path: Path) -> None:
-    path = tmp_path / "results.jsonl"
-    lines = [
-        {"custom_id": "a", "result": {"type": "succeeded", "message": {"id": "msg"}}},
-        {"custom_id": "b", "result": {"type": "expired"}},
-        {"custom_id": "c", "result": {"type": "errored", "error": {"type": "invalid_request"}}},
-    ]
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    found = read_batch(path, {key: Request("m", "anthropic/m", {}, "", key, {}) for key in "abc"})
+def test_anthropics_message_is_what_a_live_call_gets(tmp_path: Path) -> None:
+    line = {"custom_id": "a", "result": {"type": "succeeded", "message": {"id": "msg"}}}
+    (tmp_path / "results.jsonl").write_text(json.dumps(line) + "\n")
+    found = read_batch(tmp_path / "results.jsonl", {"a": Request("m", "anthropic/m", {}, "", "a", {})})
     assert found["a"].status == 200 and json.loads(found["a"].body) == {"id": "msg"}
-    assert (found["b"].error, found["c"].error) == ("batch_expired", "batch_errored")
+
+
+BODY = {"message": "too long", "type": "BadRequestError", "param": None, "code": 400}
+
+
+def chat_line(status: int | None, body: Any = None, error: Any = None) -> dict[str, Any]:
+    """A line of OpenAI's or vLLM's form."""
+    return {"custom_id": "k", "response": status and {"status_code": status, "body": body}, "error": error}
+
+
+def message_line(kind: str, **more: Any) -> dict[str, Any]:
+    """A line of Anthropic's form."""
+    return {"custom_id": "k", "result": {"type": kind, **more}}
+
+
+@pytest.mark.parametrize(
+    ("route", "line", "error"),
+    [
+        ("openai", chat_line(None, error={"code": "batch_expired", "message": "late"}), "batch_expired"),
+        ("openai", chat_line(400, {"error": BODY}), "http_400"),
+        ("openai", chat_line(500, {"error": BODY}), "server_error"),
+        ("openai", chat_line(400, error={"error": BODY}), "http_400"),  # vLLM, and an earlier one
+        ("openai", chat_line(400, error={"object": "error"} | BODY), "http_400"),
+        ("gemini", {"key": "k", "error": {"code": 503, "status": "UNAVAILABLE", "message": "x"}}, "batch_503"),
+        ("gemini", {"key": "k", "error": {"status": "CANCELLED", "message": "x"}}, "batch_cancelled"),
+        ("anthropic", message_line("expired"), "batch_expired"),
+        ("anthropic", message_line("canceled"), "batch_canceled"),
+        ("anthropic", message_line("errored", error={"type": "error"}), "batch_errored"),
+    ],
+)
+def test_failures_of_every_form_are_outcomes_of_their_kind(
+    route: str, line: dict[str, Any], error: str, entry_at: Entries, tmp_path: Path
+) -> None:
+    (tmp_path / "results.jsonl").write_text(json.dumps(line) + "\n")
+    entry = entry_at(route)
+    wanted = {"k": Request("m", f"{route}/m", dict(entry.params), "Look.", "What?", {})}
+    assert is_batch(tmp_path / "results.jsonl")
+    ((_, outcome),) = outcomes_of({"m": entry}, wanted, read_batch(tmp_path / "results.jsonl", wanted))
+    assert (outcome.kind, outcome.error) == ("error", error)
 
 
 def test_files_are_split_by_number_and_by_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

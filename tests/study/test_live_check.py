@@ -61,11 +61,37 @@ def test_a_dead_endpoint_is_named_with_its_address(check: Check) -> None:
 
 
 def test_a_wrong_name_is_named_with_those_that_are_served(check: Check, provider: Provider) -> None:
-    provider.configure(served=["other", "third"])
+    provider.configure(served=["other", "third"], fault_by_model={NAME: "not_found"})
     (problem,) = check().problems
-    assert f"serves no '{NAME}'; it serves other, third" in problem
+    assert f"serves no '{NAME}'; it lists other, third" in problem
+    provider.configure(fault_by_model={}, served_suffix="-of-another-name")
+    assert check().problems == [problem]  # something answers, and does not say that it is the model
     provider.configure(served=None, fault_by_model={NAME: "not_found"})  # a server without a list of models
     assert f"knows no model '{NAME}'" in check().problems[0]
+
+
+def test_a_name_that_a_list_lacks_is_a_note_where_it_answers(check: Check, provider: Provider) -> None:
+    provider.configure(served=["an-example"])  # transformers serve lists what was downloaded, a mock lists examples
+    live = check()
+    assert live.problems == [] and "it lists an-example, and answers to that name" in live.notes[0]
+
+
+def test_a_server_that_breaks_is_told_from_one_that_refuses(check: Check, provider: Provider) -> None:
+    provider.configure(fault_by_model={NAME: "server_error"})
+    assert {problem.partition(":")[0] for problem in check().problems} == {"clip", "no clip"}
+    assert all("an error of its own (HTTP 5xx)" in problem for problem in check().problems)
+
+
+def test_a_key_that_is_not_set_is_a_finding_and_no_end(check: Check) -> None:
+    assert "A_KEY_OF_NOBODY is not set" in check(key="A_KEY_OF_NOBODY").problems[0]
+
+
+def test_a_proxy_that_answers_400_to_a_wrong_key_is_asked_for_its_list(check: Check, provider: Provider) -> None:
+    provider.configure(fault_by_model={NAME: "bad_request"}, served=[NAME], list_status=400)
+    (problem,) = check().problems
+    assert "refuses even its list of models" in problem and f"the one in {KEY} right?" in problem
+    provider.configure(list_status=200)
+    assert "it refuses what the entry declares (http_400)" in check().problems[0]
 
 
 def test_a_wrong_key_is_named_by_its_variable(check: Check, provider: Provider) -> None:

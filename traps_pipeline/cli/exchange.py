@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.cli.command import OK, Commands, experiment_of, open_workspace
+from traps_pipeline.errors import TrapsError
 
 if TYPE_CHECKING:
     from traps_pipeline.study.exchange import Imported
@@ -20,6 +21,10 @@ def add(commands: Commands) -> None:
     parser.add_argument("experiment")
     parser.add_argument("--out", type=Path, required=True, help="folder of requests.jsonl and media/, or of batches/")
     parser.add_argument("--batch", action="store_true", help="write the providers' own batch files, with media inline")
+    parser.add_argument(
+        "--media-at", metavar="ADDRESS",
+        help="with --batch: write media to the folder media/, and refer to it under this address (https, gs, file ...)",
+    )  # fmt: skip
 
     noun = commands.noun("votes", "have judges asked in batches")
     parser = noun.add("export", export_votes, "write the votes that are missing as the judges' batch files")
@@ -41,8 +46,11 @@ def export_calls(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     if arguments.batch:
-        files, count = export_request_batches(open_workspace(arguments), experiment, arguments.out.absolute())
+        workspace, out = open_workspace(arguments), arguments.out.absolute()
+        files, count = export_request_batches(workspace, experiment, out, arguments.media_at)
         return _exported(files, count, f"traps answers import {arguments.experiment}")
+    if arguments.media_at:
+        raise TrapsError("--media-at: only batch files refer to media by an address; say --batch, too")
     count = export_requests(open_workspace(arguments), experiment, arguments.out.absolute())
     print(f"{count} requests in {arguments.out / REQUESTS}")
     print(f"next: have them answered, then traps answers import {arguments.experiment} ANSWERS.jsonl")

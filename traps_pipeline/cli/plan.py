@@ -70,11 +70,12 @@ def _print_precision(pairs: Mapping[str, int]) -> None:
 
     if any(pairs.values()):
         found, middling = precision([*pairs.values()]), Shares()
+        least = "no difference" if found.difference is None else f"a difference of {found.difference:.3f}"
         print(
             f"\nprecision with {sum(pairs.values()):,} pairs: a model with Acc {middling.acc:.0%}, AbsRec "
             f"{middling.abs_rec:.0%}, FalseAbs {middling.false_abs:.0%} (PECS {middling.pecs:.2f}) gets a 95 % "
-            f"interval of PECS about {found.width:.3f} wide; of two models with unrelated answers a difference of "
-            f"{found.difference:.3f} is found in 80 % of studies"
+            f"interval of PECS about {found.width:.3f} wide; of two models with unrelated answers {least} is found in "
+            "80 % of studies"
         )
 
 

@@ -9,11 +9,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from traps_pipeline.models.budget import BYTES_A_TOKEN, OVERHEAD_TOKENS
+from traps_pipeline.models.media_tokens import expected_clip_tokens
 from traps_pipeline.models.registry import Entry, ModelEntry, load_accounts
 from traps_pipeline.storage.ledger import AVERAGED, Totals
 
 TYPICAL_TEXT_BYTES = 1500  # system prompt, question and, for a judge, the answer
-# Until the ledger holds a call: seconds to the first token of an answer about a clip, and completion tokens a second.
+# Of an entry without `expected_latency_s`: seconds to the first token of an answer, and completion tokens a second.
 FIRST_TOKEN_S, TOKENS_A_S = 4.0, 60.0
 TYPICAL_BYTES_A_TOKEN = 4
 LOW_SHARE = 0.4  # of the expected completion: what a terse model takes
@@ -30,7 +31,8 @@ class Experience:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What calls take. Tokens are expected ones; dollars are low, expected, high, or None: unknown, never 0."""
+    """What calls take. Tokens are expected ones; dollars are low, expected, high, or None: unknown, never 0. minutes:
+    of these calls alone; paced_minutes: that the pace of their account asks for, which all calls to it share."""
 
     participant: str
     calls: int
@@ -38,6 +40,8 @@ class Forecast:
     completion_tokens: int
     dollars: tuple[float, float, float] | None
     minutes: float
+    account: str
+    paced_minutes: float
     batch_price: float = 1.0  # of a call in a batch, relative to a live one
 
 
@@ -51,33 +55,46 @@ def experience(totals: Iterable[Totals]) -> Experience:
 
 def forecast(entry: Entry, calls: int, seen: Experience) -> Forecast:
     """What so many new calls to an entry take. The high end is each call's worst case, which a budget reserves."""
-    media = _media_tokens(entry)
-    prompt = seen.prompt_tokens or media + TYPICAL_TEXT_BYTES / TYPICAL_BYTES_A_TOKEN
+    frames, most_frames = _clip_tokens(entry)
+    prompt = seen.prompt_tokens or frames + TYPICAL_TEXT_BYTES / TYPICAL_BYTES_A_TOKEN
     completion = seen.completion_tokens or entry.expected_completion_tokens
-    most_prompt = max(prompt, media + TYPICAL_TEXT_BYTES / BYTES_A_TOKEN + OVERHEAD_TOKENS)
+    most_prompt = max(prompt, most_frames + TYPICAL_TEXT_BYTES / BYTES_A_TOKEN + OVERHEAD_TOKENS)
     dollars = None
     if entry.prices is not None:
         cost = entry.prices.cost
         low, expected = cost(prompt, LOW_SHARE * completion), cost(prompt, completion)
         dollars = (calls * low, calls * expected, calls * max(expected, cost(most_prompt, entry.max_tokens)))
-    minutes = _minutes(entry, calls, seen, prompt, completion)
-    batch_price = load_accounts()[str(entry.account)].batch_price
-    return Forecast(entry.id, calls, round(calls * prompt), round(calls * completion), dollars, minutes, batch_price)
-
-
-def _media_tokens(entry: Entry) -> int:
-    if not isinstance(entry, ModelEntry) or entry.media is None:
-        return 0
-    return entry.tokens_per_frame * (entry.media.uniform or entry.media.most)
-
-
-def _minutes(entry: Entry, calls: int, seen: Experience, prompt_tokens: float, completion_tokens: float) -> float:
-    """Minutes at the entry's concurrency and its account's pace, whichever is slower."""
-    latency_s = seen.latency_s or FIRST_TOKEN_S + completion_tokens / TOKENS_A_S
-    minutes = [calls * latency_s / entry.limits.concurrency / 60]
     account = load_accounts()[str(entry.account)]
-    if account.requests_per_minute:
-        minutes.append(calls / account.requests_per_minute)
+    paced = [calls / account.requests_per_minute] if account.requests_per_minute else [0.0]
     if account.tokens_per_minute:
-        minutes.append(calls * (prompt_tokens + entry.max_tokens) / account.tokens_per_minute)
-    return max(minutes)
+        paced.append(calls * (prompt + entry.max_tokens) / account.tokens_per_minute)
+    latency_s = seen.latency_s or entry.expected_latency_s or FIRST_TOKEN_S + completion / TOKENS_A_S
+    waves = max(1.0, calls / entry.limits.concurrency) if calls else 0.0
+    return Forecast(
+        participant=entry.id,
+        calls=calls,
+        prompt_tokens=round(calls * prompt),
+        completion_tokens=round(calls * completion),
+        dollars=dollars,
+        minutes=max(waves * latency_s / 60, *paced),
+        account=str(entry.account),
+        paced_minutes=max(paced),
+        batch_price=account.batch_price,
+    )
+
+
+def minutes_of(forecasts: Iterable[Forecast]) -> float:
+    """Minutes of calls that are made side by side: those of the slowest participant, or of the account whose pace its
+    participants share."""
+    rows, shared = list(forecasts), dict[str, float]()
+    for row in rows:
+        shared[row.account] = shared.get(row.account, 0.0) + row.paced_minutes
+    return max([row.minutes for row in rows] + [*shared.values()], default=0.0)
+
+
+def _clip_tokens(entry: Entry) -> tuple[float, float]:
+    """Prompt tokens of a clip: expected, and at most."""
+    if not isinstance(entry, ModelEntry) or entry.media is None:
+        return 0.0, 0.0
+    most = entry.tokens_per_frame * (entry.media.uniform or entry.media.most)
+    return min(expected_clip_tokens(entry), most), most

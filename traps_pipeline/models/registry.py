@@ -125,6 +125,11 @@ class Entry(BaseModel):
     waivers: dict[str, str] = {}
     prices: Prices | None = Field(default=None, description="None: unknown, and a study must allow that")
     expected_completion_tokens: int = Field(default=500, ge=0, description="estimate for `traps plan`")
+    expected_latency_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="of a call, for `traps plan`; by default 4 s, and 60 tokens/s",
+    )
 
     @field_validator("id")
     @classmethod

@@ -269,7 +269,7 @@ class SegmentWriter:
             path = self._dirty.pop()
             with _writing(path):
                 os.fsync(self._files[path])
-        if not self._named:
+        if self._files and not self._named:  # without a file, not even the folder need be there
             for folder in (self.path.parent, self.path.parent.parent):
                 with _writing(folder):
                     sync_folder(folder)

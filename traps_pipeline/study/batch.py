@@ -20,6 +20,8 @@ from traps_pipeline.files import replacing
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.study.loopback import render, replay
+from traps_pipeline.study.references import FOLDER as MEDIA
+from traps_pipeline.study.references import References
 from traps_pipeline.study.wire_body import Api, WireBody
 from traps_pipeline.terminal import plain
 from traps_pipeline.yamlfile import read_lines
@@ -34,6 +36,7 @@ LIMITS: Mapping[Api, tuple[int, int]] = {
     "anthropic": (100_000, 240 * 2**20),
 }
 SHOWN = 5
+FAILED = 400  # statuses from here on are failures
 
 
 Item = TypeVar("Item")
@@ -49,14 +52,19 @@ def _some(items: Iterable[Item]) -> Iterator[list[Item]]:
 # --- export -----------------------------------------------------------------------------------------------------------
 
 
-def export_batches(calls: Mapping[str, tuple[Entry, Iterable[Request]]], out: Path) -> tuple[list[Path], int]:
+def export_batches(
+    calls: Mapping[str, tuple[Entry, Iterable[Request]]], out: Path, media_at: str | None = None
+) -> tuple[list[Path], int]:
     """Write the calls of each participant to files below `out`, split where the provider's limits want it; the files
-    and the number of calls. Raises TrapsError where a call cannot be made, or where files are there already."""
+    and the number of calls. media_at: the address under which the folder `media` of `out` will be found, to which the
+    bodies then refer; without it media are inline. Raises TrapsError where a call cannot be made, or where files are
+    there already."""
     folder = out / FOLDER
     if folder.exists() and any(folder.iterdir()):
         raise TrapsError(f"{folder} holds batches already; give another folder, or delete it")
     folder.mkdir(parents=True, exist_ok=True)
     files, count = list[Path](), 0
+    references = References(out / MEDIA, media_at) if media_at else None
     for name, (entry, requests) in calls.items():
         part = _Part(folder, name)
         for some in _some(requests):
@@ -65,25 +73,26 @@ def export_batches(calls: Mapping[str, tuple[Entry, Iterable[Request]]], out: Pa
                     raise TrapsError(
                         f"{name}: no batch can be made of its calls: {wire if isinstance(wire, str) else wire.path}"
                     )
-                part.add(wire.api, line_of(request.key, wire))
+                body = references.instead_of(wire.body) if references else wire.body
+                part.add(wire.api, line_of(request.key, wire, body))
                 count += 1
         files += part.written()
     return files, count
 
 
-def line_of(key: str, wire: WireBody) -> dict[str, Any]:
-    """The line of a call in its provider's form."""
+def line_of(key: str, wire: WireBody, body: Mapping[str, Any]) -> dict[str, Any]:
+    """The line of a call with this body, in its provider's form."""
     match wire.api:
         case "gemini":
-            return {"key": key, "request": wire.body}
+            return {"key": key, "request": body}
         case "anthropic":
-            return {"custom_id": key, "params": wire.body}
+            return {"custom_id": key, "params": body}
         case _:
             return {
                 "custom_id": key,
                 "method": "POST",
                 "url": "/v1/" + wire.path.split("/v1/", 1)[-1].lstrip("/"),
-                "body": wire.body,
+                "body": body,
             }
 
 
@@ -177,10 +186,13 @@ def _returned(line: Any) -> tuple[str, Returned]:
         return line["custom_id"], Returned(error=_word(result["type"]))
     key = line["custom_id"] if "custom_id" in line else line["key"]
     error, response = line.get("error"), line.get("response")
+    status = int((response or {}).get("status_code") or 0)
+    if error and status >= FAILED:  # vLLM: a status without a body, and beside it what it would have been
+        return key, Returned(status, json.dumps({"error": error.get("error") or error}).encode())
     if error:
         return key, Returned(error=_word(error.get("code") or error.get("status") or "error"))
     if "custom_id" in line:  # OpenAI, vLLM
-        return key, Returned(int(response["status_code"]), json.dumps(response["body"]).encode())
+        return key, Returned(status, json.dumps(response["body"]).encode())
     return key, Returned(200, json.dumps(response).encode())  # Gemini
 
 

@@ -183,14 +183,16 @@ def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> 
     return Imported(new, len(answers) - new)
 
 
-def export_request_batches(workspace: Workspace, experiment: Experiment, out: Path) -> tuple[list[Path], int]:
-    """Write the experiment's missing requests as the providers' batch files (`study.batch`); the files, and the number
-    of calls."""
+def export_request_batches(
+    workspace: Workspace, experiment: Experiment, out: Path, media_at: str | None = None
+) -> tuple[list[Path], int]:
+    """Write the experiment's missing requests as the providers' batch files (`study.batch.export_batches`); the files,
+    and the number of calls."""
     prepare_media(workspace, _cells(workspace, experiment))
     missing: dict[str, list[Request]] = {}
     for request in _missing(workspace, experiment):
         missing.setdefault(request.participant, []).append(request)
-    return export_batches({name: (get_model(name), requests) for name, requests in missing.items()}, out)
+    return export_batches({name: (get_model(name), requests) for name, requests in missing.items()}, out, media_at)
 
 
 def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path) -> tuple[list[Path], int]:

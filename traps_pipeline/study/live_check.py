@@ -40,6 +40,7 @@ from traps_pipeline.terminal import plain
 CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # names the folder of the calls, not a model
 TIMEOUT_S = 25.0  # of a call; what is wrong is named within half a minute
 REACH_S = 8.0
+BAD_REQUEST = 400
 COLOURS = {"red": (200, 30, 30), "blue": (30, 30, 200)}
 QUESTION = "The whole picture has one colour and then another: which two colours does the clip show?"
 _FPS, _SIZE, _FRAMES = 10, (160, 120), 50
@@ -129,31 +130,48 @@ def served_name(entry: Entry) -> str:
     return str(entry.provider_id).split("/", 1)[1].removeprefix("responses/")
 
 
-def unreachable(entry: Entry, account: Account) -> str | None:
-    """What is wrong with the address, the key or the name, by the server's own list of models; None if nothing is seen
-    there. A server that has no such list is not judged by it."""
+@dataclass(frozen=True)
+class Reached:
+    """What is found before anything is asked. problem: why asking is of no use; unlisted: that the server's own list of
+    models lacks the name; refused: that the list, which wants nothing but a key, is refused. Neither is certain: some
+    servers list what was downloaded, or examples, and a litellm proxy without a database answers 400 to a wrong key."""
+
+    problem: str = ""
+    unlisted: str = ""
+    refused: str = ""
+
+
+def reach(entry: Entry, account: Account) -> Reached:
+    """Look at the key, the address, and the server's own list of models if it has one."""
     import httpx
 
+    try:
+        secret = account.secret()
+    except TrapsError as error:
+        return Reached(str(error))
     if account.base_url is None:
-        return None
-    secret = account.secret()
+        return Reached()
     headers = {"Authorization": f"Bearer {secret}"} if secret else {}
     try:
         with httpx.Client(timeout=REACH_S, follow_redirects=False) as client:
             answer = client.get(f"{account.base_url.rstrip('/')}/models", headers=headers)
     except (httpx.HTTPError, httpx.InvalidURL) as error:
-        return nobody_at(account.base_url, plain(str(error))[:100])
+        return Reached(nobody_at(account.base_url, plain(str(error))[:100]))
     if answer.status_code in (401, 403):
-        return _wrong_key(account)
+        return Reached(_wrong_key(account))
+    if answer.status_code == BAD_REQUEST and account.key:
+        even = f"{account.base_url} refuses even its list of models (HTTP 400), which wants nothing but a key"
+        return Reached(refused=f"{even}: is the one in {account.key} right?")
     known = [str(one["id"]) for one in _listed(answer) if isinstance(one, dict) and "id" in one]
     if known and served_name(entry) not in known:
-        return f"{account.base_url} serves no {served_name(entry)!r}; it serves {plain(', '.join(known[:8]))[:200]}"
-    return None
+        listed = plain(", ".join(known[:8]))[:200]
+        return Reached(unlisted=f"{account.base_url} serves no {served_name(entry)!r}; it lists {listed}")
+    return Reached()
 
 
 def nobody_at(address: str, why: str = "connections are refused") -> str:
     """The sentence about an address at which nobody answers."""
-    return f"nothing answers at {address} ({why}): start the server there, or mend the address in the registry"
+    return f"nothing answers at {address} ({why}): start the server there, or mend its `base_url`"
 
 
 def _wrong_key(account: Account) -> str:
@@ -170,10 +188,23 @@ def _listed(answer: Any) -> list[Any]:
     return []
 
 
-def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome]) -> Live:
-    """What the outcomes of `requests_of` say of an entry."""
-    problems, notes = list[str](), list[str]()
+def _answers_to(name: str, outcomes: Mapping[str, Outcome]) -> bool:
+    """Whether somebody answers under that name, which a server may give with a version behind an @."""
+    return any((outcome.served_model or "").partition("@")[0] == name for outcome in outcomes.values())
+
+
+def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], reached: Reached | None = None) -> Live:
+    """What the outcomes of `requests_of` say of an entry, and what was found before them."""
+    problems, notes, before = list[str](), list[str](), reached or Reached()
+    if before.unlisted and not _answers_to(served_name(entry), outcomes):
+        return Live(entry, [before.unlisted])
+    if before.unlisted:
+        notes.append(f"{before.unlisted}, and answers to that name: make sure that it is the model that you mean")
+    if before.refused and all(outcome.error == f"http_{BAD_REQUEST}" for outcome in outcomes.values()):
+        return Live(entry, [before.refused])
     for name, outcome in outcomes.items():
+        if name == "schema" and outcome.error is not None and outcome.error == outcomes["clip"].error:
+            continue  # what fails without a schema, too, says nothing of schemas
         if outcome.kind == "error":
             slow = outcome.error == "timeout"
             (notes if slow else problems).append(_failure(entry, account, name, str(outcome.error)))
@@ -202,6 +233,8 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
             return f"{where} knows no model {served_name(entry)!r}, or has another path (is /v1 missing?)"
         case "timeout":
             return f"{name}: no answer within {TIMEOUT_S:.0f} s; a model that thinks for long may need more"
+        case "server_error" if name != "schema":
+            return f"{name}: {where} ends in an error of its own (HTTP 5xx), which the server's log explains"
         case _ if name == "schema":
             return f"it refuses structured output ({error}): say `json_schema: false` and why under waivers"
         case _:
@@ -278,8 +311,9 @@ def check_live(entries: Iterable[Entry]) -> list[Live]:
 
     async def one(entry: Entry) -> Live:
         account = account_of(entry)
-        if wrong := await asyncio.to_thread(unreachable, entry, account):
-            return Live(entry, [wrong])
+        reached = await asyncio.to_thread(reach, entry, account)
+        if reached.problem:
+            return Live(entry, [reached.problem])
         backend = make_backend(entry)
 
         async def asked(request: Request) -> Outcome:
@@ -293,7 +327,7 @@ def check_live(entries: Iterable[Entry]) -> list[Live]:
 
         requests = requests_of(entry)
         outcomes = await asyncio.gather(*map(asked, requests.values()))
-        return findings(entry, account, dict(zip(requests, outcomes, strict=True)))
+        return findings(entry, account, dict(zip(requests, outcomes, strict=True)), reached)
 
     return asyncio.run(every())
 
@@ -307,13 +341,13 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
     for entry in entries:
         check_money(workspace.study, entry)
     accounts = {entry.id: account_of(entry) for entry in entries}
-    down = {entry.id: wrong for entry in entries if (wrong := unreachable(entry, accounts[entry.id]))}
+    reached = {entry.id: reach(entry, accounts[entry.id]) for entry in entries}
     quick = {
         entry.id: entry.model_copy(
             update={"limits": entry.limits.model_copy(update={"retries": 1, "timeout_s": TIMEOUT_S / 2})}
         )
         for entry in entries
-        if entry.id not in down
+        if not reached[entry.id].problem
     }
     requests = {name: requests_of(entry) for name, entry in quick.items()}
     calls = [Call(request) for of_one in requests.values() for request in of_one.values()]
@@ -326,16 +360,16 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
         (outcomes,) = collect(workspace, "preflight", workspace.votes, quick.values(), [CELL], lambda _: calls, finish)
     found = []
     for entry in entries:
-        if entry.id in down:
-            found.append(Live(entry, [down[entry.id]]))
+        if problem := reached[entry.id].problem:
+            found.append(Live(entry, [problem]))
         else:
             mine = {name: outcomes[request.key] for name, request in requests[entry.id].items()}
-            found.append(findings(entry, accounts[entry.id], mine))
+            found.append(findings(entry, accounts[entry.id], mine, reached[entry.id]))
     return found
 
 
 def _outcome(row: Row) -> Outcome:
-    names = ("text", "finish_reason", "error", "prompt_tokens")
+    names = ("text", "finish_reason", "error", "prompt_tokens", "served_model")
     return Outcome(row["outcome"], **{name: row.get(name) for name in names})
 
 

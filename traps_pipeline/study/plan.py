@@ -14,7 +14,7 @@ from traps_pipeline.judging.panel import tasks_for, wanted_ballots
 from traps_pipeline.judging.tables import VOTES
 from traps_pipeline.mechanism.steering import count_answers
 from traps_pipeline.models.answers import answer_request, is_prepared
-from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast
+from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast, minutes_of
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.tables import RESPONSES
@@ -73,9 +73,9 @@ class Plan:
     @property
     def minutes(self) -> float:
         """Of all calls: models are asked side by side, and then judges."""
-        models = [row.minutes for row in self.forecasts if row.participant in self.calls]
-        judges = [row.minutes for row in self.forecasts if row.participant not in self.calls]
-        return max(models, default=0.0) + max(judges, default=0.0)
+        models = [row for row in self.forecasts if row.participant in self.calls]
+        judges = [row for row in self.forecasts if row.participant not in self.calls]
+        return minutes_of(models) + minutes_of(judges)
 
 
 def make_plan(workspace: Workspace | None, experiment: Experiment, study: Study) -> Plan:

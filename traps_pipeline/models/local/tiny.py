@@ -29,6 +29,7 @@ _TEXT: dict[str, Any] = {"hidden_size": 64, "intermediate_size": 128, "num_hidde
 # Standard deviation of the text weights of a random checkpoint: such that every token of a prompt tells in the answer.
 _SPREAD: dict[Family, float] = {"qwen3-vl": 0.2, "gemma-4": 0.02, "llava-next-video": 0.2}
 _VISION_SIZE = 32  # hidden size of the vision towers
+_STILL_PIXELS = 128 * 96  # of an image: as many as the frames that the pocket model is trained with have
 
 # Special tokens by the name under which the family's processor looks them up; `pad` and `eos` are in all of them.
 _SPECIAL: dict[Family, dict[str, str]] = {
@@ -62,7 +63,8 @@ _PARTS = "{%- for part in message['content'] -%}"
 _TEMPLATES: dict[Family, str] = {
     "qwen3-vl": (
         "{%- for message in messages -%}{{ '<|im_start|>' + message['role'] + '\n' }}" + _PARTS + "{%- if "
-        "part['type'] == 'video' -%}{{ '<|vision_start|><|video_pad|><|vision_end|>' }}{%- else -%}{{ part['text'] }}"
+        "part['type'] == 'video' -%}{{ '<|vision_start|><|video_pad|><|vision_end|>' }}{%- elif "
+        "part['type'] == 'image' -%}{{ '<|vision_start|><|image_pad|><|vision_end|>' }}{%- else -%}{{ part['text'] }}"
         "{%- endif -%}{%- endfor -%}{{ '<|im_end|>\n' }}{%- endfor -%}"
         "{%- if add_generation_prompt -%}{{ '<|im_start|>assistant\n' }}{%- endif -%}"
     ),
@@ -256,10 +258,13 @@ def make_processor(family: Family, tokenizer: Any, video: Overrides | None = Non
     match family:
         case "qwen3-vl":
             small = {"size": {"shortest_edge": 32 * 32, "longest_edge": 2 * 64 * 64}, "cap_pixels_per_frame": False}
+            eyes = transformers.Qwen3VLVideoProcessor(**small | asked)
+            still = {name: getattr(eyes, name) for name in ("patch_size", "image_mean", "image_std")}
+            still["size"] = {"shortest_edge": (2 * eyes.patch_size) ** 2, "longest_edge": _STILL_PIXELS}
             return transformers.Qwen3VLProcessor(
-                image_processor=transformers.Qwen2VLImageProcessor(patch_size=16),
+                image_processor=transformers.Qwen2VLImageProcessor(**still),  # a server may be sent frames one by one
                 tokenizer=tokenizer,
-                video_processor=transformers.Qwen3VLVideoProcessor(**small | asked),
+                video_processor=eyes,
                 chat_template=_TEMPLATES[family],
             )
         case "gemma-4":

@@ -1,0 +1,81 @@
+"""How many prompt tokens a provider counts for the frames of a clip, as it publishes or as was measured at it.
+
+These are expected numbers, for `traps plan`; what a budget reserves is an entry's `tokens_per_frame`, an upper bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import ceil
+
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH
+from traps_pipeline.storage.media import Profile
+
+Size = tuple[int, int]  # width and height in pixels
+# OpenAI's tokens of an image and of each tile in it, by the beginning of a model's name.
+TILED = {"gpt-5": (70, 140), "gpt-4.1": (85, 170), "gpt-4o": (85, 170), "o1": (75, 150), "o3": (75, 150)}
+# OpenAI's tokens of a patch. These names are looked at first.
+PATCHED = {"gpt-5-mini": 1.2, "gpt-5-nano": 2.46, "gpt-4.1-mini": 1.62, "gpt-4.1-nano": 2.46, "o4-mini": 1.72}
+STAMP = 8  # Qwen3-VL: the time before two frames, and the marks around them
+
+
+def openai_frame(model: str, size: Size) -> float | None:
+    """An image at detail auto or high: tiles of 512 pixels, or patches of 32, by the model; None for a model that is
+    not OpenAI's. Frames are small enough not to be scaled down, and are not enlarged.
+
+    https://platform.openai.com/docs/guides/images-vision (calculating costs). It says 1.62 tokens a patch of
+    gpt-5-mini; 1.20 were measured at the API with six sizes (OpenAI Developer Community, "GPT-5-mini image input token
+    calculation discrepancy", 2026-06-17).
+    """
+    width, height = size
+    for name, each in PATCHED.items():
+        if model.startswith(name):
+            return each * ceil(width / 32) * ceil(height / 32)
+    for name, (base, tile) in TILED.items():
+        if model.startswith(name):
+            return base + tile * ceil(width / 512) * ceil(height / 512)
+    return None
+
+
+def gemini_frame(model: str, size: Size, profile: Profile) -> float:
+    """A frame that Gemini samples of a video, or an image, at the default media resolution.
+
+    Up to Gemini 2.5: 258 tokens a frame (that is 258 a second at one frame a second), and 258 an image of at most 384
+    pixels, or each tile of 768 (https://ai.google.dev/gemini-api/docs/tokens). Gemini 3: 70 a frame and 1,120 an image
+    (https://ai.google.dev/gemini-api/docs/media-resolution). Clips have no sound, which would count 32 a second.
+    """
+    is_old = model.startswith(("gemini-1", "gemini-2"))
+    if profile == "video":
+        return 258 if is_old else 70
+    return 258 * ceil(size[0] / 768) * ceil(size[1] / 768) if is_old else 1120
+
+
+def anthropic_frame(size: Size) -> float:
+    """An image of at most 1,568 pixels on its long edge: its area by 750
+    (https://docs.anthropic.com/en/docs/build-with-claude/vision)."""
+    return size[0] * size[1] / 750
+
+
+def qwen3_vl_frame(size: Size, profile: Profile) -> float:
+    """Cells of 32 pixels, whole in each direction; two frames of a video share theirs and have a time before them (the
+    model's own processor, as transformers has it)."""
+    cells = round(size[0] / 32) * round(size[1] / 32)
+    return (cells + STAMP) / 2 if profile == "video" else cells + 2
+
+
+def expected_clip_tokens(entry: ModelEntry) -> float:
+    """Prompt tokens of a whole clip. For a provider or model that is not known here, the entry's `tokens_per_frame`."""
+    media = entry.media
+    if media is None:
+        return 0.0
+    route, _, rest = str(entry.provider_id).partition("/")
+    model, size = rest.removeprefix("responses/"), media.size or (WIDTH, HEIGHT)
+    counts: dict[str, Callable[[], float | None]] = {
+        "openai": lambda: openai_frame(model, size),
+        "gemini": lambda: gemini_frame(model, size, media.profile),
+        "vertex_ai": lambda: gemini_frame(model, size, media.profile),
+        "anthropic": lambda: anthropic_frame(size),
+    }
+    found = qwen3_vl_frame(size, media.profile) if "qwen3-vl" in model.lower() else counts.get(route, lambda: None)()
+    return (media.uniform or media.most) * (entry.tokens_per_frame if found is None else found)

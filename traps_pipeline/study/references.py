@@ -1,0 +1,58 @@
+"""Media of a batch by reference: a body names an address, and the file lies beside the batch, to be published there.
+
+A batch file with its clips inline takes 300 KB a call; with references a call takes 2 KB, and a clip is stored once for
+all regimes and runs. Which addresses a provider reads is for it to say: OpenAI and Anthropic take https for images,
+Gemini the URI of its File API or of Cloud Storage, vLLM https, and file:// below `--allowed-local-media-path`.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.files import write_bytes
+
+FOLDER = "media"
+SUFFIX = {"image/jpeg": ".jpg", "video/mp4": ".mp4"}
+_DATA, _BASE64 = "data:", ";base64,"
+
+
+@dataclass(frozen=True)
+class References:
+    """Where media are written, and the address under which that folder's files will be found."""
+
+    folder: Path
+    address: str
+
+    def of(self, kind: str, data: str) -> str:
+        """The address of a medium, given as base64; its file is written once."""
+        content = base64.b64decode(data, validate=True)
+        name = hashlib.sha256(content).hexdigest()[:32] + SUFFIX.get(kind, "")
+        if not (self.folder / name).exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_bytes(self.folder / name, content)
+        return f"{self.address.rstrip('/')}/{name}"
+
+    def instead_of(self, value: Any) -> Any:
+        """A body with an address for each inline medium, in the form of its API: OpenAI's data URIs, Gemini's inline
+        data, and Anthropic's sources. Everything else stays as it is."""
+        match value:
+            case str() if value.startswith(_DATA) and _BASE64 in value[:64]:
+                kind, _, data = value.removeprefix(_DATA).partition(_BASE64)
+                return self.of(kind, data)
+            case {"type": "base64", "media_type": str(kind), "data": str(data)}:
+                return {"type": "url", "url": self.of(kind, data)}
+            case {"inline_data": {"mime_type": str(kind), "data": str(data)}, **rest}:
+                return {"file_data": {"mime_type": kind, "file_uri": self.of(kind, data)}, **rest}
+            case {"inlineData": {"mimeType": str(kind), "data": str(data)}, **rest}:
+                return {"fileData": {"mimeType": kind, "fileUri": self.of(kind, data)}, **rest}
+            case Mapping():
+                return {key: self.instead_of(each) for key, each in value.items()}
+            case list():
+                return [self.instead_of(each) for each in value]
+            case _:
+                return value
