@@ -23,13 +23,13 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.explorer.cost import Touched, touched
 from traps_pipeline.explorer.duplicates import Comparison
 from traps_pipeline.explorer.queue import MEANINGS, QUEUES, QueueName, flags, queue
-from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script
+from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script, study_file
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.report.gallery import certificate_phrases, intervention
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.yamlfile import explain
 
-SCRIPTS = ("dom.js", "player.js", "review.js")
+SCRIPTS = ("dom.js", "player.js", "listening.js", "review.js")
 STRIP_FRAMES, STRIP_WIDTH = 8, 200  # frames of a side in the contact strip, and their width in pixels
 Record = Mapping[str, Any]
 
@@ -208,6 +208,7 @@ class Review:
         return page(
             "review.html.j2",
             shown=shown,
+            queue=name,
             spec=spec,
             labels=", ".join(spec["labels"]),
             certificate=[words for _, words in certificate_phrases(json.loads(spec["evidence"]))],
@@ -258,11 +259,9 @@ class Review:
     def clip(self, scenario_id: str, side: str) -> Path:
         """The file of a clip. Raises NotThere where the study has none."""
         row = self.clips.get((scenario_id, side))
-        path = self.workspace.resolve(row["path"]) if row else None
-        inside = path is not None and path.resolve().is_relative_to((self.workspace.root / "clips").resolve())
-        if path is None or not inside or not path.is_file():
+        if row is None:
             raise NotThere(f"{scenario_id}: the study has no {side} clip of it")
-        return path
+        return study_file(self.workspace, row["path"])
 
 
 def _as_json(value: Any) -> Any:
