@@ -7,7 +7,7 @@ person about the same unit replaces the earlier one. Stages read that file alone
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import datetime
 from itertools import combinations
 from pathlib import Path
@@ -128,7 +128,7 @@ def human_labels(workspace: Workspace) -> pd.DataFrame:
     last: dict[tuple[TaskName, str, str], dict[str, Any]] = {}
     for line in label_lines(workspace.labels):
         key = line.task, line.unit, line.who
-        row = {"task": line.task, "unit": line.unit, "annotator": line.who, "labelled_at": line.at, **line.label}
+        row = {"task": line.task, "unit": line.unit, "annotator": line.who, "created_at": line.at, **line.label}
         last[key] = row | {"seconds": last[key]["seconds"] if key in last else line.seconds}
     given, frames = pd.DataFrame(list(last.values())), list[pd.DataFrame]()
     for task in TASKS if len(given) else ():
@@ -177,23 +177,30 @@ def human_agreement(labels: pd.DataFrame) -> pd.DataFrame:
 
 def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str, Any]:
     values = matrix(labels, decision)
-    several = values[(values != INVALID).sum(axis=1) > 1]
-    pairs = [values[:, [a, b]] for a, b in combinations(range(values.shape[1]), 2)]
-    shared = np.concatenate([both[(both != INVALID).all(axis=1)] for both in pairs] or [np.zeros((0, 2), np.int8)])
-    alpha = krippendorff_alpha(values) if len(several) else float("nan")
-    why = "nothing was labelled by two people" if not len(several) else "every label is the same"
+    n_shared, agreed, alpha = agreement_of(values)
+    why = "every label is the same" if n_shared else "nothing was labelled by two people"
     return {
         "task": task,
         "decision": decision,
         "annotators": "+".join(sorted(labels["annotator"].unique())),
         "n_labels": len(labels),
         "n_units": len(values),
-        "n_shared": len(several),
-        "agreement": float((shared[:, 0] == shared[:, 1]).mean()) if len(shared) else float("nan"),
+        "n_shared": n_shared,
+        "agreement": agreed,
         "alpha": alpha,
         "undefined": why if np.isnan(alpha) else None,
         "seconds": float(np.median(labels["seconds"].to_numpy(float))),
     }
+
+
+def agreement_of(values: np.ndarray) -> tuple[int, float, float]:
+    """Of labels as `matrix` gives them: the units that two people or more labelled, the share of pairs of labels of the
+    same unit that are equal, and Krippendorff's alpha; NaN where undefined."""
+    several = int(((values != INVALID).sum(axis=1) > 1).sum())
+    pairs = [values[:, [a, b]] for a, b in combinations(range(values.shape[1]), 2)]
+    shared = np.concatenate([both[(both != INVALID).all(axis=1)] for both in pairs] or [np.zeros((0, 2), np.int8)])
+    agreed = float((shared[:, 0] == shared[:, 1]).mean()) if len(shared) else float("nan")
+    return several, agreed, krippendorff_alpha(values) if several else float("nan")
 
 
 def matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
@@ -220,10 +227,15 @@ def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
     return first.assign(truth=np.where(most == 0.5, None, most > 0.5))
 
 
-def pairs_of_people(labels: Sequence[Line]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Labels of confabulation by person and sample id, the last one of each."""
-    found: dict[str, dict[str, dict[str, Any]]] = {}
-    for line in labels:
-        if line.task == "confabulation":
-            found.setdefault(line.who, {})[line.unit] = line.label
-    return found
+def confabulation_rows(labels: pd.DataFrame) -> list[dict[str, str]]:
+    """The labels of confabulation as `traps confabulation validate` reads them, from HUMAN_LABELS rows: of failures
+    that everybody who labelled any has labelled. Raises TrapsError where there are none."""
+    own = labels.loc[labels["task"] == "confabulation"]
+    everybody = own.groupby("unit")["annotator"].transform("nunique") == own["annotator"].nunique()
+    shared = own.loc[everybody.to_numpy(bool)]
+    if shared.empty:
+        raise TrapsError("no failure is labelled by everybody yet; label some on the pages of `traps annotate`")
+    return [
+        {"annotator": row["annotator"], "sample_id": row["unit"], **{axis: str(int(row[axis])) for axis in AXES}}
+        for row in shared.sort_values(["annotator", "unit"]).to_dict("records")
+    ]

@@ -23,6 +23,7 @@ from traps_pipeline.judging.confabulation import load_protocol
 from traps_pipeline.judging.tables import CONFABULATION, VERDICTS
 from traps_pipeline.judging.validation import sheet_rows
 from traps_pipeline.judging.verdicts import current
+from traps_pipeline.models.judges import panel_id
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.paths import ASSETS
@@ -97,10 +98,10 @@ def _clips(workspace: Workspace) -> pd.DataFrame:
 
 
 def _answers(workspace: Workspace, task: TaskName) -> pd.DataFrame:
-    """The answers whose abstention or correctness the panel decided."""
+    """The answers whose abstention or correctness the study's panel decided."""
     decision = "abstained" if task == "abstention" else "correct"
-    verdicts = current(workspace, VERDICTS, [*_ANSWER, "scenario_id", "side", "unanimous", decision])
-    decided = verdicts.loc[verdicts[decision].notna()]
+    verdicts = current(workspace, VERDICTS, [*_ANSWER, "scenario_id", "side", "unanimous", "panel", decision])
+    decided = verdicts.loc[verdicts[decision].notna() & (verdicts["panel"] == panel_id(workspace.study.panel))]
     if decided.empty:
         return decided.assign(unit="")
     texts = workspace.tables.read_all(RESPONSES, [*_ANSWER, "text"], dataset=DATASETS)

@@ -36,7 +36,7 @@ class HumanLabelRow:
     epistemic_surrender: Axis
     doubt_in_reasoning: Axis
     seconds: Annotated[float, "seconds from showing it to the first label"]
-    labelled_at: Annotated[datetime, "when the label was given"]
+    created_at: Annotated[datetime, "when the label was given"]
     benchmark_version: shared.BenchmarkVersion
 
 

@@ -107,14 +107,15 @@ def _no_formula(text: str) -> str:
     return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text
 
 
-def write_sheet(rows: Sequence[Mapping[str, str]], path: Path) -> None:
-    """Write a sheet as CSV. Raises TrapsError if the file exists already, since it may hold labels."""
+def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence[str] = SHEET_COLUMNS) -> None:
+    """Write a sheet, or labels alone (LABEL_COLUMNS), as CSV. Raises TrapsError if the file exists already, since it
+    may hold labels."""
     if path.exists():
         raise TrapsError(f"{path} exists already and may hold labels; give another name, or delete it")
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
-        writer.writerow(SHEET_COLUMNS)
-        writer.writerows([row[name] for name in SHEET_COLUMNS] for row in rows)
+        writer.writerow(columns)
+        writer.writerows([row[name] for name in columns] for row in rows)
 
 
 def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:
