@@ -11,9 +11,11 @@ function part(title, text) {
 
 if (SHOWN.task === "answerability") {
   const path = `/clip/${encodeURIComponent(SHOWN.handle)}`;
-  const shownPlayer = player([{ title: "The clip", path }], SHOWN.fps, true);
+  const shownPlayer = player([{ title: "The clip", path, kind: "single" }], SHOWN.fps, true);
   add(material, [h("p", { class: "question" }, untrusted(SHOWN.question)), shownPlayer.element]);
   keys = { ...shownPlayer.keys };
+  const video = material.querySelector("video");
+  if (video) video.addEventListener("canplay", () => keys[" "](), { once: true });
 } else {
   add(material, [h("p", { class: "question" }, untrusted(SHOWN.question))]);
   if (SHOWN.truth) add(material, [h("p", null, "True answer: ", h("b", null, untrusted(SHOWN.truth)))]);
