@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping
 from datetime import date
 from functools import cached_property
@@ -27,6 +28,7 @@ from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app,
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.report.gallery import certificate_phrases, intervention
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.study.experiment import EXPERIMENTS
 from traps_pipeline.yamlfile import explain
 
 SCRIPTS = ("dom.js", "player.js", "listening.js", "review.js")
@@ -233,9 +235,15 @@ class Review:
             queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},
             reviewed=len(self.reviewed() & set(self.specs)),
             total=len(self.specs),
-            experiments=[*self.workspace.study.experiments],
+            commands=[command for name in self.workspace.study.experiments for command in self._commands(name)],
             who=self.who,
         )
+
+    def _commands(self, experiment: str) -> list[str]:
+        """What shows and then asks what decisions touch. An experiment that is not among ours has a file of its own."""
+        name = experiment if (EXPERIMENTS / f"{experiment}.yaml").is_file() else f"{experiment}.yaml"
+        there = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
+        return [f"traps status {there}", f"traps run {there}"]
 
     def strip(self, scenario_id: str) -> bytes:
         """The contact strip: frames of the control above the void's at the same times, as JPEG. Raises NotThere."""
