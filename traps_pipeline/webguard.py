@@ -10,7 +10,8 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import secrets
-from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
+from base64 import urlsafe_b64encode
+from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping, Sequence
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode, urlsplit
@@ -18,6 +19,7 @@ from urllib.parse import parse_qsl, quote, urlencode, urlsplit
 from traps_pipeline.errors import TrapsError
 
 LEAST_TOKEN = 16  # characters
+WHO = "traps.who"  # key of a request's scope: whose token it brought
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _SAFE_METHODS = ("GET", "HEAD")
 _OWN_SITE = (b"same-origin", b"none")
@@ -64,12 +66,50 @@ def token_for(host: str, given: str | None, *, danger: str, variable: str) -> st
     return given or secrets.token_urlsafe(24)
 
 
-class Guard:
-    """An ASGI app before another one. command: what printed the address, in words for who comes without its token."""
+def public_name(address: str) -> str:
+    """The name, with a port where it has one, of the address of a server with HTTPS that stands before this one. Raises
+    TrapsError for anything else than `https://NAME[:PORT]`."""
+    parts = urlsplit(address)
+    if parts.scheme != "https" or not parts.hostname or address.rstrip("/") != f"https://{parts.netloc}":
+        raise TrapsError(
+            f"--behind {address}: give the address of the server with HTTPS, as https://labels.example.org"
+        )
+    return parts.netloc.lower()
 
-    def __init__(self, app: App, token: str, host: str, port: int, *, command: str = "make ui") -> None:
-        self._app, self._token, self._cookie, self._command = app, token, f"traps-ui-{port}", command
+
+def personal_tokens(token: str, people: Sequence[str]) -> dict[str, str]:
+    """A token of each person, made from one secret: it stays the same after a restart, and tells nothing of another."""
+
+    def own(who: str) -> str:
+        return urlsafe_b64encode(hmac.digest(token.encode(), who.encode(), "sha256")[:18]).decode()
+
+    return {own(who): who for who in people}
+
+
+class Guard:
+    """An ASGI app before another one.
+
+    token: the one token, or the person that each of several tokens belongs to; the app finds the person in the scope
+    under WHO. command: what printed the address, in words for who comes without its token. behind: the address of a
+    server with HTTPS that passes requests on, if there is one.
+    """
+
+    def __init__(
+        self,
+        app: App,
+        token: str | Mapping[str, str],
+        host: str,
+        port: int,
+        *,
+        command: str = "make ui",
+        behind: str = "",
+    ) -> None:
+        self._app, self._cookie, self._command = app, f"traps-ui-{port}", command
+        self._tokens = {token: ""} if isinstance(token, str) else dict(token)
         self._names = {f"{name}:{port}" for name in (*LOOPBACK, host)} if is_loopback(host) else None
+        self._secure = "; Secure" if behind else ""
+        if behind and self._names is not None:
+            self._names.add(public_name(behind))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request through, or say in a sentence why not."""
@@ -82,7 +122,9 @@ class Guard:
         refused = self._refusal(scope, headers)
         if refused is None and scope["type"] == "http" and self._token_in(scope):
             await self._enter(scope, send)
-        elif refused is None and not self._is_known(headers):
+        elif refused is None and (who := self._whose(headers)) is not None:
+            scope[WHO] = who
+        elif refused is None:
             refused = 403, f"open the address that `{self._command}` printed: the token in it lets this browser in"
         if refused is not None:
             await _refuse(scope, receive, send, *refused)
@@ -118,30 +160,40 @@ class Guard:
     def _token_in(self, scope: Scope) -> bool:
         if scope["method"] not in _SAFE_METHODS:
             return False
-        given = dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token")
-        return given is not None and self._is_token(given)
+        return self._owner(_given_token(scope)) is not None
 
-    def _is_token(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(), self._token.encode())
+    def _owner(self, given: str | None) -> str | None:
+        """Whose token it is; None where it is nobody's. Every token is compared, so that time tells nothing."""
+        found = None
+        for token, who in self._tokens.items():
+            if given is not None and hmac.compare_digest(given.encode(), token.encode()):
+                found = who
+        return found
 
-    def _is_known(self, headers: Mapping[bytes, bytes]) -> bool:
-        """Whether the browser was let in before, or a program brings the token as `Authorization: Bearer TOKEN`."""
+    def _whose(self, headers: Mapping[bytes, bytes]) -> str | None:
+        """Whose browser it is that was let in before, or whose token a program brings as `Authorization: Bearer TOKEN`;
+        None where it is nobody's."""
         scheme, _, given = headers.get(b"authorization", b"").decode("latin-1").partition(" ")
         if scheme.lower() == "bearer":
-            return self._is_token(given.strip())
+            return self._owner(given.strip())
         try:
             cookies = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1"))
         except CookieError:
-            return False
-        return self._cookie in cookies and self._is_token(cookies[self._cookie].value)
+            return None
+        return self._owner(cookies[self._cookie].value) if self._cookie in cookies else None
 
     async def _enter(self, scope: Scope, send: Send) -> None:
         """Give the browser the token as a cookie and show the page without it: an address is seen and kept."""
         left = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
         place = "/" + quote(scope["path"].lstrip("/\\")) + (f"?{urlencode(left)}" if left else "")
-        cookie = f"{self._cookie}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+        cookie = f"{self._cookie}={_given_token(scope)}; HttpOnly; SameSite=Strict; Path=/{self._secure}"
         headers = [(b"location", place.encode()), (b"set-cookie", cookie.encode("latin-1"))]
         await _answer(send, 303, b"", headers)
+
+
+def _given_token(scope: Scope) -> str | None:
+    """The token in the address of a request."""
+    return dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token")
 
 
 async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, why: str) -> None:

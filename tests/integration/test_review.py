@@ -2,93 +2,21 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import re
-import signal
-import socket
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
 
 from tests.conftest import EXPERIMENT, Checkout
-from tests.foreign_page import CHROMIUM, QUIET
+from tests.integration.listening import a_browser, listening, ready, watched
 from tests.pages import until
 
 pytestmark = pytest.mark.slow
-TOKEN = "token-of-a-reviewer-0123"
 ILL_POSED = (
     "Is the balloon to the left or to the right of the wall?"  # of another plinko: the check proves it without looking
 )
-JSON = {"Content-Type": "application/json", "Authorization": f"Bearer {TOKEN}"}
-
-
-@dataclass
-class Server:
-    """A server of `traps review` of one person."""
-
-    port: int
-    process: subprocess.Popen[str]
-
-    @property
-    def address(self) -> str:
-        return f"http://127.0.0.1:{self.port}/?token={TOKEN}"
-
-    def ask(self, method: str, path: str, body: Any = None, **headers: str) -> tuple[int, Any]:
-        """Status and JSON (or text) of a request with the token."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
-        named = {name.replace("_", "-"): value for name, value in headers.items()}
-        connection.request(method, path, None if body is None else json.dumps(body), JSON | named)
-        answer = connection.getresponse()
-        text = answer.read()
-        connection.close()
-        is_json = (answer.getheader("content-type") or "").startswith("application/json")
-        return answer.status, json.loads(text) if is_json else text
-
-    def kill(self) -> None:
-        self.process.send_signal(signal.SIGKILL)
-        self.process.communicate()
-
-
-@contextmanager
-def reviewing(study: Checkout, who: str) -> Iterator[Server]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    command = [
-        sys.executable,
-        "-m",
-        "traps_pipeline.cli",
-        "review",
-        "--port",
-        str(port),
-        "--token",
-        TOKEN,
-        "--who",
-        who,
-    ]
-    process = study.start(*command)
-    server = Server(port, process)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == f"open {server.address}\n"
-        end = time.monotonic() + 60
-        while time.monotonic() < end:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            time.sleep(0.05)
-        yield server
-    finally:
-        if process.poll() is None:
-            server.kill()
 
 
 def decisions(study: Checkout) -> list[dict[str, Any]]:
@@ -96,22 +24,9 @@ def decisions(study: Checkout) -> list[dict[str, Any]]:
     return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
-@contextmanager
-def a_page() -> Iterator[tuple[Page, list[str]]]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
-        page, problems = browser.new_page(viewport={"width": 1280, "height": 1000}), list[str]()
-        page.on("console", lambda message: problems.append(message.text))
-        page.on("pageerror", lambda error: problems.append(str(error)))
-        own = ("http://127.0.0.1:", "data:,", "blob:http://127.0.0.1:")  # blob: a clip that is held in memory
-        page.on("request", lambda r: None if r.url.startswith(own) else problems.append(r.url))
-        yield page, problems
-        browser.close()
-
-
 def press(page: Page, *keys: str) -> None:
     """Press keys one after another as soon as they are heard; then another page has been reached."""
-    until(page, "document.documentElement.dataset.ready === '1'")
+    ready(page)
     before = page.url
     for key in keys:
         page.keyboard.press(key)
@@ -120,8 +35,9 @@ def press(page: Page, *keys: str) -> None:
 
 
 def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(study: Checkout) -> None:
-    with a_page() as (page, problems):
-        with reviewing(study, "jd") as server:
+    with a_browser() as browser:
+        page, problems = watched(browser)
+        with listening(study, "review", "jd") as server:
             page.goto(server.address)
             assert page.locator("#progress").inner_text() == "0 of 12 reviewed"
             first = page.locator("h1").inner_text()
@@ -139,7 +55,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
         assert kept[0] | {"when": ""} == {
             "scenario_id": first, "action": "keep", "who": "jd", "when": "", "why": "looks right",
         }  # fmt: skip
-        with reviewing(study, "jd") as server:
+        with listening(study, "review", "jd") as server:
             page.goto(server.address)
             assert page.locator("#progress").inner_text() == "5 of 12 reviewed"
             sixth = page.locator("h1").inner_text()
@@ -199,7 +115,7 @@ def test_ten_scenarios_by_keyboard_and_then_exactly_what_they_touch_is_asked(stu
 
 
 def test_two_reviewers_lose_nothing_and_strangers_get_nothing(study: Checkout) -> None:
-    with reviewing(study, "jd") as jd, reviewing(study, "ab") as ab:
+    with listening(study, "review", "jd") as jd, listening(study, "review", "ab") as ab:
         keep = {"action": "keep", "why": "fine", "seen": 0}
         assert jd.ask("POST", "/decide", {"scenario_id": "plinko-0001", **keep}) == (200, {"seen": 1})
         status, said = ab.ask("POST", "/decide", {"scenario_id": "plinko-0001", **keep, "action": "discard"})

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from traps_pipeline.cli import (
+    annotate,
     benchmark,
     confabulation,
     doctor,
@@ -96,6 +97,7 @@ def build_parser() -> argparse.ArgumentParser:
         results,
         site,
         review,
+        annotate,
         exchange,
         models,
         judges,

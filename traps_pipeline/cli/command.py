@@ -9,11 +9,12 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from traps_pipeline.explorer.server import Listening
     from traps_pipeline.storage.workspace import Workspace
     from traps_pipeline.study.experiment import Experiment
 
@@ -67,6 +68,32 @@ class Commands:
     def noun(self, name: str, text: str) -> Commands:
         """Add a noun, which has commands of its own."""
         return Commands(self._parsers.add_parser(name, help=text, description=text))
+
+
+def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) -> None:
+    """Add the arguments of a command whose pages listen; `listening_of` reads them."""
+    parser.add_argument("--port", type=whole(1, 65535), default=port, help=f"of the page (default: {port})")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine alone)")
+    parser.add_argument("--token", help=f"of the address, instead of a fresh one (default: ${variable})")
+    parser.add_argument(
+        "--behind", default="", help="https address of a proxy that passes requests on (docs/people.md)"
+    )
+
+
+def listening_of(
+    arguments: argparse.Namespace, command: str, variable: str, *, danger: str, people: Sequence[str] = ()
+) -> Listening:
+    """Where such a command listens and whom it lets in: who has the token, or each person with a token of their own.
+    danger: what everybody who reaches the address could do. Raises TrapsError."""
+    from traps_pipeline.explorer.server import Listening
+    from traps_pipeline.webguard import personal_tokens, public_name, token_for
+
+    if arguments.behind:
+        public_name(arguments.behind)
+    given = arguments.token or os.environ.get(variable)
+    token = token_for(arguments.host, given, danger=danger, variable=variable)
+    tokens = personal_tokens(token, people) if people else token
+    return Listening(arguments.host, arguments.port, tokens, f"traps {command}", arguments.behind)
 
 
 def root_of(arguments: argparse.Namespace) -> Path:

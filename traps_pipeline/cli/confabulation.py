@@ -9,10 +9,11 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace
 
 
 def add(commands: Commands) -> None:
-    """Add `traps confabulation sheet` and `traps confabulation validate`."""
+    """Add `traps confabulation sheet`, `labels` and `validate`."""
     noun = commands.noun("confabulation", "compare labels of void failures with people's")
     for name, command, text in (
         ("sheet", make_sheet, "write a CSV of labelled failures, which people then label blindly"),
+        ("labels", write_labels, "write the labels that people gave on the pages of `traps annotate` as such a CSV"),
         ("validate", validate_judge, "compare the judge with the labels of two annotators"),
     ):
         parser = noun.add(name, command, text)
@@ -27,6 +28,19 @@ def make_sheet(arguments: argparse.Namespace) -> int:
     write_sheet(rows, arguments.file)
     print(f"{len(rows)} failures in {arguments.file}; two people each fill in a copy: their name, then 1 or 0 an axis")
     print("next: put both copies' rows into one file, then traps confabulation validate FILE.csv")
+    return OK
+
+
+def write_labels(arguments: argparse.Namespace) -> int:
+    """See `traps confabulation labels --help`."""
+    from traps_pipeline.judging.labels import confabulation_rows, human_labels
+    from traps_pipeline.judging.validation import LABEL_COLUMNS, write_sheet
+
+    rows = confabulation_rows(human_labels(open_workspace(arguments)))
+    write_sheet(rows, arguments.file, LABEL_COLUMNS)
+    people = sorted({row["annotator"] for row in rows})
+    print(f"{len(rows)} labels of {', '.join(people)} in {arguments.file}")
+    print(f"next: traps confabulation validate {arguments.file}")
     return OK
 
 

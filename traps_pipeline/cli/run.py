@@ -163,9 +163,12 @@ def _check_participant(name: str) -> None:
 
 def _print_results(workspace: Workspace) -> None:
     from traps_pipeline.report.leaderboard import leaderboard_text
+    from traps_pipeline.report.tables.people import said_by_people
+    from traps_pipeline.scoring.people_tables import HUMAN_ROW, PANEL_ERRORS
     from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
 
-    print(leaderboard_text(workspace.tables.read(LEADERBOARD, {}), workspace.tables.read_all(ROBUST)))
+    said = said_by_people(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
+    print(leaderboard_text(workspace.tables.read(LEADERBOARD, {}), workspace.tables.read_all(ROBUST), said))
     pictures = ("figures/pecs_landscape.png", "contact_sheet.png", "shortcuts.png")
     for name in ("report.html", "leaderboard.md", "gallery.html", *pictures):
         print(workspace.reports / name)

@@ -6,7 +6,7 @@ from typing import Any
 import dagster as dg
 
 from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
-from traps_pipeline.defs import inside, judging, mechanism, scoring
+from traps_pipeline.defs import inside, judging, mechanism, people, scoring
 from traps_pipeline.defs.shown import thumbnail
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.graph import Need
@@ -19,7 +19,7 @@ from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
 GROUP = "report"
-READ = (judging, mechanism, inside, scoring)  # declared before this group, which reads their tables
+READ = (judging, people, mechanism, inside, scoring)  # declared before this group, which reads their tables
 Files = dict[str, bytes]
 published = source(
     "published",
@@ -221,6 +221,8 @@ report_page = _report(
         "verdicts",
         "leaderboard",
         "robust",
+        "human_row",
+        "panel_errors",
         "contact_sheet",
         "shortcuts",
         "worked_example",

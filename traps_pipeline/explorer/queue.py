@@ -15,9 +15,9 @@ QueueName = Literal["unreviewed", "judges", "models", "alike", "all"]
 QUEUES: tuple[QueueName, ...] = get_args(QueueName)
 MEANINGS: Mapping[QueueName, str] = {
     "unreviewed": "not reviewed yet",
-    "judges": "judges disagree, the most first",
-    "models": "models disagree on the control, the most first",
-    "alike": "control clips look alike, the most first",
+    "judges": "judges disagree",
+    "models": "models disagree on the control",
+    "alike": "control clips look alike",
     "all": "all scenarios",
 }
 

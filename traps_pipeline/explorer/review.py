@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping
 from datetime import date
 from functools import cached_property
@@ -23,13 +24,14 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.explorer.cost import Touched, touched
 from traps_pipeline.explorer.duplicates import Comparison
 from traps_pipeline.explorer.queue import MEANINGS, QUEUES, QueueName, flags, queue
-from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script
+from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script, study_file
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.report.gallery import certificate_phrases, intervention
 from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.study.experiment import EXPERIMENTS
 from traps_pipeline.yamlfile import explain
 
-SCRIPTS = ("dom.js", "player.js", "review.js")
+SCRIPTS = ("dom.js", "player.js", "listening.js", "review.js")
 STRIP_FRAMES, STRIP_WIDTH = 8, 200  # frames of a side in the contact strip, and their width in pixels
 Record = Mapping[str, Any]
 
@@ -208,6 +210,7 @@ class Review:
         return page(
             "review.html.j2",
             shown=shown,
+            queue=name,
             spec=spec,
             labels=", ".join(spec["labels"]),
             certificate=[words for _, words in certificate_phrases(json.loads(spec["evidence"]))],
@@ -232,9 +235,15 @@ class Review:
             queues={each: (MEANINGS[each], len(self.queue(each))) for each in QUEUES},
             reviewed=len(self.reviewed() & set(self.specs)),
             total=len(self.specs),
-            experiments=[*self.workspace.study.experiments],
+            commands=[command for name in self.workspace.study.experiments for command in self._commands(name)],
             who=self.who,
         )
+
+    def _commands(self, experiment: str) -> list[str]:
+        """What shows and then asks what decisions touch. An experiment that is not among ours has a file of its own."""
+        name = experiment if (EXPERIMENTS / f"{experiment}.yaml").is_file() else f"{experiment}.yaml"
+        there = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
+        return [f"traps status {there}", f"traps run {there}"]
 
     def strip(self, scenario_id: str) -> bytes:
         """The contact strip: frames of the control above the void's at the same times, as JPEG. Raises NotThere."""
@@ -258,11 +267,9 @@ class Review:
     def clip(self, scenario_id: str, side: str) -> Path:
         """The file of a clip. Raises NotThere where the study has none."""
         row = self.clips.get((scenario_id, side))
-        path = self.workspace.resolve(row["path"]) if row else None
-        inside = path is not None and path.resolve().is_relative_to((self.workspace.root / "clips").resolve())
-        if path is None or not inside or not path.is_file():
+        if row is None:
             raise NotThere(f"{scenario_id}: the study has no {side} clip of it")
-        return path
+        return study_file(self.workspace, row["path"])
 
 
 def _as_json(value: Any) -> Any:

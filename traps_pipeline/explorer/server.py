@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import hashlib
 from base64 import b64encode
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import jinja2
 from fastapi import FastAPI, Request
@@ -18,6 +21,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.webguard import Guard
 
 WEB = Path(__file__).parent / "web"
@@ -78,12 +82,43 @@ def script(*names: str) -> str:
     return f'(() => {{\n"use strict";\n{sources}\n}})();\n'
 
 
-def serve(app: FastAPI, host: str, port: int, token: str, command: str) -> None:
-    """Serve an app behind the guard until Ctrl-C, and print the address with its token."""
+def study_file(workspace: Workspace, relative: str) -> Path:
+    """A clip that a table of the study names. Raises NotThere where it is not among the study's clips."""
+    path = workspace.resolve(relative)
+    inside = path.resolve().is_relative_to((workspace.root / "clips").resolve())
+    if not inside or not path.is_file():
+        raise NotThere("the study has no such clip")
+    return path
+
+
+@dataclass(frozen=True)
+class Listening:
+    """Where a server listens, whom it lets in, and by which command it was started.
+
+    tokens: one token, or the person that each of several belongs to. behind: the address of a server with HTTPS that
+    passes requests on, if there is one.
+    """
+
+    host: str
+    port: int
+    tokens: str | Mapping[str, str]
+    command: str
+    behind: str = ""
+
+    def addresses(self) -> dict[str, str]:
+        """The address to open, by the person it is for ("" where there is one for all)."""
+        shown = f"[{self.host}]" if ":" in self.host else self.host
+        base = self.behind.rstrip("/") or f"http://{shown}:{self.port}"
+        tokens = {self.tokens: ""} if isinstance(self.tokens, str) else self.tokens
+        return {who: f"{base}/?token={quote(token)}" for token, who in tokens.items()}
+
+
+def serve(app: FastAPI, listening: Listening) -> None:
+    """Serve an app behind the guard until Ctrl-C, and print each address with its token."""
     import uvicorn
 
-    shown = f"[{host}]" if ":" in host else host
-    print(f"open http://{shown}:{port}/?token={token}", flush=True)
-    uvicorn.run(
-        Guard(app, token, host, port, command=command), host=host, port=port, access_log=False, log_level="warning"
-    )
+    for who, address in listening.addresses().items():
+        print(f"{who}: open {address}" if who else f"open {address}", flush=True)
+    at = listening.host, listening.port
+    guarded = Guard(app, listening.tokens, *at, command=listening.command, behind=listening.behind)
+    uvicorn.run(guarded, host=at[0], port=at[1], access_log=False, log_level="warning")

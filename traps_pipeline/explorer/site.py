@@ -29,8 +29,10 @@ from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, sides_of
 from traps_pipeline.report.gallery import certificate_phrases, intervention
 from traps_pipeline.report.leaderboard import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
+from traps_pipeline.report.tables.people import said_by_people
 from traps_pipeline.report.tables.shared import entries
 from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
+from traps_pipeline.scoring.people_tables import HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.workspace import Workspace
 
@@ -159,6 +161,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
     from traps_pipeline.models.registry import load_models
 
     board, robust = workspace.tables.read_all(LEADERBOARD), workspace.tables.read_all(ROBUST)
+    human_row = workspace.tables.read_all(HUMAN_ROW)
     release, registry = load_release(), load_models()
     published = entries(PublishedResults())
     evaluations = [[e.model, e.regime, e.run] for e in answers.evaluations]
@@ -182,6 +185,8 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "n_votes": len(answers.votes),
         "leaderboard": _records(board),
         "robust": _records(robust),
+        "people": _records(human_row),
+        "said": said_by_people(human_row, workspace.tables.read_all(PANEL_ERRORS)),
         "published": _records(published.loc[:, ["model", "regime", "dataset", "epoch", *_PUBLISHED]]),
         "legend": legend(board, robust) if len(board) else {},
         "marks": MARKS,

@@ -54,9 +54,10 @@ class HumanLabels:
 # --- the annotators' files --------------------------------------------------------------------------------------------
 
 
-def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
-    """The rows that an annotator fills in: SHEET_COLUMNS by failure, in an order that reveals nothing. Raises
-    TrapsError if no failure of the models to validate was labelled, or if a failure's answer has been replaced."""
+def sheet_rows(workspace: Workspace) -> list[dict[str, str]]:
+    """What an annotator is shown of each failure: sample_id, question, why_unanswerable, reasoning_trace (empty without
+    one) and response, in an order that reveals nothing. Raises TrapsError if no failure of the models to validate was
+    labelled, or if a failure's answer has been replaced."""
     protocol = load_protocol()
     labels = _judged(workspace)
     labels = labels.loc[labels["model"].isin(protocol.validation.models)].set_index("sample_id")
@@ -64,6 +65,15 @@ def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
         raise TrapsError(f"no labelled failure of {', '.join(protocol.validation.models)}; run the study first")
     chosen = drawn(protocol.seed, protocol.validation.n, [(str(sample), "sheet") for sample in labels.index])
     return [_sheet_row(workspace, sample, labels.loc[sample].to_dict()) for sample, _ in chosen]
+
+
+def annotation_sheet(workspace: Workspace) -> list[dict[str, str]]:
+    """The rows that an annotator fills in: SHEET_COLUMNS by failure, of `sheet_rows`, safe for a spreadsheet."""
+    empty = dict.fromkeys(LABEL_COLUMNS, "")
+    return [
+        empty | {name: _no_formula(text) for name, text in row.items()} | {"sample_id": row["sample_id"]}
+        for row in sheet_rows(workspace)
+    ]
 
 
 def _sheet_row(workspace: Workspace, sample: str, label: Mapping[str, Any]) -> dict[str, str]:
@@ -77,14 +87,13 @@ def _sheet_row(workspace: Workspace, sample: str, label: Mapping[str, Any]) -> d
             f"{workspace.root}: the labels of {cell.key} are of earlier answers (of {item_id}, for one); materialize "
             "confabulation, then write the sheet again"
         )
-    shown = {
-        "question": item["question"],
+    return {
+        "sample_id": sample,
+        "question": str(item["question"]),
         "why_unanswerable": VOID_KINDS[label["void_kind"]],
-        "reasoning_trace": trace or "",
-        "response": response["text"],
+        "reasoning_trace": str(trace or ""),
+        "response": str(response["text"]),
     }
-    empty = dict.fromkeys(LABEL_COLUMNS, "")
-    return empty | {"sample_id": sample} | {name: _no_formula(str(text)) for name, text in shown.items()}
 
 
 def _row_of(frame: pd.DataFrame, item_id: str) -> dict[Any, Any]:
@@ -98,14 +107,15 @@ def _no_formula(text: str) -> str:
     return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text
 
 
-def write_sheet(rows: Sequence[Mapping[str, str]], path: Path) -> None:
-    """Write a sheet as CSV. Raises TrapsError if the file exists already, since it may hold labels."""
+def write_sheet(rows: Sequence[Mapping[str, str]], path: Path, columns: Sequence[str] = SHEET_COLUMNS) -> None:
+    """Write a sheet, or labels alone (LABEL_COLUMNS), as CSV. Raises TrapsError if the file exists already, since it
+    may hold labels."""
     if path.exists():
         raise TrapsError(f"{path} exists already and may hold labels; give another name, or delete it")
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
-        writer.writerow(SHEET_COLUMNS)
-        writer.writerows([row[name] for name in SHEET_COLUMNS] for row in rows)
+        writer.writerow(columns)
+        writer.writerows([row[name] for name in columns] for row in rows)
 
 
 def read_labels(path: Path, known: Sequence[str]) -> HumanLabels:

@@ -29,7 +29,10 @@ from traps_pipeline.storage.workspace import Workspace
 PURPOSES = {
     "benchmark": ("Scenarios, clips and items.", ("benchmark",)),
     "evaluation": ("Answers, votes and verdicts; asks what the ledger does not hold.", ("evaluation",)),
-    "scoring": ("Metrics, contrasts, leaderboard; agreement of the panel, confabulation.", ("scoring", "judging")),
+    "scoring": (
+        "Metrics, contrasts, leaderboard; agreement, confabulation, people's labels.",
+        ("scoring", "judging", "people"),
+    ),
     "mechanism": ("Hidden states, probes, directions and steering of local models.", ("mechanism",)),
     "report": ("Tables, figures and pages.", ("report", "tables", "figures", "published")),
 }

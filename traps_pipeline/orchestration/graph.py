@@ -25,7 +25,18 @@ if TYPE_CHECKING:
 Node = tuple[str, str | None]  # stage or source, and its partition key
 Need = Literal["every", "some", "none"]
 Cost = Literal["", "money", "machine"]
-GROUPS = ("benchmark", "evaluation", "scoring", "judging", "mechanism", "report", "tables", "figures", "published")
+GROUPS = (
+    "benchmark",
+    "evaluation",
+    "scoring",
+    "judging",
+    "people",
+    "mechanism",
+    "report",
+    "tables",
+    "figures",
+    "published",
+)
 
 
 @dataclass(frozen=True)

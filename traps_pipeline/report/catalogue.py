@@ -17,7 +17,7 @@ from traps_pipeline.report.printed import mechanism as printed_mechanism
 from traps_pipeline.report.printed import scores as printed_scores
 from traps_pipeline.report.printed import setup as printed_setup
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables import comparisons, inside, judges, leaderboards, setup, sub_scenarios
+from traps_pipeline.report.tables import comparisons, inside, judges, leaderboards, people, setup, sub_scenarios
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
 from traps_pipeline.report.tables.shared import printed
 from traps_pipeline.report.writing import SOFT, PrintedTable, figure_bytes, figure_files, figure_style, table_files
@@ -27,7 +27,15 @@ if TYPE_CHECKING:
 
 PAPER = "published"  # folder below tables/ and figures/
 RECOMPUTED = "recomputed"  # folder below tables/, of what follows from the paper's tables
-JUDGED_STAGES = {"leaderboard", "metrics", "contrasts", "regime_tests", "steering_effects", "steering_shares"}
+JUDGED_STAGES = {
+    "leaderboard",
+    "metrics",
+    "contrasts",
+    "regime_tests",
+    "steering_effects",
+    "steering_shares",
+    "corrected",
+}
 
 
 @dataclass(frozen=True)
@@ -183,6 +191,13 @@ TABLES: tuple[TableReport, ...] = (
     TableReport("judge_agreement", judges.agreement, ("agreement",), printed_setup.agreement),
     TableReport("judge_bias", judges.judge_bias, ("judge_bias", "leave_one_out")),
     TableReport("confabulation", judges.confabulation, ("confabulation_prevalence",), printed_setup.confabulation),
+    TableReport("people", people.people, ("human_row", "human_agreement"), title="People"),
+    TableReport(
+        "judge_corrected",
+        people.judge_corrected,
+        ("panel_errors", "corrected"),
+        title="Corrected for judges’ errors",
+    ),
     TableReport("judge_validation", judges.validation, ("judge_validation",), printed_setup.validation),
     TableReport(
         "probes", tables_of_mechanism.probes, ("probes",), printed_mechanism.probes, ("probe_means",), "Probes"

@@ -94,31 +94,42 @@ LEGEND = {
 }
 
 
-def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> str:
+def leaderboard_text(board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()) -> str:
     """LEADERBOARD rows, with the figures of ROBUST rows, as a table for standard output, best first; one table for each
-    panel."""
-    return "\n".join(table_text(table) for table in ranked_tables(board, robust))
+    panel. said: further notes."""
+    return "\n".join(table_text(table) for table in ranked_tables(board, robust, said))
 
 
-def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> str:
-    """LEADERBOARD rows, with the figures of ROBUST rows, as a Markdown table with its legend, best first."""
+def leaderboard_markdown(board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()) -> str:
+    """LEADERBOARD rows, with the figures of ROBUST rows, as a Markdown table with its legend, best first. said: further
+    notes."""
     terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, robust).items()]
-    return "\n".join([*(table_markdown(table) for table in ranked_tables(board, robust)), *terms]) + "\n"
+    return "\n".join([*(table_markdown(table) for table in ranked_tables(board, robust, said)), *terms]) + "\n"
 
 
-def ranked_tables(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> list[PrintedTable]:
-    """The brief table that ranks the entries of each panel."""
-    return [_of_one_panel(part, robust, True, suffix)[0] for suffix, part in _by_panel(board)]
+def ranked_tables(
+    board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()
+) -> list[PrintedTable]:
+    """The brief table that ranks the entries of each panel. said: further notes of the first."""
+    return _with_notes([_of_one_panel(part, robust, True, suffix)[0] for suffix, part in _by_panel(board)], said)
 
 
-def leaderboards(board: pd.DataFrame, robust: pd.DataFrame | None = None) -> list[PrintedTable]:
+def _with_notes(tables: list[PrintedTable], said: Sequence[str]) -> list[PrintedTable]:
+    first = replace(tables[0], notes=[*tables[0].notes, *said])
+    return [first, *tables[1:]]
+
+
+def leaderboards(
+    board: pd.DataFrame, robust: pd.DataFrame | None = None, said: Sequence[str] = ()
+) -> list[PrintedTable]:
     """Tables of LEADERBOARD rows for each panel, whose entries are never ranked together: first the one that ranks the
     entries, then one for each other dataset. The overall table has the figures of ROBUST rows, if there are any.
 
     The first table is `overall`; if no model has all four datasets it is the first dataset of the board. An entry
-    without a row in it comes last.
+    without a row in it comes last. said: further notes of the first table.
     """
-    return [table for suffix, part in _by_panel(board) for table in _of_one_panel(part, robust, False, suffix)]
+    tables = [table for suffix, part in _by_panel(board) for table in _of_one_panel(part, robust, False, suffix)]
+    return _with_notes(tables, said)
 
 
 def _by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:

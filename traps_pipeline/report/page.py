@@ -40,11 +40,13 @@ def report_html(
     address: Callable[[Behind], str] | None = None,
     title: str = "TRAPSBench report",
     robust: pd.DataFrame | None = None,
+    said: Sequence[str] = (),
 ) -> str:
     """The page: leaderboard, figures (title -> PNG bytes, inlined), legend, one table per dataset, then the chapters.
 
-    robust: ROBUST rows, whose figures the leaderboard shows. With `address`, every number is a link to the items behind
-    it. The page opens from disk and makes no network request; its content policy forbids any.
+    robust: ROBUST rows, whose figures the leaderboard shows; said: further notes below it. With `address`, every number
+    is a link to the items behind it. The page opens from disk and makes no network request; its content policy forbids
+    any.
     """
     return (
         environment()
@@ -52,7 +54,7 @@ def report_html(
         .render(
             title=title,
             provenance=provenance(board),
-            boards=[(table.title, table_html(table, address)) for table in leaderboards(board, robust)],
+            boards=[(table.title, table_html(table, address)) for table in leaderboards(board, robust, said)],
             figures={name: base64.b64encode(png).decode() for name, png in (figures or {}).items()},
             chapters=chapters,
             all_items=address(Behind()) if address else "",

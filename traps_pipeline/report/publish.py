@@ -27,6 +27,7 @@ from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables.audited import audit_table
+from traps_pipeline.report.tables.people import said_by_people
 from traps_pipeline.report.writing import Behind, environment, figure_files, table_files
 from traps_pipeline.storage.workspace import Workspace
 
@@ -49,8 +50,9 @@ def report_files(study: StudyResults, cells: Sequence[Cell], pictures: Pictures)
     address = addresses(cells)
     landscape = FIGURES[0]
     first = {landscape.title: pictures[landscape.path(study)]} if landscape.path(study) in pictures else {}
-    page = report_html(study.board, first, _chapters(study, address, pictures), address, robust=study.robust)
-    markdown = leaderboard_markdown(study.board, study.robust)
+    said = said_by_people(study.human_row, study.panel_errors)
+    page = report_html(study.board, first, _chapters(study, address, pictures), address, robust=study.robust, said=said)
+    markdown = leaderboard_markdown(study.board, study.robust, said)
     return {PAGE: page.encode(), MARKDOWN: markdown.encode(), METRICS: metrics_lines(study.board).encode()}
 
 

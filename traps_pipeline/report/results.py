@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT
 from traps_pipeline.judging.tables import AGREEMENT, JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.control_tables import (
@@ -22,6 +23,7 @@ from traps_pipeline.mechanism.control_tables import (
 )
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_SHARES
 from traps_pipeline.partitions import DATASETS
+from traps_pipeline.scoring.people_tables import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.scoring.tables import (
     CONFABULATION_PREVALENCE,
     CONTRASTS,
@@ -109,6 +111,10 @@ class Results:
     regime_tests = Made(table=REGIME_TESTS)
     confabulation = Made(table=CONFABULATION_PREVALENCE)
     validation = Made(table=JUDGE_VALIDATION)
+    human_row = Made(table=HUMAN_ROW)
+    human_agreement = Made(table=HUMAN_AGREEMENT)
+    panel_errors = Made(table=PANEL_ERRORS)
+    corrected = Made(table=CORRECTED)
     composition = Made("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
     probes = Made("PROBES rows; the paper has only transfer, confabulated, shuffled, centroid_void.", table=PROBES)
     cosines = Made("COSINES rows at the steered layer of each model.")

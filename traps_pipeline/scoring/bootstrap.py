@@ -59,7 +59,7 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
     for key, group in items.groupby(["model", "regime"], sort=True):
         model, regime = cast(tuple[str, str], key)
         draws = {cell: figures_of(sums) for cell, sums in run_sums(group, drawn).items()}
-        for dataset, mean in _means_over_runs(draws, resamples).items():
+        for dataset, mean in means_over_runs(draws, resamples).items():
             entries.append((model, regime, dataset))
             values.append(mean)
     shape = (len(entries), len(RESAMPLED), resamples)
@@ -110,22 +110,42 @@ def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Drawn:
     return drawn
 
 
-def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Sums of COUNTS of every cell and resample: (cells, 6, resamples).
+def with_observed(drawn: Drawn) -> Drawn:
+    """The same draws after one that takes each scenario once, and so gives the figures themselves."""
+    return {
+        taxonomy: (ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights]))
+        for taxonomy, (ids, weights) in drawn.items()
+    }
 
-    weights is (resamples, scenarios), counts is (scenarios, cells, 6) in the order of COUNTS. Sums of counts stay far
-    below 2^24, so float32 products are exact.
+
+def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Sums of counts of every cell and resample: (cells, kinds, resamples).
+
+    weights is (resamples, scenarios), counts is (scenarios, cells, kinds), such as the six of COUNTS. Sums of whole
+    counts stay far below 2^24, so float32 products are exact; weighted counts are summed in float64.
     """
-    scenarios, cells, _ = counts.shape
-    products = counts.astype(np.float32).reshape(scenarios, -1).T @ weights.T
-    return products.reshape(cells, len(COUNTS), -1).astype(np.float64)
+    scenarios, cells, kinds = counts.shape
+    whole = np.array_equal(counts, np.rint(counts))
+    products = counts.astype(np.float32 if whole else np.float64).reshape(scenarios, cells * kinds).T @ weights.T
+    return products.reshape(cells, kinds, -1).astype(np.float64)
+
+
+def shares_of(sums: np.ndarray) -> np.ndarray:
+    """Acc, FalseAbs and AbsRec of sums of COUNTS: (.., 6, resamples) -> (.., 3, resamples); NaN where a denominator is
+    0."""
+    with np.errstate(invalid="ignore"):
+        return sums[..., 0::2, :] / sums[..., 1::2, :]
 
 
 def figures_of(sums: np.ndarray) -> np.ndarray:
     """RESAMPLED figures of sums of COUNTS: (.., 6, resamples) -> (.., RESAMPLED, resamples); NaN where a denominator
     is 0."""
-    with np.errstate(invalid="ignore"):
-        acc, false_abs, abs_rec = np.moveaxis(sums[..., 0::2, :] / sums[..., 1::2, :], -2, 0)
+    return figures_of_shares(shares_of(sums))
+
+
+def figures_of_shares(shares: np.ndarray) -> np.ndarray:
+    """RESAMPLED figures of Acc, FalseAbs and AbsRec: (.., 3, resamples) -> (.., RESAMPLED, resamples)."""
+    acc, false_abs, abs_rec = np.moveaxis(shares, -2, 0)
     j = abs_rec - false_abs
     return np.stack([acc, abs_rec, false_abs, j, pecs_of(acc, j)], axis=-2)
 
@@ -146,8 +166,8 @@ def run_sums(group: pd.DataFrame, drawn: Drawn) -> dict[tuple[str, int], np.ndar
     return found
 
 
-def _means_over_runs(draws: Mapping[tuple[str, int], np.ndarray], resamples: int) -> dict[str, np.ndarray]:
-    """Dataset or `overall` -> mean over runs (RESAMPLED, resamples)."""
+def means_over_runs(draws: Mapping[tuple[str, int], np.ndarray], resamples: int) -> dict[str, np.ndarray]:
+    """Dataset or `overall` -> mean over runs (RESAMPLED, resamples), from those of (dataset, run)."""
     runs = sorted({run for _, run in draws})
     means = {
         dataset: np.mean([draws[dataset, run] for run in runs if (dataset, run) in draws], axis=0)

@@ -31,6 +31,7 @@ from traps_pipeline.scoring.bootstrap import (
     figures_of,
     percentiles,
     run_sums,
+    with_observed,
 )
 from traps_pipeline.scoring.metrics import decision_counts, joined_epochs, pecs_of
 from traps_pipeline.scoring.tables import ROBUST
@@ -60,12 +61,8 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
             entries[key] = arms, group.loc[chosen]
     if not entries:
         return pd.DataFrame(columns=pd.Index(ROBUST.names))
-    # A scenario is drawn with its items in all datasets and arms. The first draw takes each scenario once, so that it
-    # gives the figures themselves.
-    drawn = {
-        taxonomy: (ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights]))
-        for taxonomy, (ids, weights) in draw_scenarios(items, resamples, seed).items()
-    }
+    # A scenario is drawn with its items in all datasets and arms.
+    drawn = with_observed(draw_scenarios(items, resamples, seed))
     rows = [
         {"model": model, "regime": regime, "arms": list(arms), **_row(group, arms, drawn)}
         for (model, regime), (arms, group) in cast(Mapping[tuple[str, str], Any], entries).items()

@@ -120,6 +120,11 @@ class Workspace:
         return self.root / "reports"
 
     @property
+    def labels(self) -> Path:
+        """What people labelled: the database of the pages, and the append-only file that stages read."""
+        return self.root / "labels"
+
+    @property
     def trajectories(self) -> Path:
         """Trajectories simulated here because a correction changed parameters."""
         return self.root / "trajectories"

@@ -141,13 +141,17 @@ async function leaderboardView(route) {
       section(
         null,
         table(columns, rows, {
-          caption: `${info.titles[dataset] || dataset}: ${rows.length} entries`,
+          caption: `${info.titles[dataset] || dataset}: ${shown.length} entries`,
           name: "leaderboard",
           order: { by: sort, down: !up },
           sortBy: change,
+          foot: own.length ? [rowOfPeople(info, dataset, columns)] : [],
           absent: own.length ? "no entry fits these filters" : `${NOT_RUN}: this study has no leaderboard yet`,
         }),
         notes(info, shown, dataset),
+        own.length
+          ? info.said.map((text) => h("p", { class: "note" }, `${text[0].toUpperCase()}${text.slice(1)}.`))
+          : null,
         inPaper
           ? null
           : h("p", { class: "note" }, own.length ? "No model of this study is in the paper's tables." : null),
@@ -155,6 +159,19 @@ async function leaderboardView(route) {
       meanings(info),
     ],
   };
+}
+
+// The row of people, below all models: nobody ranks it.
+function rowOfPeople(info, dataset, columns) {
+  const row = info.people.find((each) => each.dataset === dataset);
+  const cells = [
+    "People",
+    h("span", { class: "tag" }, "no prompt"),
+    ...FIGURES.map((each) => figure(row && row[each.field] !== null ? row : undefined, each)),
+    NONE,
+  ];
+  const rest = columns.slice(cells.length).map(({ title }) => (title === "n" && row ? `${row.n_clips} clips` : NONE));
+  return [...cells, ...rest];
 }
 
 function ordering(sort, up, regimes) {

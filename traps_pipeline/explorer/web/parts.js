@@ -74,8 +74,8 @@ function outcomeKey() {
 }
 
 // A table in a box that scrolls. columns: {title, number, sort}; rows: arrays of cells (nodes or texts); the first cell
-// heads its row. order: {by, down} and `sortBy` make headings sort.
-function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name = "" } = {}) {
+// heads its row. order: {by, down} and `sortBy` make headings sort. foot: rows below the others, which are never sorted.
+function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name = "", foot = [] } = {}) {
   const head = columns.map((column, k) => {
     const sorted = order && order.by === column.sort;
     const direction = sorted ? (order.down ? "descending" : "ascending") : null;
@@ -94,13 +94,12 @@ function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name =
       : column.title;
     return h("th", { scope: "col", class: classes(column, k), "aria-sort": direction, title: column.hint }, title);
   });
-  const body = rows.map((cells) =>
+  const line = (cells) =>
     h(
       "tr",
       null,
       cells.map((cell, k) => h(k ? "td" : "th", { scope: k ? null : "row", class: classes(columns[k], k) }, cell)),
-    ),
-  );
+    );
   const empty = h("tr", null, h("td", { colspan: columns.length, class: "absent" }, absent));
   return h(
     "div",
@@ -110,7 +109,8 @@ function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name =
       { "data-name": name },
       caption ? h("caption", null, caption) : null,
       h("thead", null, h("tr", null, head)),
-      h("tbody", null, rows.length ? body : empty),
+      h("tbody", null, rows.length ? rows.map(line) : empty),
+      foot.length ? h("tfoot", null, foot.map(line)) : null,
     ),
   );
 }

@@ -1,8 +1,6 @@
 // The review of one scenario: its clips, a key for each decision, and what a correction would cost.
 
-const SHOWN = JSON.parse(document.getElementById("shown").textContent);
 const FIELDS = ["question", "ill_posed_question", "labels", "answer", "params"];
-const field = (name) => document.getElementById(name);
 const said = field("said");
 let wanted = ""; // the decision that waits for a reason
 
@@ -53,16 +51,7 @@ function changedParams(text) {
   return Object.fromEntries(Object.entries(given).filter(differs));
 }
 
-async function post(path, body) {
-  const answer = await fetch(path, {
-    method: "POST",
-    headers: { "content-type": "application/json" },
-    body: JSON.stringify({ scenario_id: SHOWN.scenario_id, ...body }),
-  });
-  const read = await answer.json().catch(() => ({ error: `the server said ${answer.status}` }));
-  if (!answer.ok) throw new Error(read.error || `the server said ${answer.status}`);
-  return read;
-}
+const send = (path, body) => post(path, { scenario_id: SHOWN.scenario_id, ...body });
 
 let asked = 0;
 async function preview() {
@@ -73,7 +62,7 @@ async function preview() {
   try {
     const found = changes();
     if (Object.keys(found).length) {
-      const read = await post("/preview", { changes: found });
+      const read = await send("/preview", { changes: found });
       text = `Question: ${read.question}\n${read.cost}.`;
     } else text = "Nothing is changed yet.";
   } catch (error) {
@@ -103,7 +92,7 @@ async function decide(action) {
   wanted = "";
   try {
     if (action === "undo") {
-      await post("/undo", { why, seen: SHOWN.seen });
+      await send("/undo", { why, seen: SHOWN.seen });
       location.reload();
       return;
     }
@@ -114,7 +103,7 @@ async function decide(action) {
       said.textContent = "Change something first: question, labels, answer or parameters.";
       return;
     }
-    await post("/decide", { action, changes: found, why, seen: SHOWN.seen });
+    await send("/decide", { action, changes: found, why, seen: SHOWN.seen });
     if (action === "add")
       said.textContent = "Added. A run makes it in every study that holds all scenarios, or names it.";
     else leave(SHOWN.after);
@@ -145,14 +134,4 @@ for (const name of ["keep", "correct", "discard", "add", "undo"])
   field(name).addEventListener("click", () => decide(name));
 field("before").addEventListener("click", KEYS.p);
 field("after").addEventListener("click", KEYS.n);
-document.addEventListener("keydown", (event) => {
-  if (event.key === "Escape") return document.activeElement.blur();
-  if (event.key === "Enter" && event.target.id === "why") return decide(wanted || "keep");
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, textarea, select")) return null;
-  if ((event.key === " " || event.key === "Enter") && event.target.closest("a, button, summary")) return null;
-  const act = KEYS[event.key];
-  if (!act) return null;
-  event.preventDefault();
-  return act();
-});
-document.documentElement.dataset.ready = "1"; // from here on keys are heard
+hearKeys(KEYS, (event) => event.key === "Enter" && event.target.id === "why" && decide(wanted || "keep"));

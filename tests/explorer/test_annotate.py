@@ -1,0 +1,70 @@
+"""What a browser gets of a unit, and the way of labels of confabulation to the table that compares them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.judging.test_validation import MODEL, labelled_study
+from traps_pipeline.cli import main
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.explorer.annotate import Annotation, Sent
+from traps_pipeline.explorer.server import Listening
+from traps_pipeline.judging.confabulation import AXES
+from traps_pipeline.judging.tables import JUDGE_VALIDATION
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.webguard import personal_tokens, public_name
+
+TEXTS = ["It goes left.", 'He said "left",\nthen stopped.', "Right, <b>surely</b>."]
+
+
+def test_labels_of_confabulation_go_from_the_pages_to_the_comparison(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    workspace = labelled_study(tmp_path / "study", TEXTS)
+    annotation, file = Annotation(workspace), tmp_path / "labels.csv"
+    at = ("--workspace", str(workspace.root))
+    assert main(["confabulation", "labels", str(file), *at]) == 1
+    assert "no failure is labelled by everybody yet" in capsys.readouterr().err
+    seen = set()
+    for who in ("ann", "bob"):
+        while unit := annotation.next_unit(who, "confabulation"):
+            shown = annotation.shown(who, "confabulation", unit)
+            assert shown.keys() == {"task", "handle", "question", "why", "trace", "answer"}
+            assert MODEL not in json.dumps(shown) and "void" not in json.dumps(shown)
+            seen.add(shown["answer"])
+            label = dict.fromkeys(AXES, False) | {"hallucinated_premise": True}
+            annotation.record(who, Sent(handle=shown["handle"], label=label))
+    assert seen == set(TEXTS)
+    assert annotation.progress("bob", "confabulation") == (3, 3)
+    assert "You have labelled all 3" in annotation.unit_page("bob", "confabulation")
+    assert "There is nothing to label here" in annotation.unit_page("bob", "answerability")  # its clips are not there
+    assert main(["confabulation", "labels", str(file), *at]) == 0
+    assert "6 labels of ann, bob" in capsys.readouterr().out
+    assert {row["invalid_inference"] for row in csv.DictReader(file.open())} == {"0"}
+    assert main(["confabulation", "validate", str(file), *at]) == 0
+    assert workspace.tables.read(JUDGE_VALIDATION, {})["accuracy"].tolist() == [1.0] * 5
+
+
+def test_a_study_without_clips_or_answers_says_so(tmp_path: Path) -> None:
+    with pytest.raises(TrapsError, match="has no clips yet; run `traps run EXPERIMENT`"):
+        Annotation(Workspace.create(tmp_path / "study", Study(name="empty", panel="rules")))
+
+
+def test_each_person_has_an_address_of_their_own_that_stays(tmp_path: Path) -> None:
+    tokens = personal_tokens("one secret of sixteen", ["jd", "ab"])
+    assert set(tokens) < set(personal_tokens("one secret of sixteen", ["ab", "cy", "jd"]))
+    assert not set(tokens) & set(personal_tokens("another secret, sixteen", ["jd", "ab"]))
+    behind = Listening("127.0.0.1", 3200, tokens, "traps annotate", "https://labels.example.org/")
+    assert {who: address.partition("=")[0] for who, address in behind.addresses().items()} == {
+        "jd": "https://labels.example.org/?token",
+        "ab": "https://labels.example.org/?token",
+    }
+    assert public_name("https://labels.example.org:8443") == "labels.example.org:8443"
+    for wrong in ("labels.example.org", "http://labels.example.org", "https://labels.example.org/path", "https://"):
+        with pytest.raises(TrapsError, match="give the address of the server with HTTPS"):
+            public_name(wrong)

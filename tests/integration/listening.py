@@ -1,0 +1,111 @@
+"""Servers of `traps review` and `traps annotate` as a test starts, asks and kills them, and a browser that watches."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from tests.conftest import Checkout
+from tests.foreign_page import CHROMIUM, QUIET
+from tests.pages import until
+
+TOKEN = "token-of-a-reviewer-0123"
+
+
+@dataclass
+class Server:
+    """A server that listens. addresses: by person, "" where one address is for all."""
+
+    port: int
+    process: subprocess.Popen[str]
+    addresses: dict[str, str]
+
+    @property
+    def address(self) -> str:
+        return self.addresses[""]
+
+    def ask(self, method: str, path: str, body: Any = None, who: str = "", **headers: str) -> tuple[int, Any]:
+        """Status and JSON (or text) of a request with the token."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        token = self.addresses[who].partition("token=")[2]
+        sent = {"Content-Type": "application/json", "Authorization": f"Bearer {token}"}
+        sent |= {name.replace("_", "-"): value for name, value in headers.items()}
+        connection.request(method, path, None if body is None else json.dumps(body), sent)
+        answer = connection.getresponse()
+        text = answer.read()
+        connection.close()
+        is_json = (answer.getheader("content-type") or "").startswith("application/json")
+        return answer.status, json.loads(text) if is_json else text
+
+    def kill(self) -> None:
+        self.process.send_signal(signal.SIGKILL)
+        self.process.communicate()
+
+
+@contextmanager
+def listening(study: Checkout, command: str, *people: str, port: int = 0) -> Iterator[Server]:
+    """`traps review` or `traps annotate` for these people; killed at the end unless it was before."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(("127.0.0.1", port))
+        port = probe.getsockname()[1]
+    called = [sys.executable, "-m", "traps_pipeline.cli", command, "--port", str(port), "--token", TOKEN, "--who"]
+    process = study.start(*called, *people)
+    server = Server(port, process, {})
+    try:
+        assert process.stdout is not None and process.stderr is not None
+        while len(server.addresses) < (1 if command == "review" else len(people)):
+            line = process.stdout.readline()
+            found = re.fullmatch(r"(?:(.+): )?open (http://127\.0\.0\.1:\d+/\?token=\S+)\n", line)
+            assert found, line + process.stderr.read()
+            server.addresses[found[1] or ""] = found[2]
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            time.sleep(0.05)
+        yield server
+    finally:
+        if process.poll() is None:
+            server.kill()
+
+
+@contextmanager
+def a_browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+        yield browser
+        browser.close()
+
+
+def watched(browser: Browser, recording: Path | None = None) -> tuple[Page, list[str]]:
+    """A page of a person of their own, and what it says to the console or asks of others. recording: the file into
+    which all traffic is written when its context is closed."""
+    context = browser.new_context(
+        viewport={"width": 1280, "height": 1000}, record_har_path=recording, record_har_content="embed"
+    )
+    page, problems = context.new_page(), list[str]()
+    page.on("console", lambda message: problems.append(message.text))
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    own = ("http://127.0.0.1:", "data:,", "blob:http://127.0.0.1:")  # blob: a clip that is held in memory
+    page.on("request", lambda r: None if r.url.startswith(own) else problems.append(r.url))
+    return page, problems
+
+
+def ready(page: Page) -> None:
+    """Wait until a page hears keys."""
+    until(page, "document.documentElement.dataset.ready === '1'")

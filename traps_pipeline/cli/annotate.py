@@ -1,0 +1,43 @@
+"""`traps annotate`: pages on which people label clips and answers, without knowing whose they are."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+
+from traps_pipeline.cli.command import OK, Commands, add_listening, listening_of, open_workspace
+from traps_pipeline.errors import TrapsError
+
+TOKEN_VARIABLE = "TRAPS_ANNOTATE_TOKEN"
+
+
+def add(commands: Commands) -> None:
+    """Add `traps annotate`."""
+    parser = commands.add(
+        "annotate", annotate, "pages on which people label clips and answers blindly; prints an address for each"
+    )
+    user = os.environ.get("USER", "")
+    parser.add_argument(
+        "--who", nargs="+", default=[user] if user else [], metavar="NAME", help="who labels (default: $USER)"
+    )
+    add_listening(parser, port=3200, variable=TOKEN_VARIABLE)
+
+
+def annotate(arguments: argparse.Namespace) -> int:
+    """See `traps annotate --help`."""
+    from traps_pipeline.explorer.annotate import Annotation, annotation_app
+    from traps_pipeline.explorer.server import serve
+
+    people = [name.strip() for name in arguments.who]
+    wrong = [name for name in people if not re.fullmatch(r"[\w.@-]{1,60}", name)]
+    if not people or wrong or len(set(people)) < len(people):
+        raise TrapsError(
+            f"--who {' '.join(people)[:80]}: say who labels, each once, in letters, digits, `.`, `-`, `_` and "
+            "`@`, e.g. --who jd ab"
+        )
+    listening = listening_of(
+        arguments, "annotate", TOKEN_VARIABLE, danger="label in other people's names", people=people
+    )
+    serve(annotation_app(Annotation(open_workspace(arguments))), listening)
+    return OK

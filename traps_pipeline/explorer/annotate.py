@@ -1,0 +1,225 @@
+"""`traps annotate`: people label clips and answers without knowing whose they are, one a screen.
+
+The server alone knows what is shown. A browser gets a question, a clip or an answer, and a handle that is made for one
+person and one unit: no model, regime, side, dataset or scenario is ever sent, and no address names a file.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from fastapi import FastAPI, Request
+from fastapi.responses import HTMLResponse, Response
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from traps_pipeline.benchmark.tables import ITEMS, VIDEOS
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.explorer.labelstore import LabelStore, NotWaiting
+from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script, study_file
+from traps_pipeline.judging.labels import LABELS
+from traps_pipeline.judging.people import TASKS, TaskName, annotation_protocol, queue_of, require_task, sample
+from traps_pipeline.judging.validation import sheet_rows
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.partitions import DATASETS, Cell, Evaluation
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.webguard import WHO
+from traps_pipeline.yamlfile import explain
+
+SCRIPTS = ("dom.js", "player.js", "listening.js", "annotate.js")
+TITLES: Mapping[TaskName, str] = {
+    "answerability": "Clips: what happens?",
+    "abstention": "Answers: do they answer?",
+    "correctness": "Answers: are they right?",
+    "confabulation": "Wrong answers: what went wrong?",
+}
+
+
+class Sent(BaseModel):
+    """A label from a browser; `label` is checked against the task's own model."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    handle: str
+    label: dict[str, Any]
+
+
+class Reopen(BaseModel):
+    """The wish to label the last unit of a task again."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    task: str
+
+
+class Annotation:
+    """A study whose clips and answers people label. What they are given is what the study held when this was made."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace = workspace
+        self.samples = {task: self._sample(task) for task in TASKS}
+        if all(each.empty for each in self.samples.values()):
+            raise TrapsError(f"{workspace.root}: has no clips yet; run `traps run EXPERIMENT` in it first")
+        self.store = LabelStore(workspace.labels)
+
+    def _sample(self, task: TaskName) -> pd.DataFrame:
+        found = sample(self.workspace, task)
+        if task == "answerability":  # a clip that was not copied with the study cannot be shown
+            there = [self.workspace.resolve(self.items[item]["clip"]).is_file() for item in found["item_id"]]
+            found = found.loc[there]
+        return found.set_index("unit", drop=False)
+
+    @cached_property
+    def items(self) -> dict[str, dict[str, Any]]:
+        """Question, ground truth and clip by item."""
+        rows = self.workspace.tables.read_all(ITEMS, ["item_id", "question", "ground_truth", "clip"], dataset=DATASETS)
+        return {str(row["item_id"]): {str(k): v for k, v in row.items()} for row in rows.to_dict("records")}
+
+    @cached_property
+    def fps(self) -> dict[str, int]:
+        """Frames a second by clip."""
+        rows = self.workspace.tables.read_all(VIDEOS, ["path", "fps"])
+        return {str(path): int(fps) for path, fps in zip(rows["path"], rows["fps"], strict=True)}
+
+    @cached_property
+    def failures(self) -> dict[str, dict[str, str]]:
+        """What the task `confabulation` shows, by unit."""
+        return {row["sample_id"]: row for row in sheet_rows(self.workspace)}
+
+    def progress(self, who: str, task: TaskName) -> tuple[int, int]:
+        """How many units a person has labelled, and how many there are for them."""
+        own = self.samples[task]
+        return sum(unit in own.index for unit in self.store.labelled(who, task)), len(own)
+
+    def next_unit(self, who: str, task: TaskName) -> str | None:
+        """The unit that a person labels next, which they are now shown: the one that waits, else the first of their
+        queue. None where all are labelled, or those left are of scenarios that they met in this sitting."""
+        own, seen = self.samples[task], self.store.shown(who)
+        waiting = [each.unit for each in seen if each.task == task and each.waits and each.unit in own.index]
+        since = time.time() - 3600 * annotation_protocol().sitting_hours
+        met = {each.scenario_id for each in seen if each.at > since}  # in any task: answers tell about clips
+        done = {each.unit for each in seen if each.task == task} | {*self.store.labelled(who, task)}
+        blind = task != "answerability"
+        left = (
+            unit
+            for unit in queue_of(who, own)
+            if unit not in done and (blind or own.loc[unit, "scenario_id"] not in met)
+        )
+        unit = waiting[-1] if waiting else next(left, None)
+        if unit is not None:
+            self.store.show(who, task, unit, str(own.loc[unit, "scenario_id"]))
+        return unit
+
+    def find(self, who: str, handle: str) -> tuple[TaskName, str]:
+        """The task and unit of a handle that this person was given. Raises NotThere."""
+        for each in self.store.shown(who):
+            task = require_task(each.task)
+            if self.store.handle(who, each.task, each.unit) == handle and each.unit in self.samples[task].index:
+                return task, each.unit
+        raise NotThere("nothing of this name is shown to you")
+
+    def record(self, who: str, sent: Sent) -> None:
+        """Keep a label. Raises NotThere, Refused and Conflict."""
+        task, unit = self.find(who, sent.handle)
+        try:
+            label = LABELS[task].model_validate(sent.label)
+        except ValidationError as error:
+            raise Refused(explain(error)) from error
+        try:
+            self.store.record(who, task, unit, label.model_dump())
+        except NotWaiting as error:
+            raise Conflict(str(error)) from error
+
+    def reopen(self, who: str, name: str) -> None:
+        """Show the last labelled unit of a task again. Raises NotThere without one."""
+        task = require_task(name)
+        known = [unit for unit in self.store.labelled(who, task) if unit in self.samples[task].index]
+        if not known:
+            raise NotThere("you have labelled nothing here yet")
+        self.store.show(who, task, known[-1], str(self.samples[task].loc[known[-1], "scenario_id"]))
+
+    def clip(self, who: str, handle: str) -> Path:
+        """The clip behind a handle. Raises NotThere."""
+        task, unit = self.find(who, handle)
+        if task != "answerability":
+            raise NotThere("nothing of this name is shown to you")
+        return study_file(self.workspace, self.items[str(self.samples[task].loc[unit, "item_id"])]["clip"])
+
+    def shown(self, who: str, task: TaskName, unit: str) -> dict[str, Any]:
+        """All that a browser gets of a unit."""
+        row = self.samples[task].loc[unit]
+        handle = self.store.handle(who, task, unit)
+        if task == "confabulation":
+            failure = self.failures[unit]
+            texts = {"question": failure["question"], "answer": failure["response"]}
+            texts |= {"why": failure["why_unanswerable"], "trace": failure["reasoning_trace"]}
+            return {"task": task, "handle": handle, **texts}
+        item = self.items[str(row["item_id"])]
+        told = {"task": task, "handle": handle, "question": item["question"]}
+        if task == "answerability":
+            return told | {"fps": self.fps.get(item["clip"])}
+        cell = Cell(row["dataset"], Evaluation(row["model"], row["regime"], int(row["run"])))
+        answers = self.workspace.tables.read(RESPONSES, cell.partition, ["item_id", "text"]).set_index("item_id")
+        truth = {"truth": item["ground_truth"]} if task == "correctness" else {}
+        return told | truth | {"answer": str(answers.loc[row["item_id"], "text"])}
+
+    # --- pages --------------------------------------------------------------------------------------------------------
+
+    def start_page(self, who: str) -> str:
+        """The page on which a person chooses a task."""
+        return page("annotate_start.html.j2", who=who, tasks=self._tasks(who))
+
+    def unit_page(self, who: str, task: TaskName) -> str:
+        """The page of the next unit, or the one that says why there is none now."""
+        unit = self.next_unit(who, task)
+        done, total = self.progress(who, task)
+        about = {"who": who, "tasks": self._tasks(who), "task": task, "title": TITLES[task], "done": done}
+        if unit is None:
+            hours = annotation_protocol().sitting_hours
+            return page("annotate_done.html.j2", **about, total=total, hours=f"{hours:g}")
+        return page("annotate.html.j2", **about, total=total, shown=self.shown(who, task, unit))
+
+    def _tasks(self, who: str) -> dict[TaskName, tuple[str, int, int]]:
+        """Title, labelled and all units of each task."""
+        return {task: (title, *self.progress(who, task)) for task, title in TITLES.items()}
+
+
+def annotation_app(annotation: Annotation) -> FastAPI:
+    """The app of the labelling pages; the guard before it says who asks."""
+    app = new_app()
+
+    def who(request: Request) -> str:
+        return str(request.scope[WHO])
+
+    @app.get("/")
+    def start(request: Request) -> Response:
+        return HTMLResponse(annotation.start_page(who(request)))
+
+    @app.get("/task/{name}")
+    def unit(request: Request, name: str) -> Response:
+        if name not in TASKS:
+            raise NotThere(f"{name}: no task of this name")
+        return HTMLResponse(annotation.unit_page(who(request), require_task(name)))
+
+    @app.get("/clip/{handle}")
+    def clip(request: Request, handle: str) -> Response:
+        # Not as a file: its times and name would be sent along.
+        return Response(annotation.clip(who(request), handle).read_bytes(), media_type="video/mp4")
+
+    @app.get("/annotate.js")
+    def code() -> Response:
+        return Response(script(*SCRIPTS), media_type="text/javascript")
+
+    @app.post("/label")
+    def label(request: Request, sent: Sent) -> dict[str, bool]:
+        annotation.record(who(request), sent)
+        return {"kept": True}
+
+    @app.post("/reopen")
+    def reopen(request: Request, sent: Reopen) -> dict[str, bool]:
+        annotation.reopen(who(request), sent.task)
+        return {"reopened": True}
+
+    return app

@@ -1,0 +1,186 @@
+"""Where the pages of `traps annotate` keep what people see and say: SQLite, and the append-only file that stages read.
+
+A label is committed, appended to `labels.jsonl` and brought to the disk before it is confirmed, so that a kill loses
+nothing that was. What a kill leaves between the two is appended when the store is next opened; labels of a file whose
+database is gone are taken over from it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hmac
+import json
+import os
+import secrets
+import sqlite3
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import sync_folder
+from traps_pipeline.judging.labels import FILE, label_lines
+from traps_pipeline.storage.lines import append_whole, checked_line
+
+DATABASE = "labels.sqlite"
+HANDLE_DIGITS = 24
+_TAIL = 1 << 14  # bytes that hold the last label of the file
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS secrets (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS shown (
+  who TEXT NOT NULL, task TEXT NOT NULL, unit TEXT NOT NULL, scenario_id TEXT NOT NULL, at REAL NOT NULL,
+  waits INTEGER NOT NULL, PRIMARY KEY (who, task, unit)
+);
+CREATE TABLE IF NOT EXISTS labels (
+  seq INTEGER PRIMARY KEY AUTOINCREMENT, who TEXT NOT NULL, task TEXT NOT NULL, unit TEXT NOT NULL,
+  at TEXT NOT NULL, seconds REAL NOT NULL, label TEXT NOT NULL
+);
+CREATE INDEX IF NOT EXISTS labels_of_a_person ON labels (who, task);
+"""
+
+
+class NotWaiting(TrapsError):
+    """A label of what does not wait for one: it was labelled before, in another window for instance."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A unit that a person was shown. at: seconds since 1970, when it was shown last; waits: it has no label yet."""
+
+    task: str
+    unit: str
+    scenario_id: str
+    at: float
+    waits: bool
+
+
+class LabelStore:
+    """The labels of a study in one folder; several processes may have it open. Raises TrapsError for a damaged file."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        with self._database() as database:
+            database.execute("PRAGMA journal_mode=WAL")
+            database.executescript(_SCHEMA)
+            database.execute("INSERT OR IGNORE INTO secrets VALUES ('handles', ?)", (secrets.token_hex(32),))
+            (self._secret,) = database.execute("SELECT value FROM secrets WHERE name = 'handles'").fetchone()
+        self._export(restore=True)
+
+    @contextmanager
+    def _database(self) -> Iterator[sqlite3.Connection]:
+        """A connection whose changes are committed, and on the disk, when the block ends without an error."""
+        try:
+            with closing(sqlite3.connect(self.folder / DATABASE, timeout=30, isolation_level=None)) as database:
+                database.execute("PRAGMA synchronous=FULL")
+                yield database
+        except sqlite3.DatabaseError as error:
+            raise TrapsError(
+                f"{self.folder / DATABASE}: cannot be used ({error}); every confirmed label is in {FILE}: move the "
+                "database away, and it is made again from there"
+            ) from error
+
+    def handle(self, who: str, task: str, unit: str) -> str:
+        """The name under which one person's browser knows a unit: it reveals nothing, and is another's for others."""
+        whole = "\0".join((who, task, unit)).encode()
+        return hmac.new(self._secret.encode(), whole, "sha256").hexdigest()[:HANDLE_DIGITS]
+
+    def shown(self, who: str) -> list[Shown]:
+        """What a person was shown, in all tasks, the latest last."""
+        with self._database() as database:
+            rows = database.execute(
+                "SELECT task, unit, scenario_id, at, waits FROM shown WHERE who = ? ORDER BY at", (who,)
+            ).fetchall()
+        return [Shown(task, unit, scenario, at, bool(waits)) for task, unit, scenario, at, waits in rows]
+
+    def show(self, who: str, task: str, unit: str, scenario_id: str) -> None:
+        """Note that a person is shown a unit now, and that it waits for a label."""
+        with self._database() as database:
+            database.execute(
+                "INSERT INTO shown VALUES (?, ?, ?, ?, ?, 1) ON CONFLICT DO UPDATE SET at = excluded.at, waits = 1",
+                (who, task, unit, scenario_id, time.time()),
+            )
+
+    def labelled(self, who: str, task: str) -> list[str]:
+        """The units that a person has labelled, the latest last."""
+        with self._database() as database:
+            rows = database.execute(
+                "SELECT unit FROM labels WHERE who = ? AND task = ? GROUP BY unit ORDER BY max(seq)", (who, task)
+            ).fetchall()
+        return [unit for (unit,) in rows]
+
+    def record(self, who: str, task: str, unit: str, label: Mapping[str, Any]) -> None:
+        """Keep a label. Raises NotWaiting where the person is not shown this unit, or has labelled it meanwhile."""
+        with self._database() as database:
+            database.execute("BEGIN IMMEDIATE")
+            row = database.execute(
+                "SELECT at FROM shown WHERE who = ? AND task = ? AND unit = ? AND waits", (who, task, unit)
+            ).fetchone()
+            if row is None:
+                database.execute("ROLLBACK")
+                raise NotWaiting("this was labelled before, in another window perhaps; load the page again")
+            now = time.time()
+            stamp = datetime.fromtimestamp(now, UTC).isoformat(timespec="milliseconds")
+            values = who, task, unit, stamp, round(max(0.0, now - row[0]), 3), json.dumps(label, ensure_ascii=False)
+            columns = "who, task, unit, at, seconds, label"
+            database.execute(f"INSERT INTO labels ({columns}) VALUES (?, ?, ?, ?, ?, ?)", values)
+            database.execute("UPDATE shown SET waits = 0 WHERE who = ? AND task = ? AND unit = ?", (who, task, unit))
+            database.execute("COMMIT")
+        self._export()
+
+    def _export(self, *, restore: bool = False) -> None:
+        """Append the labels that the file lacks. restore: first take those over that the database lacks."""
+        path = self.folder / FILE
+        is_new = not path.exists()
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            last = _last_seq(descriptor)
+            if restore:
+                self._restore(last)
+            with self._database() as database:
+                names = "seq, task, unit, who, at, seconds, label"
+                rows = database.execute(f"SELECT {names} FROM labels WHERE seq > ? ORDER BY seq", (last,)).fetchall()
+            found = [dict(zip(names.split(", "), row, strict=True)) for row in rows]
+            append_whole(descriptor, b"".join(checked_line(row | {"label": json.loads(row["label"])}) for row in found))
+            os.fsync(descriptor)
+            if is_new:
+                sync_folder(self.folder)
+        finally:
+            os.close(descriptor)
+
+    def _restore(self, last: int) -> None:
+        """Take over the labels of the file that the database lacks: somebody moved the database away."""
+        with self._database() as database:
+            (known,) = database.execute("SELECT coalesce(max(seq), 0) FROM labels").fetchone()
+            if known >= last:
+                return
+            lines = [line for line in label_lines(self.folder) if line.seq > known]
+            database.execute("BEGIN IMMEDIATE")
+            database.executemany(
+                "INSERT OR IGNORE INTO labels VALUES (?, ?, ?, ?, ?, ?, ?)",
+                [
+                    (e.seq, e.who, e.task, e.unit, e.at.isoformat(), e.seconds, json.dumps(e.label, ensure_ascii=False))
+                    for e in lines
+                ],
+            )
+            database.execute("COMMIT")
+
+
+def _last_seq(descriptor: int) -> int:
+    """The number of the last label in the file, 0 in an empty one; half a line that a crash left is cut off."""
+    size = os.lseek(descriptor, 0, os.SEEK_END)
+    from_ = max(0, size - _TAIL)
+    tail = os.pread(descriptor, _TAIL, from_)
+    whole = tail.rfind(b"\n") + 1
+    if whole != len(tail):
+        os.ftruncate(descriptor, from_ + whole)
+    line = tail[:whole].rstrip(b"\n").rpartition(b"\n")[2]
+    try:
+        return int(json.loads(line)["seq"]) if line else 0
+    except (ValueError, KeyError, TypeError) as error:
+        raise TrapsError(f"{FILE}: its last line is no label ({error}); restore the file from a copy") from error
