@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import socket
+import time
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import SMALL, Checkout
+from tests.conftest import KEY, ROOT, SMALL, Checkout
 from tests.providers.server import Provider
 from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
@@ -59,3 +61,39 @@ def test_a_model_that_says_dots_is_broken_and_not_modest_and_a_changed_panel_mak
     assert again.code == 0, again.err
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}  # judge-a has voted before
     assert all(str(row["panel"]).startswith("one@") for row in board(unasked).values())
+
+
+def test_whatever_is_wrong_with_a_model_is_named_before_anything_is_rendered_or_judged(
+    provider: Provider, tmp_path: Path
+) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        dead = f"http://127.0.0.1:{free.getsockname()[1]}/v1"
+    said = '{"reason": "seen", "final_answer": "red and blue"}'
+    provider.configure(
+        fault_by_model={"wrong-name": "not_found", "wrong-key": "unauthorized"},
+        blind=["blind"],
+        scripts={"no-schema": {"": "red and then blue"}, "thinks": {"": f"<think>red, blue</think>{said}"}},
+    )
+    complaints = {
+        "dead": f"nothing answers at {dead}",
+        "wrong-name": "knows no model 'wrong-name'",
+        "wrong-key": f"the key in {KEY} is not accepted",
+        "blind": "it does not see the clip",
+        "no-schema": "it ignores the schema",
+        "thinks": "it thinks between <think> tags",
+    }
+    path = tmp_path / "broken.yaml"
+    address = {name: dead if name == "dead" else f"{provider.url}/v1" for name in complaints}
+    models = "".join(
+        f'  - {{id: {name}, base_url: "{url}", key: {KEY}, media: images}}\n' for name, url in address.items()
+    )
+    path.write_text(f"name: broken\nmodels:\n{models}panel: rules\nscenarios: [domino_chain-0001]\n")
+    study, began = Checkout(ROOT, tmp_path / "study"), time.monotonic()
+    finished = study.traps("run", path, "--judged-by-rules")
+    assert time.monotonic() - began < 60 and finished.code == 1  # half a minute where the cores are not shared
+    for name, complaint in complaints.items():
+        assert any(f"{name}: " in line and complaint in line for line in finished.err.splitlines()), name
+    assert "nothing was rendered and nothing was judged" in finished.err
+    assert not list((study.workspace / "clips").rglob("*.mp4")) and not study.ledger_rows("answers")
+    assert {row["components"]["about"]["check"] for row in study.ledger_rows("votes")} == {"clip", "no clip", "schema"}

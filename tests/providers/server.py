@@ -1,4 +1,4 @@
-"""An LLM provider that misbehaves on demand: OpenAI chat, OpenAI responses and Gemini over real HTTP.
+"""An LLM provider that misbehaves on demand: OpenAI chat, OpenAI responses, Gemini and Anthropic over real HTTP.
 
 Tests of asking run against it, so that client library, sockets, time-outs and retries are the real ones. It is a
 process of its own (`python -m tests.providers.server`), so that it shares neither event loop nor CPU time with the
@@ -30,7 +30,7 @@ from typing import Any, Literal, Self
 
 from aiohttp import web
 
-Api = Literal["chat", "responses", "gemini"]
+Api = Literal["chat", "responses", "gemini", "anthropic"]
 Json = dict[str, Any]
 Turn = tuple[str, list[Json]]  # role and parts
 
@@ -172,6 +172,8 @@ def api_of(path: str) -> tuple[Api, str] | None:
         return "chat", ""
     if path.endswith("/responses"):
         return "responses", ""
+    if path.endswith("/messages"):
+        return "anthropic", ""
     found = re.search(r"/models/([^/]+):generateContent$", path)
     return ("gemini", found[1]) if found else None
 
@@ -247,7 +249,12 @@ def _gemini_turns(body: Json) -> list[Turn]:
     return [("system", system.get("parts", [])), *turns]
 
 
+def _anthropic_turns(body: Json) -> list[Turn]:
+    return [("system", _parts(body.get("system"))), *_messages(body["messages"])]
+
+
 _TURNS: dict[Api, Callable[[Json], list[Turn]]] = {
+    "anthropic": _anthropic_turns,
     "chat": lambda body: _messages(body["messages"]),
     "responses": _responses_turns,
     "gemini": _gemini_turns,
@@ -266,6 +273,8 @@ def _generation(body: Json) -> Json:
 def _is_structured(api: Api, body: Json) -> bool:
     if api == "gemini":
         return _either(_generation(body), "responseMimeType") == "application/json"
+    if api == "anthropic":
+        return bool(body.get("output_format"))
     asked = body.get("response_format") if api == "chat" else (body.get("text") or {}).get("format")
     return bool(asked) and asked["type"] in ("json_object", "json_schema")
 
@@ -276,6 +285,8 @@ def _shows_reasoning(api: Api, body: Json) -> bool:
         return True
     if api == "responses":
         return bool((body.get("reasoning") or {}).get("summary"))
+    if api == "anthropic":
+        return False
     return bool(_either(_either(_generation(body), "thinkingConfig") or {}, "includeThoughts"))
 
 
@@ -458,7 +469,23 @@ def _gemini_body(question: Question, ending: Ending, served_model: str) -> Json:
     return {**said, "usageMetadata": usage, "modelVersion": served_model, "responseId": "test"}
 
 
+def _anthropic_body(question: Question, ending: Ending, served_model: str) -> Json:
+    prompt, visible = _usage(question, ending)
+    stops = {"stop": "end_turn", "length": "max_tokens", "content_filter": "refusal"}
+    return {
+        "id": "msg_test",
+        "type": "message",
+        "role": "assistant",
+        "model": served_model,
+        "content": [{"type": "text", "text": ending.text}] if ending.text else [],
+        "stop_reason": "refusal" if ending.refusal else stops[ending.finish],
+        "stop_sequence": None,
+        "usage": {"input_tokens": prompt, "output_tokens": visible},
+    }
+
+
 _BODIES: dict[Api, Callable[[Question, Ending, str], Json]] = {
+    "anthropic": _anthropic_body,
     "chat": _chat_body,
     "responses": _responses_body,
     "gemini": _gemini_body,
@@ -469,6 +496,8 @@ def error_body(api: Api, failure: Failure) -> Json:
     """The body of an error status."""
     if api == "gemini":
         return {"error": {"code": failure.status, "message": failure.message, "status": failure.gemini_status}}
+    if api == "anthropic":
+        return {"type": "error", "error": {"type": failure.kind, "message": failure.message}}
     error = {"message": failure.message, "type": failure.kind, "param": None, "code": failure.code}
     return {"error": error}
 
