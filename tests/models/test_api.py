@@ -24,7 +24,7 @@ ROUTES = {"openai/m": "/v1", "gemini/gemini-2.5-pro": "/v1beta", "openai/respons
 QUESTION = "Does the ball clear the barrier?"
 
 
-def backend(provider: Provider, route: str, **params: Any) -> ApiBackend:
+def backend(provider: Provider, route: str, limits: Limits | None = None, **params: Any) -> ApiBackend:
     account = Account(key=KEY, base_url=provider.url + ROUTES[route])
     fields = {
         "id": "m",
@@ -32,7 +32,7 @@ def backend(provider: Provider, route: str, **params: Any) -> ApiBackend:
         "account": "a",
         "provider_id": route,
         "params": {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000} | params,
-        "limits": Limits(timeout_s=1.0),
+        "limits": limits or Limits(timeout_s=1.0),
         "prices": Prices(input=1.0, output=10.0, as_of=datetime.date(2026, 11, 1)),
     }
     return ApiBackend(Entry.model_validate(fields, context={"accounts": {"a": account}}), account)
@@ -61,6 +61,30 @@ def test_an_answer_is_read_with_what_it_took(provider: Provider, route: str) -> 
     assert outcome.cost_usd == pytest.approx((outcome.prompt_tokens + 10 * outcome.completion_tokens) / 1e6)
     (record,) = provider.requests()
     assert SECRET not in str(record)
+
+
+IN_A_LOOP = """
+import asyncio, sys
+from types import SimpleNamespace
+import tests.models.test_api as test
+from traps_pipeline.models.registry import Limits
+from traps_pipeline.models.request import Request
+
+async def ask():  # the first backend is made, and the client library imported, while the loop runs
+    asking = test.backend(SimpleNamespace(url=sys.argv[1]), "gemini/gemini-2.5-pro", limits=Limits(timeout_s=600.0))
+    request = Request("m", "gemini", asking._entry.params, "You watch.", test.QUESTION, {"item_id": "x"})
+    return await asking.ask(request)
+
+outcome = asyncio.run(ask())
+print(outcome.prompt_tokens, outcome.cost_usd)
+"""
+
+
+def test_no_connection_that_the_client_library_made_at_its_import_is_used(provider: Provider) -> None:
+    command = [sys.executable, "-W", "ignore", "-c", IN_A_LOOP, provider.url]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    tokens, dollars = done.stdout.split()
+    assert int(tokens) > 0 and float(dollars) > 0, "the answer was not seen on the wire"
 
 
 @pytest.mark.parametrize("route", ROUTES)

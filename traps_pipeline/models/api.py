@@ -54,6 +54,8 @@ def load_litellm() -> Any:
     litellm.drop_params = False  # a parameter that a provider refuses is an error, never left out in silence
     litellm.callbacks = [_hook()]
     watch(import_module("litellm.llms.custom_httpx.http_handler").AsyncHTTPHandler)
+    # Its import makes connections of its own, unwatched, and keeps them for whoever has the same time-out.
+    litellm.in_memory_llm_clients_cache.flush_cache()
     return litellm
 
 
@@ -131,6 +133,8 @@ class ApiBackend:
         watched = WATCHED.set(exchange)
         try:
             response = await self._litellm.acompletion(messages=asked, **request.params, **self._fixed)
+            if exchange.status is None:  # a defect of ours, or of a new version of the client library
+                self._tell("unseen", "the answer came over a connection that is not watched; its worst case is booked")
             return read_response(response, self._entry, request, exchange)
         except Exception as error:  # noqa: BLE001 - litellm's, the SDKs' and httpx's errors; and of shapes none expected
             return self._failure(error, exchange)
