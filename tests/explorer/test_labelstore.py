@@ -8,7 +8,8 @@ import pytest
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.explorer.labelstore import DATABASE, LabelStore, NotWaiting
-from traps_pipeline.judging.labels import FILE, label_lines
+from traps_pipeline.judging.labels import label_lines
+from traps_pipeline.judging.people_tables import LABELS_FILE
 
 YES = {"abstained": True}
 
@@ -46,12 +47,12 @@ def test_what_a_crash_leaves_is_made_whole_again(tmp_path: Path) -> None:
     for unit in ("u1", "u2", "u3"):
         store.show("jd", "abstention", unit, "plinko-0001")
         store.record("jd", "abstention", unit, YES)
-    whole = (tmp_path / FILE).read_bytes()
+    whole = (tmp_path / LABELS_FILE).read_bytes()
     last = whole.rfind(b"\n", 0, -1) + 1
     for torn in (whole[:last], whole[: last + 30], b""):  # killed before, while and long before it was appended
-        (tmp_path / FILE).write_bytes(torn)
+        (tmp_path / LABELS_FILE).write_bytes(torn)
         LabelStore(tmp_path)
-        assert (tmp_path / FILE).read_bytes() == whole
+        assert (tmp_path / LABELS_FILE).read_bytes() == whole
     for name in (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"):
         (tmp_path / name).unlink(missing_ok=True)
     again = LabelStore(tmp_path)  # the database is made from the file
@@ -59,7 +60,7 @@ def test_what_a_crash_leaves_is_made_whole_again(tmp_path: Path) -> None:
     again.show("jd", "abstention", "u4", "plinko-0001")
     again.record("jd", "abstention", "u4", YES)
     assert kept(tmp_path)[-1] == (4, "jd", "u4")
-    (tmp_path / FILE).write_bytes(whole + b"nonsense\n")
+    (tmp_path / LABELS_FILE).write_bytes(whole + b"nonsense\n")
     with pytest.raises(TrapsError, match="its last line is no label"):
         LabelStore(tmp_path)
     (tmp_path / DATABASE).write_bytes(b"nonsense" * 1000)

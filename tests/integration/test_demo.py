@@ -20,6 +20,7 @@ NOT_RUN = ("confabulation", "confabulation_prevalence", "judge_validation", "jud
 MECHANISM = ("probe_items", "hidden_states", "probes", "directions", "cosines", "steering", "steering_votes")
 MECHANISM += ("steering_effects", "steering_shares", "steering_nulls", "steering_pecs")
 MECHANISM += ("probe_baselines", "gate", "risk_coverage", "patching")
+PEOPLE = ("human_labels", "human_agreement", "human_row", "panel_errors", "corrected")  # nobody has labelled
 ON_REQUEST = ("arms", "robust")  # an experiment names arms
 DEGENERATE = ("always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle")
 
@@ -85,7 +86,7 @@ def test_clips_are_five_second_masters_and_chaotic_voids_are_prefixes(workspace:
 def test_every_table_knows_its_benchmark_version(workspace: Workspace) -> None:
     for table in TABLES.values():
         rows = workspace.tables.read_all(table)
-        assert rows.empty == (table.name in {*NOT_RUN, *MECHANISM, *ON_REQUEST}), table.name
+        assert rows.empty == (table.name in {*NOT_RUN, *MECHANISM, *PEOPLE, *ON_REQUEST}), table.name
         assert set(rows.get("benchmark_version", ())) <= {load_release().version}, table.name
 
 

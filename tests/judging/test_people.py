@@ -13,16 +13,14 @@ from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.judging.labels import (
-    FILE,
     confabulation_rows,
     human_agreement,
     label_lines,
-    labels_version,
     matrix,
     truths,
 )
 from traps_pipeline.judging.people import annotation_protocol, drawn_units, queue_of
-from traps_pipeline.judging.people_tables import HUMAN_LABELS
+from traps_pipeline.judging.people_tables import HUMAN_LABELS, LABELS_FILE, labels_version
 from traps_pipeline.storage.lines import checked_line
 
 PROTOCOL = annotation_protocol()
@@ -64,7 +62,7 @@ def line(seq: int, **own: Any) -> bytes:
 
 def test_labels_are_read_as_written_and_damage_is_named(tmp_path: Path) -> None:
     assert (label_lines(tmp_path), labels_version(tmp_path)) == ([], "not run")
-    file = tmp_path / FILE
+    file = tmp_path / LABELS_FILE
     file.write_bytes(line(1) + line(2, who="ab") + line(3, unit="u2")[:40])  # the last one was never confirmed
     assert [(each.seq, each.who) for each in label_lines(tmp_path)] == [(1, "jd"), (2, "ab")]
     file.write_bytes(line(1).replace(b"true", b"fals") + line(2))

@@ -8,9 +8,7 @@ from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import judges, responses, verdicts
 from traps_pipeline.defs.judging import confabulation
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.judging.labels import labels_version
-from traps_pipeline.judging.people import PROTOCOL_FILE
-from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT, HUMAN_LABELS
+from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT, HUMAN_LABELS, PROTOCOL_FILE, labels_version
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.orchestration.graph import Need
 from traps_pipeline.orchestration.stage import source, stage

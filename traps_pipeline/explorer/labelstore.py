@@ -23,7 +23,8 @@ from typing import Any
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import sync_folder
-from traps_pipeline.judging.labels import FILE, label_lines
+from traps_pipeline.judging.labels import label_lines
+from traps_pipeline.judging.people_tables import LABELS_FILE
 from traps_pipeline.storage.lines import append_whole, checked_line
 
 DATABASE = "labels.sqlite"
@@ -80,8 +81,8 @@ class LabelStore:
                 yield database
         except sqlite3.DatabaseError as error:
             raise TrapsError(
-                f"{self.folder / DATABASE}: cannot be used ({error}); every confirmed label is in {FILE}: move the "
-                "database away, and it is made again from there"
+                f"{self.folder / DATABASE}: cannot be used ({error}); every confirmed label is in {LABELS_FILE}: move "
+                "the database away, and it is made again from there"
             ) from error
 
     def handle(self, who: str, task: str, unit: str) -> str:
@@ -134,7 +135,7 @@ class LabelStore:
 
     def _export(self, *, restore: bool = False) -> None:
         """Append the labels that the file lacks. restore: first take those over that the database lacks."""
-        path = self.folder / FILE
+        path = self.folder / LABELS_FILE
         is_new = not path.exists()
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         try:
@@ -183,4 +184,4 @@ def _last_seq(descriptor: int) -> int:
     try:
         return int(json.loads(line)["seq"]) if line else 0
     except (ValueError, KeyError, TypeError) as error:
-        raise TrapsError(f"{FILE}: its last line is no label ({error}); restore the file from a copy") from error
+        raise TrapsError(f"{LABELS_FILE}: its last line is no label ({error}); restore the file from a copy") from error

@@ -18,20 +18,18 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.judging.answers import is_correct
 from traps_pipeline.judging.confabulation import AXES
 from traps_pipeline.judging.people import ABOUT_ANSWERS, TASKS, TaskName, strata, units
-from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT, HUMAN_LABELS
+from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT, HUMAN_LABELS, LABELS_FILE
 from traps_pipeline.judging.ratings import INVALID, NO, YES
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.storage.lines import NOT_WHOLE, read_checked
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.yamlfile import explain
 
-FILE = "labels.jsonl"
 MOST_CHARACTERS = 200  # of an answer
 DECISIONS: Mapping[TaskName, tuple[str, ...]] = {
     "answerability": ("abstained",),
@@ -97,7 +95,7 @@ class Line(BaseModel):
 def label_lines(folder: Path) -> list[Line]:
     """The labels in a study's folder of labels, in order; none where nobody has labelled. Raises TrapsError for a line
     that is not what was written; a last line that a crash cut off was never confirmed and is left out."""
-    path, found = folder / FILE, list[Line]()
+    path, found = folder / LABELS_FILE, list[Line]()
     if not path.is_file():
         return found
     for line in read_checked(path):
@@ -112,12 +110,6 @@ def label_lines(folder: Path) -> list[Line]:
             raise TrapsError(f"{path}:{line.number}: {explain(error)}") from error
         found.append(read)
     return found
-
-
-def labels_version(folder: Path) -> str:
-    """A digest of the labels in a study's folder of labels."""
-    path = folder / FILE
-    return file_digest(path)[:16] if path.is_file() else "not run"
 
 
 # --- labels of what the study has -------------------------------------------------------------------------------------

@@ -20,17 +20,16 @@ from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import load_protocol
+from traps_pipeline.judging.people_tables import PROTOCOL_FILE
 from traps_pipeline.judging.tables import CONFABULATION, VERDICTS
 from traps_pipeline.judging.validation import sheet_rows
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import panel_id
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
-PROTOCOL_FILE = ASSETS / "annotation.yaml"
 TaskName = Literal["answerability", "confabulation", "abstention", "correctness"]
 TASKS: tuple[TaskName, ...] = get_args(TaskName)
 ABOUT_ANSWERS: tuple[TaskName, ...] = ("abstention", "correctness")  # in which people decide what the panel decides

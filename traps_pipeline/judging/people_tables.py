@@ -1,12 +1,17 @@
-"""The tables of people's labels and of their agreement."""
+"""The tables of people's labels and of their agreement, and the files that they are made from."""
 
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import Annotated
 
+from traps_pipeline.digests import file_digest
+from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 
+LABELS_FILE = "labels.jsonl"  # in a study's folder of labels
+PROTOCOL_FILE = ASSETS / "annotation.yaml"
 PeopleTask = Annotated[str, "answerability, confabulation, abstention or correctness"]
 Axis = Annotated[bool | None, "an axis of confabulation; null in other tasks"]
 
@@ -60,3 +65,9 @@ class HumanAgreementRow:
 
 
 HUMAN_AGREEMENT = Table("human_agreement", HumanAgreementRow, partition_by=(), key=("task", "decision"))
+
+
+def labels_version(folder: Path) -> str:
+    """A digest of the labels in a study's folder of labels."""
+    path = folder / LABELS_FILE
+    return file_digest(path)[:16] if path.is_file() else "not run"

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import DATASET, MODEL, REGIME, RUNS, ordered, titled
 from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, fraction, percent
-from traps_pipeline.scoring.bootstrap import RESAMPLED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,7 +20,7 @@ _PERCENT = ("acc", "abs_rec", "false_abs", "sensitivity", "specificity")
 def people(results: Results) -> list[PrintedTable]:
     """What people score on the clips, by dataset, and how far people agree about clips and answers."""
     rows = ordered(titled(results.human_row), ["dataset"])
-    rows = _with_intervals(rows, [*RESAMPLED])
+    rows = _with_intervals(rows, [*_FIGURES])
     figures = [Column(f"{field}_shown", heading, "range") for field, heading in _FIGURES.items()]
     columns = [
         DATASET, *figures, Column("agreement", "Agree %", "percent"),
@@ -60,7 +59,7 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     ]  # fmt: skip
     rows = results.corrected
     overall = rows.loc[rows["dataset"] == "overall"] if "overall" in set(rows["dataset"]) else rows
-    shown = _with_intervals(overall, [f"{name}{end}" for name in RESAMPLED for end in ("", "_corrected")])
+    shown = _with_intervals(overall, [f"{name}{end}" for name in _FIGURES for end in ("", "_corrected")])
     shown = ordered(titled(shown), ["dataset", "model", "regime"])
     figures = [
         Column(f"{field}{end}_shown", f"{heading}{', corrected' if end else ''}", "range", group=not end)
