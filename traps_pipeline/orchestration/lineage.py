@@ -95,10 +95,17 @@ class Lineage:
         return ""
 
     def waits(self, name: str, key: str | None) -> bool:
-        """Whether something above a partition is outdated itself or must be made first: it would be made twice."""
-        above = [(p, k) for p, keys in self.graph.parents(name, key).items() if not self.graph.source(p) for k in keys]
-        outdated = any(k in self._wanted(p) and self.status(p, k).outdated for p, k in above)
-        return outdated or bool(self.blocked(name, key, current=True))
+        """Whether something above a partition is outdated itself or must be made first: it would be made twice. What
+        costs money, and can be done without, may never come and is not waited for."""
+        needs = self.graph[name].needs
+        parents = {
+            parent: keys
+            for parent, keys in self.graph.parents(name, key).items()
+            if not self.graph.source(parent)
+            and not (needs.get(parent) == "none" and self.graph[parent].cost == "money")
+        }
+        above = [(parent, k) for parent, keys in parents.items() for k in keys if k in self._wanted(parent)]
+        return any(self.status(*node).outdated for node in above) or bool(self.blocked(name, key, current=True))
 
     def _unusable(self, name: str, key: str | None, current: bool) -> str:
         if damage := self.damage(name, key):
