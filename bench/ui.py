@@ -55,14 +55,17 @@ with dg.DagsterInstance.get() as history:
 def study(folder: Path, cells: int) -> dict[str, str]:
     """A workspace whose study names so many cells, of models in a registry of its own; its environment."""
     models = -(-cells // (DATASETS * REGIMES * RUNS))
-    entry = {"backend": "reference", "params": {"strategy": "oracle"}, "runs": RUNS}
+    entries = [  # each of its own: a dictionary that is written twice would become an alias, which the reader refuses
+        {"id": f"m{n:04d}", "backend": "reference", "params": {"strategy": "oracle"}, "runs": RUNS}
+        for n in range(models)
+    ]
     shipped = yaml.safe_load((ROOT / "assets" / "models.yaml").read_text())
-    registry = shipped | {"models": [*shipped["models"], *({"id": f"m{n:04d}"} | entry for n in range(models))]}
+    registry = shipped | {"models": [*shipped["models"], *entries]}
     (folder / "models.yaml").write_text(yaml.safe_dump(registry))
     experiment = {
         "name": "many",
         "description": "Cells of many models.",
-        "models": [f"m{n:04d}" for n in range(models)],
+        "models": [entry["id"] for entry in entries],
         "regimes": ["standard", "guided", "json"],
         "runs": [1, 2, 3],
         "panel": "rules",
@@ -77,7 +80,7 @@ def study(folder: Path, cells: int) -> dict[str, str]:
         "PYTHONPATH": str(ROOT),
     }
     command = [sys.executable, "-m", "traps_pipeline.cli", "init", str(folder / "many.yaml")]
-    subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True)
+    subprocess.run(command, cwd=ROOT, env=environment, check=True, stdout=subprocess.DEVNULL)
     return environment
 
 
