@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,16 @@ def canonical_json(value: Any) -> str:
 def digest(value: Any) -> str:
     """Hexadecimal SHA-256 of a JSON-able value."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()
+
+
+def digest_of_list(values: Iterable[Any]) -> str:
+    """`digest(list(values))`, one value held at a time: the text of a whole table would be a copy of it."""
+    whole, separator = hashlib.sha256(b"["), b""
+    for value in values:
+        whole.update(separator + canonical_json(value).encode())
+        separator = b","
+    whole.update(b"]")
+    return whole.hexdigest()
 
 
 def file_digest(path: Path) -> str:

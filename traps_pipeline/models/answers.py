@@ -25,6 +25,10 @@ from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
+# The columns of an item that a request or a response is made from.
+_ASKED = ("item_id", "pair_id", "side", "labels", "question", "ground_truth", "commonest_answer", "clip")
+_ASKED += ("media_digest", "benchmark_version")
+
 
 @dataclass(frozen=True)
 class Question(Call):
@@ -82,7 +86,14 @@ def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
 
 
 def _items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    return workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
+    """What is asked and told of the items of a dataset, in order. Of equal texts one copy is held: a cell of 100,000
+    items may have a hundred questions."""
+    copies: dict[str, str] = {}
+    rows = workspace.tables.read_all(ITEMS, _ASKED, dataset=dataset).to_dict("records")
+    return [
+        {name: copies.setdefault(value, value) if isinstance(value, str) else value for name, value in row.items()}
+        for row in rows
+    ]
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:

@@ -136,7 +136,7 @@ class _Asking:
         dollars = row["cost_usd"] or 0.0
         self.writer.append(row, beside)
         self.work.budget.booked(name, dollars)
-        self.rows[request.key] = row
+        self.rows[request.key] = _held(row)
         progress.current().called(self.work.stage, name, not settles(row), row["latency_s"], dollars)
         participant.breaker.watch(attempted[0])
         return True
@@ -172,6 +172,11 @@ class _Asking:
             syncing.cancel()
         if self.problems:
             raise self.problems[0]
+
+
+def _held(row: Row) -> Row:
+    """A row without its components: they are most of it, and the request holds them too."""
+    return {name: value for name, value in row.items() if name != "components"}
 
 
 @dataclass(frozen=True)
@@ -214,7 +219,7 @@ async def _settle_cell(
     for place in sorted({*known.notes} - its.told):
         report.note(f"{place}: {known.notes[place]}")
     its.told.update(known.notes)
-    rows = known.settled
+    rows = {key: _held(row) for key, row in known.settled.items()}
     missing = [request for key, request in wanted.items() if key not in rows]
     new = Counter(request.participant for request in missing)
     for name, count in Counter(request.participant for request in wanted.values()).items():

@@ -43,7 +43,7 @@ class Request:
     media_digest: str = ""
     secret: Mapping[str, Any] = field(default_factory=dict)
 
-    @cached_property
+    @property
     def components(self) -> dict[str, Any]:
         """What the ledger key is made of, by name. Holds no code version, concurrency, time-out or API key."""
         parts: dict[str, Any] = {

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from zlib import crc32
 
-from traps_pipeline.digests import digest
+from traps_pipeline.digests import digest_of_list
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import replacing
 from traps_pipeline.progress import Tally
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _FOOTER = b"traps"
 # A file holds the digest of its own bytes, in its footer, behind this mark: taken while zeros stood in its place.
 _SUM, _MARK, _ZEROS = b"traps-sum", b"traps-sum:", b"0" * 8
+_ROWS_AT_ONCE = 1000  # of a table as Python values
 _WHOLE: dict[Path, str] = {}  # files whose bytes this process has held against the digest in them, by their stamp
 _SOUND: dict[Path, str] = {}  # files whose content this process has compared with their footer
 
@@ -106,13 +107,13 @@ class TableStore:
         import pyarrow as pa
 
         schema = table.arrow_schema()
-        listed = [_without_nan(vars(row)) for row in rows] if isinstance(rows, Sequence) else None
-        names = {str(name) for name in (rows if listed is None else (name for row in listed for name in row))}
+        listed = isinstance(rows, Sequence)
+        names = {str(name) for name in ((name for row in rows for name in vars(row)) if listed else rows)}
         try:
             if names - set(schema.names):
                 raise ValueError(f"unknown columns {sorted(names - set(schema.names))}")
-            if listed is not None:
-                data = pa.Table.from_pylist(listed, schema=schema)
+            if listed:  # a column at a time: a dictionary a row would be a copy of all
+                data = pa.table([_column(rows, field) for field in schema], schema=schema)
             else:
                 data = pa.Table.from_pandas(rows, schema=schema, preserve_index=False, safe=True)
                 data = data.replace_schema_metadata(None).cast(schema)
@@ -277,9 +278,13 @@ def _stamp(found: os.stat_result) -> str:
     return f"{found.st_mtime_ns} {found.st_size} {found.st_ino}"
 
 
-def _without_nan(row: Mapping[str, Any]) -> dict[str, Any]:
-    """The row with NaN as a missing value, which is what it is in a data frame."""
-    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
+def _column(rows: Sequence[Any], field: pa.Field) -> pa.Array:
+    """A column of rows, NaN as a missing value, which is what it is in a data frame."""
+    import pyarrow as pa
+
+    values = (getattr(row, field.name, None) for row in rows)
+    missing = (None if isinstance(value, float) and math.isnan(value) else value for value in values)
+    return pa.array(list(missing), field.type)
 
 
 def _wanted(table: Table, columns: Sequence[str] | None) -> pa.Schema:
@@ -296,5 +301,6 @@ def _unreadable(path: Path, table: Table, error: Exception) -> TrapsError:
 
 def content_version(data: pa.Table) -> str:
     """Digest of a table's content, volatile columns left out: unchanged content makes nothing downstream stale."""
-    rows = data.drop_columns([c for c in VOLATILE if c in data.column_names]).to_pylist()
-    return digest(rows)[:16]
+    lasting = data.drop_columns([c for c in VOLATILE if c in data.column_names])
+    rows = (row for batch in lasting.to_batches(max_chunksize=_ROWS_AT_ONCE) for row in batch.to_pylist())
+    return digest_of_list(rows)[:16]
