@@ -189,3 +189,44 @@ def test_the_bias_of_a_judge_is_its_rate_of_yes_against_the_majority_on_the_same
     assert (c.dissent_yes, c.dissent_no) == pytest.approx((0, 2 / 5))
     a = rows.loc["a"]  # y n y y against y n y n
     assert (a.n_invalid, a.n_decided, a.bias, a.dissent_yes) == (1, 4, pytest.approx(1 / 4), pytest.approx(1 / 4))
+
+
+def test_two_judges_have_a_kappa_and_one_agrees_with_nobody() -> None:
+    # Yes 2, 1, 0, 0 of 2: pairs that agree 1, 0, 1, 1, mean 3/4. p = 3/8, chance 9/64 + 25/64. (48 - 34) / (64 - 34).
+    assert fleiss_kappa(matrix("yy", "yn", "nn", "nn")) == pytest.approx(14 / 30)
+    assert agreement(vote_rows(["yy", "nn"], judges=("a", "b")))["undefined"].isna().all()
+    assert np.isnan([fleiss_kappa(matrix("y", "n")), unanimous_share(matrix("y", "n"))]).all()
+    alone = agreement(vote_rows(["y", "n"], judges=("a",)))
+    assert list(alone["undefined"]) == ["one judge agrees with nobody"]
+    assert alone["agreement"].isna().all()
+
+
+def test_rows_hold_alpha_and_a_pair_holds_nothing_of_a_panel() -> None:
+    rows = agreement(vote_rows(["yy-", "ynn", "nnn", "--y"])).set_index("judges")
+    assert rows.loc["panel", "alpha"] == pytest.approx(8 / 15)
+    assert rows.loc["a+b", ["n_undecided", "fleiss_kappa"]].isna().all()
+    assert np.isnan(rows.loc["panel", "cohen_kappa"])
+
+
+def test_bias_is_counted_by_dataset_and_of_the_panel_s_own_judges() -> None:
+    votes = pd.concat(
+        [
+            vote_rows(["yyn"]),
+            vote_rows(["nnn", "nnn"], dataset="chaotic"),
+            vote_rows(["yyn"], judges=("a", "b", "d"), run=2),
+        ],
+        ignore_index=True,
+    )
+    rows = judge_bias(votes, ["a", "b", "c"])
+    assert rows.set_index(["dataset", "judge"])["n_votes"].to_dict() == {
+        ("occlusion", "a"): 1, ("occlusion", "b"): 1, ("occlusion", "c"): 1,
+        ("chaotic", "a"): 2, ("chaotic", "b"): 2, ("chaotic", "c"): 2,
+    }  # fmt: skip
+    assert rows.set_index(["dataset", "judge"]).loc[("occlusion", "c"), "bias"] == -1
+
+
+def test_a_judge_without_a_valid_vote_has_no_rates() -> None:
+    rows = agreement(vote_rows(["---"])).set_index("judges")
+    assert (rows.loc["panel", "invalid"], np.isnan(rows.loc["panel", "prevalence"])) == (1.0, True)
+    bias = judge_bias(vote_rows(["yy-"])).set_index("judge").loc["c"]
+    assert np.isnan([bias.yes, bias.panel_yes, bias.bias, bias.dissent_yes, bias.dissent_no]).all()

@@ -101,6 +101,11 @@ def test_agreement_is_over_what_two_people_labelled() -> None:
         [0, -1, 0],
         [-1, -1, 1],
     ]
+    assert (row["decision"], pd.isna(row["undefined"])) == ("abstained", True)
+    assert row["seconds"] == given.loc[given["task"] == "abstention", "seconds"].median()
+    same = labels(("abstention", "u1", "jd", True), ("abstention", "u1", "ab", True))
+    assert human_agreement(same).loc[0, "undefined"] == "every label is the same"
+    assert human_agreement(same).loc[0, "agreement"] == 1.0
     assert human_agreement(given.iloc[:0]).empty
 
 

@@ -281,6 +281,21 @@ def test_versions_are_compared_on_what_both_hold(rows):
     assert row["difference"] == pytest.approx(1 - (20 / 30) ** 2)
 
 
+def test_the_interval_between_versions_is_that_of_the_difference_on_the_same_resamples(rows):
+    pairs = pairs_with(40, 20, 0, 20)
+    then = rows(pairs)
+    same = only(version_contrasts(then, then, resamples=200), figure="pecs")
+    assert (same["difference"], same["ci_low"], same["ci_high"]) == (0, 0, 0)
+    with pytest.raises(TrapsError, match="the two studies share no whole pair of the same model, regime and run"):
+        version_contrasts(then, rows(pairs, model="other"))
+    better = rows([(True, False, True)] * 40)
+    table = version_contrasts(then, better, resamples=200)
+    row = only(table, figure="pecs")
+    assert 0 < row["ci_low"] <= row["difference"] <= row["ci_high"] <= 1
+    assert (table["p_holm"] >= table["p"]).all()  # adjusted over the models of a figure: here there is one
+    assert row["p_holm"] == row["p"]
+
+
 def test_versions_of_different_epochs_are_refused_row_by_row(rows):
     pairs = pairs_with(10, 5, 0, 5)
     then = pd.concat([rows(pairs), rows(pairs, dataset="chaotic")], ignore_index=True)

@@ -9,7 +9,7 @@ import pytest
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts
-from traps_pipeline.scoring.leaderboard import leaderboard, pooled_j
+from traps_pipeline.scoring.leaderboard import leaderboard, pooled_j, wrong_intervals
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.parquet import TableStore
@@ -202,6 +202,25 @@ def test_pooled_j_and_its_standard_error(rows):
     runs = [rows([(True, False, True), (True, False, True)]), rows([(True, True, True), (True, False, False)], run=2)]
     pooled = pooled_j(pd.concat(runs, ignore_index=True)).set_index("model").loc["m"]
     assert [pooled.j, pooled.standard_error, pooled.n] == pytest.approx([0.5, np.sqrt(2 * 0.25 * 0.75 / 4), 8])
+
+
+def test_pooled_j_of_a_single_void_and_of_no_decided_void(rows):
+    one = pooled_j(rows([(True, False, True)])).iloc[0]
+    assert (one.j, one.standard_error, one.n) == (1.0, 0.0, 2)
+    none = pooled_j(rows([(True, False, None)])).iloc[0]
+    assert (np.isnan(none.j), none.n) == (True, 1)
+
+
+@pytest.mark.parametrize(
+    ("figure", "low", "wrong"), [("pecs", -0.1, 1), ("j", -0.1, 0), ("j", -1.1, 1), ("acc", 0.0, 0)]
+)
+def test_intervals_out_of_order_or_range_are_counted(figure, low, wrong, rows):
+    board = board_of(rows([(True, False, True), (True, False, False), (True, False, True)])).head(1)
+    assert wrong_intervals(board) == 0
+    assert wrong_intervals(board.assign(**{f"{figure}_ci_low": low})) == wrong
+    assert wrong_intervals(board.assign(**{f"{figure}_ci_high": 1.1})) == 1
+    assert wrong_intervals(board.assign(**{f"{figure}_ci_low": 0.6, f"{figure}_ci_high": 0.4})) == 1
+    assert wrong_intervals(board.assign(**{f"{figure}_ci_low": np.nan, f"{figure}_ci_high": np.nan})) == 0
 
 
 @pytest.mark.parametrize("name", ["random-50", "confidence-noise"])

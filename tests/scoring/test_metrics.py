@@ -123,6 +123,34 @@ def test_figures_outside_their_bounds_are_wrong(rows):
     assert wrong_figures(metrics.assign(pecs_low=-0.1)) == len(metrics)
 
 
+SOUND = {"acc": 0.8, "abs_rec": 0.75, "false_abs": 0.25, "pecs": 0.4, "pecs_low": 0.3, "pecs_high": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("altered", "wrong"),
+    [
+        ({}, 0),
+        ({"pecs_low": 0.4, "pecs_high": 0.4}, 0),
+        ({"pecs_high": 1.0}, 0),
+        ({"pecs_high": 1.1}, 1),
+        ({"pecs_low": -0.1}, 1),
+        ({"pecs_low": 0.4 + 1e-9}, 1),
+        ({"pecs_high": 0.4 - 1e-9}, 1),
+        ({"pecs_low": 0.5, "pecs_high": 0.3}, 1),
+        ({"pecs": 0.41}, 1),
+        ({"acc": 0.9}, 1),
+        ({"false_abs": 0.8, "abs_rec": 0.75, "pecs": 0.0, "pecs_low": 0.0}, 0),
+        ({"false_abs": -0.25, "pecs": 0.8, "pecs_high": 0.9}, 1),
+        ({"abs_rec": 1.25, "pecs": 0.8, "pecs_high": 0.9}, 1),
+        ({"acc": 1.5, "pecs": 0.9, "pecs_low": 0.7, "pecs_high": 0.6}, 3),  # a share, its bounds, the product
+    ],
+)
+def test_each_wrong_figure_of_a_cell_is_counted_once(altered, wrong):
+    assert [name for name in SOUND if name.startswith("pecs_")] == BOUNDS
+    assert wrong_figures(pd.DataFrame([SOUND | altered])) == wrong
+    assert wrong_figures(pd.DataFrame([SOUND, SOUND | altered])) == wrong
+
+
 def test_an_empty_denominator_makes_a_figure_null_and_what_depends_on_it(rows):
     cell = one(cell_metrics(rows([(True, False, None), (False, False, None)])), scope="all")
     assert (cell.acc, cell.false_abs) == (0.5, 0.0)

@@ -1,0 +1,57 @@
+"""What a row of the ledger may hold, at the edges of each range, and what becomes of the rest."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from traps_pipeline.storage.rows import MOST_TOKENS, MOST_USD, heal, is_cost, is_count, is_seconds
+
+
+@pytest.mark.parametrize("value", [0, 1, MOST_TOKENS])
+def test_whole_numbers_from_nothing_to_the_most_that_a_call_can_take_are_counts(value: int) -> None:
+    assert is_count(value)
+
+
+@pytest.mark.parametrize("value", [-1, MOST_TOKENS + 1, 1.0, True, "1", None, math.nan])
+def test_anything_else_is_no_count(value: Any) -> None:
+    assert not is_count(value)
+
+
+@pytest.mark.parametrize("value", [0, 0.0, 0.25, MOST_USD])
+def test_finite_sums_up_to_the_most_that_a_call_can_cost_are_costs(value: float) -> None:
+    assert is_cost(value)
+
+
+@pytest.mark.parametrize("value", [-1e-9, MOST_USD + 1, math.inf, math.nan, True, "0.25", None])
+def test_anything_else_is_no_cost(value: Any) -> None:
+    assert not is_cost(value)
+
+
+@pytest.mark.parametrize(("value", "fits"), [(0, True), (0.5, True), (-0.5, False), (math.inf, False), ("1", False)])
+def test_a_call_takes_no_negative_and_no_endless_time(value: Any, fits: bool) -> None:
+    assert is_seconds(value) is fits
+
+
+@pytest.mark.parametrize("outcome", ["answer", "truncated"])
+def test_an_answer_whose_text_is_none_is_out_of_order(outcome: str) -> None:
+    row: dict[str, Any] = {"outcome": outcome, "text": 5, "prompt_tokens": 3}
+    assert heal(row) == ["text"]
+    assert row == {"outcome": "malformed", "text": None, "prompt_tokens": 3}
+
+
+def test_a_text_loses_what_cannot_be_stored_and_stays_an_answer() -> None:
+    row: dict[str, Any] = {"outcome": "answer", "text": "left \ud800", "served_model": "m \udfff", "cost_usd": -1.0}
+    assert heal(row) == ["text", "served_model", "cost_usd"]
+    assert row == {"outcome": "answer", "text": "left ?", "served_model": None, "cost_usd": None}
+
+
+def test_a_row_in_order_and_a_failure_without_text_are_left_alone() -> None:
+    for row in ({"outcome": "answer", "text": "left", "cost_usd": 0}, {"outcome": "error", "text": None}):
+        before = dict(row)
+        assert heal(row) == []
+        assert row == before
+    failed: dict[str, Any] = {"outcome": "error", "text": None, "prompt_tokens": 2**63}
+    assert (heal(failed), failed["outcome"]) == (["prompt_tokens"], "error")
