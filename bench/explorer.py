@@ -174,7 +174,13 @@ def _cell(items: pd.DataFrame, cell: Cell, seed: int) -> tuple[pd.DataFrame, pd.
             dissents = draw.random() < 0.04
             abstained = abstains ^ dissents
             why = draw.choice(WHY_ABSTAINED if abstained else WHY_ANSWERED).format(**words)
-            vote = {**about, "judge": judge, "valid": True, "vote_key": f"{draw.getrandbits(64):016x}"}
+            vote = {
+                **about,
+                "judge": judge,
+                "panel": "bench@1",
+                "valid": True,
+                "vote_key": f"{draw.getrandbits(64):016x}",
+            }
             votes.append({**vote, "task": "abstention", "abstained": abstained, "rationale": why, "confidence": "high"})
             if not void:
                 correct = not abstains and right == item["control_answer"]
