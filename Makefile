@@ -10,7 +10,7 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test ui bench explorer-vendor lint setup render-packages test-packages clean
+.PHONY: demo demo-mechanism check fast-tests test ui bench explorer-vendor environments lint setup render-packages test-packages clean
 
 demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -80,6 +80,14 @@ else \
 	echo "  sudo apt-get install -y --no-install-recommends $(1)"; exit 1; \
 fi
 endef
+
+# Libraries and harnesses that others use, each in an environment of its own: tests/release is tried with them.
+ENVIRONMENTS := $(patsubst tests/release/%.txt,.workspaces/environments/%/.installed,$(wildcard tests/release/*.txt))
+environments: $(ENVIRONMENTS)
+.workspaces/environments/%/.installed: tests/release/%.txt
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	touch $@
 
 clean: ## remove the environment; studies under .workspaces stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache

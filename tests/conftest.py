@@ -110,7 +110,8 @@ def make_checkout(root: Path) -> Path:
     """Copy what the package needs to run."""
     for name in ("traps_pipeline", "assets", "scene_specs"):
         shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "dagster.yaml", root / "dagster.yaml")
+    for name in ("dagster.yaml", "LICENSE-DATA", "CITATION.cff"):
+        shutil.copy(ROOT / name, root / name)
     return root
 
 

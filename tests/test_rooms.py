@@ -36,6 +36,7 @@ ROOMS = (
     "report",
     "orchestration",
     "study",
+    "release",
     "explorer",
     "defs",
     "definitions",

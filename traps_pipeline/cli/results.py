@@ -1,4 +1,4 @@
-"""`traps audit`, `export`, `dataset` and `compare`: check the published tables, write results or pairs, compare."""
+"""`traps audit`, `export` and `compare`: check the published tables, write results, compare studies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from traps_pipeline.terminal import text_table
 
 
 def add(commands: Commands) -> None:
-    """Add `traps audit`, `traps export`, `traps dataset` and `traps compare`."""
+    """Add `traps audit`, `traps export` and `traps compare`."""
     text = "recompute published values from other published tables, and compare"
     parser = commands.add("audit", audit_published, text, workspace=False)
     parser.add_argument("--all", action="store_true", help="show also the statements that agree")
@@ -18,9 +18,6 @@ def add(commands: Commands) -> None:
 
     parser = commands.add("export", export_results, "write every table, figure and page to a folder")
     parser.add_argument("folder", nargs="?", type=Path, help="default: `export` in the study's folder")
-
-    parser = commands.add("dataset", write_pairs, "write the pairs: clips, questions, prompts, licences")
-    parser.add_argument("folder", type=Path)
 
     parser = commands.add(
         "compare", compare_studies, "print this study minus another on their common pairs, with paired intervals"
@@ -49,18 +46,6 @@ def export_results(arguments: argparse.Namespace) -> int:
     target = (arguments.folder or workspace.root / "export").absolute()
     count = export(workspace, target, say=lambda line: print(line, flush=True))
     print(f"{count} files in {target}\nnext: open {target / INDEX}")
-    return OK
-
-
-def write_pairs(arguments: argparse.Namespace) -> int:
-    """See `traps dataset --help`."""
-    from traps_pipeline.benchmark.dataset import PAIRS, write_dataset
-    from traps_pipeline.benchmark.tables import ITEMS
-    from traps_pipeline.partitions import DATASETS
-
-    workspace, target = open_workspace(arguments), arguments.folder.absolute()
-    count = write_dataset(workspace.tables.read_all(ITEMS, dataset=DATASETS), workspace.root, target)
-    print(f"{count} pairs in {target / PAIRS}")
     return OK
 
 

@@ -1,0 +1,65 @@
+"""The SHA-256 of every file of a folder, in the form that `sha256sum --check` reads."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from traps_pipeline.digests import file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
+
+CHECKSUMS = "SHA256SUMS"
+SIGNATURE = "signature.sig.json"
+_OUTSIDE = (CHECKSUMS, SIGNATURE)  # what cannot hold its own checksum, and what is signed over it
+_LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
+
+
+def released_files(folder: Path) -> list[str]:
+    """Every file below a folder that has a checksum, as a path from it, in order. Hidden files are none of it."""
+    paths = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file() or path.is_symlink()]
+    names = [path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)]
+    return sorted(name for name in names if name not in _OUTSIDE)
+
+
+def write_checksums(folder: Path, canary: str) -> int:
+    """Write the checksums of a folder, below a comment with the canary; returns the number of files."""
+    names = released_files(folder)
+    lines = [f"{file_digest(folder / name)}  {name}\n" for name in names]
+    write_text(folder / CHECKSUMS, f"# {canary}\n{''.join(lines)}")
+    return len(names)
+
+
+def read_checksums(folder: Path) -> dict[str, str]:
+    """The checksum of each file by its path. Raises TrapsError naming the line that is none."""
+    path = folder / CHECKSUMS
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrapsError(f"{path}: cannot be read ({error}); give the folder that `traps release` wrote") from error
+    found: dict[str, str] = {}
+    for number, line in enumerate(lines, start=1):
+        if line.startswith("#"):
+            continue
+        match = _LINE.fullmatch(line)
+        if match is None or match[2] in found or match[2].startswith("/") or ".." in Path(match[2]).parts:
+            raise TrapsError(f"{path}:{number}: is no checksum of a file of the folder; get the folder again")
+        found[match[2]] = match[1]
+    return found
+
+
+def altered_files(folder: Path) -> list[str]:
+    """What differs between a folder and its checksums, a sentence for each file. Raises TrapsError."""
+    said, there = read_checksums(folder), {*released_files(folder)}
+    problems = []
+    for name in sorted({*said, *there}):
+        if name not in there:
+            problems.append(f"{name}: is missing")
+        elif name not in said:
+            problems.append(f"{name}: has no checksum, so it was added")
+        elif (folder / name).is_symlink():
+            problems.append(f"{name}: is a link, not a file")
+        elif file_digest(folder / name) != said[name]:
+            same = [other for other, sha256 in said.items() if sha256 == file_digest(folder / name)]
+            problems.append(f"{name}: is {f'in truth {same[0]}' if same else 'altered'}")
+    return problems

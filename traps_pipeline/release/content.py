@@ -1,0 +1,225 @@
+"""The rows of a released folder, from the tables of a study whose clips are rendered."""
+
+from __future__ import annotations
+
+import hmac
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.benchmark.records import Release, load_release
+from traps_pipeline.benchmark.specs import spec_of
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS
+from traps_pipeline.digests import digest, file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.panel import tasks_for
+from traps_pipeline.models.prompts import prompt, system_prompt
+from traps_pipeline.partitions import ARMS, DATASETS, REGIMES
+from traps_pipeline.release.tables import (
+    CertificateRow,
+    HeldOutItemRow,
+    PairRow,
+    PromptRow,
+    ReleasedItemRow,
+    ScenarioRow,
+    SplitRow,
+)
+from traps_pipeline.scenes.certificates import certificates_for, pair_of, stored_evidence
+from traps_pipeline.scenes.evidence import Claim
+from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.study.experiment import LITE_FILE
+from traps_pipeline.yamlfile import read_yaml
+
+CLIPS = "clips"
+DATA_LICENCE, PROMPT_LICENCE = "CC-BY-4.0", "CC-BY-NC-4.0"
+SYSTEM, JUDGE = "system prompt of a model", "prompt of a judge"
+_CLIPS = f"{CLIPS}/"
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Content:
+    """What is released: ITEMS rows, of the pairs and of arms; SCENE_SPECS rows; the clips by their path in the folder;
+    name, version and canary of the benchmark."""
+
+    items: Rows
+    specs: Rows
+    clips: Mapping[str, Path]
+    release: Release
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """The benchmark version of each dataset and arm."""
+        return {str(row["dataset"]): str(row["benchmark_version"]) for row in self.items}
+
+
+def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
+    """The pairs of a study, and items of these arms. Raises TrapsError for items that are not made, for an arm without
+    items, and for a clip that is missing or not the one that its item names."""
+    items = _records(workspace, ITEMS, (*DATASETS, *arms))
+    if not items:
+        raise TrapsError(f"{workspace.root}: no pairs to release; make items first (traps run ... --until items)")
+    for arm in arms:
+        if arm not in ARMS or arm not in {row["dataset"] for row in items}:
+            raise TrapsError(
+                f"{workspace.root}: has no items of the arm {arm[:40]!r}; known arms: {', '.join(ARMS)}. Name it among "
+                "the datasets of an experiment and run that, or leave it out"
+            )
+    specs = [spec for spec in _records(workspace, SCENE_SPECS) if spec["scenario_id"] in _ids(items)]
+    clips = {str(row["clip"]): workspace.resolve(str(row["clip"])) for row in items}
+    for row in items:
+        path = clips[row["clip"]]
+        if not path.is_file() or file_digest(path) != row["media_digest"]:
+            raise TrapsError(f"{path}: is missing or not the clip of its item; materialize videos again")
+    return Content(items, specs, clips, load_release())
+
+
+def _records(workspace: Workspace, table: Any, datasets: Sequence[str] | None = None) -> list[dict[str, Any]]:
+    frame = workspace.tables.read_all(table, **({} if datasets is None else {"dataset": tuple(datasets)}))
+    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    rows = [{str(name): value for name, value in row.items()} for row in rows]
+    for row in rows:
+        row["labels"] = list(row["labels"])
+    return sorted(rows, key=lambda row: [row[name] for name in table.key])
+
+
+def _ids(items: Iterable[Mapping[str, Any]]) -> set[str]:
+    return {str(row["scenario_id"]) for row in items}
+
+
+def lite_of(items: Iterable[Mapping[str, Any]]) -> set[str]:
+    """The scenarios of the lite set that are among the items."""
+    return _ids(items) & {*read_yaml(LITE_FILE)["scenarios"]}
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def pair_rows(content: Content) -> list[PairRow]:
+    """A row a pair, in the order of their ids. Raises TrapsError for a pair of which a side is missing."""
+    lite, rows, pairs = lite_of(content.items), list[PairRow](), dict[str, dict[str, Mapping[str, Any]]]()
+    for row in content.items:
+        if row["dataset"] in DATASETS:
+            pairs.setdefault(row["pair_id"], {})[row["side"]] = row
+    for pair_id, sides in sorted(pairs.items()):
+        if len(sides) < 2:
+            raise TrapsError(f"{pair_id}: only its {next(iter(sides))} is there; make items again")
+        control, void = sides["control"], sides["void"]
+        own = ("pair_id", "dataset", "scenario_id", "taxonomy", "category", "sub_scenario", "labels", "aliases")
+        own += ("answer_type", "ground_truth", "benchmark_version")
+        rows.append(
+            PairRow(
+                **{name: control[name] for name in own},
+                control_item_id=control["item_id"],
+                void_item_id=void["item_id"],
+                control_file_name=control["clip"],
+                void_file_name=void["clip"],
+                control_question=control["question"],
+                void_question=void["question"],
+                lite=control["scenario_id"] in lite,
+                canary=content.release.canary,
+            )
+        )
+    return rows
+
+
+def item_rows(content: Content) -> list[ReleasedItemRow]:
+    """A row an item, in the order of their ids."""
+    lite = lite_of(content.items)
+    return [
+        ReleasedItemRow(
+            **row,
+            file_name=row["clip"].removeprefix(_CLIPS),
+            lite=row["scenario_id"] in lite,
+            canary=content.release.canary,
+        )
+        for row in content.items
+    ]
+
+
+def opaque(key: bytes, item_id: str) -> str:
+    """The name of a held-out item: without the key nobody can say which item it is."""
+    return hmac.new(key, item_id.encode(), "sha256").hexdigest()[:24]
+
+
+def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:
+    """A row an item, without what tells its answer, in the order of names that tell nothing."""
+    rows = [
+        HeldOutItemRow(
+            item=opaque(key, row["item_id"]),
+            question=row["question"],
+            file_name=held_out_clip(row["media_digest"]).removeprefix(_CLIPS),
+            media_digest=row["media_digest"],
+            canary=content.release.canary,
+        )
+        for row in content.items
+    ]
+    return sorted(rows, key=lambda row: row.item)
+
+
+def held_out_clip(media_digest: str) -> str:
+    """Path of a clip in a folder without answers: its name is its content."""
+    return f"{_CLIPS}{media_digest[:2]}/{media_digest[:32]}.mp4"
+
+
+def scenario_rows(content: Content) -> list[ScenarioRow]:
+    """A row a scenario: its whole record."""
+    return [ScenarioRow(**row, canary=content.release.canary) for row in content.specs]
+
+
+def certificate_rows(content: Content) -> list[CertificateRow]:
+    """A row for each certificate of each scenario, judged by the numbers that its record stores."""
+    return [row for spec in content.specs for row in _certificates(spec_of(dict(spec)), content.release.canary)]
+
+
+def _certificates(spec: SceneSpec, canary: str) -> Iterable[CertificateRow]:
+    import numpy as np
+
+    stored, claim = stored_evidence(spec), Claim.of_record(spec)
+    nothing = np.empty((0, 0), np.float32)  # words are certified without a trajectory
+    for certificate in certificates_for(spec.void_kind):
+        words = certificate.about == "words"
+        evidence = {**certificate.measured(pair_of(spec, nothing, nothing))} if words else stored
+        failure = certificate.failure(evidence, claim)
+        numbers = {n.name: evidence[n.name] for n in certificate.numbers if n.name in evidence}
+        yield CertificateRow(
+            scenario_id=spec.scenario_id,
+            certificate=certificate.name,
+            about=certificate.about,
+            promises=" ".join(certificate.promises.split()),
+            holds=failure is None,
+            failure=failure,
+            evidence=json.dumps(numbers, sort_keys=True, ensure_ascii=False, default=list),
+            canary=canary,
+        )
+
+
+def split_rows(content: Content) -> list[SplitRow]:
+    """A row for each scenario of each split."""
+    splits = {"lite": lite_of(content.items), "test": _ids(content.items)}
+    return [
+        SplitRow(split=name, scenario_id=id_, canary=content.release.canary)
+        for name, ids in splits.items()
+        for id_ in sorted(ids)
+    ]
+
+
+def prompt_rows(canary: str) -> list[PromptRow]:
+    """A row for the system prompt of each regime, and for each of the panel's tasks."""
+    texts = {(JUDGE, task): prompt(f"judge_{task}") for task in tasks_for("control")}
+    texts |= {(SYSTEM, regime): system_prompt(regime) for regime in REGIMES}
+    return [
+        PromptRow(
+            name=name,
+            role=role,
+            text=text,
+            version=digest(text)[:16],
+            licence=PROMPT_LICENCE,
+            canary=canary,
+        )
+        for (role, name), text in sorted(texts.items())
+    ]

@@ -1,0 +1,227 @@
+"""`traps release`: the folder that is published, the same bytes whenever it is made from the same study."""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_bytes, write_text
+from traps_pipeline.paths import ASSETS
+from traps_pipeline.release import content as rows_of
+from traps_pipeline.release.card import card, dictionary
+from traps_pipeline.release.checksums import CHECKSUMS, SIGNATURE, write_checksums
+from traps_pipeline.release.content import CLIPS, Content
+from traps_pipeline.release.croissant import croissant
+from traps_pipeline.release.tables import (
+    CERTIFICATES,
+    HELD_OUT,
+    HELD_OUT_ITEMS,
+    OPEN,
+    PAIRS,
+    PROMPTS,
+    RELEASED_ITEMS,
+    SCENARIOS,
+    SPLITS,
+)
+from traps_pipeline.storage.tables import Table
+
+FORMAT = 1  # of a released folder
+MANIFEST, CARD, DICTIONARY, CROISSANT, CITATION = (
+    "release.json",
+    "README.md",
+    "DICTIONARY.md",
+    "croissant.json",
+    "CITATION.cff",
+)
+COMMITMENT = "commitment.json"
+LICENCE = "LICENSE-DATA"
+PROMPTS_LICENCE = "LICENSE-PROMPTS"
+# The hub's loader finds clips below the folder of their table alone: pairs name theirs from the top, items from clips/.
+PLACES: Mapping[str, str] = {
+    PAIRS.name: "metadata.jsonl",
+    RELEASED_ITEMS.name: f"{CLIPS}/metadata.jsonl",
+    SCENARIOS.name: "scenarios.jsonl",
+    CERTIFICATES.name: "certificates.jsonl",
+    SPLITS.name: "splits.jsonl",
+    PROMPTS.name: "prompts.jsonl",
+}
+KEY_BYTES = 32
+_ROOT = ASSETS.parent
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a folder is released. arms: beside the pairs. held_out: the file of the key under which items get opaque
+    names, and beside which their answers are written; None to publish the answers. date: of the publication,
+    YYYY-MM-DD. commitment: a file that `traps commit` wrote."""
+
+    arms: Sequence[str] = ()
+    anonymous: bool = False
+    held_out: Path | None = None
+    date: str | None = None
+    commitment: Path | None = None
+
+
+@dataclass(frozen=True)
+class Released:
+    """What was written: numbers of files, clips and rows by table; where the answers of a held-out set lie."""
+
+    files: int
+    clips: int
+    rows: Mapping[str, int]
+    answers: Path | None = None
+
+
+@dataclass
+class _Folder:
+    """A folder that is being written, with what must not be told in it."""
+
+    root: Path
+    hide: Callable[[str], str]
+    rows: dict[str, int] = field(default_factory=dict)
+
+    def text(self, name: str, text: str) -> None:
+        write_text(self.root / name, self.hide(text))
+
+    def table(self, table: Table[Any], rows: Sequence[Any]) -> None:
+        lines = [json.dumps({n: getattr(row, n) for n in table.names}, ensure_ascii=False) + "\n" for row in rows]
+        self.text(PLACES[table.name], "".join(lines))
+        self.rows[table.name] = len(rows)
+
+
+def write_release(content: Content, target: Path, options: Options) -> Released:
+    """Write the folder; nothing but a former release may lie there. Raises TrapsError."""
+    if target.exists() and any(target.iterdir()) and not (target / CHECKSUMS).is_file():
+        raise TrapsError(f"{target}: holds other files; give an empty or a new folder")
+    _clear(target)
+    folder = _Folder(target, anonymous if options.anonymous else str)
+    answers = None
+    if options.held_out is None:
+        _open_tables(folder, content)
+        clips = dict(content.clips)
+    else:
+        answers = _held_out_tables(folder, content, options.held_out)
+        clips = {rows_of.held_out_clip(row["media_digest"]): content.clips[row["clip"]] for row in content.items}
+    folder.table(PROMPTS, rows_of.prompt_rows(content.release.canary))
+    for name, source in sorted(clips.items()):
+        write_bytes(target / name, source.read_bytes())
+    _pages(folder, content, options)
+    files = write_checksums(target, content.release.canary) + 1
+    return Released(files, len(clips), folder.rows, answers)
+
+
+def _clear(target: Path) -> None:
+    """Remove a former release, of which each file is named in its checksums, so that nothing of it stays."""
+    from traps_pipeline.release.checksums import read_checksums, released_files
+
+    if not (target / CHECKSUMS).is_file():
+        return
+    strangers = sorted({*released_files(target)} - {*read_checksums(target)})
+    if strangers:
+        raise TrapsError(f"{target / strangers[0]}: is no file of the release there; move it away")
+    for name in (*released_files(target), CHECKSUMS, SIGNATURE):
+        (target / name).unlink(missing_ok=True)
+
+
+def _open_tables(folder: _Folder, content: Content) -> None:
+    folder.table(PAIRS, rows_of.pair_rows(content))
+    folder.table(RELEASED_ITEMS, rows_of.item_rows(content))
+    folder.table(SCENARIOS, rows_of.scenario_rows(content))
+    folder.table(CERTIFICATES, rows_of.certificate_rows(content))
+    folder.table(SPLITS, rows_of.split_rows(content))
+
+
+def _held_out_tables(folder: _Folder, content: Content, key_file: Path) -> Path:
+    """Write the items without their answers, and beside the key which item each of them is."""
+    if key_file.is_relative_to(folder.root):
+        raise TrapsError(f"{key_file}: lies in the folder that is published; keep the key elsewhere")
+    key = held_out_key(key_file, make=True)
+    folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(content, key))
+    names = sorted((rows_of.opaque(key, row["item_id"]), row["item_id"]) for row in content.items)
+    answers = key_file.with_name(f"{key_file.name}.items.jsonl")
+    write_text(answers, "".join(json.dumps({"item": name, "item_id": id_}) + "\n" for name, id_ in names))
+    return answers
+
+
+def held_out_key(path: Path, *, make: bool = False) -> bytes:
+    """The key of a held-out set, from its file of 64 hexadecimal digits; a missing one is drawn and written, readable
+    by its owner alone. Raises TrapsError."""
+    if make and not path.exists():
+        write_text(path, secrets.token_hex(KEY_BYTES) + "\n")
+        path.chmod(0o600)
+    try:
+        text = path.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrapsError(f"{path}: cannot be read ({error}); give the file of the held-out set's key") from error
+    if not re.fullmatch(rf"[0-9a-f]{{{2 * KEY_BYTES}}}", text):
+        raise TrapsError(f"{path}: is no key ({2 * KEY_BYTES} hexadecimal digits); give the one that the release made")
+    return bytes.fromhex(text)
+
+
+def _pages(folder: _Folder, content: Content, options: Options) -> None:
+    """Everything but tables and clips."""
+    canary = content.release.canary
+    tables = OPEN if options.held_out is None else HELD_OUT
+    licence = (_ROOT / LICENCE).read_text(encoding="utf-8")
+    prompts = (ASSETS / "prompts" / "README.md").read_text(encoding="utf-8")
+    folder.text(LICENCE, f"{licence.rstrip()}\n\n{canary}\n")
+    folder.text(PROMPTS_LICENCE, f"{prompts.rstrip()}\n\n{canary}\n")
+    citation = yaml.safe_dump(ANONYMOUS_CITATION) if options.anonymous else (_ROOT / CITATION).read_text("utf-8")
+    folder.text(CITATION, f"# {canary}\n{citation}")
+    if options.commitment is not None:
+        folder.text(COMMITMENT, options.commitment.read_text(encoding="utf-8"))
+    manifest = {
+        "format": FORMAT,
+        **_about(content),
+        "held_out": options.held_out is not None,
+        "anonymous": options.anonymous,
+        "date": options.date,
+        "arms": sorted(options.arms),
+        "rows": dict(folder.rows),
+        "prompts": {row.name: row.version for row in rows_of.prompt_rows(canary) if row.role == rows_of.SYSTEM},
+    }
+    folder.text(MANIFEST, json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
+    folder.text(DICTIONARY, dictionary(tables, PLACES, canary))
+    folder.text(CARD, card(manifest, tables, PLACES))
+    folder.text(CROISSANT, croissant(folder.root, manifest, tables, PLACES))
+
+
+def _about(content: Content) -> dict[str, Any]:
+    """Name, version and canary of what is released, and the version of each dataset."""
+    return {**content.release.model_dump(), "versions": content.versions}
+
+
+# --- double-blind review ----------------------------------------------------------------------------------------------
+
+ANONYMOUS_CITATION = {
+    "cff-version": "1.2.0",
+    "message": "Authors are withheld for double-blind review.",
+    "title": "A dataset under double-blind review",
+    "type": "dataset",
+    "authors": [{"name": "Anonymous authors"}],
+}
+
+
+def identifying() -> dict[str, str]:
+    """What tells who made the benchmark, and what stands in its place for double-blind review."""
+    data = yaml.safe_load((_ROOT / CITATION).read_text(encoding="utf-8"))
+    paper = data["preferred-citation"]
+    names = [f"{one['given-names']} {one['family-names']}" for one in paper["authors"]]
+    words = {paper["url"]: "(address withheld)", paper["title"]: "(title withheld)", data["title"]: "(title withheld)"}
+    words |= {paper["collection-title"]: "(venue withheld)", paper["conference"]["name"]: "(venue withheld)"}
+    return words | {", ".join(names): "Anonymous authors"} | dict.fromkeys(names, "Anonymous authors")
+
+
+def anonymous(text: str) -> str:
+    """A text without what tells who made the benchmark, wherever lines are broken."""
+    for words, instead in identifying().items():
+        text = re.sub(r"\s+".join(map(re.escape, words.split())), instead, text)
+    return text

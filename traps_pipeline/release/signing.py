@@ -1,0 +1,62 @@
+"""The signature of a released folder: the OpenSSF's format, by a key, checked without a network.
+
+`model_signing` is an extra, and is imported only here. A signature by an elliptic key holds a random number, so it is
+the one file of a release that differs when it is made twice.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.release.checksums import SIGNATURE
+from traps_pipeline.terminal import plain
+
+
+def _library() -> Any:
+    try:
+        import model_signing
+    except ImportError as error:
+        raise TrapsError(
+            f"a signature needs the package model_signing ({error}); install it: pip install 'traps-pipeline[sign]'"
+        ) from None
+    return model_signing
+
+
+def require_signing() -> None:
+    """Raises TrapsError with the line to type where the library is missing."""
+    _library()
+
+
+def sign(folder: Path, private_key: Path) -> Path:
+    """Sign every file of a folder with a private key (PEM, elliptic curve); the signature's path. Raises TrapsError
+    where the library is missing or the key is none."""
+    library, path = _library(), folder / SIGNATURE
+    try:
+        config = library.signing.Config().use_elliptic_key_signer(private_key=private_key)
+        config.set_hashing_config(_hashing(library, path)).sign(folder, path)
+    except (ValueError, TypeError, OSError) as error:
+        raise TrapsError(
+            f"{private_key}: cannot sign ({plain(error)[:200]}); give a private elliptic key in PEM, e.g. of `openssl "
+            "ecparam -name prime256v1 -genkey -noout -out KEY.pem`"
+        ) from error
+    return path
+
+
+def check_signature(folder: Path, public_key: Path) -> str:
+    """What is wrong with the signature of a folder, in words; empty where it is that of the key over these very files.
+    Raises TrapsError where the library or the signature is missing."""
+    library, path = _library(), folder / SIGNATURE
+    if not path.is_file():
+        raise TrapsError(f"{path}: is missing, so that there is nothing to verify; leave --key out")
+    try:
+        config = library.verifying.Config().use_elliptic_key_verifier(public_key=public_key)
+        config.set_hashing_config(_hashing(library, path)).verify(folder, path)
+    except (ValueError, TypeError, OSError) as error:
+        return f"{SIGNATURE}: is not of this key over these files ({plain(error)[:300]})"
+    return ""
+
+
+def _hashing(library: Any, signature: Path) -> Any:
+    return library.hashing.Config().set_ignored_paths(paths=[signature], ignore_git_paths=False)
