@@ -1,12 +1,17 @@
-"""`traps release`, `traps verify`: the folder that is published, and what was altered in one."""
+"""`traps release`, `verify`, `commit`, `verify-commitment`: the folder that is published, and what proves it."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from traps_pipeline.cli.command import OK, Commands, open_workspace
+from traps_pipeline.cli.command import OK, Commands, open_workspace, whole
 from traps_pipeline.errors import TrapsError
+
+if TYPE_CHECKING:
+    from traps_pipeline.release.commitment import Commitment
+    from traps_pipeline.scenes.spec import SceneSpec
 
 
 def add(commands: Commands) -> None:
@@ -20,6 +25,7 @@ def add(commands: Commands) -> None:
         "--without-answers", type=Path, metavar="KEY",
         help="a held-out set: items under opaque names, which only this file tells (it is made where it is missing)",
     )  # fmt: skip
+    parser.add_argument("--commitment", type=Path, metavar="FILE", help="publish a file of `traps commit` with it")
     parser.add_argument("--date", metavar="YYYY-MM-DD", help="of the publication, for the descriptions")
     parser.add_argument("--sign", type=Path, metavar="PEM", help="sign it with this private elliptic key")
 
@@ -27,6 +33,20 @@ def add(commands: Commands) -> None:
     parser = commands.add("verify", verify, text, workspace=False)
     parser.add_argument("path", type=Path, help="a folder that `traps release` wrote")
     parser.add_argument("--key", type=Path, metavar="PEM", help="check the signature with this public key, too")
+
+    text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
+    parser = commands.add("commit", commit_benchmark, text, workspace=False)
+    parser.add_argument("benchmark", type=Path, help="a folder that `traps sample` wrote")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the commitment")
+    parser.add_argument("--reveal", type=Path, required=True, metavar="FILE", help="the seed and a secret number")
+
+    text = "prove that a revealed benchmark is the one that was committed"
+    parser = commands.add("verify-commitment", verify_commitment, text, workspace=False)
+    parser.add_argument("commitment", type=Path)
+    parser.add_argument("reveal", type=Path)
+    parser.add_argument("--specs", type=Path, metavar="FOLDER", help="the revealed benchmark, sampled or released")
+    parser.add_argument("--without-drawing", action="store_true", help="look at --specs alone; nothing is drawn again")
+    parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
 
 
 def release(arguments: argparse.Namespace) -> int:
@@ -43,6 +63,7 @@ def release(arguments: argparse.Namespace) -> int:
         anonymous=arguments.anonymous,
         held_out=arguments.without_answers and arguments.without_answers.absolute(),
         date=_date(arguments.date),
+        commitment=arguments.commitment,
     )
     written = write_release(content_of(workspace, arguments.arms), target, options)
     rows = ", ".join(f"{count} {table}" for table, count in written.rows.items())
@@ -82,3 +103,53 @@ def verify(arguments: argparse.Namespace) -> int:
     signed = "; the signature is of this key" if arguments.key else "; no signature was checked (say --key)"
     print(f"{len(read_checksums(arguments.path))} files are what their checksums say{signed}")
     return OK
+
+
+def commit_benchmark(arguments: argparse.Namespace) -> int:
+    """See `traps commit --help`."""
+    from traps_pipeline.release.commitment import commit
+
+    made = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
+    print(f"{len(made.specs)} records of {made.name} {made.version} are committed in {arguments.out}: publish it")
+    print(f"keep {arguments.reveal} secret until the benchmark is revealed; without it nothing can be proven")
+    return OK
+
+
+def verify_commitment(arguments: argparse.Namespace) -> int:
+    """See `traps verify-commitment --help`."""
+    from traps_pipeline.release import commitment as sealed
+
+    published, reveal = sealed.read_commitment(arguments.commitment), sealed.read_reveal(arguments.reveal)
+    if arguments.without_drawing and not arguments.specs:
+        raise TrapsError("--without-drawing: leaves nothing to look at; name the revealed benchmark with --specs")
+    problems, proven = [], []
+    specs = sealed.revealed_specs(arguments.specs.absolute()) if arguments.specs else None
+    if specs is not None:
+        problems += sealed.broken_seals(published, reveal, specs)
+        proven.append(f"the records of {arguments.specs} are the committed ones")
+    if not arguments.without_drawing and not problems:
+        drawn = sealed.drawn_again(
+            published, reveal, workers=arguments.workers, report=lambda line: print(line, flush=True)
+        )
+        problems += _not_drawn(published, sealed.broken_seals(published, reveal, drawn), specs, drawn)
+        proven.append("the revealed seed draws them")
+    for problem in problems:
+        print(problem)
+    if problems:
+        raise TrapsError(f"{arguments.commitment}: is not proven; {len(problems)} things are not what was committed")
+    print(f"{len(published.specs)} records of {published.name} {published.version}: {', and '.join(proven)}")
+    if arguments.without_drawing:
+        print("not checked: whether the revealed seed draws them")
+    return OK
+
+
+def _not_drawn(
+    published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
+) -> list[str]:
+    """What the seed does not draw here; where only the machine's arithmetic differs, that is said too."""
+    from traps_pipeline.release.commitment import other_arithmetic, same_scene
+
+    if problems and specs is not None and {*specs} == {*drawn} and all(same_scene(specs[i], drawn[i]) for i in specs):
+        elsewhere = other_arithmetic(published) or "another kind of CPU"
+        problems.append(f"all scenes are the same but for the last digits of their simulation ({elsewhere})")
+    return problems

@@ -6,6 +6,7 @@ the one file of a release that differs when it is made twice.
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,11 @@ from traps_pipeline.terminal import plain
 
 def _library() -> Any:
     try:
-        import model_signing
+        return import_module("model_signing")
     except ImportError as error:
         raise TrapsError(
             f"a signature needs the package model_signing ({error}); install it: pip install 'traps-pipeline[sign]'"
         ) from None
-    return model_signing
 
 
 def require_signing() -> None:

@@ -1,0 +1,123 @@
+"""A revealed benchmark is proven to be the committed one; a changed record, seed or number is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import Checkout, once
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.release.commitment import (
+    broken_seals,
+    commit,
+    read_commitment,
+    read_reveal,
+    revealed_specs,
+    same_scene,
+)
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def committed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a sampled benchmark of one scenario, its commitment and its reveal."""
+    from traps_pipeline.benchmark.composition import sample_benchmark
+
+    def make(folder: Path) -> str:
+        sample_benchmark(folder / "private", {"hidden_drop": 1}, 2026, "private", workers=1)
+        commit(folder / "private", folder / "commitment.json", folder / "reveal.json")
+        return ""
+
+    return once(tmp_path_factory, "committed", make)
+
+
+@pytest.fixture
+def copy(committed: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(committed, tmp_path / "copy"))
+
+
+def edit(path: Path, **changes: Any) -> Path:
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes) + "\n")
+    return path
+
+
+def problems(folder: Path) -> list[str]:
+    files = read_commitment(folder / "commitment.json"), read_reveal(folder / "reveal.json")
+    return broken_seals(*files, revealed_specs(folder / "private"))
+
+
+def test_the_seed_draws_the_committed_records_again(committed: Path, demo: Checkout) -> None:
+    given = committed / "commitment.json", committed / "reveal.json", "--specs", committed / "private"
+    finished = demo.traps("verify-commitment", *given, "--workers", "1")
+    assert finished.code == 0, finished.out + finished.err
+    assert finished.out.splitlines()[-1].endswith("are the committed ones, and the revealed seed draws them")
+
+
+def test_a_commitment_tells_neither_the_seed_nor_a_record(committed: Path) -> None:
+    text, reveal = (committed / "commitment.json").read_text(), read_reveal(committed / "reveal.json")
+    (spec,) = load_released(committed / "private" / "released").values()
+    assert [word for word in (reveal.nonce, spec.spec_hash, spec.scene_hash, spec.question) if word in text] == []
+    assert (committed / "reveal.json").stat().st_mode & 0o077 == 0
+
+
+def test_an_edited_record_is_named(copy: Path, committed: Path) -> None:
+    assert problems(committed) == []
+    edit(copy / "private" / "released" / "hidden_drop.jsonl", ill_posed_question="What does it weigh?")
+    assert problems(copy) == ["hidden_drop-0001: is not the record that was committed"]
+
+
+def test_an_edited_trajectory_is_named(copy: Path) -> None:
+    path = copy / "private" / "released" / "trajectories" / "hidden_drop-0001.npz"
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(TrapsError, match=r"hidden_drop-0001\.npz"):
+        problems(copy)
+
+
+def test_records_that_were_left_out_or_added_are_named(copy: Path) -> None:
+    (spec,) = revealed_specs(copy / "private").values()
+    other = spec.model_copy(update={"scenario_id": "hidden_drop-0002"})
+    files = read_commitment(copy / "commitment.json"), read_reveal(copy / "reveal.json")
+    assert broken_seals(*files, {other.scenario_id: other}) == [
+        "hidden_drop-0001: was committed and is not there",
+        "hidden_drop-0002: was not committed",
+    ]
+
+
+@pytest.mark.parametrize("change", [{"seed": 2027}, {"nonce": "0" * 64}])
+def test_another_seed_or_number_is_refused_before_anything_is_drawn(
+    copy: Path, demo: Checkout, change: dict[str, Any]
+) -> None:
+    reveal = edit(copy / "reveal.json", **change)
+    finished = demo.traps("verify-commitment", copy / "commitment.json", reveal, "--specs", copy / "private")
+    assert finished.code == 1 and "drawing" not in finished.out
+    assert "the revealed seed, number or composition is not the one that was committed" in finished.out
+
+
+def test_records_that_were_chosen_and_not_drawn_are_refused(copy: Path, committed: Path) -> None:
+    """Whoever edits a record and then commits can seal it, but the seed still draws the other one."""
+    edit(copy / "private" / "released" / "hidden_drop.jsonl", ill_posed_question="What does it weigh?")
+    published = commit(copy / "private", copy / "c.json", copy / "r.json")
+    drawn = load_released(committed / "private" / "released")  # what the seed draws, as the first test shows
+    assert broken_seals(published, read_reveal(copy / "r.json"), drawn) == [
+        "hidden_drop-0001: is not the record that was committed"
+    ]
+    chosen = load_released(copy / "private" / "released")
+    assert not same_scene(drawn["hidden_drop-0001"], chosen["hidden_drop-0001"])
+    elsewhere = drawn["hidden_drop-0001"].model_copy(update={"trajectory_sha256": "0" * 64})
+    assert same_scene(drawn["hidden_drop-0001"], elsewhere)
+
+
+def test_a_commitment_is_made_once_and_of_one_draw(copy: Path, tmp_path: Path) -> None:
+    with pytest.raises(TrapsError, match="a commitment is made once"):
+        commit(copy / "private", copy / "commitment.json", tmp_path / "reveal.json")
+    (copy / "private" / "released" / "draws.json").unlink()
+    with pytest.raises(TrapsError, match="is not one draw of one seed"):
+        commit(copy / "private", tmp_path / "c.json", tmp_path / "r.json")
+    with pytest.raises(TrapsError, match="is no commitment"):
+        read_commitment(copy / "reveal.json")

@@ -1,0 +1,187 @@
+"""Commit and reveal: a benchmark is fixed before anybody sees it, and later proven to be the one that was fixed.
+
+The commitment holds a digest of the seed and one of each record, all mixed with a secret number, so that nobody can try
+seeds until one fits. The reveal holds the seed and that number. Whoever has both draws the benchmark again.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import secrets
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from traps_pipeline.benchmark.records import load_release, load_released, parse_record
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
+from traps_pipeline.scenes.sample import load_tallies, sample_family
+from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+from traps_pipeline.terminal import plain
+from traps_pipeline.yamlfile import explain, read_lines
+
+_HEX = r"^[0-9a-f]{64}$"
+# What a record says of arithmetic: another CPU or another version of the simulator may draw the same scene otherwise.
+_OF_ARITHMETIC = ("evidence", "trajectory_sha256", "twin")
+_LIBRARIES = ("mujoco", "numpy")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Commitment(_Strict):
+    """What is published first. draws: scenarios by family. seed: digest of the seed. specs: digest of each record.
+    made_with: machine and libraries, of which the arithmetic of a draw may depend."""
+
+    format: Literal[1] = 1
+    name: str
+    version: str
+    canary: str
+    draws: dict[str, int]
+    seed: str = Field(pattern=_HEX)
+    specs: dict[str, str] = Field(min_length=1)
+    made_with: dict[str, str]
+
+
+class Reveal(_Strict):
+    """What is kept secret until the benchmark is revealed. nonce: the secret number, in hexadecimal digits."""
+
+    format: Literal[1] = 1
+    seed: int = Field(ge=0)
+    nonce: str = Field(pattern=_HEX)
+
+
+def _sealed_seed(reveal: Reveal, draws: Mapping[str, int]) -> str:
+    return digest(["seed", reveal.nonce, reveal.seed, dict(draws)])
+
+
+def _sealed_spec(reveal: Reveal, spec: SceneSpec) -> str:
+    return digest(["spec", reveal.nonce, spec.scenario_id, spec.spec_hash])
+
+
+def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
+    """Commit to a benchmark that `traps sample` drew: write what is published, and what is kept (readable by its owner
+    alone). Raises TrapsError where the folder is none, or of several seeds, and where either file is there already."""
+    for path in (commitment, reveal):
+        if path.exists():
+            raise TrapsError(f"{path}: is there already, and a commitment is made once; name another file")
+    specs, tallies = load_released(benchmark / "released"), load_tallies(benchmark / "released")
+    seeds = {tally.seed for tally in tallies.values()}
+    if len(seeds) != 1 or {spec.family for spec in specs.values()} != {*tallies}:
+        raise TrapsError(f"{benchmark}: is not one draw of one seed; draw one with `traps sample` into a new folder")
+    kept = Reveal(seed=seeds.pop(), nonce=secrets.token_hex(32))
+    release, draws = load_release(benchmark / "benchmark.yaml"), {n: t.wanted for n, t in sorted(tallies.items())}
+    published = Commitment(
+        **release.model_dump(include={"name", "version", "canary"}),
+        draws=draws,
+        seed=_sealed_seed(kept, draws),
+        specs={id_: _sealed_spec(kept, spec) for id_, spec in sorted(specs.items())},
+        made_with=_made_with(),
+    )
+    write_text(reveal, kept.model_dump_json(indent=1) + "\n")
+    reveal.chmod(0o600)
+    write_text(commitment, published.model_dump_json(indent=1) + "\n")
+    return published
+
+
+def _made_with() -> dict[str, str]:
+    return {"machine": platform.machine(), **{name: version(name) for name in _LIBRARIES}}
+
+
+def read_commitment(path: Path) -> Commitment:
+    """A commitment from its file. Raises TrapsError."""
+    return _read(Commitment, path)
+
+
+def read_reveal(path: Path) -> Reveal:
+    """A reveal from its file. Raises TrapsError."""
+    return _read(Reveal, path)
+
+
+def _read(kind: type[Any], path: Path) -> Any:
+    try:
+        return kind.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise TrapsError(f"{path}: is no {kind.__name__.lower()} ({explain(error)}); get the file again") from error
+    except OSError as error:
+        raise TrapsError(f"{path}: cannot be read ({error.strerror}); name a file of `traps commit`") from error
+
+
+# --- verification -----------------------------------------------------------------------------------------------------
+
+
+def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
+    """The records of a revealed benchmark: of the folder that `traps sample` wrote, or of a released folder. Raises
+    TrapsError, also for a trajectory that is not its record's."""
+    from traps_pipeline.benchmark.specs import spec_of
+
+    if (folder / "scenarios.jsonl").is_file():
+        path, found = folder / "scenarios.jsonl", dict[str, SceneSpec]()
+        for number, line in read_lines(path):
+            try:
+                spec = spec_of(json.loads(line))
+            except (ValueError, KeyError, TypeError) as error:
+                raise TrapsError(f"{path}:{number}: is no record ({plain(error)[:200]}); get it again") from error
+            found[spec.scenario_id] = parse_record(spec.model_dump_json(), f"{path}:{number}")
+        return found
+    specs = load_released(folder / "released")
+    for spec in specs.values():
+        path = folder / "released" / "trajectories" / f"{spec.scenario_id}.npz"
+        try:
+            load_trajectory(path, spec.trajectory_sha256)
+            load_trajectory(path, spec.twin.trajectory_sha256, "twin")
+        except ValueError as error:
+            raise TrapsError(str(error)) from error
+    return specs
+
+
+def broken_seals(commitment: Commitment, reveal: Reveal, specs: Mapping[str, SceneSpec]) -> list[str]:
+    """How records differ from those that were committed, a sentence each; the first says so of the seed."""
+    found = []
+    if _sealed_seed(reveal, commitment.draws) != commitment.seed:
+        found.append("the revealed seed, number or composition is not the one that was committed")
+    for id_ in sorted({*commitment.specs, *specs}):
+        if id_ not in specs:
+            found.append(f"{id_}: was committed and is not there")
+        elif id_ not in commitment.specs:
+            found.append(f"{id_}: was not committed")
+        elif _sealed_spec(reveal, specs[id_]) != commitment.specs[id_]:
+            found.append(f"{id_}: is not the record that was committed")
+    return found
+
+
+def drawn_again(
+    commitment: Commitment,
+    reveal: Reveal,
+    *,
+    workers: int | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> dict[str, SceneSpec]:
+    """The records that the revealed seed gives here. Raises TrapsError where a family cannot be filled."""
+    with TemporaryDirectory(prefix="traps-") as folder:
+        for family, count in commitment.draws.items():
+            report(f"drawing {count} of {family} again")
+            try:
+                sample_family(family, count, reveal.seed, Path(folder) / "released", workers=workers, report=report)
+            except (RuntimeError, KeyError) as error:
+                raise TrapsError(f"{family}: the seed does not give {count} scenarios here ({plain(error)})") from error
+        return load_released(Path(folder) / "released")
+
+
+def same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
+    """Whether two records differ in nothing but what depends on a machine's arithmetic."""
+    return spec.model_dump(exclude={*_OF_ARITHMETIC}) == other.model_dump(exclude={*_OF_ARITHMETIC})
+
+
+def other_arithmetic(commitment: Commitment) -> str:
+    """How this machine and its libraries differ from those of the commitment, in words; empty where they do not."""
+    here = _made_with()
+    names = [name for name in here if commitment.made_with.get(name) != here[name]]
+    return ", ".join(f"{name} {commitment.made_with.get(name, 'unknown')} there, {here[name]} here" for name in names)
