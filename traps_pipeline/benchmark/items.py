@@ -155,10 +155,22 @@ def _decisive(
     }
 
 
+_DECISIVE = (
+    *("item_id", "pair_id", "dataset", "scenario_id", "side", "taxonomy", "category", "sub_scenario", "question"),
+    *("labels", "aliases", "answer_type", "ground_truth", "control_answer", "media_digest"),
+)
+
+
+def item_hash(row: Record) -> str:
+    """Digest of all of an item that decides its answer or its score."""
+    decisive = {name: row[name] for name in _DECISIVE}
+    return digest(decisive | {"labels": list(row["labels"]), "aliases": json.loads(row["aliases"])})
+
+
 def _row(decisive: dict[str, Any], spec: Record, commonest: Mapping[str, str], clip: str, version: str) -> ItemRow:
     return ItemRow(
         **decisive,
-        item_hash=digest(decisive | {"aliases": json.loads(spec["aliases"])}),
+        item_hash=item_hash(decisive),
         commonest_answer=commonest[spec["sub_scenario"]],
         clip=clip,
         benchmark_version=version,

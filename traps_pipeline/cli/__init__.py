@@ -29,6 +29,7 @@ from traps_pipeline.cli import (
     run,
     site,
     status,
+    submission,
     ui,
 )
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, Run
@@ -97,6 +98,7 @@ def build_parser() -> argparse.ArgumentParser:
         ui,
         results,
         release,
+        submission,
         site,
         review,
         annotate,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.cli.command import OK, Commands, open_workspace, whole
+from traps_pipeline.cli.submission import verify_file
 from traps_pipeline.errors import TrapsError
 
 if TYPE_CHECKING:
@@ -29,10 +30,11 @@ def add(commands: Commands) -> None:
     parser.add_argument("--date", metavar="YYYY-MM-DD", help="of the publication, for the descriptions")
     parser.add_argument("--sign", type=Path, metavar="PEM", help="sign it with this private elliptic key")
 
-    text = "name every altered file of a release"
+    text = "name what was altered in a release, or what does not hold in a submission"
     parser = commands.add("verify", verify, text, workspace=False)
-    parser.add_argument("path", type=Path, help="a folder that `traps release` wrote")
-    parser.add_argument("--key", type=Path, metavar="PEM", help="check the signature with this public key, too")
+    parser.add_argument("path", type=Path, help="a folder of `traps release`, or a file of `traps submit`")
+    parser.add_argument("--key", type=Path, metavar="PEM", help="of a release: check its signature, too")
+    parser.add_argument("--release", type=Path, metavar="FOLDER", help="of a submission: hold its items against this")
 
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
     parser = commands.add("commit", commit_benchmark, text, workspace=False)
@@ -90,6 +92,10 @@ def verify(arguments: argparse.Namespace) -> int:
     """See `traps verify --help`."""
     from traps_pipeline.release.checksums import altered_files, read_checksums
 
+    if not arguments.path.is_dir():
+        if arguments.key:
+            raise TrapsError(f"--key: only folders are signed, and {arguments.path} is none; leave it out")
+        return verify_file(arguments.path, arguments.release)
     problems = altered_files(arguments.path)
     if arguments.key:
         from traps_pipeline.release.signing import check_signature

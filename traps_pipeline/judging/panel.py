@@ -22,7 +22,7 @@ from traps_pipeline.judging.tables import VoteRow
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.judges import SCHEMAS, JudgeEntry, Task, load_panel, panel_id, require_panel
+from traps_pipeline.models.judges import SCHEMAS, JudgeEntry, Seat, Task, load_panel, panel_id, require_panel
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
@@ -59,22 +59,20 @@ def render(task: Task, question: str, answer: str, ground_truth: str | None) -> 
     return "\n\n".join([*parts, quoted("response", "RESPONSE", answer)])
 
 
-def judge_request(
-    judge: JudgeEntry, task: str, schema: Mapping[str, Any], cell: Cell, item_id: str, user: str
-) -> Request:
+def judge_request(judge: Seat, task: str, schema: Mapping[str, Any], cell: Cell, item_id: str, user: str) -> Request:
     """The call to a judge for one task about one answer of a cell; the judge returns the schema's JSON."""
     e = cell.evaluation
     return Request(
         participant=judge.id,
         endpoint=judge.endpoint,
-        params=judge.params | ({"response_format": schema} if judge.backend == NETWORK else {}),
+        params={**judge.params, **({"response_format": schema} if judge.backend == NETWORK else {})},
         system=prompt(f"judge_{task}"),
         user=user,
         about={"task": task, "item_id": item_id, "model": e.model, "regime": e.regime, "run": e.run},
     )
 
 
-def vote_request(judge: JudgeEntry, task: Task, cell: Cell, item: Mapping[str, Any], answer: str) -> Request:
+def vote_request(judge: Seat, task: Task, cell: Cell, item: Mapping[str, Any], answer: str) -> Request:
     """The call for one judge's vote on one task about one answer."""
     user = render(task, item["question"], answer, item["ground_truth"])
     return judge_request(judge, task, SCHEMAS[task], cell, item["item_id"], user)

@@ -3,7 +3,8 @@ votes stands in `judging/`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import typing
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -52,6 +53,30 @@ SCHEMAS: Mapping[Task, Mapping[str, Any]] = {
         reasoning={"type": "string"},
     ),
 }
+
+
+class Seat(typing.Protocol):
+    """What of a judge decides its votes, wherever it is described."""
+
+    @property
+    def id(self) -> str:
+        """Its name."""
+        ...
+
+    @property
+    def backend(self) -> str:
+        """Kind of backend."""
+        ...
+
+    @property
+    def endpoint(self) -> str:
+        """What answers."""
+        ...
+
+    @property
+    def params(self) -> Mapping[str, Any]:
+        """What is sent besides the prompts."""
+        ...
 
 
 class JudgeEntry(Entry):
@@ -130,17 +155,24 @@ def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -
 
 def panel_version(panel: str) -> str:
     """Version of what decides a panel's votes besides answers: judges, their prompts and schemas."""
-    if not panel:
-        return "no panel is named"
-    judges = [[judge.id, judge.endpoint, judge.params, SCHEMAS] for judge in load_panel(panel)]
+    return version_of_seats(load_panel(panel)) if panel else "no panel is named"
+
+
+def version_of_seats(seats: Iterable[Seat]) -> str:
+    """Version of what these judges decide."""
+    judges = [[seat.id, seat.endpoint, dict(seat.params), SCHEMAS] for seat in seats]
     return digest([judges, prompt("judge_abstention"), prompt("judge_correctness")])[:16]
 
 
 def panel_id(panel: str) -> str:
     """What stands for a panel in the rows that it decided: its name and the version of its judges, and a mark where it
     is a single judge."""
-    alone = ONE_JUDGE if panel and len(load_panel(panel)) == 1 else ""
-    return f"{panel}@{panel_version(panel)[:8]}{alone}"
+    return id_of_seats(panel, load_panel(panel)) if panel else f"@{panel_version(panel)[:8]}"
+
+
+def id_of_seats(name: str, seats: Sequence[Seat]) -> str:
+    """What stands for a panel of this name and these judges."""
+    return f"{name}@{version_of_seats(seats)[:8]}{ONE_JUDGE if len(seats) == 1 else ''}"
 
 
 def panel_names(panels: str) -> list[str]:

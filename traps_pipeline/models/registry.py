@@ -358,9 +358,10 @@ def get_model(model_id: str) -> ModelEntry:
 
 
 def is_reference(model_id: str) -> bool:
-    """Whether a model is one of the strategies, observers and rules that the rule judges are made for."""
-    known = load_models()
-    return model_id in known and known[model_id].backend in ("reference", "observer", "rule")
+    """Whether a model is one of the strategies, observers and rules that the rule judges are made for; on a board of
+    several submissions it may be named model@submission."""
+    known, name = load_models(), model_id.partition("@")[0]
+    return name in known and known[name].backend in ("reference", "observer", "rule")
 
 
 @own.keeps

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from traps_pipeline.benchmark.tables import AnswerType, ItemRow, Labels, SceneSpecRow, Taxonomy
+from traps_pipeline.scoring.tables import LeaderboardRow
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 
@@ -117,6 +118,17 @@ class PromptRow:
 
 
 PROMPTS = Table("prompts", PromptRow, partition_by=(), key=("role", "name"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubmittedRow(LeaderboardRow):
+    """An entry of a leaderboard of submissions, ranked among those of its group."""
+
+    submission: Annotated[str, "the submission that its answers and votes are from"]
+    group: Annotated[str, "digest of items, and panel: entries of different groups are not ranked together"]
+
+
+SUBMITTED = Table("submitted", SubmittedRow, partition_by=(), key=("group", "model", "regime", "dataset"))
 
 OPEN = (PAIRS, RELEASED_ITEMS, SCENARIOS, CERTIFICATES, SPLITS, PROMPTS)
 HELD_OUT = (HELD_OUT_ITEMS, PROMPTS)

@@ -1,0 +1,276 @@
+"""A submission holds, or what was edited in it is named; other items or panels are not ranked together."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from tests.conftest import Checkout
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.release.content import content_of
+from traps_pipeline.release.folder import Options, write_release
+from traps_pipeline.release.submission import ABOUT, TABLES, _parquet, _zipped, pack, read_submission
+from traps_pipeline.release.submissions import gather, write_board
+from traps_pipeline.release.tables import SUBMITTED
+from traps_pipeline.release.verification import verify
+from traps_pipeline.scoring.board import score
+from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.slow
+Frames = dict[str, pd.DataFrame]
+ITEM = "occlusion:domino_chain-0001:control"
+
+
+@pytest.fixture(scope="module")
+def packed(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("submissions") / "small.zip"
+    pack(Workspace.open(small.workspace), path, "small")
+    return path
+
+
+@pytest.fixture(scope="module")
+def release(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("release") / "small"
+    write_release(content_of(Workspace.open(small.workspace)), folder, Options())
+    return folder
+
+
+def forged(
+    packed: Path, target: Path, change: Callable[[Frames], None], *, rescore: bool = False, **about: object
+) -> Path:
+    """A submission whose tables were changed by somebody who also corrects the digests, and the numbers if asked."""
+    submission = read_submission(packed)
+    frames = {name: frame.copy() for name, frame in submission.tables.items()}
+    change(frames)
+    if rescore:
+        items, answers, votes = (frames[f"{name}.parquet"] for name in ("items", "responses", "votes"))
+        own = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
+        scored = score(decide(items[own], answers.drop(columns="benchmark_version"), votes))
+        frames |= {"metrics.parquet": scored.metrics, "leaderboard.parquet": scored.board}
+    content = {name: _parquet(TABLES[name], frame) for name, frame in frames.items()}
+    digests = {name: hashlib.sha256(data).hexdigest() for name, data in content.items()}
+    said = json.loads(submission.about.model_dump_json()) | {"files": digests} | about
+    target.write_bytes(_zipped({ABOUT: json.dumps(said).encode(), **content}))
+    return target
+
+
+def put(frames: Frames, name: str, column: str, value: object, **where: object) -> None:
+    """Change one cell of a table."""
+    frame = frames[f"{name}.parquet"]
+    chosen = pd.concat([frame[key] == wanted for key, wanted in where.items()], axis=1).all(axis=1)
+    assert chosen.sum() >= 1
+    frame.loc[chosen[chosen].index[:1], column] = value
+
+
+def problems(path: Path, release: Path | None = None) -> list[str]:
+    return verify(read_submission(path), release).problems
+
+
+def test_a_study_packed_twice_is_the_same_file_and_holds_against_its_release(
+    packed: Path, release: Path, small: Checkout, tmp_path: Path
+) -> None:
+    again = tmp_path / "again.zip"
+    packing = small.traps("submit", again, "--name", "small")
+    assert packing.code == 0 and again.read_bytes() == packed.read_bytes()
+    finished = small.traps("verify", again, "--release", release)
+    assert finished.code == 0 and finished.out.splitlines()[-1] == f"{again}: holds"
+    assert "not checked: that the answers are the model's" in finished.out
+    # 12 scenarios x 2 datasets x 2 sides; 3 models x 2 regimes; three judges on two tasks of a control, one of a void
+    rows = {name: len(frame) for name, frame in read_submission(again).tables.items()}
+    assert (rows["items.parquet"], rows["responses.parquet"], rows["votes.parquet"]) == (48, 288, 144 * 9)
+
+
+def test_a_table_that_is_not_the_packed_one_is_named(packed: Path, tmp_path: Path) -> None:
+    submission = read_submission(packed)
+    about = json.loads(submission.about.model_dump_json())
+    about["files"]["votes.parquet"] = "0" * 64
+    content = {name: _parquet(TABLES[name], frame) for name, frame in submission.tables.items()}
+    (tmp_path / "f.zip").write_bytes(_zipped({ABOUT: json.dumps(about).encode(), **content}))
+    assert problems(tmp_path / "f.zip") == ["votes.parquet: is not the table that was packed"]
+
+
+def test_an_edited_answer_is_named(packed: Path, tmp_path: Path) -> None:
+    def edit(frames: Frames) -> None:
+        put(frames, "responses", "text", "The answer is: left.", item_id=ITEM, model="prior", regime="standard")
+
+    found = problems(forged(packed, tmp_path / "f.zip", edit))
+    # the answer of prior does not stand before the votes of its three judges on two tasks
+    assert len(found) == 6
+    assert found[0] == (
+        f"answer of prior (standard, run 1) on {ITEM}: is not the text, or not to the question, that rule-1 judged"
+    )
+
+
+def test_an_edited_vote_is_named_though_all_numbers_were_made_anew(packed: Path, tmp_path: Path) -> None:
+    def edit(frames: Frames) -> None:
+        for judge in ("rule-1", "rule-2", "rule-3"):
+            put(frames, "votes", "correct", True, model="prior", task="correctness", correct=False, judge=judge)
+
+    found = problems(forged(packed, tmp_path / "f.zip", edit, rescore=True))
+    assert len(found) == 3
+    assert found[0].startswith("vote of rule-1 on correctness of prior (")
+    assert found[0].endswith("correct is True, its rules say False")
+
+
+def test_an_edited_number_is_named(packed: Path, tmp_path: Path) -> None:
+    def edit(frames: Frames) -> None:
+        put(frames, "leaderboard", "pecs", 0.75, model="prior", regime="json", dataset="overall")
+
+    assert problems(forged(packed, tmp_path / "f.zip", edit)) == [
+        "leaderboard prior json overall: pecs is 0.75, the votes give 0.0"
+    ]
+
+
+def test_an_edited_question_and_a_missing_answer_are_named(packed: Path, tmp_path: Path) -> None:
+    def edit(frames: Frames) -> None:
+        put(frames, "items", "question", "Is it easy?", item_id=ITEM)
+        frame = frames["responses.parquet"]
+        gone = (frame["model"] == "oracle") & (frame["regime"] == "json") & (frame["item_id"] == ITEM)
+        frames["responses.parquet"] = frame.loc[~gone]
+
+    found = problems(forged(packed, tmp_path / "f.zip", edit))
+    assert found[0] == f"item {ITEM}: is not what its digest says"
+    assert f"answer of oracle (json, run 1) on {ITEM}: is missing" in found
+    assert any("there is nothing to judge" in one for one in found)
+
+
+def test_items_of_another_benchmark_are_told_from_the_release(
+    packed: Path, released: Path, release: Path, tmp_path: Path
+) -> None:
+    found = problems(packed, released)  # the demo's release has more scenarios
+    assert found and all(one.endswith("is in the release and was not asked") for one in found[:-1])
+
+    def edit(frames: Frames) -> None:
+        put(frames, "items", "media_digest", "0" * 64, item_id=ITEM)
+
+    assert f"item {ITEM}: its clip is not the released one" in problems(
+        forged(packed, tmp_path / "f.zip", edit), release
+    )
+    (clip, *_) = (release / "clips").glob("plinko-0001/control*.mp4")
+    content = clip.read_bytes()
+    try:
+        clip.write_bytes(b"other")
+        with pytest.raises(TrapsError, match=r"is not what was released: clips/plinko-0001/control"):
+            problems(packed, release)
+    finally:
+        clip.write_bytes(content)
+
+
+def test_prompts_and_judges_of_another_version_are_named(packed: Path, tmp_path: Path) -> None:
+    path = forged(packed, tmp_path / "f.zip", lambda frames: None, prompts={"standard": "0" * 16, "json": "1" * 16})
+    assert problems(path) == [
+        "regime standard: was asked with another prompt than this version's",
+        "regime json: was asked with another prompt than this version's",
+    ]
+    seats = [{"id": f"rule-{k}", "backend": "rule", "endpoint": "rule", "params": {"rules": 1}} for k in "123"]
+    found = problems(forged(packed, tmp_path / "g.zip", lambda frames: None, judges=seats))
+    assert any("these judges and this version's prompts are rules@" in one for one in found)
+    assert any("its rules are of another version" in one for one in found)
+
+
+def test_a_zip_with_other_names_is_refused(packed: Path, tmp_path: Path) -> None:
+    path = tmp_path / "f.zip"
+    path.write_bytes(packed.read_bytes())
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("../evil", b"x")
+    with pytest.raises(TrapsError, match="it holds other files than"):
+        read_submission(path)
+    assert not (tmp_path.parent / "evil").exists()
+
+
+def test_compressed_members_other_columns_and_other_files_are_refused(packed: Path, tmp_path: Path) -> None:
+    path = tmp_path / "f.zip"
+    with zipfile.ZipFile(packed) as source:
+        content = {name: source.read(name) for name in source.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+    with pytest.raises(TrapsError, match="is compressed or encrypted"):
+        read_submission(path)
+    table = pq.read_table(io.BytesIO(content["votes.parquet"])).drop_columns(["rationale"])
+    made = io.BytesIO()
+    pq.write_table(table, made)
+    path.write_bytes(_zipped(content | {"votes.parquet": made.getvalue()}))
+    with pytest.raises(TrapsError, match=r"votes\.parquet has other columns"):
+        read_submission(path)
+    path.write_bytes(_zipped(content | {"votes.parquet": b"\x80\x04K\x01."}))  # a pickle is no table
+    with pytest.raises(TrapsError, match=r"votes\.parquet is no readable table"):
+        read_submission(path)
+    path.write_bytes(b"no zip")
+    with pytest.raises(TrapsError, match="is no submission"):
+        read_submission(path)
+
+
+def test_submissions_of_the_same_items_and_panel_are_ranked_together(
+    packed: Path, one_regime: Checkout, tmp_path: Path
+) -> None:
+    other = tmp_path / "other.zip"
+    pack(Workspace.open(one_regime.workspace), other, "other")
+    board = gather([packed, other])
+    (group,) = board.groups
+    standard = group.board.loc[(group.board["regime"] == "standard") & (group.board["dataset"] == "overall")]
+    ranks = dict(zip(standard["model"], standard["rank"], strict=True))
+    assert {*ranks} == {
+        "oracle@small", "oracle@other", "random-50@small", "random-50@other", "prior@small", "prior@other",
+        "confidence-noise",
+    }  # fmt: skip
+    assert ranks["oracle@small"] == ranks["oracle@other"] == 1 and min(ranks["prior@small"], ranks["prior@other"]) > 2
+    write_board(board, tmp_path / "board")
+    rows = pq.read_table(tmp_path / "board" / "leaderboard.parquet")
+    assert rows.schema.equals(SUBMITTED.arrow_schema())
+    assert {*rows["submission"].to_pylist()} == {"small", "other"}
+    page = (tmp_path / "board" / "index.html").read_text()
+    assert "oracle@other" in page and "not comparable" not in page
+    with pytest.raises(TrapsError, match="two submissions are called 'small'"):
+        gather([packed, packed])
+
+
+def test_other_items_or_another_panel_are_never_ranked_together(packed: Path, tmp_path: Path) -> None:
+    def fewer(frames: Frames) -> None:
+        for name in ("items", "responses", "votes"):
+            frame = frames[f"{name}.parquet"]
+            frames[f"{name}.parquet"] = frame.loc[~frame["item_id"].str.contains("domino_chain-0001")]
+
+    def renamed(frames: Frames) -> None:
+        votes = frames["votes.parquet"]
+        votes["panel"] = votes["panel"].str.replace("rules@", "others@")
+
+    paths = [
+        packed,
+        forged(packed, tmp_path / "fewer.zip", fewer, rescore=True, name="fewer"),
+        forged(packed, tmp_path / "panel.zip", renamed, rescore=True, name="panel", panel="others"),
+    ]
+    board = gather(paths)
+    assert board.refused == []
+    assert sorted((group.n_items, group.panel.partition("@")[0]) for group in board.groups) == [
+        (44, "rules"), (48, "others"), (48, "rules"),
+    ]  # fmt: skip
+    assert all(group.board["rank"].max() <= 3 for group in board.groups)
+    write_board(board, tmp_path / "board")
+    page = (tmp_path / "board" / "index.html").read_text()
+    assert page.count('class="chapter"') == 3
+
+
+def test_a_forged_submission_is_not_ranked_and_its_reason_is_on_the_page(
+    packed: Path, tmp_path: Path, small: Checkout
+) -> None:
+    def edit(frames: Frames) -> None:
+        put(frames, LEADERBOARD.name, "pecs", 1.0, model="prior", regime="json", dataset="overall")
+
+    path = forged(packed, tmp_path / "forged.zip", edit, name="forged")
+    finished = small.traps("leaderboard", packed, path, "--out", tmp_path / "board")
+    assert finished.code == 1 and "refused: forged.zip: leaderboard prior json overall: pecs is 1.0" in finished.out
+    page = (tmp_path / "board" / "index.html").read_text()
+    assert "leaderboard prior json overall: pecs is 1.0, the votes give 0.0" in page
+    with pytest.raises(TrapsError, match="no submission holds"):
+        gather([path])

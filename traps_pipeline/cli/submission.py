@@ -1,0 +1,66 @@
+"""`traps submit` and `traps leaderboard`: a study as one file, and a page of many of them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from traps_pipeline.cli.command import FAILED, OK, Commands, open_workspace
+from traps_pipeline.terminal import plain
+
+
+def add(commands: Commands) -> None:
+    """Add `traps submit` and `traps leaderboard`."""
+    parser = commands.add("submit", submit, "pack a study's items, answers, votes and numbers into one file")
+    parser.add_argument("file", type=Path, help="the zip to write")
+    parser.add_argument("--name", required=True, help="of the submission: lower-case letters, digits, - and .")
+
+    text = "verify submissions, and make one page of them; other versions or panels are not ranked together"
+    parser = commands.add("leaderboard", leaderboard, text, workspace=False)
+    parser.add_argument("submissions", type=Path, nargs="+", help="files of `traps submit`, or folders of such files")
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="of the page and its table")
+    parser.add_argument("--release", type=Path, metavar="FOLDER", help="hold items and clips against this release")
+
+
+def submit(arguments: argparse.Namespace) -> int:
+    """See `traps submit --help`."""
+    from traps_pipeline.release.submission import pack
+
+    about = pack(open_workspace(arguments), arguments.file.absolute(), arguments.name)
+    size = arguments.file.stat().st_size / 1e6
+    of_what = f"benchmark {about.benchmark} {about.version}, panel {about.panel}"
+    print(f"{arguments.file}: {about.name}, {of_what}, {size:.1f} MB")
+    print(f"next: traps verify {arguments.file} --release FOLDER")
+    return OK
+
+
+def verify_file(path: Path, release: Path | None) -> int:
+    """What `traps verify` says of a submission."""
+    from traps_pipeline.release.submission import read_submission
+    from traps_pipeline.release.verification import verify
+
+    found = verify(read_submission(path), release)
+    for problem in found.problems:
+        print(plain(problem))
+    print(f"checked: {', '.join(found.checked)}")
+    for what in found.unchecked:
+        print(f"not checked: {what}")
+    print(f"{path}: {'does not hold' if found.problems else 'holds'}")
+    return FAILED if found.problems else OK
+
+
+def leaderboard(arguments: argparse.Namespace) -> int:
+    """See `traps leaderboard --help`."""
+    from traps_pipeline.release.submissions import PAGE, gather, write_board
+    from traps_pipeline.report.leaderboard import leaderboard_text
+
+    given = arguments.submissions
+    paths = [path for one in given for path in (sorted(one.glob("*.zip")) if one.is_dir() else [one])]
+    board = gather(paths, arguments.release, say=lambda line: print(plain(line), flush=True))
+    write_board(board, arguments.out.absolute())
+    for group in board.groups:
+        print(f"\n{group.title}\n{leaderboard_text(group.board)}")
+    for one in board.refused:
+        print(plain(f"refused: {one.name}: {one.problems[0]}"))
+    print(f"next: open {arguments.out / PAGE}")
+    return FAILED if board.refused else OK

@@ -1,0 +1,216 @@
+"""A submission: one file with a study's items, answers, votes and numbers, which anybody can verify.
+
+The file is a zip of Parquet tables and one JSON; nothing in it is executed. It comes from strangers: names, sizes and
+schemas are checked before anything is read, and nothing is written to a disk.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from traps_pipeline.benchmark.records import load_release
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_bytes
+from traps_pipeline.judging.tables import VOTES
+from traps_pipeline.judging.verdicts import current
+from traps_pipeline.models.judges import RULES_VERSION, load_panel, panel_id
+from traps_pipeline.models.prompts import prompt_version
+from traps_pipeline.models.reading import READING
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.partitions import DATASETS
+from traps_pipeline.scoring.tables import LEADERBOARD, METRICS
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.terminal import plain
+from traps_pipeline.yamlfile import explain
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ABOUT = "submission.json"
+TABLES: Mapping[str, Table[Any]] = {f"{t.name}.parquet": t for t in (ITEMS, RESPONSES, VOTES, METRICS, LEADERBOARD)}
+MOST_FILE_BYTES, MOST_TABLE_BYTES, MOST_ROWS = 2 * 2**30, 4 * 2**30, 20_000_000
+MOST_ABOUT_BYTES = 2**20
+_DATE = (1980, 1, 1, 0, 0, 0)
+_NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, OverflowError, NotImplementedError)
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class SeatEntry(_Strict):
+    """A judge as a submission describes it: what decides its votes, no address and no key."""
+
+    id: str = Field(max_length=200)
+    backend: str = Field(max_length=50)
+    endpoint: str = Field(max_length=300)
+    params: dict[str, Any]
+
+
+class About(_Strict):
+    """`submission.json`. panel: name of the panel. prompts: version of each regime's. versions: of the code that made
+    the tables. files: SHA-256 of each table."""
+
+    format: Literal[1] = 1
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9.-]{0,79}$")
+    benchmark: str = Field(max_length=200)
+    version: str = Field(max_length=200)
+    panel: str = Field(max_length=200)
+    judges: tuple[SeatEntry, ...] = Field(min_length=1, max_length=10, strict=False)
+    judged_by_rules: bool
+    prompts: dict[str, str]
+    versions: dict[str, str]
+    files: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Submission:
+    """A submission in memory. altered: tables that are not what `about` says was packed."""
+
+    path: Path
+    about: About
+    tables: Mapping[str, pd.DataFrame]
+    altered: tuple[str, ...]
+
+    def table(self, table: Table[Any]) -> pd.DataFrame:
+        """The rows of one of its tables."""
+        return self.tables[f"{table.name}.parquet"]
+
+
+# --- packing ----------------------------------------------------------------------------------------------------------
+
+
+def pack(workspace: Workspace, target: Path, name: str) -> About:
+    """Write a study's submission; the same study gives the same bytes. Raises TrapsError where it is not judged or
+    scored yet."""
+    study = workspace.study
+    frames = {
+        "items.parquet": workspace.tables.read_all(ITEMS, dataset=DATASETS),
+        "responses.parquet": current(workspace, RESPONSES),
+        "votes.parquet": current(workspace, VOTES),
+        "metrics.parquet": workspace.tables.read_all(METRICS, dataset=DATASETS),
+        "leaderboard.parquet": workspace.tables.read_all(LEADERBOARD),
+    }
+    empty = [file.partition(".")[0] for file, frame in frames.items() if frame.empty]
+    if empty:
+        raise TrapsError(f"{workspace.root}: has no {', '.join(empty)}; run it first: traps run EXPERIMENT")
+    frames["votes.parquet"] = frames["votes.parquet"].loc[lambda votes: votes["panel"] == panel_id(study.panel)]
+    content = {file: _parquet(TABLES[file], frame) for file, frame in frames.items()}
+    seats = [
+        SeatEntry(id=seat.id, backend=seat.backend, endpoint=seat.endpoint, params=dict(seat.params))
+        for seat in load_panel(study.panel)
+    ]
+    try:
+        about = About(
+            name=name,
+            benchmark=load_release().name,
+            version=load_release().version,
+            panel=study.panel,
+            judges=tuple(seats),
+            judged_by_rules=study.judged_by_rules,
+            prompts={regime: prompt_version(regime) for regime in sorted({*frames["responses.parquet"]["regime"]})},
+            versions={"traps": version("traps-pipeline"), "rules": str(RULES_VERSION), "reading": READING},
+            files={file: hashlib.sha256(data).hexdigest() for file, data in content.items()},
+        )
+    except ValidationError as error:
+        raise TrapsError(f"--name {name!r:.100}: {explain(error)}; use lower-case letters, digits, - and .") from error
+    write_bytes(target, _zipped({ABOUT: about.model_dump_json(indent=1).encode() + b"\n", **content}))
+    return about
+
+
+def _parquet(table: Table[Any], frame: pd.DataFrame) -> bytes:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    data = pa.Table.from_pandas(frame, schema=table.arrow_schema(), preserve_index=False)
+    data = data.replace_schema_metadata(None).sort_by([(name, "ascending") for name in table.key])
+    made = io.BytesIO()
+    pq.write_table(data, made, compression="zstd")
+    return made.getvalue()
+
+
+def _zipped(content: Mapping[str, bytes]) -> bytes:
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive:
+        for name, data in content.items():
+            entry = zipfile.ZipInfo(name, date_time=_DATE)
+            entry.create_system, entry.external_attr = 3, 0o644 << 16
+            archive.writestr(entry, data, zipfile.ZIP_STORED)
+    return made.getvalue()
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_submission(path: Path) -> Submission:
+    """A submission from its file. Raises TrapsError for a file that is none: other names, too large, compressed as a
+    whole, other columns, or text where a table should be."""
+    try:
+        size = path.stat().st_size
+        if size > MOST_FILE_BYTES:
+            raise TrapsError(f"{path}: has {size} bytes, at most {MOST_FILE_BYTES} are read; submit models one by one")
+        with zipfile.ZipFile(path) as archive:
+            content = _members(path, archive)
+    except OSError as error:
+        raise TrapsError(f"{path}: cannot be read ({error.strerror}); name a file that `traps submit` wrote") from error
+    except _NO_ZIP as error:
+        raise TrapsError(f"{path}: is no submission ({plain(error)[:200]}); get it again") from error
+    try:
+        about = About.model_validate_json(content[ABOUT])
+    except ValidationError as error:
+        raise TrapsError(f"{path}: {ABOUT}: {explain(error)}; pack it again with `traps submit`") from error
+    altered = [file for file in TABLES if about.files.get(file) != hashlib.sha256(content[file]).hexdigest()]
+    frames = {file: _frame(path, file, content[file]) for file in TABLES}
+    return Submission(path, about, frames, tuple(altered))
+
+
+def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, bytes]:
+    entries = archive.infolist()
+    wanted = sorted([ABOUT, *TABLES])
+    if sorted(entry.filename for entry in entries) != wanted:
+        raise TrapsError(f"{path}: is no submission: it holds other files than {', '.join(wanted)}")
+    for entry in entries:
+        # Stored, so that no entry can be larger than the file; Parquet compresses its own columns.
+        if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
+            raise TrapsError(f"{path}: {entry.filename} is compressed or encrypted; pack it with `traps submit`")
+        if entry.filename == ABOUT and entry.file_size > MOST_ABOUT_BYTES:
+            raise TrapsError(f"{path}: {ABOUT} has {entry.file_size} bytes, at most {MOST_ABOUT_BYTES} are read")
+    return {entry.filename: archive.read(entry) for entry in entries}
+
+
+def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
+    """A table whose size was looked at before it is unpacked, and whose columns are those of this version."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = TABLES[file]
+    try:
+        found = pq.ParquetFile(io.BytesIO(content))
+        groups = [found.metadata.row_group(i) for i in range(found.metadata.num_row_groups)]
+        if found.metadata.num_rows > MOST_ROWS or sum(g.total_byte_size for g in groups) > MOST_TABLE_BYTES:
+            raise TrapsError(f"{path}: {file} is too large ({found.metadata.num_rows} rows)")
+        wanted = table.arrow_schema()
+        if found.schema_arrow.names != wanted.names or found.schema_arrow.types != wanted.types:
+            raise TrapsError(f"{path}: {file} has other columns than this version's; pack it again, or verify it there")
+        data = found.read()
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise TrapsError(f"{path}: {file} is no readable table ({plain(error)[:200]}); pack it again") from error
+    for column in wanted:
+        if not column.nullable and data[column.name].null_count:
+            raise TrapsError(f"{path}: {file}: column {column.name} has missing values")
+    keys = data.select(list(table.key)).to_pandas()
+    if keys.duplicated().any():
+        raise TrapsError(f"{path}: {file}: {dict(keys.loc[keys.duplicated()].iloc[0])} stands there twice")
+    return data.to_pandas()

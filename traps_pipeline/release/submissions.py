@@ -1,0 +1,178 @@
+"""A leaderboard of many submissions: each is verified, and those of the same items and panel are ranked together."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_bytes, write_text
+from traps_pipeline.models.judges import id_of_seats
+from traps_pipeline.release.submission import Submission, read_submission
+from traps_pipeline.release.tables import SUBMITTED
+from traps_pipeline.release.verification import Verified, verify
+from traps_pipeline.report.leaderboard import leaderboards, legend
+from traps_pipeline.report.writing import environment, table_html
+from traps_pipeline.scoring.board import score
+
+PAGE, TABLE = "index.html", "leaderboard.parquet"
+TITLE = "TRAPSBench: submissions"
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """A submission without a problem, and what its verification found."""
+
+    submission: Submission
+    verified: Verified
+
+    @property
+    def name(self) -> str:
+        """As it calls itself."""
+        return self.submission.about.name
+
+    @property
+    def version(self) -> str:
+        """Of the code that made it."""
+        return self.submission.about.versions.get("traps", "unknown")
+
+    @property
+    def checked(self) -> list[str]:
+        """What was checked."""
+        return self.verified.checked
+
+    @property
+    def unchecked(self) -> list[str]:
+        """What could not be."""
+        return self.verified.unchecked
+
+    @property
+    def group(self) -> tuple[str, str]:
+        """The digest of its items, and its panel: with which submissions it may be ranked."""
+        items = self.submission.table(ITEMS)
+        about = self.submission.about
+        return digest(sorted(items["item_hash"]))[:16], id_of_seats(about.panel, about.judges)
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A file that is not ranked, and why."""
+
+    name: str
+    problems: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Entries that are ranked together: LEADERBOARD rows, of models named model@submission where several submissions
+    have one of that name."""
+
+    items: str
+    panel: str
+    versions: str
+    n_items: int
+    board: pd.DataFrame
+    submissions: dict[str, str]
+
+    @property
+    def title(self) -> str:
+        """What its entries have in common, in words."""
+        return f"Benchmark {self.versions}, {self.n_items} items ({self.items[:8]}), panel {self.panel}"
+
+
+@dataclass
+class Board:
+    """All submissions of a page."""
+
+    groups: list[Group] = field(default_factory=list)
+    accepted: list[Accepted] = field(default_factory=list)
+    refused: list[Refused] = field(default_factory=list)
+
+
+def gather(paths: Iterable[Path], release: Path | None = None, say: Callable[[str], None] = lambda line: None) -> Board:
+    """Verify submissions and rank those that hold. Raises TrapsError where two have one name, and where none holds."""
+    board = Board()
+    for path in paths:
+        try:
+            submission = read_submission(path)
+        except TrapsError as error:
+            board.refused.append(Refused(path.name, [str(error)]))
+            say(f"{path}: refused")
+            continue
+        verified = verify(submission, release)
+        if verified.problems:
+            board.refused.append(Refused(path.name, verified.problems))
+        else:
+            board.accepted.append(Accepted(submission, verified))
+        say(f"{path}: {'refused' if verified.problems else 'verified'}")
+    names = Counter(one.name for one in board.accepted)
+    twice = [name for name, n in names.items() if n > 1]
+    if twice:
+        raise TrapsError(f"two submissions are called {twice[0]!r}; pack one of them again with another --name")
+    if not board.accepted:
+        why = "; ".join(f"{one.name}: {one.problems[0]}" for one in board.refused[:3])
+        raise TrapsError(f"no submission holds, so there is nothing to rank ({why})")
+    groups: dict[tuple[str, str], list[Accepted]] = {}
+    for one in board.accepted:
+        groups.setdefault(one.group, []).append(one)
+    board.groups = [_group(key, members) for key, members in sorted(groups.items())]
+    return board
+
+
+def _group(key: tuple[str, str], members: Sequence[Accepted]) -> Group:
+    """The members' verdicts scored together, so that their differences are paired over the same scenarios."""
+    owners = Counter(model for one in members for model in _verdicts(one)["model"].unique())
+    parts, submissions = list[pd.DataFrame](), dict[str, str]()
+    for one in members:
+        verdicts = _verdicts(one)
+        names = {m: m if owners[m] == 1 else f"{m}@{one.name}" for m in verdicts["model"].unique()}
+        submissions |= dict.fromkeys(names.values(), one.name)
+        parts.append(verdicts.assign(model=verdicts["model"].map(names)))
+    verdicts = pd.concat(parts, ignore_index=True)
+    versions = " + ".join(sorted(verdicts["benchmark_version"].unique()))
+    items = len(members[0].submission.table(ITEMS))
+    return Group(*key, versions, items, score(verdicts).board, submissions)
+
+
+def _verdicts(one: Accepted) -> pd.DataFrame:
+    verdicts = one.verified.verdicts
+    assert verdicts is not None  # without verdicts there is a problem, and it is not accepted
+    return verdicts
+
+
+def write_board(board: Board, folder: Path) -> None:
+    """Write the page, and all its rows as Parquet."""
+    shown: list[dict[str, Any]] = []
+    for group in board.groups:
+        tables = [(table.title, table_html(table)) for table in leaderboards(group.board)]
+        shown.append({"title": group.title, "tables": tables})
+    page = environment().get_template("submissions.html.j2")
+    terms = legend(pd.concat([group.board for group in board.groups], ignore_index=True))
+    html = page.render(title=TITLE, groups=shown, accepted=board.accepted, refused=board.refused, legend=terms)
+    write_bytes(folder / TABLE, _parquet(board))
+    write_text(folder / PAGE, html)
+
+
+def _parquet(board: Board) -> bytes:
+    import io
+
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    frames = [
+        group.board.assign(submission=group.board["model"].map(group.submissions), group=f"{group.items}|{group.panel}")
+        for group in board.groups
+    ]
+    rows = pd.concat(frames, ignore_index=True)
+    data = pa.Table.from_pandas(rows, schema=SUBMITTED.arrow_schema(), preserve_index=False)
+    made = io.BytesIO()
+    data = data.replace_schema_metadata(None).sort_by([(name, "ascending") for name in SUBMITTED.key])
+    pq.write_table(data, made, compression="zstd")
+    return made.getvalue()

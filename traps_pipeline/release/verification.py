@@ -1,0 +1,303 @@
+"""Verification of a submission: its votes are cast again where that needs no key, every number is computed again from
+them, and items, prompts and media are held against a release. What cannot be checked is said.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from traps_pipeline.benchmark.items import item_hash
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.answers import is_correct
+from traps_pipeline.judging.panel import parse_vote, tasks_for, vote_request
+from traps_pipeline.judging.rules import RuleJudge
+from traps_pipeline.judging.tables import VOTES
+from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.models.judges import RULE, RULES_VERSION, id_of_seats
+from traps_pipeline.models.prompts import prompt_version
+from traps_pipeline.models.reading import degenerate
+from traps_pipeline.models.registry import is_reference
+from traps_pipeline.models.request import JUDGED, Outcome, Request
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
+from traps_pipeline.release.submission import Submission
+from traps_pipeline.scoring.board import Scored, score
+from traps_pipeline.scoring.tables import LEADERBOARD, METRICS
+from traps_pipeline.storage.tables import Table
+from traps_pipeline.yamlfile import read_lines
+
+SHOWN = 10  # sentences of one kind; the others are counted
+CLOSE = 1e-9  # figures of another machine's linear algebra may differ in their last digits
+_SAME = ("side", "pair_id", "dataset", "benchmark_version")  # columns that an answer has from its item
+Row = Mapping[str, Any]
+
+
+@dataclass
+class Verified:
+    """What verification found: problems, each a sentence; what was checked, and what could not be. verdicts and scored:
+    made again from the votes, None where that is impossible."""
+
+    problems: list[str] = field(default_factory=list)
+    checked: list[str] = field(default_factory=list)
+    unchecked: list[str] = field(default_factory=list)
+    verdicts: pd.DataFrame | None = None
+    scored: Scored | None = None
+
+    def look(self, what: str, found: Iterator[str]) -> None:
+        """Note a check, and its problems, of which the first are kept and the others counted."""
+        problems = list(found)
+        self.checked.append(what)
+        self.problems += problems[:SHOWN]
+        if len(problems) > SHOWN:
+            self.problems.append(f"... and {len(problems) - SHOWN} more of this kind")
+
+
+def verify(submission: Submission, release: Path | None = None) -> Verified:
+    """Verify a submission, against a released folder if one is given. Raises TrapsError for a release that cannot be
+    read."""
+    found = Verified()
+    items = {row["item_id"]: row for row in _records(submission.table(ITEMS))}
+    answers, votes = _records(submission.table(RESPONSES)), _records(submission.table(VOTES))
+    found.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
+    found.look("items", _wrong_items(items.values()))
+    found.look("prompts", _wrong_prompts(submission))
+    found.look("answers", _wrong_answers(answers, items))
+    found.look("panel", _wrong_panel(submission, votes))
+    by_rules = all(seat.backend == RULE for seat in submission.about.judges)
+    found.look("votes", _wrong_votes(submission, votes, answers, items))
+    _numbers(found, submission)
+    if release is None:
+        found.unchecked.append("items and clips against a release: name its folder with --release")
+    else:
+        found.look("items and clips against the release", _strangers(items, release))
+    found.unchecked.append("that the answers are the model's: only who asked it knows")
+    found.unchecked.append("that the clips named by digest are those that the model was sent")
+    if not by_rules:
+        found.unchecked.append("that the judges cast these votes: asking language models again needs their keys")
+    return found
+
+
+def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    return [{str(name): value for name, value in row.items()} for row in rows]
+
+
+# --- items and prompts ------------------------------------------------------------------------------------------------
+
+
+def _wrong_items(items: Any) -> Iterator[str]:
+    for row in items:
+        try:
+            same = item_hash(row) == row["item_hash"]
+        except (ValueError, RecursionError):
+            same = False
+        if not same or row["item_id"] != f"{row['dataset']}:{row['scenario_id']}:{row['side']}":
+            yield f"item {row['item_id']}: is not what its digest says"
+        elif row["dataset"] not in DATASETS:
+            yield f"item {row['item_id']}: is none of the pairs'"
+
+
+def _wrong_prompts(submission: Submission) -> Iterator[str]:
+    for regime, said in submission.about.prompts.items():
+        if regime not in REGIMES:
+            yield f"regime {regime[:40]!r}: is unknown"
+        elif said != prompt_version(regime):
+            yield f"regime {regime}: was asked with another prompt than this version's"
+    for regime in sorted({*submission.table(RESPONSES)["regime"]} - {*submission.about.prompts}):
+        yield f"regime {str(regime)[:40]!r}: was asked with a prompt that is not named"
+
+
+def released_items(release: Path) -> dict[str, tuple[str, str]]:
+    """Digests of item and clip of each item of a released folder. Raises TrapsError, also where the folder was
+    altered."""
+    from traps_pipeline.release.checksums import altered_files
+    from traps_pipeline.release.content import CLIPS
+
+    altered = altered_files(release)
+    if altered:
+        raise TrapsError(f"{release}: is not what was released: {altered[0]}")
+    found = {}
+    for number, line in read_lines(release / CLIPS / "metadata.jsonl"):
+        row = json.loads(line)
+        if "item_hash" not in row:
+            raise TrapsError(f"{release}: is a held-out set; verify against the open release")
+        found[row["item_id"]] = row["item_hash"], row["media_digest"]
+        if row["dataset"] in DATASETS and item_hash(row) != row["item_hash"]:
+            raise TrapsError(f"{release}: line {number} of its items is not what its digest says")
+    return found
+
+
+def _strangers(items: Mapping[str, Row], release: Path) -> Iterator[str]:
+    known = released_items(release)
+    for id_, row in items.items():
+        if id_ not in known:
+            yield f"item {id_}: is not in the release"
+        elif known[id_][1] != row["media_digest"]:
+            yield f"item {id_}: its clip is not the released one"
+        elif known[id_][0] != row["item_hash"]:
+            yield f"item {id_}: its question, choices or answer are not the released ones"
+    lacking = sorted(id_ for id_ in known if id_.partition(":")[0] in DATASETS and id_ not in items)
+    for id_ in lacking:
+        yield f"item {id_}: is in the release and was not asked"
+
+
+# --- answers and votes ------------------------------------------------------------------------------------------------
+
+
+def _named(row: Row) -> str:
+    return f"{row['model']} ({row['regime']}, run {row['run']}) on {row['item_id']}"
+
+
+def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator[str]:
+    asked = dict[tuple[Any, ...], set[str]]()
+    for row in answers:
+        item = items.get(row["item_id"])
+        if item is None:
+            yield f"answer of {_named(row)}: there is no such item"
+            continue
+        asked.setdefault((row["dataset"], row["model"], row["regime"], row["run"]), set()).add(row["item_id"])
+        if any(row[name] != item[name] for name in _SAME):
+            yield f"answer of {_named(row)}: its pair, side, dataset or version is not its item's"
+        if (row["outcome"] in JUDGED) != (row["text"] is not None and bool(row["text"].strip())):
+            yield f"answer of {_named(row)}: outcome {row['outcome']!r} does not go with its text"
+        elif row["outcome"] in JUDGED and degenerate(row["text"]):
+            yield f"answer of {_named(row)}: {degenerate(row['text'])}, so it is none"
+    wanted = dict[str, set[str]]()
+    for id_, item in items.items():
+        wanted.setdefault(item["dataset"], set()).add(id_)
+    for (dataset, model, regime, run), ids in asked.items():
+        for id_ in sorted(wanted[dataset] - ids):
+            yield f"answer of {model} ({regime}, run {run}) on {id_}: is missing"
+
+
+def _wrong_panel(submission: Submission, votes: Sequence[Row]) -> Iterator[str]:
+    about = submission.about
+    own = id_of_seats(about.panel, about.judges)
+    for panel in sorted({row["panel"] for row in votes} - {own}):
+        yield f"panel {panel!r:.100}: these judges and this version's prompts are {own}"
+    if RULE in {seat.backend for seat in about.judges} and not about.judged_by_rules:
+        for model in sorted({row["model"] for row in votes}):
+            if not is_reference(model):
+                yield f"model {model!r:.100}: rules judged it, which are made for reference models, and nobody says so"
+    for judge in sorted({row["judge"] for row in votes} - {seat.id for seat in about.judges}):
+        yield f"judge {judge!r:.100}: sits in no panel of the submission"
+    rules = [seat for seat in about.judges if seat.backend == RULE]
+    if rules and any(seat.params != {"rules": RULES_VERSION} for seat in rules):
+        yield f"panel {about.panel!r}: its rules are of another version than {RULES_VERSION}"
+
+
+def _wrong_votes(
+    submission: Submission, votes: Sequence[Row], answers: Sequence[Row], items: Mapping[str, Row]
+) -> Iterator[str]:
+    seats = {seat.id: seat for seat in submission.about.judges}
+    texts = {
+        (row["item_id"], row["model"], row["regime"], row["run"]): row for row in answers if row["outcome"] in JUDGED
+    }
+    cast = dict[tuple[Any, ...], set[tuple[str, str]]]()
+    for row in votes:
+        key = (row["item_id"], row["model"], row["regime"], row["run"])
+        answer, item, seat = texts.get(key), items.get(row["item_id"]), seats.get(row["judge"])
+        if answer is None or item is None or seat is None or row["task"] not in tasks_for(item["side"]):
+            yield f"vote of {row['judge']!r:.60} on {row['task']!r:.40} of {_named(row)}: there is nothing to judge"
+            continue
+        cast.setdefault(key, set()).add((row["task"], row["judge"]))
+        cell = Cell(row["dataset"], Evaluation(row["model"], row["regime"], row["run"]))
+        request = vote_request(seat, row["task"], cell, item, answer["text"])
+        if request.key != row["vote_key"]:
+            yield f"answer of {_named(row)}: is not the text, or not to the question, that {seat.id} judged"
+            continue
+        wrong = _other_vote(row, item, _cast_again(request) if seat.backend == RULE else None)
+        if wrong:
+            yield f"vote of {seat.id} on {row['task']} of {_named(row)}: {wrong}"
+    for key, row in texts.items():
+        item = items.get(row["item_id"])
+        wanted = {(task, judge) for task in tasks_for(item["side"]) for judge in seats} if item else set()
+        for task, judge in sorted(wanted - cast.get(key, set())):
+            yield f"vote of {judge} on {task} of {_named(row)}: is missing"
+
+
+@cache
+def _rules_on(task: str, user: str) -> Outcome:
+    request = Request("rules", RULE, {}, "", user, {"task": task})
+    return asyncio.run(RuleJudge().ask(request))
+
+
+def _cast_again(request: Request) -> Outcome:
+    """What the rules make of a request: they read its text and its task alone."""
+    return _rules_on(str(request.about["task"]), request.user)
+
+
+def _other_vote(row: Row, item: Row, again: Outcome | None) -> str:
+    """How a vote differs from what it must be; an item whose truth is of another kind than it says decides nothing."""
+    try:
+        return _difference(row, item, again)
+    except (ValueError, TypeError, AttributeError) as error:
+        return f"cannot be decided by its item ({error})"
+
+
+def _difference(row: Row, item: Row, again: Outcome | None) -> str:
+    """How a vote differs from what it must be, in words; empty where it does not."""
+    decision = "abstained" if row["task"] == "abstention" else "correct"
+    if again is not None:
+        vote = parse_vote(row["task"], {"outcome": again.kind, "text": again.text}, item)
+        said = {decision: vote.decision, "extracted_value": vote.extracted_value, "valid": vote.valid}
+        wrong = [name for name, value in said.items() if row[name] != value]
+        return f"{wrong[0]} is {row[wrong[0]]!r:.40}, its rules say {said[wrong[0]]!r:.40}" if wrong else ""
+    if not row["valid"]:
+        return "is invalid and decides nothing, yet has a decision" if row[decision] is not None else ""
+    if row[decision] is None:
+        return "is valid and has no decision"
+    if decision == "correct":
+        labels, aliases = list(item["labels"]), json.loads(item["aliases"])
+        own = is_correct(row["extracted_value"], item["ground_truth"], item["answer_type"], labels, aliases)
+        return "" if own == row["correct"] else f"correct is {row['correct']}, its extracted value gives {own}"
+    return ""
+
+
+# --- numbers ----------------------------------------------------------------------------------------------------------
+
+
+def _numbers(found: Verified, submission: Submission) -> None:
+    """Verdicts, metrics and leaderboard again from the votes, and how the submission's numbers differ from them."""
+    own = id_of_seats(submission.about.panel, submission.about.judges)
+    try:
+        tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))
+        items, answers, votes = tables
+        columns = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
+        verdicts = decide(items[columns], answers.drop(columns="benchmark_version"), votes).fillna({"panel": own})
+        found.verdicts, found.scored = verdicts, score(verdicts)
+    except (TrapsError, ValueError, KeyError, TypeError) as error:
+        found.problems.append(f"no number can be computed: {error}")
+        return
+    found.look("metrics", _other_numbers(METRICS, submission.table(METRICS), found.scored.metrics))
+    found.look("leaderboard", _other_numbers(LEADERBOARD, submission.table(LEADERBOARD), found.scored.board))
+
+
+def _other_numbers(table: Table[Any], said: pd.DataFrame, own: pd.DataFrame) -> Iterator[str]:
+    key = list(table.key)
+    theirs, ours = ({tuple(row[k] for k in key): row for row in _records(frame)} for frame in (said, own))
+    for entry in sorted({*theirs, *ours}, key=str):
+        name = f"{table.name} {' '.join(map(str, entry))}"
+        if entry not in ours or entry not in theirs:
+            yield f"{name}: {'has no votes' if entry not in ours else 'is left out'}"
+            continue
+        for column in table.columns:
+            one, other = theirs[entry][column.name], ours[entry][column.name]
+            if not _equal(one, other):
+                yield f"{name}: {column.name} is {one!r:.40}, the votes give {other!r:.40}"
+
+
+def _equal(one: Any, other: Any) -> bool:
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=CLOSE, abs_tol=CLOSE)
+    return one == other
