@@ -17,7 +17,7 @@ FOLDER = ROOT / ".workspaces" / "environments"
 
 
 def python_of(name: str) -> str:
-    """The Python of `hub`, `sign`, `inspect` or `lmms`; skips the test where it is not there."""
+    """The Python of `hub`, `sign`, `inspect`, `lmms` or `eval`; skips the test where it is not there."""
     variable = f"TRAPS_TEST_{name.upper()}"
     found = Path(os.environ.get(variable) or FOLDER / name / "bin" / "python")
     if not found.is_file():
@@ -25,12 +25,17 @@ def python_of(name: str) -> str:
     return str(found)
 
 
-def run_in(name: str, *arguments: str | Path, **variables: str) -> str:
-    """What the Python of an environment prints, offline and without this checkout on its path."""
+def run_in(name: str, *arguments: str | Path, folder: Path | None = None, **variables: str) -> str:
+    """What the Python of an environment prints, offline and without this checkout on its path, in a folder."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "TRAPS"))}
     environment |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1"} | variables
     finished = subprocess.run(
-        [python_of(name), *map(str, arguments)], env=environment, capture_output=True, text=True, check=False
+        [python_of(name), *map(str, arguments)],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert finished.returncode == 0, finished.stdout[-3000:] + finished.stderr[-3000:]
     return finished.stdout

@@ -13,6 +13,7 @@ import yaml
 
 from tests.conftest import Checkout
 from tests.release.environments import run_in
+from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.digests import file_digest
@@ -20,7 +21,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import content_of, item_rows
-from traps_pipeline.release.folder import Options, held_out_key, identifying, write_release
+from traps_pipeline.release.folder import Options, identifying, write_release
 from traps_pipeline.release.tables import OPEN
 from traps_pipeline.scenes.encode import decode
 from traps_pipeline.storage.workspace import Workspace

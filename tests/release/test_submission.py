@@ -18,7 +18,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
-from traps_pipeline.release.submission import ABOUT, TABLES, _parquet, _zipped, pack, read_submission
+from traps_pipeline.release.submission import ABOUT, TABLES, _zipped, pack, read_submission, table_bytes
 from traps_pipeline.release.submissions import gather, write_board
 from traps_pipeline.release.tables import SUBMITTED
 from traps_pipeline.release.verification import verify
@@ -57,7 +57,7 @@ def forged(
         own = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
         scored = score(decide(items[own], answers.drop(columns="benchmark_version"), votes))
         frames |= {"metrics.parquet": scored.metrics, "leaderboard.parquet": scored.board}
-    content = {name: _parquet(TABLES[name], frame) for name, frame in frames.items()}
+    content = {name: table_bytes(TABLES[name], frame) for name, frame in frames.items()}
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in content.items()}
     said = json.loads(submission.about.model_dump_json()) | {"files": digests} | about
     target.write_bytes(_zipped({ABOUT: json.dumps(said).encode(), **content}))
@@ -94,7 +94,7 @@ def test_a_table_that_is_not_the_packed_one_is_named(packed: Path, tmp_path: Pat
     submission = read_submission(packed)
     about = json.loads(submission.about.model_dump_json())
     about["files"]["votes.parquet"] = "0" * 64
-    content = {name: _parquet(TABLES[name], frame) for name, frame in submission.tables.items()}
+    content = {name: table_bytes(TABLES[name], frame) for name, frame in submission.tables.items()}
     (tmp_path / "f.zip").write_bytes(_zipped({ABOUT: json.dumps(about).encode(), **content}))
     assert problems(tmp_path / "f.zip") == ["votes.parquet: is not the table that was packed"]
 

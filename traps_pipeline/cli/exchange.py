@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from traps_pipeline.cli.command import OK, Commands, experiment_of, open_workspace
+from traps_pipeline.cli.command import OK, Commands, experiment_of, open_workspace, whole
 from traps_pipeline.errors import TrapsError
 
 if TYPE_CHECKING:
@@ -34,10 +34,13 @@ def add(commands: Commands) -> None:
     parser.add_argument("experiment")
     parser.add_argument("file", type=Path)
 
-    text = "import answers (JSON lines by key, or a provider's batch) into the ledger"
+    text = "import answers into the ledger: by key, a provider's batch, an inspect_ai log, or lmms-eval's samples"
     parser = commands.noun("answers", "import answers from elsewhere").add("import", import_given, text)
     parser.add_argument("experiment")
     parser.add_argument("file", type=Path)
+    parser.add_argument("--model", help="who answered, in a file by item (default: the experiment's only model)")
+    parser.add_argument("--run", type=whole(1, 1_000), default=1, help="of a file by item (default: 1)")
+    parser.add_argument("--key", type=Path, help="of the held-out set whose items a file names")
 
 
 def export_calls(arguments: argparse.Namespace) -> int:
@@ -59,10 +62,13 @@ def export_calls(arguments: argparse.Namespace) -> int:
 
 def import_given(arguments: argparse.Namespace) -> int:
     """See `traps answers import --help`."""
-    from traps_pipeline.study.exchange import import_answers
+    from traps_pipeline.benchmark.held_out import held_out_key
+    from traps_pipeline.study.exchange import Whose, import_answers
 
     experiment = experiment_of(arguments)
-    return _imported(import_answers(open_workspace(arguments), experiment, arguments.file), arguments, "answers")
+    whose = Whose(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
+    found = import_answers(open_workspace(arguments), experiment, arguments.file, whose)
+    return _imported(found, arguments, "answers")
 
 
 def export_votes(arguments: argparse.Namespace) -> int:

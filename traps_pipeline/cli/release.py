@@ -36,6 +36,12 @@ def add(commands: Commands) -> None:
     parser.add_argument("--key", type=Path, metavar="PEM", help="of a release: check its signature, too")
     parser.add_argument("--release", type=Path, metavar="FOLDER", help="of a submission: hold its items against this")
 
+    text = "write the folder with which inspect_ai and lmms-eval evaluate models on a release"
+    parser = commands.add("harness", harness, text, workspace=False)
+    parser.add_argument("release", type=Path, help="a folder that `traps release` wrote")
+    parser.add_argument("folder", type=Path, help="an empty or new one")
+    parser.add_argument("--media", choices=["images", "video"], default="images", help="what models are shown")
+
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
     parser = commands.add("commit", commit_benchmark, text, workspace=False)
     parser.add_argument("benchmark", type=Path, help="a folder that `traps sample` wrote")
@@ -108,6 +114,18 @@ def verify(arguments: argparse.Namespace) -> int:
         raise TrapsError(f"{arguments.path}: {len(problems)} of its files are not what was released")
     signed = "; the signature is of this key" if arguments.key else "; no signature was checked (say --key)"
     print(f"{len(read_checksums(arguments.path))} files are what their checksums say{signed}")
+    return OK
+
+
+def harness(arguments: argparse.Namespace) -> int:
+    """See `traps harness --help`."""
+    from traps_pipeline.release.harness.write import LMMS, write_harness
+
+    target = arguments.folder.absolute()
+    count = write_harness(arguments.release, target, arguments.media)
+    print(f"{count} items in {target}")
+    print(f"next: inspect eval {target / 'traps_task.py'} -T regime=standard --model MODEL")
+    print(f"or: python -m lmms_eval --include_path {target / LMMS} --tasks traps_standard --model MODEL --log_samples")
     return OK
 
 

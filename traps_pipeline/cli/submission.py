@@ -1,4 +1,4 @@
-"""`traps submit` and `traps leaderboard`: a study as one file, and a page of many of them."""
+"""`traps submit`, `results` and `leaderboard`: a study as one file, in forms of others, and a page of many studies."""
 
 from __future__ import annotations
 
@@ -10,10 +10,16 @@ from traps_pipeline.terminal import plain
 
 
 def add(commands: Commands) -> None:
-    """Add `traps submit` and `traps leaderboard`."""
+    """Add `traps submit`, `traps results` and `traps leaderboard`."""
     parser = commands.add("submit", submit, "pack a study's items, answers, votes and numbers into one file")
     parser.add_argument("file", type=Path, help="the zip to write")
     parser.add_argument("--name", required=True, help="of the submission: lower-case letters, digits, - and .")
+
+    text = "write the leaderboard as the hub's .eval_results, as Every Eval Ever JSON, and as Parquet"
+    parser = commands.add("results", results, text)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--dataset", required=True, metavar="OWNER/NAME", help="repository of the release on the hub")
+    parser.add_argument("--organization", default="unknown", help="who made the evaluation")
 
     text = "verify submissions, and make one page of them; other versions or panels are not ranked together"
     parser = commands.add("leaderboard", leaderboard, text, workspace=False)
@@ -31,6 +37,16 @@ def submit(arguments: argparse.Namespace) -> int:
     of_what = f"benchmark {about.benchmark} {about.version}, panel {about.panel}"
     print(f"{arguments.file}: {about.name}, {of_what}, {size:.1f} MB")
     print(f"next: traps verify {arguments.file} --release FOLDER")
+    return OK
+
+
+def results(arguments: argparse.Namespace) -> int:
+    """See `traps results --help`."""
+    from traps_pipeline.release.results import write_results
+
+    target = arguments.folder.absolute()
+    written = write_results(open_workspace(arguments), target, arguments.dataset, arguments.organization)
+    print(f"{len(written)} files in {target}")
     return OK
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hmac
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.benchmark.specs import spec_of
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS
@@ -139,11 +139,6 @@ def item_rows(content: Content) -> list[ReleasedItemRow]:
         )
         for row in content.items
     ]
-
-
-def opaque(key: bytes, item_id: str) -> str:
-    """The name of a held-out item: without the key nobody can say which item it is."""
-    return hmac.new(key, item_id.encode(), "sha256").hexdigest()[:24]
 
 
 def held_out_rows(content: Content, key: bytes) -> list[HeldOutItemRow]:

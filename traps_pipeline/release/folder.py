@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import secrets
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import yaml
 
+from traps_pipeline.benchmark.held_out import held_out_key, opaque
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_bytes, write_text
 from traps_pipeline.paths import ASSETS
@@ -53,7 +53,6 @@ PLACES: Mapping[str, str] = {
     SPLITS.name: "splits.jsonl",
     PROMPTS.name: "prompts.jsonl",
 }
-KEY_BYTES = 32
 _ROOT = ASSETS.parent
 
 
@@ -145,25 +144,10 @@ def _held_out_tables(folder: _Folder, content: Content, key_file: Path) -> Path:
         raise TrapsError(f"{key_file}: lies in the folder that is published; keep the key elsewhere")
     key = held_out_key(key_file, make=True)
     folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(content, key))
-    names = sorted((rows_of.opaque(key, row["item_id"]), row["item_id"]) for row in content.items)
+    names = sorted((opaque(key, row["item_id"]), row["item_id"]) for row in content.items)
     answers = key_file.with_name(f"{key_file.name}.items.jsonl")
     write_text(answers, "".join(json.dumps({"item": name, "item_id": id_}) + "\n" for name, id_ in names))
     return answers
-
-
-def held_out_key(path: Path, *, make: bool = False) -> bytes:
-    """The key of a held-out set, from its file of 64 hexadecimal digits; a missing one is drawn and written, readable
-    by its owner alone. Raises TrapsError."""
-    if make and not path.exists():
-        write_text(path, secrets.token_hex(KEY_BYTES) + "\n")
-        path.chmod(0o600)
-    try:
-        text = path.read_text(encoding="ascii").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise TrapsError(f"{path}: cannot be read ({error}); give the file of the held-out set's key") from error
-    if not re.fullmatch(rf"[0-9a-f]{{{2 * KEY_BYTES}}}", text):
-        raise TrapsError(f"{path}: is no key ({2 * KEY_BYTES} hexadecimal digits); give the one that the release made")
-    return bytes.fromhex(text)
 
 
 def _pages(folder: _Folder, content: Content, options: Options) -> None:

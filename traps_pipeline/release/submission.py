@@ -107,7 +107,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
     if empty:
         raise TrapsError(f"{workspace.root}: has no {', '.join(empty)}; run it first: traps run EXPERIMENT")
     frames["votes.parquet"] = frames["votes.parquet"].loc[lambda votes: votes["panel"] == panel_id(study.panel)]
-    content = {file: _parquet(TABLES[file], frame) for file, frame in frames.items()}
+    content = {file: table_bytes(TABLES[file], frame) for file, frame in frames.items()}
     seats = [
         SeatEntry(id=seat.id, backend=seat.backend, endpoint=seat.endpoint, params=dict(seat.params))
         for seat in load_panel(study.panel)
@@ -130,7 +130,8 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
     return about
 
 
-def _parquet(table: Table[Any], frame: pd.DataFrame) -> bytes:
+def table_bytes(table: Table[Any], frame: pd.DataFrame) -> bytes:
+    """The rows of a table as Parquet, in the order of its key: equal rows give equal bytes."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -15,7 +15,7 @@ from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_bytes, write_text
 from traps_pipeline.models.judges import id_of_seats
-from traps_pipeline.release.submission import Submission, read_submission
+from traps_pipeline.release.submission import Submission, read_submission, table_bytes
 from traps_pipeline.release.tables import SUBMITTED
 from traps_pipeline.release.verification import Verified, verify
 from traps_pipeline.report.leaderboard import leaderboards, legend
@@ -134,7 +134,7 @@ def _group(key: tuple[str, str], members: Sequence[Accepted]) -> Group:
         verdicts = _verdicts(one)
         names = {m: m if owners[m] == 1 else f"{m}@{one.name}" for m in verdicts["model"].unique()}
         submissions |= dict.fromkeys(names.values(), one.name)
-        parts.append(verdicts.assign(model=verdicts["model"].map(names)))
+        parts.append(verdicts.assign(model=[names[model] for model in verdicts["model"]]))
     verdicts = pd.concat(parts, ignore_index=True)
     versions = " + ".join(sorted(verdicts["benchmark_version"].unique()))
     items = len(members[0].submission.table(ITEMS))
@@ -161,18 +161,11 @@ def write_board(board: Board, folder: Path) -> None:
 
 
 def _parquet(board: Board) -> bytes:
-    import io
-
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     frames = [
-        group.board.assign(submission=group.board["model"].map(group.submissions), group=f"{group.items}|{group.panel}")
+        group.board.assign(
+            submission=[group.submissions[model] for model in group.board["model"]],
+            group=f"{group.items}|{group.panel}",
+        )
         for group in board.groups
     ]
-    rows = pd.concat(frames, ignore_index=True)
-    data = pa.Table.from_pandas(rows, schema=SUBMITTED.arrow_schema(), preserve_index=False)
-    made = io.BytesIO()
-    data = data.replace_schema_metadata(None).sort_by([(name, "ascending") for name in SUBMITTED.key])
-    pq.write_table(data, made, compression="zstd")
-    return made.getvalue()
+    return table_bytes(SUBMITTED, pd.concat(frames, ignore_index=True))

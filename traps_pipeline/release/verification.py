@@ -168,10 +168,11 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
         asked.setdefault((row["dataset"], row["model"], row["regime"], row["run"]), set()).add(row["item_id"])
         if any(row[name] != item[name] for name in _SAME):
             yield f"answer of {_named(row)}: its pair, side, dataset or version is not its item's"
-        if (row["outcome"] in JUDGED) != (row["text"] is not None and bool(row["text"].strip())):
+        text = row["text"] or ""
+        if (row["outcome"] in JUDGED) != bool(text.strip()):
             yield f"answer of {_named(row)}: outcome {row['outcome']!r} does not go with its text"
-        elif row["outcome"] in JUDGED and degenerate(row["text"]):
-            yield f"answer of {_named(row)}: {degenerate(row['text'])}, so it is none"
+        elif row["outcome"] in JUDGED and (why := degenerate(text)):
+            yield f"answer of {_named(row)}: {why}, so it is none"
     wanted = dict[str, set[str]]()
     for id_, item in items.items():
         wanted.setdefault(item["dataset"], set()).add(id_)
@@ -274,7 +275,9 @@ def _numbers(found: Verified, submission: Submission) -> None:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))
         items, answers, votes = tables
         columns = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
-        verdicts = decide(items[columns], answers.drop(columns="benchmark_version"), votes).fillna({"panel": own})
+        verdicts = decide(items.loc[:, columns], answers.drop(columns="benchmark_version"), votes).fillna(
+            {"panel": own}
+        )
         found.verdicts, found.scored = verdicts, score(verdicts)
     except (TrapsError, ValueError, KeyError, TypeError) as error:
         found.problems.append(f"no number can be computed: {error}")

@@ -11,7 +11,7 @@ import json
 import secrets
 import shutil
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from traps_pipeline import progress
+from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import replacing, sync_folder, write_bytes
@@ -36,6 +37,7 @@ from traps_pipeline.storage.rows import MOST_TOKENS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.study.experiment import Experiment
+from traps_pipeline.study.harness_logs import LOG, Given, reader_of
 from traps_pipeline.terminal import plain
 from traps_pipeline.yamlfile import explain, read_lines
 
@@ -162,8 +164,19 @@ def _line(request: Request, out: Path) -> dict[str, Any]:
     }
 
 
-def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> Imported:
-    """Import answers (JSON lines, see `Answer`) into the ledger; `traps run` then makes tables from them.
+@dataclass(frozen=True)
+class Whose:
+    """What a file of answers by item does not say: which model of the experiment answered (None: its only one), in
+    which run, and the key of the held-out set whose opaque names it has."""
+
+    model: str | None = None
+    run: int = 1
+    key: bytes | None = None
+
+
+def import_answers(workspace: Workspace, experiment: Experiment, path: Path, whose: Whose | None = None) -> Imported:
+    """Import answers (JSON lines, see `Answer`; or by item, see `study.harness_logs`) into the ledger; `traps run` then
+    makes tables from them.
 
     All lines are checked before any is written. Raises TrapsError naming lines that are not answers, that have a key
     outside the experiment (another question, clip, parameter or run), or that answer a key a second time differently.
@@ -172,9 +185,10 @@ def import_answers(workspace: Workspace, experiment: Experiment, path: Path) -> 
     prepare_media(workspace, cells)
     requests = [question.request for cell in cells for question in wanted_questions(workspace, cell)]
     wanted = {request.key: request for request in requests}
-    if is_batch(path):
+    if path.suffix != LOG and is_batch(path):
         return _import_batch(workspace, workspace.answers, load_models(), wanted, path)
-    answers = checked_answers(path, wanted)
+    reader = reader_of(path)
+    answers = checked_answers(path, wanted) if reader is None else _by_item(reader(path), wanted, whose or Whose())
     found = [
         _Stored(wanted[key], answer.as_outcome(get_model(wanted[key].participant)), answer.latency_s)
         for key, answer in answers.items()
@@ -263,6 +277,37 @@ def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answ
     if wrong:
         more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
         raise TrapsError("\n".join(wrong[:SHOWN]) + more + "\nnothing was imported")
+    return answers
+
+
+def _by_item(given: Iterable[Given], wanted: Mapping[str, Request], whose: Whose) -> dict[str, Answer]:
+    """The answers of a harness by key. Raises TrapsError naming those (up to five) that are wrong or not wanted."""
+    models = sorted({request.participant for request in wanted.values()})
+    model = whose.model or (models[0] if len(models) == 1 else None)
+    if model not in models:
+        raise TrapsError(f"say whose answers these are: --model, one of {', '.join(models)}")
+    keys = {
+        (str(at["item_id"]), str(at["regime"]), int(at["run"])): key
+        for key, request in wanted.items()
+        if (at := request.about)["model"] == model
+    }
+    names = {opaque(whose.key, item): item for item, _, _ in keys} if whose.key else {}
+    answers, wrong = dict[str, Answer](), list[str]()
+    for one in given:
+        run = whose.run if one.run is None else one.run
+        key = keys.get((names.get(one.item, one.item), one.regime, run))
+        try:
+            if key is None:
+                wrong.append(f"{one.where}: {one.item} under {one.regime}, run {run}, is not wanted of {model}")
+            elif answers.setdefault(key, answer := Answer(key=key, **one.answer)) != answer:
+                wrong.append(f"{one.where}: gives another answer to {one.item} than an earlier one")
+        except ValidationError as error:
+            wrong.append(f"{one.where}: {explain(error)}")
+        except TypeError as error:
+            wrong.append(f"{one.where}: {plain(error)[:200]}")
+    if wrong:
+        more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+        raise TrapsError("\n".join(map(plain, wrong[:SHOWN])) + more + "\nnothing was imported")
     return answers
 
 

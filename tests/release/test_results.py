@@ -1,0 +1,60 @@
+"""A leaderboard in the forms that others collect is accepted by their own readers, and holds the study's figures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+from tests.conftest import Checkout
+from tests.release.environments import run_in
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.release.results import write_results
+from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def written(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("results")
+    finished = small.traps("results", folder, "--dataset", "owner/traps", "--organization", "A lab")
+    assert finished.code == 0 and finished.out.startswith("7 files in"), finished.err
+    return folder
+
+
+def test_every_form_holds_the_figures_of_the_leaderboard(written: Path, small: Checkout) -> None:
+    board = Workspace.open(small.workspace).tables.read_all(LEADERBOARD)
+    assert pq.read_table(written / "leaderboard.parquet").num_rows == len(board)
+    for row in board.loc[board["dataset"] == "overall"].to_dict("records"):
+        hub = yaml.safe_load((written / "eval_results" / f"{row['model']}.yaml").read_text())
+        values = {entry["dataset"]["task_id"]: entry["value"] for entry in hub}
+        assert values[f"traps_{row['regime']}"] == row["pecs"]
+        (path,) = (written / "data" / "trapsbench" / "unknown" / row["model"]).iterdir()
+        record = json.loads(path.read_text())
+        scores = {one["evaluation_result_id"]: one["score_details"]["score"] for one in record["evaluation_results"]}
+        for name in ("pecs", "acc", "abs_rec", "false_abs", "j"):
+            assert scores[f"trapsbench/{row['regime']}/{name}"] == row[name]
+
+
+def test_a_name_that_is_no_repository_is_refused(small: Checkout, tmp_path: Path) -> None:
+    with pytest.raises(TrapsError, match="write it as OWNER/NAME"):
+        write_results(Workspace.open(small.workspace), tmp_path, "traps", "A lab")
+
+
+def test_the_hubs_library_reads_the_results(written: Path) -> None:
+    read = "import sys, yaml; from huggingface_hub import parse_eval_result_entries as parse; "
+    read += "print([(e.dataset_id, e.task_id, e.value) for e in parse(yaml.safe_load(open(sys.argv[1])))])"
+    printed = run_in("hub", "-c", read, written / "eval_results" / "oracle.yaml")
+    assert printed.strip() == "[('owner/traps', 'traps_json', 1.0), ('owner/traps', 'traps_standard', 1.0)]"
+
+
+def test_every_eval_ever_validates_the_records(written: Path) -> None:
+    files = sorted(path.relative_to(written) for path in (written / "data").rglob("*.json"))
+    printed = run_in("eval", "-m", "every_eval_ever", "validate", "--format", "json", *files, folder=written)
+    found = json.loads(printed)
+    assert [(one["valid"], one["errors"], one["warnings"]) for one in found] == [(True, [], [])] * 3

@@ -1,0 +1,33 @@
+"""The key of a held-out set: under it items have names that tell nothing, and only its owner can say which is which."""
+
+from __future__ import annotations
+
+import hmac
+import re
+import secrets
+from pathlib import Path
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
+
+KEY_BYTES = 32
+
+
+def opaque(key: bytes, item_id: str) -> str:
+    """The name of a held-out item: without the key nobody can say which item it is."""
+    return hmac.new(key, item_id.encode(), "sha256").hexdigest()[:24]
+
+
+def held_out_key(path: Path, *, make: bool = False) -> bytes:
+    """The key of a held-out set, from its file of 64 hexadecimal digits; a missing one is drawn and written, readable
+    by its owner alone. Raises TrapsError."""
+    if make and not path.exists():
+        write_text(path, secrets.token_hex(KEY_BYTES) + "\n")
+        path.chmod(0o600)
+    try:
+        text = path.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrapsError(f"{path}: cannot be read ({error}); give the file of the held-out set's key") from error
+    if not re.fullmatch(rf"[0-9a-f]{{{2 * KEY_BYTES}}}", text):
+        raise TrapsError(f"{path}: is no key ({2 * KEY_BYTES} hexadecimal digits); give the one that the release made")
+    return bytes.fromhex(text)

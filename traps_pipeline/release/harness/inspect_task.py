@@ -1,0 +1,83 @@
+# pyright: reportMissingImports=false
+"""The benchmark as a task of inspect_ai: `inspect eval traps_task.py -T regime=standard --model ...`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from inspect_ai import Task, task
+from inspect_ai.dataset import MemoryDataset, Sample
+from inspect_ai.model import (
+    ChatMessageSystem,
+    ChatMessageUser,
+    ContentImage,
+    ContentText,
+    ContentVideo,
+    GenerateConfig,
+)
+from inspect_ai.scorer import Score, metric, scorer
+from inspect_ai.solver import generate
+
+from traps_pipeline.release.harness.items import about, items, media_of, prompt
+from traps_pipeline.release.harness.scoring import Judged, figures, judge
+
+_OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_filter": "refused"}
+
+
+@task
+def traps(regime: str = "standard") -> Any:
+    """All items under one regime, once: a further run is a further evaluation, so that PECS is computed per run."""
+    system = prompt(regime)
+    samples = [
+        Sample(
+            id=item["item_id"],
+            input=[ChatMessageSystem(content=system), ChatMessageUser(content=[*_shown(item), _text(item)])],
+            target=item["ground_truth"] or "",
+            metadata={"item_id": item["item_id"], "dataset": item["dataset"], "side": item["side"], "regime": regime},
+        )
+        for item in items()
+    ]
+    own = about()
+    return Task(
+        dataset=MemoryDataset(samples, name=own["name"]),
+        solver=generate(),
+        scorer=panel(regime),
+        config=GenerateConfig(**own["parameters"]),
+        version=own["version"],
+        metadata={"canary": own["canary"], "panel": own["panel"]},
+    )
+
+
+def _shown(item: dict[str, Any]) -> list[Any]:
+    paths = [str(path) for path in media_of(item)]
+    if paths[0].endswith(".mp4"):
+        return [ContentVideo(video=path, format="mp4") for path in paths]
+    return [ContentImage(image=path) for path in paths]
+
+
+def _text(item: dict[str, Any]) -> Any:
+    return ContentText(text=item["question"])
+
+
+@metric
+def traps_figures() -> Any:
+    """PECS and what it is made of, overall and by dataset."""
+
+    def compute(scores: list[Any]) -> dict[str, float]:
+        found = figures(Judged.of(one.score.metadata) for one in scores)
+        return {name: value for name, value in found.items() if value is not None}
+
+    return compute
+
+
+@scorer(metrics=[traps_figures()])
+def panel(regime: str) -> Any:
+    """The panel of rules: 1 for a control answered correctly and for a void abstained on."""
+    known = {item["item_id"]: item for item in items()}
+
+    async def score(state: Any, target: Any) -> Any:
+        outcome = _OUTCOMES.get(state.output.stop_reason, "answer")
+        judged = judge(known[str(state.sample_id)], outcome, state.output.completion, regime)
+        return Score(value=float(judged.right), answer=state.output.completion, metadata={**vars(judged)})
+
+    return score

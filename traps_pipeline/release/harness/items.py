@@ -1,0 +1,37 @@
+"""The items, prompts and frames that lie beside this file in a harness."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).parent
+ITEMS, ABOUT, MEDIA = "items.jsonl", "about.json", "media"
+
+
+@cache
+def about() -> dict[str, Any]:
+    """Name, version and canary of the benchmark, prompts by regime, and the parameters that the protocol sends."""
+    return json.loads((FOLDER / ABOUT).read_text(encoding="utf-8"))
+
+
+@cache
+def items() -> list[dict[str, Any]]:
+    """Every item: question, labels, truth, and the paths of what is shown of its clip, in order."""
+    lines = (FOLDER / ITEMS).read_text(encoding="utf-8").split("\n")
+    return [json.loads(line) for line in lines if line]
+
+
+def media_of(item: dict[str, Any]) -> list[Path]:
+    """What a model is shown: the mp4, or the JPEGs in order."""
+    return [FOLDER / name for name in item["media"]]
+
+
+def prompt(regime: str) -> str:
+    """The system prompt. Raises ValueError with the known regimes."""
+    prompts: dict[str, str] = about()["prompts"]
+    if regime not in prompts:
+        raise ValueError(f"regime {regime!r} is unknown; known: {', '.join(prompts)}")
+    return prompts[regime]

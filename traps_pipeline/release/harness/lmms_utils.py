@@ -1,0 +1,64 @@
+# pyright: reportMissingImports=false
+"""The benchmark as tasks of lmms-eval, one a regime: functions that the YAML files beside this one name."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # lmms-eval loads this file alone, from any folder
+
+from traps_pipeline.release.harness.items import media_of, prompt
+from traps_pipeline.release.harness.scoring import Judged, figures, judge
+
+
+def doc_to_visual(doc: dict[str, Any]) -> list[Any]:
+    """The clip's path, or its frames in order."""
+    from PIL import Image
+
+    paths = media_of(doc)
+    if paths[0].suffix == ".mp4":
+        return [str(path) for path in paths]
+    return [Image.open(path).convert("RGB") for path in paths]
+
+
+def doc_to_target(doc: dict[str, Any]) -> str:
+    """The right answer; nothing on a void."""
+    return doc["ground_truth"] or ""
+
+
+def _text(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> str:
+    """For models that take one text: the system prompt stands before the question."""
+    return f"{prompt(regime)}\n\n{doc['question']}"
+
+
+def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> list[dict[str, Any]]:
+    """For chat models: system prompt, then the clip and the question, nothing else."""
+    shown = doc_to_visual(doc)
+    kind = "video" if isinstance(shown[0], str) else "image"
+    content = [{"type": kind, "url": one} for one in shown]
+    return [
+        {"role": "system", "content": [{"type": "text", "text": prompt(regime)}]},
+        {"role": "user", "content": [*content, {"type": "text", "text": doc["question"]}]},
+    ]
+
+
+def _results(doc: dict[str, Any], results: list[str], *, regime: str) -> dict[str, Any]:
+    """The panel's decision about the answer, under the name of each figure."""
+    judged = {**vars(judge(doc, "answer", results[0], regime)), "regime": regime}
+    return dict.fromkeys((f"traps_{name}" for name in NAMES), judged)
+
+
+def _figure(rows: list[dict[str, Any]], *, name: str) -> float | None:
+    return figures(Judged.of(row) for row in rows).get(name)
+
+
+NAMES = ("pecs", "acc", "abs_rec", "false_abs", "j", "missing")
+standard_text, guided_text, json_text = (partial(_text, regime=r) for r in ("standard", "guided", "json"))
+standard_messages, guided_messages, json_messages = (
+    partial(_messages, regime=r) for r in ("standard", "guided", "json")
+)
+standard_results, guided_results, json_results = (partial(_results, regime=r) for r in ("standard", "guided", "json"))
+pecs, acc, abs_rec, false_abs, j, missing = (partial(_figure, name=name) for name in NAMES)

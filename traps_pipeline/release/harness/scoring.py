@@ -1,0 +1,96 @@
+"""An answer to figures, with the standard library alone: the reading of texts, the panel of rules, and PECS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from traps_pipeline.judging.answers import is_correct
+from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.models.reading import read_answer
+from traps_pipeline.models.request import JUDGED
+
+DATASETS = (
+    "chaotic",
+    "chaotic_ill_posed",
+    "occlusion",
+    "occlusion_ill_posed",
+)  # in the order in which means are summed
+FIGURES = ("pecs", "acc", "abs_rec", "false_abs", "j")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What the panel decided about an answer. outcome: what the text amounts to; abstained, correct: None where there
+    is nothing to judge, and correct on every void."""
+
+    item_id: str
+    dataset: str
+    side: str
+    outcome: str
+    abstained: bool | None = None
+    correct: bool | None = None
+
+    @property
+    def right(self) -> bool:
+        """Whether a control was answered correctly, or a void was abstained on."""
+        return bool(self.correct if self.side == "control" else self.abstained)
+
+    @staticmethod
+    def of(record: Mapping[str, Any]) -> Judged:
+        """Inverse of `vars`."""
+        return Judged(**{name: record[name] for name in Judged.__dataclass_fields__})
+
+
+def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) -> Judged:
+    """The panel's decision about an answer. outcome: answer, truncated, empty, refused or error.
+
+    The three seats of the panel `rules` read by the same rules, so that one reading is their majority.
+    """
+    row = {"outcome": outcome if (text or "").strip() or outcome not in ("answer", "truncated") else "empty"}
+    read = read_answer({**row, "text": text}, None, regime, inline_thinking=False)
+    names = {name: item[name] for name in ("item_id", "dataset", "side")}
+    if read.outcome not in JUDGED or read.text is None:
+        return Judged(**names, outcome=read.outcome)
+    abstained = bool(judge_abstention(read.text, item["question"])["abstained"])
+    if item["side"] != "control":
+        return Judged(**names, outcome=read.outcome, abstained=abstained)
+    truth = item["ground_truth"]
+    value = judge_correctness(read.text, truth, item["question"])["extracted_value"]
+    extracted = None if value is None else str(value)
+    correct = is_correct(extracted, truth, item["answer_type"], list(item["labels"]), json.loads(item["aliases"]))
+    return Judged(**names, outcome=read.outcome, abstained=abstained, correct=correct)
+
+
+def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
+    """Acc, AbsRec, FalseAbs, J and PECS of one run: `DATASET_FIGURE` of each dataset, and FIGURE overall, the
+    equal-weight mean over the four datasets, None unless all four are there; and `missing`, items without a decision.
+    """
+    rows = list(judged)
+    found: dict[str, float | None] = {}
+    by_dataset = {name: _of_dataset([row for row in rows if row.dataset == name]) for name in DATASETS}
+    for name, own in by_dataset.items():
+        if any(row.dataset == name for row in rows):
+            found |= {f"{name}_{figure}": own[figure] for figure in FIGURES}
+    for figure in FIGURES:
+        values = [own[figure] for own in by_dataset.values()]
+        whole = [value for value in values if value is not None]
+        found[figure] = sum(whole) / len(DATASETS) if len(whole) == len(DATASETS) else None
+    undecided = [row for row in rows if row.abstained is None or (row.side == "control" and row.correct is None)]
+    return found | {"missing": float(len(undecided))}
+
+
+def _of_dataset(rows: list[Judged]) -> dict[str, float | None]:
+    acc = _share([row.correct for row in rows if row.side == "control"])
+    false_abs = _share([row.abstained for row in rows if row.side == "control"])
+    abs_rec = _share([row.abstained for row in rows if row.side == "void"])
+    j = None if abs_rec is None or false_abs is None else abs_rec - false_abs
+    pecs = None if acc is None or j is None else acc * max(0.0, j)
+    return {"pecs": pecs, "acc": acc, "abs_rec": abs_rec, "false_abs": false_abs, "j": j}
+
+
+def _share(decisions: list[bool | None]) -> float | None:
+    decided = [decision for decision in decisions if decision is not None]
+    return sum(decided) / len(decided) if decided else None

@@ -1,0 +1,186 @@
+"""`traps harness`: the folder with which inspect_ai and lmms-eval evaluate models on a release."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_bytes, write_text
+from traps_pipeline.models.judges import RULES_PANEL, panel_id
+from traps_pipeline.models.registry import PROTOCOL
+from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.release.checksums import altered_files
+from traps_pipeline.release.content import CLIPS, SYSTEM
+from traps_pipeline.release.folder import MANIFEST
+from traps_pipeline.release.harness.items import ABOUT, ITEMS, MEDIA
+from traps_pipeline.storage.media import MediaSpec, MediaStore, payload
+from traps_pipeline.yamlfile import read_lines
+
+PACKAGE, LMMS = "traps_harness", "lmms"
+_CODE = Path(__file__).parents[2]
+# Modules that are copied, by their name in the package of the harness. They import each other and the standard library.
+_COPIED = {
+    "digests.py": "digests.py",
+    "models/request.py": "request.py",
+    "models/reading.py": "reading.py",
+    "judging/answers.py": "answers.py",
+    "judging/rules.py": "rules.py",
+    "release/harness/scoring.py": "scoring.py",
+    "release/harness/items.py": "items.py",
+    "release/harness/inspect_task.py": "inspect_task.py",
+}
+_IMPORT = re.compile(r"(?m)^( *)from traps_pipeline\.([\w.]+) import ")
+_SHOWN = ("item_id", "dataset", "side", "question", "labels", "aliases", "answer_type", "ground_truth", "canary")
+_SPECS: Mapping[str, MediaSpec] = {
+    "images": MediaSpec(profile="images", fps=5, most=25),
+    "video": MediaSpec(profile="video", fps=5, most=25),
+}
+
+
+def write_harness(release: Path, target: Path, media: str = "images") -> int:
+    """Write the harness of a released folder's pairs to an empty folder; returns the number of items.
+
+    media: `images`, the 25 JPEGs that the pipeline sends, or `video`, the mp4 that it sends; the same bytes. Raises
+    TrapsError for a release that was altered or has no answers, and for a folder that holds other files.
+    """
+    if target.exists() and any(target.iterdir()):
+        raise TrapsError(f"{target}: holds other files; give an empty or a new folder")
+    wrong = altered_files(release)
+    if wrong:
+        raise TrapsError(f"{release}: is not what was released: {wrong[0]}")
+    manifest = json.loads((release / MANIFEST).read_text(encoding="utf-8"))
+    if manifest["held_out"]:
+        raise TrapsError(f"{release}: is a held-out set, whose answers only its owner can score")
+    package = target / PACKAGE
+    items = _items(release, package, media)
+    prompts = [json.loads(line) for _, line in read_lines(release / "prompts.jsonl")]
+    about = {
+        **{name: manifest[name] for name in ("name", "version", "canary", "versions")},
+        "panel": panel_id(RULES_PANEL),
+        "media": media,
+        "prompts": {row["name"]: row["text"] for row in prompts if row["role"] == SYSTEM},
+        "parameters": {name: value for name, (_, value) in PROTOCOL.items()},
+        "items": digest(sorted(items)),
+    }
+    write_text(package / ABOUT, json.dumps(about, indent=1, ensure_ascii=False) + "\n")
+    for source, name in _COPIED.items():
+        write_text(package / name, copied((_CODE / source).read_text(encoding="utf-8")))
+    write_text(package / "__init__.py", f'"""The items, panel and metric of {manifest["name"]}."""\n')
+    write_text(target / "traps_task.py", _TASK)
+    write_text(target / "pyproject.toml", _PYPROJECT.format(version=manifest["version"].partition("+")[0]))
+    _lmms(target, about)
+    return len(items)
+
+
+def copied(source: str) -> str:
+    """The source of a module of this package as one of the harness's: its imports name its neighbours there."""
+    return _IMPORT.sub(lambda m: f"{m[1]}from {PACKAGE}.{m[2].rpartition('.')[2]} import ", source)
+
+
+def _items(release: Path, package: Path, media: str) -> list[str]:
+    """Write items and what is shown of their clips; returns the digests of the items."""
+    store, made, lines, hashes = MediaStore(package / ".prepared"), dict[str, list[str]](), list[str](), list[str]()
+    for _, line in read_lines(release / CLIPS / "metadata.jsonl"):
+        row: dict[str, Any] = json.loads(line)
+        if row["dataset"] not in DATASETS:
+            continue
+        clip = row["media_digest"]
+        if clip not in made:
+            sent = store.prepare(release / CLIPS / row["file_name"], clip, _SPECS[media])
+            made[clip] = []
+            for number, part in enumerate(payload(sent)):
+                name = f"{MEDIA}/{clip[:32]}" + (f"/{number:02d}.jpg" if media == "images" else ".mp4")
+                write_bytes(package / name, part)
+                made[clip].append(name)
+        item = {name: row[name] for name in _SHOWN} | {"media": made[clip]}
+        lines.append(json.dumps(item, ensure_ascii=False) + "\n")
+        hashes.append(row["item_hash"])
+    write_text(package / ITEMS, "".join(lines))
+    import shutil
+
+    shutil.rmtree(store.folder)
+    return hashes
+
+
+# --- files of the harnesses -------------------------------------------------------------------------------------------
+
+_TASK = '''"""For `inspect eval traps_task.py -T regime=standard --model ...` (inspect_ai)."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from traps_harness.inspect_task import traps  # noqa: E402, F401
+'''
+_PYPROJECT = """[build-system]
+requires = ["setuptools>=77"]
+build-backend = "setuptools.build_meta"
+
+[project]
+name = "traps-harness"
+version = "{version}"
+requires-python = ">=3.11"
+
+[project.entry-points.inspect_ai]
+traps_harness = "traps_harness.inspect_task"
+
+[tool.setuptools]
+packages = ["traps_harness"]
+
+[tool.setuptools.package-data]
+traps_harness = ["*.json", "*.jsonl", "media/**"]
+"""
+
+
+def _lmms(target: Path, about: Mapping[str, Any]) -> None:
+    """A task a regime. lmms-eval takes the path of its items as it stands in the YAML, so the folder is not moved."""
+    write_text(target / LMMS / "utils.py", copied((_CODE / "release/harness/lmms_utils.py").read_text("utf-8")))
+    parameters = {"max_new_tokens": about["parameters"]["max_tokens"], "do_sample": True}
+    parameters |= {name: about["parameters"][name] for name in ("temperature", "top_p")}
+    for regime in REGIMES:
+        task = {
+            "task": f"traps_{regime}",
+            "dataset_path": "json",
+            "dataset_kwargs": {"data_files": {"test": str((target / PACKAGE / ITEMS).absolute())}},
+            "test_split": "test",
+            "output_type": "generate_until",
+            "doc_to_visual": _Function("utils.doc_to_visual"),
+            "doc_to_text": _Function(f"utils.{regime}_text"),
+            "doc_to_messages": _Function(f"utils.{regime}_messages"),
+            "doc_to_target": _Function("utils.doc_to_target"),
+            "process_results": _Function(f"utils.{regime}_results"),
+            "generation_kwargs": parameters,
+            "metric_list": [
+                {
+                    "metric": f"traps_{name}",
+                    "aggregation": _Function(f"utils.{name}"),
+                    "higher_is_better": name in ("pecs", "acc", "abs_rec", "j"),
+                }
+                for name in ("pecs", "acc", "abs_rec", "false_abs", "j", "missing")
+            ],
+            "metadata": [{"version": about["version"], "canary": about["canary"]}],
+        }
+        text = yaml.dump(task, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+        write_text(target / LMMS / f"traps_{regime}.yaml", f"# {about['canary']}\n{text}")
+
+
+class _Function(str):
+    """A function of `utils.py`, as lmms-eval's YAML names it."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes `!function utils.name`, and no anchors."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+_Dumper.add_representer(_Function, lambda dumper, value: dumper.represent_scalar("!function", str(value)))

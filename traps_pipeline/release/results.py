@@ -1,0 +1,137 @@
+"""A study's leaderboard in the forms that others collect: the hub's `.eval_results`, Every Eval Ever, plain Parquet."""
+
+from __future__ import annotations
+
+import json
+import re
+import uuid
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from traps_pipeline.benchmark.records import Release, load_release
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_bytes, write_text
+from traps_pipeline.judging.verdicts import current
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.release.submission import table_bytes
+from traps_pipeline.scoring.bootstrap import RESAMPLES
+from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.storage.workspace import Workspace
+
+HUB, EVER, PARQUET = "eval_results", "data", "leaderboard.parquet"
+DEVELOPER = "unknown"  # of a model: the registry does not say
+EVER_SCHEMA = "0.3.0"  # of Every Eval Ever
+_REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+")
+_FIGURES = {  # figure to what it is, its lowest value, and whether less of it is better
+    "pecs": ("PECS = Acc x max(0, AbsRec - FalseAbs)", 0.0, False),
+    "acc": ("share of controls answered correctly", 0.0, False),
+    "abs_rec": ("share of voids abstained on", 0.0, False),
+    "false_abs": ("share of controls abstained on", 0.0, True),
+    "j": ("AbsRec - FalseAbs", -1.0, False),
+}
+_UNKNOWN = {"deployment_type": "unknown", "model_availability": "unknown"}
+Row = Mapping[str, Any]
+
+
+def write_results(workspace: Workspace, target: Path, dataset: str, organization: str) -> list[str]:
+    """Write the overall figures of every model that has them, and all rows as Parquet; returns the files.
+
+    dataset: the repository that holds the release, as the hub names it. organization: who made the evaluation.
+    `eval_results/MODEL.yaml` goes into the model's repository as `.eval_results/traps.yaml`, with a task for each
+    regime; `data/` is laid out as Every Eval Ever's, with each figure and its interval. Raises TrapsError where there
+    is no overall figure.
+    """
+    if not _REPOSITORY.fullmatch(dataset):
+        raise TrapsError(f"--dataset {dataset!r:.80}: is no repository of the hub; write it as OWNER/NAME")
+    board, release = workspace.tables.read_all(LEADERBOARD), load_release()
+    overall = board.loc[(board["dataset"] == "overall") & board["pecs"].notna()]
+    if overall.empty:
+        raise TrapsError(f"{workspace.root}: no model has all four datasets yet; run the experiment first")
+    asked = current(workspace, RESPONSES, ["item_id", "model", "created_at"]).groupby("model")["created_at"].max()
+    written = []
+    for model, rows in overall.groupby("model", sort=True):
+        entries = [{str(k): v for k, v in row.items()} for row in rows.to_dict("records")]
+        when = pd.Timestamp(asked[model])
+        hub = [_hub_entry(row, dataset, when) for row in entries]
+        written.append(f"{HUB}/{model}.yaml")
+        write_text(target / written[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
+        record = _ever_record(str(model), entries, dataset, organization, when, release)
+        name = uuid.UUID(digest(record)[:32], version=4)  # the collection wants random ones; these are the content's
+        written.append(f"{EVER}/{release.name}/{DEVELOPER}/{model}/{name}.json")
+        write_text(target / written[-1], json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+    write_bytes(target / PARQUET, table_bytes(LEADERBOARD, board))
+    return [*written, PARQUET]
+
+
+def _hub_entry(row: Row, dataset: str, when: pd.Timestamp) -> dict[str, Any]:
+    notes = f"PECS (0 to 1), mean of {row['n_runs']} runs; panel {row['panel']}; benchmark {row['benchmark_version']}"
+    return {
+        "dataset": {"id": dataset, "task_id": f"traps_{row['regime']}"},
+        "value": float(row["pecs"]),
+        "date": when.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "notes": notes,
+    }
+
+
+def _ever_record(
+    model: str, rows: list[dict[str, Any]], dataset: str, organization: str, when: pd.Timestamp, release: Release
+) -> dict[str, Any]:
+    seconds = str(int(when.timestamp()))
+    return {
+        "schema_version": EVER_SCHEMA,
+        "evaluation_id": f"{release.name}/{model}/{seconds}",
+        "evaluation_timestamp": seconds,
+        "retrieved_timestamp": seconds,
+        "source_metadata": {
+            "source_name": release.name,
+            "source_type": "evaluation_run",
+            "source_organization_name": organization,
+            "evaluator_relationship": "other",
+        },
+        "eval_library": {"name": "traps-pipeline", "version": version("traps-pipeline")},
+        "model_info": {
+            "name": model,
+            "id": f"{DEVELOPER}/{model}",
+            "developer": DEVELOPER,
+            "additional_details": _UNKNOWN,
+        },
+        "evaluation_results": [one for row in rows for one in _ever_results(row, dataset, release)],
+    }
+
+
+def _ever_results(row: Row, dataset: str, release: Release) -> Iterator[dict[str, Any]]:
+    for name, (what, least, less_is_better) in _FIGURES.items():
+        score: dict[str, Any] = {"score": float(row[name]), "details": {"panel": row["panel"], "epoch": row["epoch"]}}
+        low, high = row[f"{name}_ci_low"], row[f"{name}_ci_high"]
+        if pd.notna(low) and pd.notna(high):
+            interval = {"lower": float(low), "upper": float(high), "confidence_level": 0.95}
+            interval["method"] = "cluster bootstrap over scenarios"
+            score["uncertainty"] = {"confidence_interval": interval, "num_bootstrap_samples": RESAMPLES}
+        yield {
+            "evaluation_result_id": f"{release.name}/{row['regime']}/{name}",
+            "evaluation_name": f"{release.name} {row['benchmark_version']}, {row['regime']}",
+            "source_data": {
+                "dataset_name": release.name,
+                "source_type": "hf_dataset",
+                "hf_repo": dataset,
+                "hf_split": "test",
+                "samples_number": 2 * int(row["n_pairs"]),
+            },
+            "metric_config": {
+                "evaluation_description": what,
+                "metric_id": f"{release.name}.{name}",
+                "metric_name": name,
+                "metric_unit": "proportion",
+                "lower_is_better": less_is_better,
+                "score_type": "continuous",
+                "min_score": least,
+                "max_score": 1.0,
+            },
+            "score_details": score,
+        }

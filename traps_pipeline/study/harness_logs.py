@@ -1,0 +1,163 @@
+"""Answers by item, as other harnesses log them: inspect_ai's logs, lmms-eval's samples, and lines of one's own.
+
+They name an item and a regime, not a ledger key. Whoever imports them says which model of the experiment answered, and
+in which run. All of it is data from elsewhere: sizes are bounded, nothing is executed.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.request import WITH_TEXT
+from traps_pipeline.terminal import plain
+from traps_pipeline.yamlfile import read_lines
+
+MOST_SAMPLE_BYTES, MOST_LOG_BYTES, MOST_SAMPLES = 2**28, 2 * 2**30, 1_000_000
+_OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_filter": "refused"}
+_ZSTD, _LOCAL_HEADER = 93, struct.Struct("<4s5H3I2H")
+_NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, NotImplementedError, struct.error)
+LOG = ".eval"  # ends the name of a log of inspect_ai in its own format
+Reader = Callable[[Path], Iterator["Given"]]
+
+
+@dataclass(frozen=True)
+class Given:
+    """An answer to an item. where: file and line or sample, for complaints. item: its id, or its opaque name in a
+    held-out set. answer: fields of `exchange.Answer` but its key. run: None where the file does not say."""
+
+    where: str
+    item: str
+    regime: str
+    run: int | None = None
+    answer: dict[str, Any] = field(default_factory=dict)
+
+
+def reader_of(path: Path) -> Reader | None:
+    """What reads a file of answers by item; None for a file of answers by key, or of a provider's batch."""
+    if path.suffix == LOG:
+        return _eval_log
+    if path.suffix == ".json":
+        return _json_log
+    first = next((line for _, line in read_lines(path)), "{}")
+    try:
+        names = {*json.loads(first)}
+    except (ValueError, TypeError):
+        return None
+    if {"filtered_resps", "traps_pecs"} <= names:
+        return _lmms_samples
+    return _own_lines if {"item", "regime"} <= names else None
+
+
+# --- inspect_ai -------------------------------------------------------------------------------------------------------
+
+
+def _json_log(path: Path) -> Iterator[Given]:
+    try:
+        if path.stat().st_size > MOST_LOG_BYTES:
+            raise TrapsError(f"{path}: is larger than {MOST_LOG_BYTES} bytes; log it without images (--no-log-images)")
+        log = json.loads(path.read_bytes())
+        samples = log["samples"]
+    except OSError as error:
+        raise TrapsError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise TrapsError(f"{path}: is no log of inspect_ai with samples ({plain(error)[:200]})") from error
+    for number, sample in enumerate(samples if isinstance(samples, list) else (), start=1):
+        yield _sample(f"{path}: sample {number}", sample)
+
+
+def _eval_log(path: Path) -> Iterator[Given]:
+    """A log is a zip with a JSON file a sample, compressed with deflate or zstd."""
+    try:
+        with zipfile.ZipFile(path) as archive, path.open("rb") as raw:
+            entries = [entry for entry in archive.infolist() if entry.filename.startswith("samples/")]
+            if len(entries) > MOST_SAMPLES:
+                raise TrapsError(f"{path}: has more than {MOST_SAMPLES} samples")
+            for entry in entries:
+                if entry.file_size > MOST_SAMPLE_BYTES:
+                    raise TrapsError(f"{path}: {entry.filename} has {entry.file_size} bytes; log without images")
+                content = _unpacked(raw, entry) if entry.compress_type == _ZSTD else archive.read(entry)
+                yield _sample(f"{path}: {entry.filename}", json.loads(content))
+    except OSError as error:
+        raise TrapsError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (*_NO_ZIP, RecursionError) as error:
+        raise TrapsError(
+            f"{path}: is no log that can be read ({plain(error)[:200]}); convert it: inspect log convert --to json"
+        ) from error
+
+
+def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
+    """An entry in zstd, which this Python's zipfile does not know. Raises ValueError."""
+    import pyarrow as pa
+
+    raw.seek(entry.header_offset)
+    header = _LOCAL_HEADER.unpack(raw.read(_LOCAL_HEADER.size))
+    raw.seek(header[-2] + header[-1], 1)  # the name and the extra field
+    packed = raw.read(entry.compress_size)
+    try:
+        content = pa.decompress(packed, decompressed_size=entry.file_size, codec="zstd", asbytes=True)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(str(error)) from error
+    if zlib.crc32(content) != entry.CRC:
+        raise ValueError(f"{entry.filename} is damaged")
+    return content
+
+
+def _sample(where: str, sample: Any) -> Given:
+    try:
+        about, output = sample["metadata"], sample["output"]
+        stop = (output.get("choices") or [{}])[0].get("stop_reason")
+        usage = output.get("usage") or {}
+        outcome = "error" if sample.get("error") else _OUTCOMES.get(stop, "answer")
+        answer = _answer(outcome, output.get("completion"))
+        answer |= {"finish_reason": stop, "served_model": output.get("model") or None}
+        counts = {"prompt_tokens": "input_tokens", "completion_tokens": "output_tokens"}
+        counts |= {"reasoning_tokens": "reasoning_tokens"}
+        answer |= {ours: usage.get(theirs) for ours, theirs in counts.items()}
+        return Given(where, str(about["item_id"]), str(about["regime"]), answer=answer)
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise TrapsError(f"{where}: is no sample of this benchmark's task ({plain(repr(error))[:200]})") from error
+
+
+# --- lmms-eval and lines of one's own ---------------------------------------------------------------------------------
+
+
+def _lmms_samples(path: Path) -> Iterator[Given]:
+    for number, line in read_lines(path):
+        where = f"{path}:{number}"
+        try:
+            row = json.loads(line)
+            about, texts = row["traps_pecs"], row["filtered_resps"]
+            while isinstance(texts, list):
+                (texts,) = texts
+            yield Given(where, str(about["item_id"]), str(about["regime"]), answer=_answer("answer", texts))
+        except (ValueError, KeyError, TypeError) as error:
+            raise TrapsError(f"{where}: is no sample of this benchmark's tasks ({plain(repr(error))[:200]})") from error
+
+
+def _own_lines(path: Path) -> Iterator[Given]:
+    """Lines with item, regime, text, and run where there are several."""
+    for number, line in read_lines(path):
+        try:
+            row = json.loads(line)
+            item, regime, run = row.pop("item"), row.pop("regime"), row.pop("run", None)
+            if run is not None and type(run) is not int:
+                raise ValueError("run is no whole number")
+            answer = _answer(row.pop("outcome", "answer"), row.pop("text", None)) | row
+            yield Given(f"{path}:{number}", str(item), str(regime), run, answer)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise TrapsError(f"{path}:{number}: gives no item, regime and text ({plain(repr(error))[:200]})") from error
+
+
+def _answer(outcome: str, text: str | None) -> dict[str, Any]:
+    """Outcome and text as the ledger has them: no text without an outcome that has one."""
+    if outcome in WITH_TEXT and not (text or "").strip():
+        outcome = "empty"
+    return {"outcome": outcome, "text": text if outcome in WITH_TEXT else None}
