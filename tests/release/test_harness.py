@@ -175,6 +175,11 @@ def test_inspect_ai_gives_the_same_figures_to_the_last_digit(
     assert found["missing"] == 0
 
 
+def test_inspect_ai_finds_the_task_in_its_file(harness: Path) -> None:
+    listed = run_in("inspect", "-m", "inspect_ai", "list", "tasks", "traps_task.py", folder=harness)
+    assert listed.split() == ["traps_task.py@traps"]
+
+
 LMMS = """
 import json, sys
 from importlib.metadata import version

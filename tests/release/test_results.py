@@ -12,7 +12,7 @@ import yaml
 from tests.conftest import Checkout
 from tests.release.environments import run_in
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.release.results import write_results
+from traps_pipeline.release.results import Who, write_results
 from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
@@ -34,7 +34,7 @@ def test_every_form_holds_the_figures_of_the_leaderboard(written: Path, small: C
         hub = yaml.safe_load((written / "eval_results" / f"{row['model']}.yaml").read_text())
         values = {entry["dataset"]["task_id"]: entry["value"] for entry in hub}
         assert values[f"traps_{row['regime']}"] == row["pecs"]
-        (path,) = (written / "data" / "trapsbench" / "unknown" / row["model"]).iterdir()
+        (path,) = (written / "data" / "trapsbench" / "traps-pipeline" / row["model"]).iterdir()
         record = json.loads(path.read_text())
         scores = {one["evaluation_result_id"]: one["score_details"]["score"] for one in record["evaluation_results"]}
         for name in ("pecs", "acc", "abs_rec", "false_abs", "j"):
@@ -43,7 +43,7 @@ def test_every_form_holds_the_figures_of_the_leaderboard(written: Path, small: C
 
 def test_a_name_that_is_no_repository_is_refused(small: Checkout, tmp_path: Path) -> None:
     with pytest.raises(TrapsError, match="write it as OWNER/NAME"):
-        write_results(Workspace.open(small.workspace), tmp_path, "traps", "A lab")
+        write_results(Workspace.open(small.workspace), tmp_path, "traps", Who())
 
 
 def test_the_hubs_library_reads_the_results(written: Path) -> None:

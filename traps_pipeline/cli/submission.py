@@ -20,6 +20,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--dataset", required=True, metavar="OWNER/NAME", help="repository of the release on the hub")
     parser.add_argument("--organization", default="unknown", help="who made the evaluation")
+    parser.add_argument("--developer", default="unknown", help="of the models, as the hub names it")
 
     text = "verify submissions, and make one page of them; other versions or panels are not ranked together"
     parser = commands.add("leaderboard", leaderboard, text, workspace=False)
@@ -42,10 +43,10 @@ def submit(arguments: argparse.Namespace) -> int:
 
 def results(arguments: argparse.Namespace) -> int:
     """See `traps results --help`."""
-    from traps_pipeline.release.results import write_results
+    from traps_pipeline.release.results import Who, write_results
 
-    target = arguments.folder.absolute()
-    written = write_results(open_workspace(arguments), target, arguments.dataset, arguments.organization)
+    target, who = arguments.folder.absolute(), Who(arguments.organization, arguments.developer)
+    written = write_results(open_workspace(arguments), target, arguments.dataset, who)
     print(f"{len(written)} files in {target}")
     return OK
 

@@ -6,6 +6,7 @@ import json
 import re
 import uuid
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_bytes, write_text
 from traps_pipeline.judging.verdicts import current
+from traps_pipeline.models.registry import is_reference
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.release.submission import table_bytes
 from traps_pipeline.scoring.bootstrap import RESAMPLES
@@ -25,7 +27,7 @@ from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
 HUB, EVER, PARQUET = "eval_results", "data", "leaderboard.parquet"
-DEVELOPER = "unknown"  # of a model: the registry does not say
+OURS = "traps-pipeline"  # makes the reference models
 EVER_SCHEMA = "0.3.0"  # of Every Eval Ever
 _REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+")
 _FIGURES = {  # figure to what it is, its lowest value, and whether less of it is better
@@ -39,10 +41,23 @@ _UNKNOWN = {"deployment_type": "unknown", "model_availability": "unknown"}
 Row = Mapping[str, Any]
 
 
-def write_results(workspace: Workspace, target: Path, dataset: str, organization: str) -> list[str]:
+@dataclass(frozen=True)
+class Who:
+    """organization: who made the evaluation. developer: of the models that are no reference models, as the hub names
+    it."""
+
+    organization: str = "unknown"
+    developer: str = "unknown"
+
+    def made(self, model: str) -> str:
+        """Who made a model."""
+        return OURS if is_reference(model) else self.developer
+
+
+def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) -> list[str]:
     """Write the overall figures of every model that has them, and all rows as Parquet; returns the files.
 
-    dataset: the repository that holds the release, as the hub names it. organization: who made the evaluation.
+    dataset: the repository that holds the release, as the hub names it.
     `eval_results/MODEL.yaml` goes into the model's repository as `.eval_results/traps.yaml`, with a task for each
     regime; `data/` is laid out as Every Eval Ever's, with each figure and its interval. Raises TrapsError where there
     is no overall figure.
@@ -61,9 +76,9 @@ def write_results(workspace: Workspace, target: Path, dataset: str, organization
         hub = [_hub_entry(row, dataset, when) for row in entries]
         written.append(f"{HUB}/{model}.yaml")
         write_text(target / written[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
-        record = _ever_record(str(model), entries, dataset, organization, when, release)
+        record = _ever_record(str(model), entries, dataset, who, when, release)
         name = uuid.UUID(digest(record)[:32], version=4)  # the collection wants random ones; these are the content's
-        written.append(f"{EVER}/{release.name}/{DEVELOPER}/{model}/{name}.json")
+        written.append(f"{EVER}/{release.name}/{who.made(str(model))}/{model}/{name}.json")
         write_text(target / written[-1], json.dumps(record, indent=1, ensure_ascii=False) + "\n")
     write_bytes(target / PARQUET, table_bytes(LEADERBOARD, board))
     return [*written, PARQUET]
@@ -80,7 +95,7 @@ def _hub_entry(row: Row, dataset: str, when: pd.Timestamp) -> dict[str, Any]:
 
 
 def _ever_record(
-    model: str, rows: list[dict[str, Any]], dataset: str, organization: str, when: pd.Timestamp, release: Release
+    model: str, rows: list[dict[str, Any]], dataset: str, who: Who, when: pd.Timestamp, release: Release
 ) -> dict[str, Any]:
     seconds = str(int(when.timestamp()))
     return {
@@ -91,14 +106,14 @@ def _ever_record(
         "source_metadata": {
             "source_name": release.name,
             "source_type": "evaluation_run",
-            "source_organization_name": organization,
+            "source_organization_name": who.organization,
             "evaluator_relationship": "other",
         },
         "eval_library": {"name": "traps-pipeline", "version": version("traps-pipeline")},
         "model_info": {
             "name": model,
-            "id": f"{DEVELOPER}/{model}",
-            "developer": DEVELOPER,
+            "id": f"{who.made(model)}/{model}",
+            "developer": who.made(model),
             "additional_details": _UNKNOWN,
         },
         "evaluation_results": [one for row in rows for one in _ever_results(row, dataset, release)],

@@ -26,6 +26,11 @@ _OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_fi
 
 @task
 def traps(regime: str = "standard") -> Any:
+    """The task of the installed package: `inspect eval traps_harness/traps`."""
+    return evaluation(regime)
+
+
+def evaluation(regime: str) -> Any:
     """All items under one regime, once: a further run is a further evaluation, so that PECS is computed per run."""
     system = prompt(regime)
     samples = [

@@ -111,14 +111,22 @@ def _items(release: Path, package: Path, media: str) -> list[str]:
 
 # --- files of the harnesses -------------------------------------------------------------------------------------------
 
-_TASK = '''"""For `inspect eval traps_task.py -T regime=standard --model ...` (inspect_ai)."""
+_TASK = '''"""For `inspect eval traps_task.py -T regime=standard --model ...`: inspect_ai looks for a task in this very file."""
 
 import sys
 from pathlib import Path
 
+from inspect_ai import Task, task
+
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from traps_harness.inspect_task import traps  # noqa: E402, F401
+from traps_harness.inspect_task import evaluation  # noqa: E402
+
+
+@task
+def traps(regime: str = "standard") -> Task:
+    """All items under one regime, once."""
+    return evaluation(regime)
 '''
 _PYPROJECT = """[build-system]
 requires = ["setuptools>=77"]
