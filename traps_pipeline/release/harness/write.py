@@ -111,7 +111,7 @@ def _items(release: Path, package: Path, media: str) -> list[str]:
 
 # --- files of the harnesses -------------------------------------------------------------------------------------------
 
-_TASK = '''"""For `inspect eval traps_task.py -T regime=standard --model ...`: inspect_ai looks for a task in this very file."""
+_TASK = '''"""`inspect eval traps_task.py -T regime=standard --model ...`: inspect_ai wants a task in this very file."""
 
 import sys
 from pathlib import Path
