@@ -99,7 +99,9 @@ class _Folder:
 def write_release(content: Content, target: Path, options: Options) -> Released:
     """Write the folder; nothing but a former release may lie there. Raises TrapsError."""
     if target.exists() and any(target.iterdir()) and not (target / CHECKSUMS).is_file():
-        raise TrapsError(f"{target}: holds other files; give an empty or a new folder")
+        raise TrapsError(
+            f"{target}: holds other files, or what a stopped release left; give an empty or a new folder, or delete it"
+        )
     _clear(target)
     folder = _Folder(target, anonymous if options.anonymous else str)
     answers = None
