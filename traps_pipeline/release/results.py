@@ -68,11 +68,14 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Who) ->
     overall = board.loc[(board["dataset"] == "overall") & board["pecs"].notna()]
     if overall.empty:
         raise TrapsError(f"{workspace.root}: no model has all four datasets yet; run the experiment first")
-    asked = current(workspace, RESPONSES, ["item_id", "model", "created_at"]).groupby("model")["created_at"].max()
+    answers: list[dict[Any, Any]] = current(workspace, RESPONSES, ["item_id", "model", "created_at"]).to_dict("records")
+    asked: dict[str, list[pd.Timestamp]] = {}
+    for row in answers:
+        asked.setdefault(row["model"], []).append(row["created_at"])
     written = []
     for model, rows in overall.groupby("model", sort=True):
         entries = [{str(k): v for k, v in row.items()} for row in rows.to_dict("records")]
-        when = pd.Timestamp(asked[model])
+        when = max(asked[str(model)])
         hub = [_hub_entry(row, dataset, when) for row in entries]
         written.append(f"{HUB}/{model}.yaml")
         write_text(target / written[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
@@ -125,7 +128,7 @@ def _ever_results(row: Row, dataset: str, release: Release) -> Iterator[dict[str
         score: dict[str, Any] = {"score": float(row[name]), "details": {"panel": row["panel"], "epoch": row["epoch"]}}
         low, high = row[f"{name}_ci_low"], row[f"{name}_ci_high"]
         if pd.notna(low) and pd.notna(high):
-            interval = {"lower": float(low), "upper": float(high), "confidence_level": 0.95}
+            interval: dict[str, Any] = {"lower": float(low), "upper": float(high), "confidence_level": 0.95}
             interval["method"] = "cluster bootstrap over scenarios"
             score["uncertainty"] = {"confidence_interval": interval, "num_bootstrap_samples": RESAMPLES}
         yield {

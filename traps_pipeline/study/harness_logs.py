@@ -115,7 +115,7 @@ def _sample(where: str, sample: Any) -> Given:
         about, output = sample["metadata"], sample["output"]
         stop = (output.get("choices") or [{}])[0].get("stop_reason")
         usage = output.get("usage") or {}
-        outcome = "error" if sample.get("error") else _OUTCOMES.get(stop, "answer")
+        outcome = "error" if sample.get("error") else _OUTCOMES.get(str(stop), "answer")
         answer = _answer(outcome, output.get("completion"))
         answer |= {"finish_reason": stop, "served_model": output.get("model") or None}
         counts = {"prompt_tokens": "input_tokens", "completion_tokens": "output_tokens"}
