@@ -83,9 +83,10 @@ endef
 
 # Libraries and harnesses that others use, each in an environment of its own: tests/release is tried with them.
 ENVIRONMENTS := $(patsubst tests/release/%.txt,.workspaces/environments/%/.installed,$(wildcard tests/release/*.txt))
-environments: $(ENVIRONMENTS)
+PYTHON_eval ?= python3.12
+environments: $(ENVIRONMENTS) ## one file of tests/release, one environment
 .workspaces/environments/%/.installed: tests/release/%.txt
-	$(PYTHON) -m venv $(@D)
+	$(or $(PYTHON_$*),$(PYTHON)) -m venv $(@D)
 	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	touch $@
 
