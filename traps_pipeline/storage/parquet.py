@@ -107,13 +107,13 @@ class TableStore:
         import pyarrow as pa
 
         schema = table.arrow_schema()
-        listed = isinstance(rows, Sequence)
-        names = {str(name) for name in ((name for row in rows for name in vars(row)) if listed else rows)}
+        listed = rows if isinstance(rows, Sequence) else None
+        names = {str(name) for name in (rows if listed is None else (name for row in listed for name in vars(row)))}
         try:
             if names - set(schema.names):
                 raise ValueError(f"unknown columns {sorted(names - set(schema.names))}")
-            if listed:  # a column at a time: a dictionary a row would be a copy of all
-                data = pa.table([_column(rows, field) for field in schema], schema=schema)
+            if listed is not None:  # a column at a time: a dictionary a row would be a copy of all
+                data = pa.table([_column(listed, field) for field in schema], schema=schema)
             else:
                 data = pa.Table.from_pandas(rows, schema=schema, preserve_index=False, safe=True)
                 data = data.replace_schema_metadata(None).cast(schema)
