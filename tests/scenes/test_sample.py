@@ -64,8 +64,9 @@ def test_a_stopped_sampling_goes_on_and_gives_the_same_scenarios(tmp_path: Path,
     said: list[str] = []
 
     def stop(line: str) -> None:
-        said.append(line)
-        raise KeyboardInterrupt
+        if line.startswith("hidden_race-"):  # a record, no rejection
+            said.append(line)
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         sample_family("hidden_race", 2, 11, tmp_path / "halves", workers=1, report=stop)
@@ -74,7 +75,8 @@ def test_a_stopped_sampling_goes_on_and_gives_the_same_scenarios(tmp_path: Path,
     with (tmp_path / "halves" / "hidden_race.jsonl").open("a", encoding="utf-8") as lines:
         lines.write('{"scenario_id": "hidden_race-00')  # what a kill leaves of a line
     sample_family("hidden_race", 2, 11, tmp_path / "halves", workers=1, report=said.append)
-    assert [line.split(":")[0] for line in said] == ["hidden_race-0001", "hidden_race-0002"]
+    records = [line.split(":")[0] for line in said if line.startswith("hidden_race-")]
+    assert records == ["hidden_race-0001", "hidden_race-0002"]
     for name in ("hidden_race.jsonl", "draws.json"):
         assert (tmp_path / "halves" / name).read_text(encoding="utf-8") == (whole / name).read_text(encoding="utf-8")
     specs = load_released(whole).values()
@@ -93,6 +95,25 @@ def test_another_seed_replaces_what_is_there(tmp_path: Path, whole: Path) -> Non
     assert len(after.splitlines()) == 1
     assert after not in (whole / "hidden_race.jsonl").read_text(encoding="utf-8")
     assert [path.stem for path in (tmp_path / "released" / "trajectories").iterdir()] == ["hidden_race-0001"]
+
+
+def test_records_of_another_version_of_a_familys_file_are_drawn_again(tmp_path: Path, whole: Path) -> None:
+    folder = shutil.copytree(whole, tmp_path / "released")
+    notes = json.loads((folder / "draws.json").read_text(encoding="utf-8"))
+    assert sample_family("hidden_race", 2, 11, folder, workers=1).draws == notes["hidden_race"]["draws"]
+    notes["hidden_race"]["file"] = "0" * 64
+    (folder / "draws.json").write_text(json.dumps(notes), encoding="utf-8")
+    said: list[str] = []
+
+    def stop(line: str) -> None:
+        said.append(line)
+        if len(said) == 2:  # after the first draw that counts
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample_family("hidden_race", 2, 11, folder, workers=1, report=stop)
+    assert said[0] == "hidden_race: its file was changed since its scenarios were drawn; all are drawn again"
+    assert {path.stem for path in (folder / "trajectories").iterdir()} <= {"hidden_race-0001"}
 
 
 def test_families_are_found_by_file_and_an_unknown_one_is_answered_with_the_known() -> None:

@@ -7,10 +7,13 @@ is drawn depending on what is seen.
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import pkgutil
 import re
 from functools import cache
+from pathlib import Path
 
+from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import CHAOTIC_CATEGORIES, OCCLUSION_CATEGORIES
 from traps_pipeline.scenes import families as package
@@ -28,8 +31,8 @@ def family_names() -> tuple[str, ...]:
 
 @cache
 def get_family(name: str) -> Family:
-    """The family of that name. Raises KeyError with the known names, TrapsError if there is none in its file or its
-    category is unknown."""
+    """The family of that name. Raises KeyError with the known names, TrapsError if there is none in its file, or one of
+    another name or of an unknown category."""
     if name not in family_names():
         raise KeyError(f"unknown family {name!r}; known: {', '.join(family_names())}")
     module = importlib.import_module(f"{package.__name__}.{name}")
@@ -37,7 +40,10 @@ def get_family(name: str) -> Family:
     if not isinstance(family, Family):
         raise TrapsError(f"{_file(name)} defines no FAMILY = scene_family(...); write it, or take the file away")
     if family.name != name:
-        raise ValueError(f"{_file(name)} defines a family named {family.name!r}; they must agree")
+        raise TrapsError(
+            f"{_file(name)} defines a family named {family.name!r}; give it the name of its file, {name!r}, or rename "
+            "the file"
+        )
     known = CATEGORIES[family.taxonomy]
     if family.category not in known:
         raise TrapsError(
@@ -45,6 +51,13 @@ def get_family(name: str) -> Family:
             f"families: {', '.join(known)}"
         )
     return family
+
+
+def family_digest(name: str) -> str:
+    """Hexadecimal SHA-256 of a family's file: records of one digest were drawn by the same text."""
+    found = importlib.util.find_spec(f"{package.__name__}.{name}")
+    assert found is not None and found.origin is not None, f"{_file(name)} is a file"
+    return file_digest(Path(found.origin))
 
 
 @cache

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from traps_pipeline.files import write_text
 from traps_pipeline.scenes.certificates import settled_outcome
 from traps_pipeline.scenes.kit import Family
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, simulated
-from traps_pipeline.scenes.registry import fit_to_sample, get_family
+from traps_pipeline.scenes.registry import family_digest, fit_to_sample, get_family
 from traps_pipeline.scenes.resolve import Resolved, resolve
 from traps_pipeline.scenes.simulate import replay
 from traps_pipeline.scenes.spec import SceneSpec, save_trajectory
@@ -30,17 +31,20 @@ from traps_pipeline.scenes.workers import run_in_order
 
 MOST_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
 DRAWS = "draws.json"  # beside the records: how each family was drawn
+_MEASURED = re.compile(r"[\d.]+|'[^']*'")  # numbers and answers in a reason, which differ from draw to draw
 _UNASKED = "?"  # stands for the ill-posed question until the scenario has its place
 
 
 @dataclass
 class Tally:
-    """How a family was drawn: the seed, scenarios wanted, draws made, and why the others were rejected."""
+    """How a family was drawn: the seed, scenarios wanted, draws made, why the others were rejected, and the digest of
+    the family's file (empty in notes that were written before it was kept)."""
 
     seed: int
     wanted: int
     draws: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
+    file: str = ""
 
 
 def load_tallies(released: Path) -> dict[str, Tally]:
@@ -89,13 +93,17 @@ def sample_family(
     """Draw until `released` holds `count` scenarios of a family; the same seed gives the same ones on a machine type.
 
     Goes on where a stopped call with the same seed and count was, and fills the places of records that were taken out
-    (`take_out`); anything else of the family is replaced. Raises RuntimeError with the tally of rejections when 40
-    draws a scenario are not enough, TrapsError for an unfit family.
+    (`take_out`); anything else of the family is replaced, as are records of another version of the family's file.
+    `report` gets a line for each record and for the first rejection of each kind. Raises RuntimeError with the tally of
+    rejections when 40 draws a scenario are not enough, TrapsError for an unfit family.
     """
     family, records = fit_to_sample(name), Records(released, name)
-    tally = load_tallies(released).get(name)
+    tally, file = load_tallies(released).get(name), family_digest(name)
+    if tally is not None and (tally.seed, tally.wanted) == (seed, count) and tally.file not in ("", file):
+        report(f"{name}: its file was changed since its scenarios were drawn; all are drawn again")
+        tally = None
     if tally is None or (tally.seed, tally.wanted) != (seed, count):
-        tally = Tally(seed, count)
+        tally = Tally(seed, count, file=file)
         records.clear()
     specs = records.read(tally)
     answers = Counter(spec.ground_truth for spec in specs)
@@ -109,6 +117,7 @@ def sample_family(
         for number in range(tally.draws, MOST_DRAWS * count):
             yield Draw(name, seed, number, _closed(answers, count, family))
 
+    said: set[str] = set()  # kinds of rejections that the report has
     results = run_in_order(try_draw, jobs(), workers)
     try:
         for draw, found in results:
@@ -117,12 +126,16 @@ def sample_family(
                 found = f"answer {found.spec.ground_truth!r} has its quota"
             if isinstance(found, str):
                 tally.rejected[found.split(":")[0]] += 1
+                kind = _MEASURED.sub("", found.split(":")[0])
+                if kind not in said:  # so that a family that never passes says why at once
+                    said.add(kind)
+                    report(f"{name}: draw {draw.number + 1} is rejected: {found}")
                 continue
-            named = _named(family, found, draw, places.pop(0), texts, count)
-            answers[named.spec.ground_truth] += 1
-            texts[named.spec.ill_posed_question] += 1
-            records.append(named, tally)
-            report(f"{named.spec.scenario_id}: {named.spec.ground_truth} after {tally.draws} draws")
+            placed = _named(family, found, draw, places.pop(0), texts, count)
+            answers[placed.spec.ground_truth] += 1
+            texts[placed.spec.ill_posed_question] += 1
+            records.append(placed, tally)
+            report(f"{placed.spec.scenario_id}: {placed.spec.ground_truth} after {tally.draws} draws")
             if not places:
                 records.sort()
                 return tally
