@@ -203,9 +203,15 @@ def check_benchmark(study: Study) -> None:
     there = "released" if SCENE_SPECS == CHECKOUT / "scene_specs" else load_release().name
     if study.benchmark != there:
         raise TrapsError(
-            f"study.yaml: its benchmark is {study.benchmark!r}, the records in {SCENE_SPECS} are {there!r}; set "
-            f"{SPECS_VARIABLE} to the folder of {study.benchmark!r}, or write `benchmark: {there}` in a new study"
+            f"the benchmark of the study is {study.benchmark!r}, the records in {SCENE_SPECS} are {there!r}; "
+            f"{_elsewhere(study.benchmark)}, or write `benchmark: {there}` into the experiment of a new workspace"
         )
+
+
+def _elsewhere(benchmark: str) -> str:
+    """Where the records of a benchmark are looked for, as a thing to do."""
+    released = benchmark == "released"
+    return f"unset {SPECS_VARIABLE}" if released else f"set {SPECS_VARIABLE} to the folder of {benchmark!r}"
 
 
 @cache

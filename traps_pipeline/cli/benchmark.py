@@ -64,13 +64,17 @@ def certify(arguments: argparse.Namespace) -> int:
 def sample(arguments: argparse.Namespace) -> int:
     """See `traps sample --help`."""
     from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
+    from traps_pipeline.benchmark.records import load_release
     from traps_pipeline.scenes.registry import family_names
 
     counts = load_composition()
     names = arguments.families or list(counts)
-    unknown = sorted(set(names) - (set(family_names()) if arguments.count else set(counts)))
+    unknown = sorted(set(names) - set(family_names()))
     if unknown:
         raise TrapsError(f"unknown families {', '.join(unknown)}; known: {', '.join(family_names())}")
+    uncounted = [name for name in names if name not in counts]
+    if uncounted and not arguments.count:
+        raise TrapsError(f"composition.yaml has no number of scenarios for {', '.join(uncounted)}; say --count N")
     wanted = {name: arguments.count or max(1, round(counts[name] * arguments.scale)) for name in names}
     name = arguments.name or f"private-{arguments.seed}"
     sample_benchmark(
@@ -82,5 +86,9 @@ def sample(arguments: argparse.Namespace) -> int:
         report=lambda line: print(line, flush=True),
     )
     print(f"{sum(wanted.values())} scenarios of {len(wanted)} families in {arguments.out}")
-    print(f"next: traps certify --specs {arguments.out}; to run studies on it, TRAPS_SCENE_SPECS={arguments.out}")
+    there = load_release(arguments.out.absolute() / "benchmark.yaml").name
+    print(
+        f"next: traps certify --specs {arguments.out}; to run studies on it, TRAPS_SCENE_SPECS={arguments.out} and "
+        f"`benchmark: {there}` in the experiment"
+    )
     return OK

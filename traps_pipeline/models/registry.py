@@ -145,7 +145,9 @@ class Entry(BaseModel):
             return self
         accounts: Mapping[str, Account] = (info.context or {}).get("accounts", {})
         if self.account not in accounts:
-            raise ValueError(f"account is {self.account!r}; known accounts: {', '.join(accounts) or 'none'}")
+            known = f"known accounts: {', '.join(accounts) or 'none'}"
+            known += f"; add one under `accounts:` of {MODELS_FILE.name} or of the experiment"
+            raise ValueError(f"account is {self.account!r}; {known}")
         if self.provider_id is None or "/" not in self.provider_id:
             raise ValueError(f"provider_id is {self.provider_id!r}; it is route/model, e.g. openai/gpt-5")
         self._check_waivers(self.protocol())
@@ -274,6 +276,12 @@ def _add(
     found: dict[str, _Entry], kind: type[_Entry], raw: Any, path: Path, what: str, context: Mapping[str, Any]
 ) -> None:
     name = raw.get("id", "?") if isinstance(raw, dict) else "?"
+    short = [field for field in own.SHORT if isinstance(raw, dict) and field in raw]
+    if short:  # `own` writes those of an experiment out in full before they come here
+        raise TrapsError(
+            f"{path}: {what} ({name}): {', '.join(short)}: an entry with an address of its own stands in an "
+            "experiment's file (docs/models.md); one of the registry has backend, account and provider_id"
+        )
     entry = parse_yaml_model(kind, raw, path, f"{what} ({name})", context)
     if entry.id in found:
         raise TrapsError(f"{path}: {what}: id {entry.id!r} occurs twice, here or in {MODELS_FILE.parent}")
