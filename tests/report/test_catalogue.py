@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from matplotlib.image import imread
 
+from tests.conftest import ROOT
 from tests.report.test_items import row
 from tests.report.test_report import board_of, board_row
 from tests.report.test_writing import latex_cells
@@ -18,7 +19,7 @@ from traps_pipeline.judging.tables import JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report import publish
-from traps_pipeline.report.catalogue import FIGURES, OF_PAPER, OF_STUDY, PRINTED, TABLES, workspace_files
+from traps_pipeline.report.catalogue import FIGURES, JUDGED_STAGES, OF_PAPER, OF_STUDY, PRINTED, TABLES, workspace_files
 from traps_pipeline.report.figures.abstention import doubt_points
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.study_results import StudyResults
@@ -285,6 +286,19 @@ def test_a_table_or_figure_is_stale_when_what_it_reads_changed_and_only_then():
     assert "chaotic" in graph.parents("table_chaotic_sub_scenarios", None)["metrics"]
     assert graph.parents("published_tables", None) == {"published": [None]}
     assert graph.parents("report_page", None).keys() >= {*OF_STUDY, *OF_PAPER, "verdicts", "leaderboard"}
+
+
+def test_whatever_reads_figures_that_the_panel_decided_says_who_judged():
+    about_else = {"judge_bias", "panel_errors", "probes"}  # judges against each other, against people; hidden states
+    reads = {stage for report in (*TABLES, *FIGURES) for stage in report.reads}
+    assert (reads & the_graph().below("verdicts")) - about_else == JUDGED_STAGES
+
+
+def test_the_page_of_the_docs_names_every_table_and_figure():
+    rows = re.findall(r"^\| (.+?) \| (.*?) \|$", (ROOT / "docs" / "report.md").read_text(), re.MULTILINE)
+    for column, reports in enumerate((TABLES, FIGURES)):
+        named = {name for row in rows for name in re.findall(r"\w+", row[column])}
+        assert [report.name for report in reports if report.name not in named] == []
 
 
 def test_names_of_tables_and_figures_are_unique():

@@ -27,13 +27,18 @@ if TYPE_CHECKING:
 
 PAPER = "published"  # folder below tables/ and figures/
 RECOMPUTED = "recomputed"  # folder below tables/, of what follows from the paper's tables
+# Stages whose tables hold figures that the panel decided: what reads one of them says who judged. Tests hold this
+# against the graph.
 JUDGED_STAGES = {
     "leaderboard",
     "metrics",
     "contrasts",
     "regime_tests",
+    "leave_one_out",
     "steering_effects",
     "steering_shares",
+    "gate",
+    "risk_coverage",
     "corrected",
 }
 
