@@ -120,19 +120,10 @@ def test_a_category_of_the_other_taxonomy_is_refused(add: Add) -> None:
 
 
 def test_a_family_of_another_name_than_its_file_is_refused_with_both(add: Add) -> None:
-    add("plank_post", name=('"plank_post"', '"plank"'))
+    add("plank_post", called=('"plank_post"', '"plank"'))
     message = r"families/plank_post\.py defines a family named 'plank'; give it the name of its file, 'plank_post'"
     with pytest.raises(TrapsError, match=message):
         registry.get_family("plank_post")
-
-
-def test_a_family_that_never_passes_says_why_at_its_first_draw(add: Add, tmp_path: Path) -> None:
-    add("plank_post", margin=("min_margin_m=0.03", "min_margin_m=9.0"))  # no plank is as long
-    said: list[str] = []
-    with pytest.raises(RuntimeError, match="plank_post: 0 of 1 after 40 draws"):
-        sample_family("plank_post", 1, 1, tmp_path / "released", workers=1, report=said.append)
-    assert re.match(r"plank_post: draw 1 is rejected: outcome '\w+' has a margin of 0\.\d+ m, below 9\.0 m", said[0])
-    assert sum("has a margin of" in line for line in said) == 1
 
 
 @pytest.mark.parametrize("placeholder", ["{ball}", "{plank}"])  # a question is the same whatever fills it

@@ -11,7 +11,7 @@ import pytest
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.registry import family_names, get_family
-from traps_pipeline.scenes.sample import answer_quota, load_tallies, sample_family, take_out
+from traps_pipeline.scenes.sample import answer_quota, kind_of, load_tallies, sample_family, take_out
 from traps_pipeline.scenes.spec import load_trajectory
 
 
@@ -37,9 +37,20 @@ def test_the_quota_of_an_answer(count: int, labels: int, quota: int) -> None:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenarios of hidden_race, drawn in one go."""
     folder = tmp_path_factory.mktemp("whole")
-    tally = sample_family("hidden_race", 2, 11, folder, workers=1)
+    said: list[str] = []
+    tally = sample_family("hidden_race", 2, 11, folder, workers=1, report=said.append)
     assert (tally.seed, tally.wanted, tally.draws >= 2) == (11, 2, True)
+    # Every kind of rejection is said once, with the draw that it was first met in.
+    reasons = [line.split(" is rejected: ")[1] for line in said if line.startswith("hidden_race: draw ")]
+    assert len(reasons) == len({kind_of(reason) for reason in reasons}) == len({*map(kind_of, tally.rejected)}) > 0
     return folder
+
+
+def test_a_reason_is_of_one_kind_whatever_was_measured() -> None:
+    small = "outcome 'yes' has a margin of 0.0120 m, below 0.03 m"
+    assert kind_of(small) == kind_of("outcome 'no' has a margin of 0.0041 m, below 0.03 m")
+    assert kind_of("the twin's void differs from the void: in 5 pixels") == "the twin's void differs from the void"
+    assert kind_of("answer 'yes' has its quota") != kind_of(small)
 
 
 @pytest.mark.slow  # draws one scenario

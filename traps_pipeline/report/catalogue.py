@@ -37,6 +37,8 @@ JUDGED_STAGES = {
     "leave_one_out",
     "steering_effects",
     "steering_shares",
+    "steering_nulls",
+    "steering_pecs",
     "gate",
     "risk_coverage",
     "corrected",

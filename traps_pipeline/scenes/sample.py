@@ -31,7 +31,7 @@ from traps_pipeline.scenes.workers import run_in_order
 
 MOST_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
 DRAWS = "draws.json"  # beside the records: how each family was drawn
-_MEASURED = re.compile(r"[\d.]+|'[^']*'")  # numbers and answers in a reason, which differ from draw to draw
+_MEASURED = re.compile(r"\d[\d.]*|'\w+'(?=\s)")  # numbers and answers in a reason, which differ from draw to draw
 _UNASKED = "?"  # stands for the ill-posed question until the scenario has its place
 
 
@@ -126,9 +126,8 @@ def sample_family(
                 found = f"answer {found.spec.ground_truth!r} has its quota"
             if isinstance(found, str):
                 tally.rejected[found.split(":")[0]] += 1
-                kind = _MEASURED.sub("", found.split(":")[0])
-                if kind not in said:  # so that a family that never passes says why at once
-                    said.add(kind)
+                if kind_of(found) not in said:  # so that a family that never passes says why at once
+                    said.add(kind_of(found))
                     report(f"{name}: draw {draw.number + 1} is rejected: {found}")
                 continue
             placed = _named(family, found, draw, places.pop(0), texts, count)
@@ -143,6 +142,11 @@ def sample_family(
         results.close()  # type: ignore[attr-defined]
     reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common())
     raise RuntimeError(f"{name}: {answers.total()} of {count} after {tally.draws} draws; rejected: {reasons}")
+
+
+def kind_of(reason: str) -> str:
+    """What a rejection has in common with others: its reason without what was measured, and without details."""
+    return _MEASURED.sub("", reason.split(":")[0])
 
 
 class Records:
