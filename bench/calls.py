@@ -39,7 +39,7 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     from traps_pipeline.models.registry import Account, Entry, Limits
     from traps_pipeline.models.request import Request
     from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
-    from traps_pipeline.storage.ledger import Ledger
+    from traps_pipeline.storage.segments import SegmentLedger
     from traps_pipeline.storage.study import Study
 
     account = Account(key=KEY, base_url=f"{url}/v1")
@@ -60,7 +60,7 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         free = Study(allow_unknown_prices=True)
         participants = Participants({"m": entry}, lambda e: ApiBackend(e, account), free, {"a": account})
-        ledger = Ledger(Path(folder), "answers")
+        ledger = SegmentLedger(Path(folder), "answers")
         work = Work("responses", ledger, participants, Budget(0, {}, {}), "1", calls, lambda _: None)
         return _measured(lambda: list(run_work(work, cells)), answers)
 

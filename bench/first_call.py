@@ -39,7 +39,7 @@ def fill(root: Path, rows: int) -> None:
     from traps_pipeline.models.request import Outcome, Request
     from traps_pipeline.orchestration.wanted import Wanted
     from traps_pipeline.partitions import Evaluation
-    from traps_pipeline.storage.ledger import Ledger
+    from traps_pipeline.storage.segments import SegmentLedger
 
     params, text = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}, "The ball comes to rest on the left. " * 15
     outcome = Outcome("answer", text, None, "stop", None, "m-2026", 6500, 150, 20, 0.0002)
@@ -47,7 +47,7 @@ def fill(root: Path, rows: int) -> None:
     evaluations = [asked, *(e for e in Wanted(None).evaluations if e.model != asked.model)]
     for start in range(0, rows, EVALUATION_ROWS):
         evaluation = evaluations[start // EVALUATION_ROWS % len(evaluations)]
-        with Ledger(root, "answers").writer(evaluation.key) as writer:
+        with SegmentLedger(root, "answers").writer(evaluation.key) as writer:
             for n in range(start, min(start + EVALUATION_ROWS, rows)):
                 about = {
                     "item_id": f"occlusion:old-{n}:void",

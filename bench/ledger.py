@@ -13,19 +13,19 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.segments import SegmentLedger
 
 ROWS = [{"key": f"{number:064x}", "outcome": "answer", "text": "x" * 900} for number in range(20_000)]
 
 
 def ledger_write(folder: Path) -> None:
-    with Ledger(folder, "answers").writer("m__standard__run1") as writer:
+    with SegmentLedger(folder, "answers").writer("m__standard__run1") as writer:
         for row in ROWS:
             writer.append(row)
 
 
 def ledger_read(folder: Path) -> int:
-    return len(Ledger(folder, "answers").read("m__standard__run1").rows)
+    return len(SegmentLedger(folder, "answers").read("m__standard__run1").rows)
 
 
 def _connect(folder: Path) -> sqlite3.Connection:

@@ -18,13 +18,15 @@ import pytest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.storage.ledger import Ledger, Totals
 from traps_pipeline.storage.lines import checked_line
+from traps_pipeline.storage.segments import SegmentLedger
 
 HOLD = """
 import asyncio, sys, time
 from pathlib import Path
 from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.segments import SegmentLedger
 async def hold():
-    async with Ledger(Path(sys.argv[1]), "answers").lock("m", print):
+    async with SegmentLedger(Path(sys.argv[1]), "answers").lock("m", print):
         print("held", flush=True)
         time.sleep(60)
 asyncio.run(hold())
@@ -34,9 +36,10 @@ import resource, sys
 from pathlib import Path
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.segments import SegmentLedger
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 try:
-    with Ledger(Path(sys.argv[1]), "answers").writer("m") as writer:
+    with SegmentLedger(Path(sys.argv[1]), "answers").writer("m") as writer:
         for n in range(100):
             writer.append({"key": f"k{n}", "text": "x" * 100})
 except TrapsError as error:
@@ -46,7 +49,7 @@ except TrapsError as error:
 
 @pytest.fixture
 def ledger(tmp_path: Path) -> Ledger:
-    return Ledger(tmp_path, "answers")
+    return SegmentLedger(tmp_path, "answers")
 
 
 def segments(ledger: Ledger) -> list[Path]:
@@ -206,7 +209,7 @@ def test_a_full_disk_loses_no_earlier_row_and_leaves_no_half_line(ledger: Ledger
 
 
 def test_a_disk_that_is_really_full_loses_no_earlier_row(tiny_disk: Path) -> None:
-    ledger, written = Ledger(tiny_disk, "answers"), 0
+    ledger, written = SegmentLedger(tiny_disk, "answers"), 0
     with (
         pytest.raises(TrapsError, match=r"\.jsonl: .*No space left on device.*free some space"),
         ledger.writer("m") as w,

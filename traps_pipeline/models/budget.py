@@ -24,8 +24,9 @@ from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_accounts, load_models
 from traps_pipeline.models.request import Request
-from traps_pipeline.storage.ledger import JOURNAL, Totals
+from traps_pipeline.storage.ledger import Totals
 from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, read_checked
+from traps_pipeline.storage.segments import JOURNAL
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

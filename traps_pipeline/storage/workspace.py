@@ -16,6 +16,7 @@ from traps_pipeline.files import write_text
 from traps_pipeline.paths import CHECKOUT, require_checkout
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
@@ -149,12 +150,12 @@ class Workspace:
     @cached_property
     def answers(self) -> Ledger:
         """Every answer ever paid for."""
-        return Ledger(self.root / "ledger", "answers")
+        return SegmentLedger(self.root / "ledger", "answers")
 
     @cached_property
     def votes(self) -> Ledger:
         """Every vote ever paid for."""
-        return Ledger(self.root / "ledger", "votes")
+        return SegmentLedger(self.root / "ledger", "votes")
 
     def failed_check(self, stage: str, check: str, key: str | None) -> Path:
         """File that exists while a check of a partition does not pass; it holds the details."""
