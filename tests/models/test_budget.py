@@ -25,14 +25,13 @@ from traps_pipeline.models.budget import (
     Journal,
     check_money,
     most_tokens,
-    spending,
     worst_case_usd,
 )
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.models.spending import spending
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.storage.ledger import Totals
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -115,17 +114,6 @@ def test_an_unknown_cost_counts_as_the_worst() -> None:
         return budget.spent_usd
 
     assert asyncio.run(run()) == pytest.approx(0.4)
-
-
-def test_spend_is_what_the_ledger_holds_repeated_answers_too(tmp_path: Path) -> None:
-    ledger = SegmentLedger(tmp_path, "answers")
-    trap = 'says "cost_usd": 9.5, and "participant": "evil"'
-    for name, cost in (("m__standard__run1", 0.25), ("m__standard__run1", 0.5), ("n__json__run1", 1e-05)):
-        with ledger.writer(name) as writer:
-            about = {"participant": name.split("__")[0]}
-            writer.append({"key": "k", "text": trap, "cost_usd": cost, "components": about})
-            writer.append({"key": "l", "text": None, "cost_usd": None, "components": about})
-    assert ledger.totals() == {"m": Totals(0.75, 0.5), "n": Totals(1e-05, 1e-05)}
 
 
 def test_costs_that_cannot_be_count_as_the_dearest_call_and_are_told(

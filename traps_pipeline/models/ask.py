@@ -19,10 +19,11 @@ from typing import Any, Generic, TypeVar
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.budget import Budget, BudgetReached, spending
+from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.participants import Allowed, Participant, Participants, Row, attempt, ledger_row
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
+from traps_pipeline.models.spending import spending
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, Writer, settles
@@ -213,7 +214,7 @@ async def _settle_cell(
     report = progress.current()
     calls = work.calls(cell)
     wanted = {call.request.key: call.request for call in calls}
-    known = work.ledger.read(cell.evaluation.key, wanted)
+    known = await asyncio.to_thread(work.ledger.read, cell.evaluation.key, wanted)
     for place in sorted({*known.notes} - its.told):
         report.note(f"{place}: {known.notes[place]}")
     its.told.update(known.notes)
@@ -227,7 +228,7 @@ async def _settle_cell(
     rows |= asking.rows
     if stop.is_set() or len(rows) < len(wanted):
         return None
-    its.writer.sync()
+    await asyncio.to_thread(its.writer.sync)
     errors = sum(not settles(row) for row in rows.values())
     tally = Tally(asked=len(missing), cached=len(wanted) - len(missing), errors=errors)
     return Settled(cell, calls, {key: rows[key] for key in wanted}, tally)
