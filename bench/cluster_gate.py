@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, LiteralString
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -200,7 +200,7 @@ class Gate:
 
         return self.instance.get_runs(RunsFilter(tags={"dagster/partition": cell}))[0].run_id
 
-    def query(self, sql: str, *values: Any) -> list[Any]:
+    def query(self, sql: LiteralString, *values: Any) -> list[Any]:
         import psycopg
 
         with psycopg.connect(self.database.address(), autocommit=True) as opened:

@@ -7,7 +7,6 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
@@ -41,7 +40,7 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
             opened.callback(budget.close)
             yield budget
             return
-        held = opened.enter_context(_locked(workspace.locks / "budget.lock"))
+        held = opened.enter_context(alone(workspace))
         journal = Journal(workspace.ledger_folder / JOURNAL)
         opened.callback(journal.close)
         spent = spent_usd(workspace, journal)
@@ -57,9 +56,10 @@ def _accounts(workspace: Workspace, spent: Mapping[str, float], opened: ExitStac
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[Callable[[], None]]:
-    """Hold a lock file; the value raises TrapsError when it is called after the file was removed."""
-    told = False
+def alone(workspace: Workspace) -> Iterator[Callable[[], None]]:
+    """Be the one process of this machine that spends from a study's budget; the value raises TrapsError when it is
+    called after the lock's file was removed."""
+    path, told = workspace.locks / "budget.lock", False
     while (descriptor := try_lock(path)) is None:
         if not told:
             progress.current().note("another run spends from this study's budget; waiting for it to finish")

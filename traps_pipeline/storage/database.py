@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, LiteralString, TypeVar
 from urllib.parse import urlsplit
 
 from traps_pipeline.errors import TrapsError
@@ -35,7 +35,12 @@ PATIENCE_S = 60.0  # how long a run waits for a server that is away
 GRACE_S = 10  # after the server was started, those who held a lock before have so long to take it again
 RETRY_S = 0.2
 FORMAT = 1  # of the tables
-_KEEPALIVE = {"keepalives_idle": 5, "keepalives_interval": 5, "keepalives_count": 3, "tcp_user_timeout": 15_000}
+_KEEPALIVE: dict[str, Any] = {
+    "keepalives_idle": 5,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 15_000,
+}
 _SCHEMA = """
 create schema traps;
 create table traps.format (version int not null);
@@ -95,7 +100,7 @@ class Session:
         self.id = secrets.token_hex(8)
         self.study, self._address, self._variable, self._idle_s = study, address, variable, idle_s
         self.claims: dict[int, Claim] = {}
-        self.guard, self.closed = threading.RLock(), False
+        self.guard, self.closed, self.patience_s = threading.RLock(), False, PATIENCE_S
         self.has_blocks, self.purse = False, threading.Lock()  # of the study's budget; one purse at a time
         self._connection: Connection[Any] | None = None
         self._looked_at = float("-inf")  # when it was last seen that no claim was lost
@@ -109,12 +114,12 @@ class Session:
 
     # --- connecting -------------------------------------------------------------------------------------------------
 
-    def run(self, work: Callable[[Connection[Any]], T], patience_s: float = PATIENCE_S) -> T:
+    def run(self, work: Callable[[Connection[Any]], T], patience_s: float | None = None) -> T:
         """What `work` returns, done in one transaction. Where the connection breaks it is done again on a new one, so
         it must be such that twice is as good as once. Raises TrapsError when the server stays away."""
         import psycopg
 
-        until = time.monotonic() + patience_s
+        until = time.monotonic() + (self.patience_s if patience_s is None else patience_s)
         with self.guard:
             while True:
                 try:
@@ -149,10 +154,10 @@ class Session:
     def _enter(self, connection: Connection[Any]) -> None:
         """Make a new connection this session's: end those before it, and take again what nobody else has taken."""
         for name, seconds in (("idle_session", self._idle_s), ("idle_in_transaction_session", self._idle_s)):
-            connection.execute(f"set {name}_timeout = {int(1000 * seconds)}")
-        for name in ("idle", "interval"):
-            connection.execute(f"set tcp_keepalives_{name} = 5")
-        connection.execute("set tcp_keepalives_count = 3")
+            setting = f"{name}_timeout", f"{int(1000 * seconds)}"
+            connection.execute("select set_config(%s, %s, false)", setting)
+        for name, value in (("idle", "5"), ("interval", "5"), ("count", "3")):
+            connection.execute("select set_config(%s, %s, false)", [f"tcp_keepalives_{name}", value])
         own = "select pg_terminate_backend(pid) from pg_stat_activity where application_name = %s and pid <> %s"
         connection.execute(own, [f"traps {self.id}", connection.info.backend_pid])
         until = time.monotonic() + 5  # the old connection takes a moment to end
@@ -186,7 +191,7 @@ class Session:
         """Make the tables if there are none; the study's number."""
         connection.execute("select pg_advisory_xact_lock(%s)", [lock_number("schema")])
         if not _value(connection, "select to_regclass('traps.format') is not null"):
-            connection.execute(_SCHEMA)  # pyright: ignore[reportArgumentType]
+            connection.execute(_SCHEMA)
             connection.execute("insert into traps.format values (%s)", [FORMAT])
         found = _value(connection, "select version from traps.format")
         if found != FORMAT:
@@ -237,7 +242,7 @@ class Session:
     @staticmethod
     def is_settled(connection: Connection[Any]) -> bool:
         """Whether the server has been up for a while."""
-        return _value(connection, f"select now() - pg_postmaster_start_time() > interval '{GRACE_S} s'")
+        return _value(connection, "select extract(epoch from now() - pg_postmaster_start_time()) > %s", GRACE_S)
 
     @property
     def is_held(self) -> bool:
@@ -253,9 +258,9 @@ class Session:
                     self._connection.close()
 
 
-def _value(connection: Connection[Any], sql: str, *values: Any) -> Any:
+def _value(connection: Connection[Any], sql: LiteralString, *values: Any) -> Any:
     """The first column of the first row."""
-    row = connection.execute(sql, values).fetchone()  # pyright: ignore[reportArgumentType]
+    row = connection.execute(sql, values).fetchone()
     return row[0] if row else None
 
 

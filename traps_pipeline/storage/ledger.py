@@ -169,6 +169,15 @@ class Ledger(ABC):
         writes to these evaluations meanwhile. Raises TrapsError."""
 
     @abstractmethod
+    def evaluations(self) -> list[str]:
+        """Those that have rows."""
+
+    @abstractmethod
+    def rows(self, evaluation: str) -> Iterator[Stored]:
+        """Every row of an evaluation as it was written, the oldest first, and what stands beside it. Rows that are not
+        what was written are left out."""
+
+    @abstractmethod
     def damage(self) -> Iterator[str]:
         """A sentence for each place where rows are not what was written. Reads all."""
 

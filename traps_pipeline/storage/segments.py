@@ -186,6 +186,21 @@ class SegmentLedger(Ledger):
                 shutil.rmtree(staged.root, ignore_errors=True)
         return new
 
+    def evaluations(self) -> list[str]:
+        """See `Ledger.evaluations`."""
+        return sorted({path.parent.name for path in (self.root / self.kind).glob("*/*.jsonl")})
+
+    def rows(self, evaluation: str) -> Iterator[Stored]:
+        """See `Ledger.rows`."""
+        for segment in sorted(self.folder(evaluation).glob("*.jsonl")):
+            beside: dict[str, dict[str, str]] = {}
+            for name in ASIDES:
+                path = segment.with_suffix(f".jsonl.{name}")
+                for row in _whole_rows(path) if path.exists() else ():
+                    beside.setdefault(row["key"], {})[name] = row[name]
+            for row in _whole_rows(segment):
+                yield row, beside.get(row["key"], {})
+
     def damage(self) -> Iterator[str]:
         """See `Ledger.damage`."""
         for path in sorted((self.root / self.kind).glob("*/*.jsonl*")):
@@ -318,6 +333,15 @@ def _read_segment(
                     "will be asked anew, all others are kept"
                 ) from error
             yield place, row, f"{', '.join(healed)}: no possible value, counted as unknown" if healed else None
+
+
+def _whole_rows(path: Path) -> Iterator[dict[str, Any]]:
+    """The rows of a segment, or of what is kept beside it, that are what was written."""
+    for line in _lines(path):
+        row = _parsed(line)
+        if row is not None and "key" in row:
+            row.pop("sum", None)
+            yield row
 
 
 def _parsed(line: Line) -> dict[str, Any] | None:

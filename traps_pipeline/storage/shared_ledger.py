@@ -8,14 +8,16 @@ flight.
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.storage.database import OLD_S, PATIENCE_S, Claim, Session, lock_number
+from traps_pipeline.storage.database import OLD_S, Claim, Session, lock_number
 from traps_pipeline.storage.ledger import (
+    ASIDES,
     GiveUp,
     Known,
     Ledger,
@@ -79,11 +81,26 @@ class SharedLedger(Ledger):
         found = self.session.run(lambda c: c.execute(sql, [self.session.study_id, self.kind]).fetchall())
         return {participant: totals_of(*its) for participant, *its in found}
 
+    def evaluations(self) -> list[str]:
+        """See `Ledger.evaluations`."""
+        sql = """select name from traps.evaluations e where study = %s and kind = %s
+                 and exists (select from traps.rows where evaluation = e.id) order by name"""
+        found = self.session.run(lambda c: c.execute(sql, [self.session.study_id, self.kind]).fetchall())
+        return [evaluation for (evaluation,) in found]
+
+    def rows(self, evaluation: str) -> Iterator[Stored]:
+        """See `Ledger.rows`."""
+        for _, line, *beside in self._pages(f"line, {', '.join(ASIDES)}", evaluation):
+            if is_whole(line):
+                row = json.loads(line)
+                row.pop("sum")
+                kept = {name: json.loads(of)[name] for name, of in zip(ASIDES, beside, strict=True) if of}
+                yield row, kept
+
     def damage(self) -> Iterator[str]:
         """See `Ledger.damage`."""
-        sql = "select name from traps.evaluations where study = %s and kind = %s order by name"
-        for (evaluation,) in self.session.run(lambda c: c.execute(sql, [self.session.study_id, self.kind]).fetchall()):
-            for column in ("line", "reasoning", "raw"):
+        for evaluation in self.evaluations():
+            for column in ("line", *ASIDES):
                 places = [place for place, line in self._lines(column, evaluation) if not is_whole(line)]
                 yield from (f"{place} ({column}): {NOT_WHOLE}, and not believed" for place in places)
 
@@ -91,16 +108,21 @@ class SharedLedger(Ledger):
         self, column: str, evaluation: str, wanted: Collection[str] | None = None
     ) -> Iterator[tuple[str, bytes]]:
         """Place and content of the lines of an evaluation, the oldest first."""
-        last = 0
-        sql = f"""select r.id, r.key, r.{column} from traps.rows r join traps.evaluations e on e.id = r.evaluation
-                  where e.study = %s and e.kind = %s and e.name = %s and r.id > %s and r.{column} is not null
+        for key, line in self._pages(column, evaluation, wanted):
+            if line is not None:
+                yield f"{self.session.host}: {self.kind} of {evaluation}, key {key[:16]}", line
+
+    def _pages(self, columns: str, evaluation: str, wanted: Collection[str] | None = None) -> Iterator[Sequence[Any]]:
+        """Key and columns of the rows of an evaluation (of the wanted keys), the oldest first."""
+        last, keys = 0, None if wanted is None else list(wanted)
+        sql = f"""select r.id, r.key, {columns} from traps.rows r join traps.evaluations e on e.id = r.evaluation
+                  where e.study = %s and e.kind = %s and e.name = %s and r.id > %s
                   and (%s::text[] is null or r.key = any(%s::text[])) order by r.id limit {FETCHED}"""
-        keys = None if wanted is None else list(wanted)
         while True:
             values = [self.session.study_id, self.kind, evaluation, last, keys, keys]
             found = self.session.run(lambda c, values=values: c.execute(sql, values).fetchall())  # pyright: ignore
-            for _, key, line in found:
-                yield f"{self.session.host}: {self.kind} of {evaluation}, key {key[:16]}", bytes(line)
+            for _, *row in found:
+                yield row
             if len(found) < FETCHED:
                 return
             last = found[-1][0]
@@ -177,9 +199,11 @@ class SharedLedger(Ledger):
         """The claim, or who has it."""
         session, lock = self.session, lock_number(f"{self.session.study}/{self.kind}/{evaluation}")
 
+        slot = [session.study_id, self.kind, evaluation]
+
         def work(connection: Connection[Any]) -> Claim | str:
+            connection.execute("update traps.studies set is_here = true where id = %s and not is_here", slot[:1])
             sql = "insert into traps.evaluations (study, kind, name) values (%s, %s, %s) on conflict do nothing"
-            slot = [session.study_id, self.kind, evaluation]
             connection.execute(sql, slot)
             sql = """select id, holder, to_char(since, 'HH24:MI:SS') from traps.evaluations
                      where study = %s and kind = %s and name = %s"""
@@ -224,7 +248,8 @@ class SharedWriter(Writer):
 
     async def require(self) -> None:
         """See `Writer.require`. While the database is away, or too slow to say, wait for a while."""
-        session, until = self._stream.session, time.monotonic() + PATIENCE_S
+        session = self._stream.session
+        until = time.monotonic() + session.patience_s
         while not session.is_fresh and not self.claim.lost and time.monotonic() < until:
             await asyncio.to_thread(session.look)
         if self.claim.lost or not session.is_fresh:

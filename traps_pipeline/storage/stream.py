@@ -29,18 +29,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Encoded:
-    """A row as it is stored. beside: what is kept beside it, in the order of ASIDES, None where there is none."""
+    """A row as it is stored. settles: whether it is the one row that settles its key; beside: what is kept beside it,
+    in the order of ASIDES, None where there is none."""
 
     row: Mapping[str, Any]
+    settles: bool
     line: bytes
     beside: tuple[bytes | None, ...]
 
 
-def encoded(stored: Stored) -> Encoded:
-    """A row, ready to be stored. Raises ValueError for what no line can hold."""
+def encoded(stored: Stored, *, is_newest: bool = True) -> Encoded:
+    """A row, ready to be stored. is_newest: no later row of the ledger that it comes from settles its key. Raises
+    ValueError for what no line can hold."""
     row, its = stored
     beside = (checked_line({"key": row["key"], name: its[name]}) if name in its else None for name in ASIDES)
-    return Encoded(row, checked_line(row), tuple(beside))
+    return Encoded(row, is_newest and row.get("outcome") not in FAILED, checked_line(row), tuple(beside))
 
 
 @dataclass
@@ -178,7 +181,7 @@ def insert_rows(connection: Connection[Any], evaluation: int, rows: Sequence[Enc
     connection.execute(sql, [evaluation, keys])
     lines = [one.line for one in rows]
     beside = [[one.beside[number] for one in rows] for number in range(len(ASIDES))]
-    settled = [one.row.get("outcome") not in FAILED for one in rows]
+    settled = [one.settles for one in rows]
     digests = [sha256(line).digest() for line in lines]
     sql = """insert into traps.rows (evaluation, key, settled, line, digest, reasoning, raw)
              select %s, * from unnest(%s::text[], %s::bool[], %s::bytea[], %s::bytea[], %s::bytea[], %s::bytea[])
@@ -203,14 +206,21 @@ def add_up(connection: Connection[Any], session: Session, rows: Iterable[tuple[s
         (before,) = connection.execute(sql, slot).fetchall()
         whole = totals_of(*before)
         whole.join(its)
-        sql = """update traps.totals set dollars = %s, dearest = %s, unknown = %s, means = %s
-                 where study = %s and kind = %s and participant = %s"""
-        connection.execute(sql, [whole.dollars, whole.dearest, whole.unknown, json.dumps(whole.means), *slot])
+        put_totals(connection, session, kind, participant, whole)
     for participant, usd in sorted(spent.items()):
         if usd > 0:
             add_spent(connection, session, participant, usd)
             sql = "update traps.blocks set booked = booked + %s where study = %s and session = %s and participant = %s"
             connection.execute(sql, [usd, session.study_id, session.id, participant])
+
+
+def put_totals(connection: Connection[Any], session: Session, kind: str, participant: str, its: Totals) -> None:
+    """Store what all rows of a participant add up to."""
+    sql = """insert into traps.totals values (%s, %s, %s, %s, %s, %s, %s) on conflict (study, kind, participant)
+             do update set dollars = excluded.dollars, dearest = excluded.dearest, unknown = excluded.unknown,
+             means = excluded.means"""
+    values = [its.dollars, its.dearest, its.unknown, json.dumps(its.means)]
+    connection.execute(sql, [session.study_id, kind, participant, *values])
 
 
 def add_spent(connection: Connection[Any], session: Session, participant: str, usd: float) -> None:
