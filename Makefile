@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := $(CURDIR)/.workspaces/demo
 RENDER_PACKAGES := libosmesa6 python3-venv
-TEST_PACKAGES := $(RENDER_PACKAGES) chromium strace
+TEST_PACKAGES := $(RENDER_PACKAGES) chromium postgresql strace
 # Outside the lock, so that a machine may bring the build that suits it; a CPU build is enough: make TORCH="torch==2.13.0 --index-url ..."
 TORCH ?= torch==2.13.0
 PORT ?= 3000
@@ -70,7 +70,7 @@ $(VENV)/.installed: requirements.lock pyproject.toml
 render-packages:
 	@{ ldconfig -p | grep -q libOSMesa && $(PYTHON) -c 'import ensurepip'; } 2>/dev/null || $(call install,$(RENDER_PACKAGES))
 test-packages:
-	@{ ldconfig -p | grep -q libOSMesa && $(PYTHON) -c 'import ensurepip' && command -v chromium >/dev/null && command -v strace >/dev/null; } 2>/dev/null || $(call install,$(TEST_PACKAGES))
+	@{ ldconfig -p | grep -q libOSMesa && $(PYTHON) -c 'import ensurepip' && command -v chromium >/dev/null && command -v strace >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null; } 2>/dev/null || $(call install,$(TEST_PACKAGES))
 
 define install
 if [ "$$(id -u)" = 0 ]; then \
