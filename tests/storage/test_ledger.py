@@ -68,9 +68,9 @@ def damage(ledger: Ledger, key: str, change: bytes) -> None:
     else:
         assert isinstance(ledger, SharedLedger)
         sql = """update traps.rows set line = %s where key = %s
-                 and evaluation in (select id from traps.evaluations where study = %s)"""
+                 and evaluation in (select id from traps.evaluations where study = %s) returning key"""
         values = [change, key, ledger.session.study_id]
-        assert ledger.session.run(lambda connection: connection.execute(sql, values).rowcount) == 1
+        assert ledger.session.run(lambda connection: connection.execute(sql, values).fetchall()) == [(key,)]
 
 
 def test_rows_come_back_by_key_and_evaluation(place: Place) -> None:

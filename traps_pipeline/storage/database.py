@@ -57,7 +57,8 @@ create unique index on traps.rows (evaluation, key) where settled;
 create index on traps.rows (evaluation, key);
 create table traps.totals (
     study int not null references traps.studies, kind text not null, participant text not null,
-    dollars float8 not null, dearest float8 not null, unknown bigint not null, means jsonb not null,
+    dollars float8 not null, dearest float8 not null, unknown bigint not null,
+    sums float8[] not null, counts float8[] not null,  -- of the columns whose means forecast what a call takes
     primary key (study, kind, participant));
 create table traps.spent (
     study int not null references traps.studies, participant text not null, usd float8 not null,
@@ -124,6 +125,7 @@ class Session:
             while True:
                 try:
                     connection = self._connected()
+                    # Not in a pipeline: the server does not end a session that is stopped within one.
                     with connection.transaction():
                         return work(connection)
                 except psycopg.Error as error:
@@ -191,7 +193,9 @@ class Session:
         """Make the tables if there are none; the study's number."""
         connection.execute("select pg_advisory_xact_lock(%s)", [lock_number("schema")])
         if not _value(connection, "select to_regclass('traps.format') is not null"):
-            connection.execute(_SCHEMA)
+            for statement in _SCHEMA.split(";\n"):
+                if statement.strip():
+                    connection.execute(statement)
             connection.execute("insert into traps.format values (%s)", [FORMAT])
         found = _value(connection, "select version from traps.format")
         if found != FORMAT:

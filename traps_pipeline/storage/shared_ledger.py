@@ -77,7 +77,8 @@ class SharedLedger(Ledger):
 
     def totals(self) -> dict[str, Totals]:
         """See `Ledger.totals`."""
-        sql = "select participant, dollars, dearest, unknown, means from traps.totals where study = %s and kind = %s"
+        sql = """select participant, dollars, dearest, unknown, sums, counts from traps.totals
+                 where study = %s and kind = %s"""
         found = self.session.run(lambda c: c.execute(sql, [self.session.study_id, self.kind]).fetchall())
         return {participant: totals_of(*its) for participant, *its in found}
 
@@ -169,7 +170,7 @@ class SharedLedger(Ledger):
 
         def work(connection: Connection[Any]) -> list[Claim]:
             numbers = current_numbers(connection, groups)
-            if refused := [g.claim for g in groups if g.claim.number != numbers[g.claim.evaluation][0]]:
+            if refused := [g.claim for g in groups if g.claim.number != numbers.get(g.claim.evaluation)]:
                 return refused
             return store_groups(connection, self.session, groups)
 

@@ -6,7 +6,6 @@ whose writer is not the evaluation's any more is refused.
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import threading
@@ -20,11 +19,14 @@ from weakref import WeakKeyDictionary
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.storage.database import BEAT_S, Claim, Session
-from traps_pipeline.storage.ledger import ASIDES, FAILED, SYNC_ROWS, Stored, Totals, participant_of
+from traps_pipeline.storage.ledger import ASIDES, AVERAGED, FAILED, SYNC_ROWS, Stored, Totals, participant_of
 from traps_pipeline.storage.lines import checked_line
 
 if TYPE_CHECKING:
     from psycopg import Connection
+
+
+_MEANS = ("sums", "counts")
 
 
 @dataclass(frozen=True)
@@ -150,43 +152,48 @@ def this_process() -> str:
 def store_groups(connection: Connection[Any], session: Session, groups: Sequence[Group]) -> list[Claim]:
     """Store groups of rows, with what they add to the totals and to what was spent; the claims whose groups are
     refused. A group that was stored before, when the connection broke, is not stored again."""
-    numbers = current_numbers(connection, groups)
-    refused, new = list[Claim](), list[Group]()
-    for group in groups:
-        number, stored = numbers.get(group.claim.evaluation, (-1, 0))
-        if number != group.claim.number:
-            group.claim.lost = True
-            refused.append(group.claim)
-        elif stored == group.claim.groups:
-            new.append(group)
+    claims = [group.claim for group in groups]
+    sql = """update traps.evaluations e set groups = e.groups + 1
+             from unnest(%s::int[], %s::bigint[], %s::bigint[]) as mine (id, number, groups)
+             where e.id = mine.id and e.number = mine.number and e.groups = mine.groups returning e.id"""
+    values = [[claim.evaluation for claim in claims], [claim.number for claim in claims], [c.groups for c in claims]]
+    allowed = {evaluation for (evaluation,) in connection.execute(sql, values).fetchall()}
+    new = [group for group in groups if group.claim.evaluation in allowed]
     for group in new:
-        sql = "update traps.evaluations set groups = groups + 1 where id = %s"
-        connection.execute(sql, [group.claim.evaluation])
         insert_rows(connection, group.claim.evaluation, group.rows)
     add_up(connection, session, ((group.kind, one.row) for group in new for one in group.rows))
+    others = [group for group in groups if group.claim.evaluation not in allowed]
+    numbers = current_numbers(connection, others) if others else {}
+    refused = [g.claim for g in others if numbers.get(g.claim.evaluation) != g.claim.number]
+    for claim in refused:
+        claim.lost = True
     return refused
 
 
-def current_numbers(connection: Connection[Any], groups: Sequence[Group]) -> dict[int, tuple[int, int]]:
-    """Writer's number and groups stored by evaluation; nobody else can change them before this transaction's end."""
-    sql = "select id, number, groups from traps.evaluations where id = any(%s) order by id for update"
-    found = connection.execute(sql, [[group.claim.evaluation for group in groups]]).fetchall()
-    return {evaluation: (number, stored) for evaluation, number, stored in found}
+def current_numbers(connection: Connection[Any], groups: Sequence[Group]) -> dict[int, int]:
+    """The writer's number by evaluation; nobody else can change it before this transaction's end."""
+    sql = "select id, number from traps.evaluations where id = any(%s) order by id for update"
+    return dict(connection.execute(sql, [[group.claim.evaluation for group in groups]]).fetchall())
 
 
 def insert_rows(connection: Connection[Any], evaluation: int, rows: Sequence[Encoded]) -> None:
     """Insert rows; a key that is settled keeps its row, unless that is damaged."""
     keys = [one.row["key"] for one in rows]
-    sql = "delete from traps.rows where evaluation = %s and settled and key = any(%s) and sha256(line) <> digest"
-    connection.execute(sql, [evaluation, keys])
     lines = [one.line for one in rows]
     beside = [[one.beside[number] for one in rows] for number in range(len(ASIDES))]
     settled = [one.settles for one in rows]
     digests = [sha256(line).digest() for line in lines]
     sql = """insert into traps.rows (evaluation, key, settled, line, digest, reasoning, raw)
              select %s, * from unnest(%s::text[], %s::bool[], %s::bytea[], %s::bytea[], %s::bytea[], %s::bytea[])
-             on conflict (evaluation, key) where settled do nothing"""
-    connection.execute(sql, [evaluation, keys, settled, lines, digests, *beside])
+             on conflict (evaluation, key) where settled do nothing returning key"""
+    stored = connection.execute(sql, [evaluation, keys, settled, lines, digests, *beside]).fetchall()
+    if len(stored) < len(rows):
+        damaged = (
+            "delete from traps.rows where evaluation = %s and settled and key = any(%s) and sha256(line) <> digest"
+        )
+        ended = connection.execute(damaged + " returning key", [evaluation, keys]).fetchall()
+        if again := [one for one in rows if (one.row["key"],) in ended]:
+            insert_rows(connection, evaluation, again)
 
 
 def add_up(connection: Connection[Any], session: Session, rows: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
@@ -198,15 +205,7 @@ def add_up(connection: Connection[Any], session: Session, rows: Iterable[tuple[s
     spent: dict[str, float] = {}
     for (kind, participant), its in sorted(totals.items()):
         spent[participant] = spent.get(participant, 0.0) + its.dollars
-        slot = [session.study_id, kind, participant]
-        sql = "insert into traps.totals values (%s, %s, %s, 0, 0, 0, '{}') on conflict do nothing"
-        connection.execute(sql, slot)
-        sql = """select dollars, dearest, unknown, means from traps.totals
-                 where study = %s and kind = %s and participant = %s for update"""
-        (before,) = connection.execute(sql, slot).fetchall()
-        whole = totals_of(*before)
-        whole.join(its)
-        put_totals(connection, session, kind, participant, whole)
+        add_totals(connection, session, kind, participant, its)
     for participant, usd in sorted(spent.items()):
         if usd > 0:
             add_spent(connection, session, participant, usd)
@@ -214,13 +213,16 @@ def add_up(connection: Connection[Any], session: Session, rows: Iterable[tuple[s
             connection.execute(sql, [usd, session.study_id, session.id, participant])
 
 
-def put_totals(connection: Connection[Any], session: Session, kind: str, participant: str, its: Totals) -> None:
-    """Store what all rows of a participant add up to."""
-    sql = """insert into traps.totals values (%s, %s, %s, %s, %s, %s, %s) on conflict (study, kind, participant)
-             do update set dollars = excluded.dollars, dearest = excluded.dearest, unknown = excluded.unknown,
-             means = excluded.means"""
-    values = [its.dollars, its.dearest, its.unknown, json.dumps(its.means)]
-    connection.execute(sql, [session.study_id, kind, participant, *values])
+def add_totals(connection: Connection[Any], session: Session, kind: str, participant: str, its: Totals) -> None:
+    """Add to what all rows of a participant add up to."""
+    added = (f"array(select a + b from unnest(totals.{of}, excluded.{of}) as both_of (a, b))" for of in _MEANS)
+    sql = f"""insert into traps.totals values (%s, %s, %s, %s, %s, %s, %s, %s)
+              on conflict (study, kind, participant) do update set dollars = totals.dollars + excluded.dollars,
+              dearest = greatest(totals.dearest, excluded.dearest), unknown = totals.unknown + excluded.unknown,
+              sums = {next(added)}, counts = {next(added)}"""
+    sums, counts = ([float(its.means.get(column, (0.0, 0))[place]) for column in AVERAGED] for place in (0, 1))
+    values = [session.study_id, kind, participant, its.dollars, its.dearest, its.unknown, sums, counts]
+    connection.execute(sql, values)
 
 
 def add_spent(connection: Connection[Any], session: Session, participant: str, usd: float) -> None:
@@ -230,6 +232,7 @@ def add_spent(connection: Connection[Any], session: Session, participant: str, u
     connection.execute(sql, [session.study_id, participant, usd])
 
 
-def totals_of(dollars: float, dearest: float, unknown: int, means: Mapping[str, Any]) -> Totals:
+def totals_of(dollars: float, dearest: float, unknown: int, sums: Sequence[float], counts: Sequence[float]) -> Totals:
     """Totals as the database holds them."""
-    return Totals(dollars, dearest, unknown, {column: (mean[0], mean[1]) for column, mean in means.items()})
+    means = {name: (total, int(n)) for name, total, n in zip(AVERAGED, sums, counts, strict=True) if n}
+    return Totals(dollars, dearest, unknown, means)

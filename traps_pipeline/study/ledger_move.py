@@ -26,7 +26,7 @@ from traps_pipeline.storage.ledger import Ledger, LockGivenUp, Stored, settles
 from traps_pipeline.storage.purse import Purse
 from traps_pipeline.storage.segments import JOURNAL, SegmentLedger
 from traps_pipeline.storage.shared_ledger import SharedLedger
-from traps_pipeline.storage.stream import add_spent, encoded, insert_rows, put_totals
+from traps_pipeline.storage.stream import add_spent, add_totals, encoded, insert_rows
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def _fill(connection: Connection[Any], session: Session, ledgers: Iterable[Segme
                 insert_rows(connection, number, rows)
                 count += len(rows)
         for participant, its in ledger.totals().items():
-            put_totals(connection, session, ledger.kind, participant, its)
+            add_totals(connection, session, ledger.kind, participant, its)
     for participant, usd in spent.items():
         add_spent(connection, session, participant, usd)
     return count
