@@ -79,7 +79,7 @@ def test_one_budget_holds_for_both_and_the_next_run_goes_on(
     hosts: tuple[Checkout, Checkout], provider: Provider
 ) -> None:
     one, two = hosts
-    provider.configure(latency_s=0.05)
+    provider.configure(latency_s=0.05, usd_a_token=[1e-6, 1e-5])  # as the entry says
     path = experiment(one, ["image-model"])
     running = [start(host, path, "0.4") for host in (one, two)]  # all answers cost about $0.70
     said = [process.communicate(timeout=600) for process in running]

@@ -188,11 +188,10 @@ def insert_rows(connection: Connection[Any], evaluation: int, rows: Sequence[Enc
              on conflict (evaluation, key) where settled do nothing returning key"""
     stored = connection.execute(sql, [evaluation, keys, settled, lines, digests, *beside]).fetchall()
     if len(stored) < len(rows):
-        damaged = (
-            "delete from traps.rows where evaluation = %s and settled and key = any(%s) and sha256(line) <> digest"
-        )
-        ended = connection.execute(damaged + " returning key", [evaluation, keys]).fetchall()
-        if again := [one for one in rows if (one.row["key"],) in ended]:
+        sql = """delete from traps.rows where evaluation = %s and settled and key = any(%s) and sha256(line) <> digest
+                 returning key"""
+        damaged = connection.execute(sql, [evaluation, keys]).fetchall()
+        if again := [one for one in rows if one.settles and (one.row["key"],) in damaged]:
             insert_rows(connection, evaluation, again)
 
 
