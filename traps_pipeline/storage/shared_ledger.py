@@ -13,6 +13,7 @@ import time
 from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AsyncExitStack, asynccontextmanager
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.storage.database import OLD_S, Claim, Session, lock_number
@@ -114,19 +115,24 @@ class SharedLedger(Ledger):
                 yield f"{self.session.host}: {self.kind} of {evaluation}, key {key[:16]}", line
 
     def _pages(self, columns: str, evaluation: str, wanted: Collection[str] | None = None) -> Iterator[Sequence[Any]]:
-        """Key and columns of the rows of an evaluation (of the wanted keys), the oldest first."""
-        last, keys = 0, None if wanted is None else list(wanted)
+        """Key and columns of the rows of an evaluation, the oldest first; of the wanted keys, part of them by part."""
         sql = f"""select r.id, r.key, {columns} from traps.rows r join traps.evaluations e on e.id = r.evaluation
-                  where e.study = %s and e.kind = %s and e.name = %s and r.id > %s
-                  and (%s::text[] is null or r.key = any(%s::text[])) order by r.id limit {FETCHED}"""
-        while True:
-            values = [self.session.study_id, self.kind, evaluation, last, keys, keys]
-            found = self.session.run(lambda c, values=values: c.execute(sql, values).fetchall())  # pyright: ignore
-            for _, *row in found:
+                  where e.study = %s and e.kind = %s and e.name = %s"""
+        slot = [self.session.study_id, self.kind, evaluation]
+        if wanted is not None:
+            keys = iter(wanted)
+            while part := list(islice(keys, FETCHED)):
+                for _, *row in self._fetched(f"{sql} and r.key = any(%s::text[]) order by r.id", [*slot, part]):
+                    yield row
+            return
+        last = 0
+        while found := self._fetched(f"{sql} and r.id > %s order by r.id limit {FETCHED}", [*slot, last]):
+            for last, *row in found:  # noqa: B007 - where the next part begins
                 yield row
-            if len(found) < FETCHED:
-                return
-            last = found[-1][0]
+
+    def _fetched(self, sql: str, values: Sequence[Any]) -> Sequence[Any]:
+        """Rows of the database. sql: of this file's own words."""
+        return self.session.run(lambda c: c.execute(sql, values).fetchall())  # pyright: ignore[reportArgumentType]
 
     @asynccontextmanager
     async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = never) -> AsyncIterator[Writer]:

@@ -132,7 +132,7 @@ def test_a_second_run_asks_nothing(tmp_path: Path, batches: list[int]) -> None:
 
     rows, tally = run()
     assert (tally.asked, tally.cached, batches) == (3, 0, [2, 1])
-    written = Ledger(tmp_path, "answers").read(cell.evaluation.key).settled.values()
+    written = SegmentLedger(tmp_path, "answers").read(cell.evaluation.key).settled.values()
     assert {row["components"]["params"]["checkpoint_digest"] for row in written} == {model(of.id).checkpoint.digest}
     again, tally = run()
     assert (tally.asked, tally.cached, batches) == (0, 3, [2, 1])
