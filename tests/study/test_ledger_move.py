@@ -80,7 +80,7 @@ def test_a_ledger_comes_back_line_by_line_with_all_that_was_spent(study: Workspa
     assert inside.answers.totals()["m"].unknown == 1
     back = move_back(inside)
     outside = Workspace.open(study.root)
-    assert (back.rows, outside.study.database, seen(outside)) == (5, "", before)
+    assert (back.rows, outside.study.database, seen(outside)) == (5, None, before)
     assert spent_usd(outside) == pytest.approx(spent)
     assert sorted(line for path in segments(outside) for line in path.read_bytes().splitlines()) == lines
     assert inside.answers.evaluations() == [] and inside.answers.totals() == {}
@@ -111,7 +111,7 @@ def test_nothing_moves_while_somebody_asks(study: Workspace) -> None:
                 await asyncio.to_thread(move)
 
     asyncio.run(while_asking(lambda: move_to_database(study, VARIABLE)))
-    assert Workspace.open(study.root).study.database == "" and segments(study)
+    assert Workspace.open(study.root).study.database is None and segments(study)
     move_to_database(study, VARIABLE)
     asyncio.run(while_asking(lambda: move_back(Workspace.open(study.root))))
     assert Workspace.open(study.root).study.database == VARIABLE
@@ -138,6 +138,16 @@ def test_the_command_says_where_the_ledger_lies(study: Workspace, capsys: pytest
     assert main(["ledger", "move", "--to", VARIABLE, *where]) == 1
     assert "already" in capsys.readouterr().err
     assert main(["ledger", "move", "--back", *where]) == 0
+
+
+def test_an_address_in_the_place_of_a_variable_is_refused_and_not_repeated(
+    study: Workspace, capsys: pytest.CaptureFixture[str]
+) -> None:
+    address = "postgresql://traps:secret@127.0.0.1/postgres"
+    assert main(["ledger", "move", "--to", address, "--workspace", str(study.root)]) == 1
+    said = capsys.readouterr().err
+    assert "give the name of a variable of the environment" in said and "secret" not in said
+    assert "secret" not in (study.root / "study.yaml").read_text()
 
 
 def test_a_study_whose_database_cannot_be_reached_says_so(study: Workspace, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,6 +7,7 @@ then: a move that is killed has changed nothing, and the same command does it ag
 from __future__ import annotations
 
 import asyncio
+import re
 import secrets
 import time
 from collections.abc import AsyncIterator, Iterable, Iterator
@@ -52,6 +53,11 @@ def move_to_database(workspace: Workspace, variable: str) -> Moved:
         raise TrapsError(
             f"{workspace.root}/study.yaml: the ledger lies in a database already ({workspace.study.database}); move it "
             "back first (`traps ledger move --back`)"
+        )
+    if not re.fullmatch(r"[A-Z][A-Z0-9_]*", variable):  # not repeated: it may be an address with its password
+        raise TrapsError(
+            "--to: give the name of a variable of the environment, in capitals (LAB_DATABASE), that holds the address; "
+            "study.yaml holds the name, and never the address"
         )
     return asyncio.run(_move_in(workspace, session_of(variable, workspace.study.name), variable))
 
@@ -159,7 +165,7 @@ async def _move_out(workspace: Workspace, session: Session) -> Moved:
                 path.rename(workspace.ledger_folder / path.name)
             staged.rmdir()
             sync_folder(workspace.ledger_folder)
-            workspace.allow(database="")
+            workspace.allow(database=None)
             session.run(lambda connection: _clear(connection, session))
         finally:
             purse.close()
