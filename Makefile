@@ -10,7 +10,7 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test ui bench explorer-vendor environments lint setup render-packages test-packages clean
+.PHONY: demo demo-mechanism check fast-tests test test-cluster ui bench explorer-vendor environments lint setup render-packages test-packages clean
 
 demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -31,6 +31,11 @@ fast-tests: setup
 # One more worker than the two cores that are needed: tests of servers and of Dagster's daemon wait for much of their time.
 test: test-packages setup lint ## lint, types and all tests, the slow ones too
 	$(PYTEST) -n 3
+
+# Ray is 80 MB and in no other test; not part of `make test` until something but the gate needs it.
+test-cluster: test-packages setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-cluster.lock
+	$(BIN)/python bench/cluster_gate.py
 
 ui: setup ## Dagster's web server and daemon on 127.0.0.1:$(PORT); open the address that it prints
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo

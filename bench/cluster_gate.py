@@ -22,7 +22,8 @@ from typing import Any, LiteralString
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
-POLL_S, WATCH_S = 15, 240
+POLL_S, WATCH_S, STEPS = 15, 240, 60
+ENDED = ("SUCCESS", "FAILURE", "CANCELED")
 DAGSTER_YAML = """
 telemetry: {{enabled: false}}
 storage: {{postgres: {{postgres_url: {{env: TRAPS_GATE_HISTORY}}}}}}
@@ -166,6 +167,7 @@ class Gate:
     def __init__(self, folder: Path, cluster: Cluster, database: Any) -> None:
         self.folder, self.cluster, self.database = folder, cluster, database
         self.daemon: subprocess.Popen[bytes] | None = None
+        self.failures: list[str] = []
 
     def start(self) -> None:
         import psycopg
@@ -222,8 +224,16 @@ class Gate:
             return type(error).__name__
         return run.status.value if run else "gone"
 
-    def watch(self, runs: dict[str, str], began: float, seconds: float = WATCH_S) -> None:
-        """Print each change of the runs' states, and of the nodes that make their steps, until all have ended."""
+    def watch(
+        self,
+        runs: dict[str, str],
+        began: float,
+        seconds: float = WATCH_S,
+        may_go_on: bool = False,
+        may_fail: bool = False,
+    ) -> None:
+        """Print each change of the runs' states, and of the nodes that make their steps, until all have ended. A run
+        that does not succeed with all its steps is a failure, unless it `may_go_on` or `may_fail`."""
         seen: dict[str, tuple[str, str]] = {}
         while time.monotonic() - began < seconds:
             for cell, run_id in runs.items():
@@ -236,13 +246,17 @@ class Gate:
                 if seen.get(cell) != (status, node):
                     print(f"  {at:6.1f} s  {cell} {status:9s} last step on {node}", flush=True)
                     seen[cell] = status, node
-            if all(status in ("SUCCESS", "FAILURE", "CANCELED") for status, _ in seen.values()):
+            if all(status in ENDED for status, _ in seen.values()):
                 break
             time.sleep(0.5)
         for cell in runs:
             tried, steps = self.query("select count(*), count(distinct step) from tried where cell = %s", cell)[0]
             made = self.query("select count(*) from made where cell = %s", cell)[0][0]
             print(f"  {cell}: {made} steps made, {tried} tried, {tried - steps} twice", flush=True)
+            status = seen[cell][0]
+            if may_go_on or (status == "SUCCESS" and made == STEPS) or (status == "FAILURE" and may_fail):
+                continue
+            self.failures.append(f"{cell} is {status} with {made} of {STEPS} steps")
 
 
 def killed_run(gate: Gate) -> None:
@@ -290,7 +304,7 @@ def stopped_node(gate: Gate) -> None:
     time.sleep(3)
     began = time.monotonic()
     print(f"  {gate.cluster.signal(node, signal.SIGSTOP)} processes of {node} stopped")
-    gate.watch({"c03": run_id}, began, 90)
+    gate.watch({"c03": run_id}, began, 90, may_go_on=True)
     gate.cluster.signal(node, signal.SIGCONT)
     print("  continued")
     gate.watch({"c03": run_id}, began)
@@ -309,7 +323,7 @@ def killed_postgres(gate: Gate) -> None:
     gate.database.stop()
     time.sleep(5)
     gate.database.start()
-    gate.watch({"c04": run_id}, began)
+    gate.watch({"c04": run_id}, began, may_fail=True)
 
 
 SCENARIOS: dict[str, Callable[[Gate], None]] = {
@@ -325,6 +339,8 @@ def main() -> None:
         for name in chosen:
             print(f"{name}: {SCENARIOS[name].__doc__}", flush=True)
             SCENARIOS[name](running)
+    if running.failures:
+        sys.exit("\n".join(running.failures))
 
 
 if __name__ == "__main__":

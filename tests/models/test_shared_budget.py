@@ -98,6 +98,7 @@ def test_two_processes_use_a_cap_up_to_the_last_worst_case_and_never_pass_it(pos
     assert all(each.count("calls") > 40 for each in said)  # both took part
 
 
+@pytest.mark.slow
 def test_what_a_killed_process_may_have_spent_is_counted_and_the_cap_holds(postgres: Postgres) -> None:  # noqa: F811
     session = opened(postgres)
     killed = spender(postgres, session.study, "one", 10.0, 30.0)

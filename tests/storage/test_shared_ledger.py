@@ -48,6 +48,7 @@ except TrapsError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_writer_that_slept_while_another_took_over_pays_nothing_and_stores_nothing(
     postgres: Postgres, tmp_path: Path
 ) -> None:
@@ -145,6 +146,7 @@ def test_a_group_that_was_stored_when_the_connection_broke_is_not_stored_again(p
     assert one.totals()["m"].dollars == 1.0
 
 
+@pytest.mark.slow
 def test_a_server_that_stops_and_starts_ends_no_run_and_loses_no_row(tmp_path: Path) -> None:
     with Postgres.running(durable=True) as server:
         place = in_database(server)
@@ -168,6 +170,7 @@ def test_a_server_that_stops_and_starts_ends_no_run_and_loses_no_row(tmp_path: P
             assert abs(len(other.read("m").rows) - (tmp_path / "calls").stat().st_size) <= 1
 
 
+@pytest.mark.slow
 def test_while_the_server_is_away_no_call_is_sent_and_then_the_run_ends_with_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -237,6 +240,7 @@ def proxy(port: int) -> Iterator[tuple[int, threading.Event]]:
         listener.close()
 
 
+@pytest.mark.slow
 def test_a_writer_that_is_cut_off_sends_nothing_once_another_has_taken_over(postgres: Postgres, tmp_path: Path) -> None:
     direct, calls = in_database(postgres), tmp_path / "calls"
     with proxy(postgres.port) as (port, cut):

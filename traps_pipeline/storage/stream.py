@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from psycopg import Connection
 
 
-_MEANS = ("sums", "counts")
-
-
 @dataclass(frozen=True)
 class Encoded:
     """A row as it is stored. settles: whether it is the one row that settles its key; beside: what is kept beside it,
@@ -214,11 +211,11 @@ def add_up(connection: Connection[Any], session: Session, rows: Iterable[tuple[s
 
 def add_totals(connection: Connection[Any], session: Session, kind: str, participant: str, its: Totals) -> None:
     """Add to what all rows of a participant add up to."""
-    added = (f"array(select a + b from unnest(totals.{of}, excluded.{of}) as both_of (a, b))" for of in _MEANS)
-    sql = f"""insert into traps.totals values (%s, %s, %s, %s, %s, %s, %s, %s)
-              on conflict (study, kind, participant) do update set dollars = totals.dollars + excluded.dollars,
-              dearest = greatest(totals.dearest, excluded.dearest), unknown = totals.unknown + excluded.unknown,
-              sums = {next(added)}, counts = {next(added)}"""
+    sql = """insert into traps.totals values (%s, %s, %s, %s, %s, %s, %s, %s)
+             on conflict (study, kind, participant) do update set dollars = totals.dollars + excluded.dollars,
+             dearest = greatest(totals.dearest, excluded.dearest), unknown = totals.unknown + excluded.unknown,
+             sums = array(select a + b from unnest(totals.sums, excluded.sums) as two (a, b)),
+             counts = array(select a + b from unnest(totals.counts, excluded.counts) as two (a, b))"""
     sums, counts = ([float(its.means.get(column, (0.0, 0))[place]) for column in AVERAGED] for place in (0, 1))
     values = [session.study_id, kind, participant, its.dollars, its.dearest, its.unknown, sums, counts]
     connection.execute(sql, values)
