@@ -4,13 +4,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := $(CURDIR)/.workspaces/demo
 RENDER_PACKAGES := libosmesa6 python3-venv
-TEST_PACKAGES := $(RENDER_PACKAGES) chromium strace
+TEST_PACKAGES := $(RENDER_PACKAGES) chromium postgresql strace
 # Outside the lock, so that a machine may bring the build that suits it; a CPU build is enough: make TORCH="torch==2.13.0 --index-url ..."
 TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test ui bench explorer-vendor environments lint setup render-packages test-packages clean
+.PHONY: demo demo-mechanism check fast-tests test test-cluster ui bench explorer-vendor environments lint setup render-packages test-packages clean
 
 demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -31,6 +31,11 @@ fast-tests: setup
 # One more worker than the two cores that are needed: tests of servers and of Dagster's daemon wait for much of their time.
 test: test-packages setup lint ## lint, types and all tests, the slow ones too
 	$(PYTEST) -n 3
+
+# Ray is 80 MB and in no other test; not part of `make test` until something but the gate needs it.
+test-cluster: test-packages setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-cluster.lock
+	$(BIN)/python bench/cluster_gate.py
 
 ui: setup ## Dagster's web server and daemon on 127.0.0.1:$(PORT); open the address that it prints
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
@@ -70,7 +75,7 @@ $(VENV)/.installed: requirements.lock pyproject.toml
 render-packages:
 	@{ ldconfig -p | grep -q libOSMesa && $(PYTHON) -c 'import ensurepip'; } 2>/dev/null || $(call install,$(RENDER_PACKAGES))
 test-packages:
-	@{ ldconfig -p | grep -q libOSMesa && $(PYTHON) -c 'import ensurepip' && command -v chromium >/dev/null && command -v strace >/dev/null; } 2>/dev/null || $(call install,$(TEST_PACKAGES))
+	@{ ldconfig -p | grep -q libOSMesa && $(PYTHON) -c 'import ensurepip' && command -v chromium >/dev/null && command -v strace >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null; } 2>/dev/null || $(call install,$(TEST_PACKAGES))
 
 define install
 if [ "$$(id -u)" = 0 ]; then \

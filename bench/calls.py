@@ -1,8 +1,9 @@
 """Answers a second and CPU an answer, through our backend, ledger and limits against bare `litellm.acompletion` in a
-loop, on the same server (50 ms latency), in one run; with `--inspect PYTHON` also against inspect_ai. Ours are laid out
-as a study is: cells of 1,000 items (500 pairs), each finished before the next.
+loop, on the same server (50 ms latency), in one run; with `--inspect PYTHON` also against inspect_ai, with `--database`
+also with the ledger in a PostgreSQL that syncs to the disk. Ours are laid out as a study is: cells of 1,000 items (500
+pairs), each finished before the next.
 
-python bench/calls.py [--answers 2000] [--memory] [--inspect /path/to/python]
+python bench/calls.py [--answers 2000] [--memory] [--database] [--inspect /path/to/python]
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +29,11 @@ PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
 SYSTEM, QUESTION = "You watch a clip. " * 90, "Does the ball clear the barrier {number}, yes or no?"  # 2 KB in all
 CONNECTIONS = (24, 200)
 CELL_ITEMS = 1000
-KEY = "BENCH_KEY"
+KEY, DATABASE = "BENCH_KEY", "BENCH_DATABASE"
 
 
 def ours(url: str, connections: int, answers: int) -> dict[str, float]:
-    """Requests through `ask`: backend, retries, pace, budget and the ledger on disk."""
+    """Requests through `ask`: backend, retries, pace, budget and the ledger, on disk or in a database."""
     from traps_pipeline.models.api import ApiBackend, load_litellm
     from traps_pipeline.models.ask import Call, Work, run_work
     from traps_pipeline.models.budget import Budget
@@ -39,7 +41,9 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     from traps_pipeline.models.registry import Account, Entry, Limits
     from traps_pipeline.models.request import Request
     from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
-    from traps_pipeline.storage.ledger import Ledger
+    from traps_pipeline.storage.database import session_of
+    from traps_pipeline.storage.segments import SegmentLedger
+    from traps_pipeline.storage.shared_ledger import SharedLedger
     from traps_pipeline.storage.study import Study
 
     account = Account(key=KEY, base_url=f"{url}/v1")
@@ -60,7 +64,10 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         free = Study(allow_unknown_prices=True)
         participants = Participants({"m": entry}, lambda e: ApiBackend(e, account), free, {"a": account})
-        ledger = Ledger(Path(folder), "answers")
+        in_database = DATABASE in os.environ
+        ledger = SegmentLedger(Path(folder), "answers")
+        if in_database:
+            ledger = SharedLedger(session_of(DATABASE, f"bench-{os.getpid()}"), "answers")
         work = Work("responses", ledger, participants, Budget(0, {}, {}), "1", calls, lambda _: None)
         return _measured(lambda: list(run_work(work, cells)), answers)
 
@@ -118,15 +125,16 @@ def _cpu_s() -> float:
     return sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
 
 
-def _in_a_process(command: Sequence[str]) -> dict[str, float]:
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ | {KEY: "k"}, check=False)
+def _in_a_process(command: Sequence[str], **more: str) -> dict[str, float]:
+    environment = os.environ | {KEY: "k"} | more
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
     if done.returncode:
         raise SystemExit(done.stderr)
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def _worker(name: str, url: str, connections: int, answers: int) -> dict[str, float]:
-    return _in_a_process([sys.executable, __file__, "--worker", name, url, str(connections), str(answers)])
+def _worker(name: str, url: str, connections: int, answers: int, **more: str) -> dict[str, float]:
+    return _in_a_process([sys.executable, __file__, "--worker", name, url, str(connections), str(answers)], **more)
 
 
 def _inspect(python: str, url: str, connections: int, answers: int) -> dict[str, float]:
@@ -136,17 +144,24 @@ def _inspect(python: str, url: str, connections: int, answers: int) -> dict[str,
 
 
 def main() -> None:
+    from tests.postgres import Postgres
     from tests.providers.server import Provider
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--answers", type=int, default=2000)
     parser.add_argument("--memory", action="store_true", help="peak memory after 4,000 and after 20,000 calls")
+    parser.add_argument("--database", action="store_true", help="the ledger in PostgreSQL, too")
     parser.add_argument("--inspect", metavar="PYTHON", help="a Python that has inspect_ai and openai")
     arguments = parser.parse_args()
-    with Provider.start({"latency_s": 0.05}, keeps_records=False) as provider:
+    with ExitStack() as opened:
+        provider = opened.enter_context(Provider.start({"latency_s": 0.05}, keeps_records=False))
+        database = opened.enter_context(Postgres.running(durable=True)) if arguments.database else None
         print(f"{'connections':>11} {'':<18} {'answers/s':>10} {'CPU ms each':>12}")
         for connections in CONNECTIONS:
             found = {name: _worker(name, provider.url, connections, arguments.answers) for name in ("ours", "bare")}
+            if database:
+                where = {DATABASE: database.address()}
+                found["ours, PostgreSQL"] = _worker("ours", provider.url, connections, arguments.answers, **where)
             if arguments.inspect:
                 few = max(200, arguments.answers // 5)
                 found["inspect_ai"] = _inspect(arguments.inspect, provider.url, connections, few)
@@ -155,6 +170,9 @@ def main() -> None:
             print(
                 f"{connections:>11} CPU, ours / bare litellm: {found['ours']['cpu_ms'] / found['bare']['cpu_ms']:.2f}"
             )
+            if database:
+                longer = found["ours"]["rate"] / found["ours, PostgreSQL"]["rate"]
+                print(f"{connections:>11} time, PostgreSQL / folder: {longer:.2f}")
             if arguments.inspect:
                 ratio = found["ours"]["rate"] / found["inspect_ai"]["rate"]
                 print(f"{connections:>11} answers a second, ours / inspect_ai: {ratio:.1f}")

@@ -2,7 +2,7 @@
 arrival at the server, and how much of that is imports; CPU seconds too, which a loaded machine does not stretch. Then
 `traps plan` on the same ledger. The first of either reads every row once and keeps totals beside the segments.
 
-python bench/first_call.py [--rows 100000]         (1600000: a large lab's year)
+python bench/first_call.py [--rows 100000] [--database]        (1600000: a large lab's year; the ledger in PostgreSQL)
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 EVALUATION_ROWS = 4000  # four datasets of 500 pairs
-RUNS = 3
+RUNS, DATABASE = 3, "BENCH_DATABASE"
 IMPORTS = """
 import dagster, pandas, pyarrow, traps_pipeline.cli, traps_pipeline.definitions
 from traps_pipeline.models.api import load_litellm
@@ -39,7 +40,7 @@ def fill(root: Path, rows: int) -> None:
     from traps_pipeline.models.request import Outcome, Request
     from traps_pipeline.orchestration.wanted import Wanted
     from traps_pipeline.partitions import Evaluation
-    from traps_pipeline.storage.ledger import Ledger
+    from traps_pipeline.storage.segments import SegmentLedger
 
     params, text = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}, "The ball comes to rest on the left. " * 15
     outcome = Outcome("answer", text, None, "stop", None, "m-2026", 6500, 150, 20, 0.0002)
@@ -47,7 +48,7 @@ def fill(root: Path, rows: int) -> None:
     evaluations = [asked, *(e for e in Wanted(None).evaluations if e.model != asked.model)]
     for start in range(0, rows, EVALUATION_ROWS):
         evaluation = evaluations[start // EVALUATION_ROWS % len(evaluations)]
-        with Ledger(root, "answers").writer(evaluation.key) as writer:
+        with SegmentLedger(root, "answers").writer(evaluation.key) as writer:
             for n in range(start, min(start + EVALUATION_ROWS, rows)):
                 about = {
                     "item_id": f"occlusion:old-{n}:void",
@@ -78,13 +79,16 @@ def _cpu_s(pid: int) -> float:
 def main() -> None:
     from tests.conftest import KEY, SECRET, Checkout, make_checkout
     from tests.integration.test_network import entry, experiment, register
+    from tests.postgres import Postgres
     from tests.providers.server import Provider
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rows", type=int, default=100_000)
+    parser.add_argument("--database", action="store_true", help="move the ledger into PostgreSQL first")
     arguments = parser.parse_args()
     os.environ |= {KEY: SECRET, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "osmesa")}
-    with tempfile.TemporaryDirectory() as name, Provider.start() as provider:
+    with ExitStack() as opened:
+        name, provider = opened.enter_context(tempfile.TemporaryDirectory()), opened.enter_context(Provider.start())
         study = Checkout(make_checkout(Path(name) / "checkout"), Path(name) / "study")
         register(study, provider, entry("image-model", "images"))
         free = experiment(study, ["oracle"], regimes=["standard"])
@@ -93,6 +97,12 @@ def main() -> None:
         began = time.perf_counter()
         fill(study.workspace / "ledger", arguments.rows)
         print(f"{arguments.rows} rows written in {time.perf_counter() - began:.1f} s")
+        if arguments.database:
+            os.environ[DATABASE] = opened.enter_context(Postgres.running(durable=True)).address()
+            began = time.perf_counter()
+            moved = study.traps("ledger", "move", "--to", DATABASE)
+            assert moved.code == 0, moved.err
+            print(f"moved into PostgreSQL in {time.perf_counter() - began:.1f} s", flush=True)
         path = experiment(study, ["image-model"], regimes=["standard"])
         for run in range(1, RUNS + 1):
             imports_s, imports_cpu_s = _imports(study)

@@ -1,31 +1,39 @@
 """Ledger writes and reads against SQLite in WAL mode, the same 20,000 rows of 1 KB, one run.
 
 Both keep the ledger's promise that a row survives kill -9 as soon as it is written (SQLite: a commit a row, without a
-sync to disk; the ledger also syncs every 100 rows). python bench/ledger.py
+sync to disk; the ledger also syncs every 100 rows). With `--database` also rows a second of the ledger in a PostgreSQL
+that syncs to the disk, from one process and from two, each of whose 24 connections waits until its row is stored.
+
+python bench/ledger.py [--database]
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import sqlite3
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from traps_pipeline.storage.ledger import Ledger
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from traps_pipeline.storage.segments import SegmentLedger
 
 ROWS = [{"key": f"{number:064x}", "outcome": "answer", "text": "x" * 900} for number in range(20_000)]
 
 
 def ledger_write(folder: Path) -> None:
-    with Ledger(folder, "answers").writer("m__standard__run1") as writer:
+    with SegmentLedger(folder, "answers").writer("m__standard__run1") as writer:
         for row in ROWS:
             writer.append(row)
 
 
 def ledger_read(folder: Path) -> int:
-    return len(Ledger(folder, "answers").read("m__standard__run1").rows)
+    return len(SegmentLedger(folder, "answers").read("m__standard__run1").rows)
 
 
 def _connect(folder: Path) -> sqlite3.Connection:
@@ -49,6 +57,45 @@ def sqlite_read(folder: Path) -> int:
     return len([json.loads(row) for (row,) in rows])
 
 
+WRITE = """
+import asyncio, sys, time
+from traps_pipeline.storage.database import Session
+from traps_pipeline.storage.shared_ledger import SharedLedger
+address, evaluation, rows = sys.argv[1], sys.argv[2], int(sys.argv[3])
+async def write():
+    numbers = iter(range(rows))
+    async with SharedLedger(Session(address, "BENCH", "bench"), "answers").writing(evaluation, print) as writer:
+        async def connection():
+            for number in numbers:
+                writer.append({"key": f"{number:064x}", "outcome": "answer", "text": "x" * 900})
+                await writer.kept()
+        began = time.perf_counter()
+        await asyncio.gather(*(connection() for _ in range(24)))
+        print(rows / (time.perf_counter() - began))
+asyncio.run(write())
+"""
+
+
+def database_rates() -> None:
+    """Print how many rows a second processes store in one database."""
+    from tests.postgres import Postgres
+    from traps_pipeline.storage.database import Session
+    from traps_pipeline.storage.shared_ledger import SharedLedger
+
+    with Postgres.running(durable=True) as server:
+        for count in (1, 2):
+            command = [sys.executable, "-c", WRITE, server.address()]
+            running = [
+                subprocess.Popen([*command, f"m{count}{n}", str(len(ROWS))], stdout=subprocess.PIPE, text=True)
+                for n in range(count)
+            ]
+            rates = [float(process.communicate()[0].splitlines()[-1]) for process in running]
+            print(f"PostgreSQL, {count} processes of 24 connections: {sum(rates):,.0f} rows/s", flush=True)
+        began = time.perf_counter()
+        found = SharedLedger(Session(server.address(), "BENCH", "bench"), "answers").read("m10").rows
+        print(f"PostgreSQL, read: {len(found) / (time.perf_counter() - began):,.0f} rows/s")
+
+
 def _rate(work: Callable[[Path], object], folder: Path) -> float:
     began = time.perf_counter()
     work(folder)
@@ -56,6 +103,11 @@ def _rate(work: Callable[[Path], object], folder: Path) -> float:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--database", action="store_true")
+    if parser.parse_args().database:
+        database_rates()
+        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         print(f"{'':<8} {'ledger, rows/s':>16} {'SQLite WAL':>14} {'ratio':>7}")

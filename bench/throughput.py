@@ -53,8 +53,8 @@ def main() -> None:
     from traps_pipeline.models.registry import Account, ModelEntry
     from traps_pipeline.models.request import Request
     from traps_pipeline.partitions import Cell, Evaluation
-    from traps_pipeline.storage.ledger import Ledger
     from traps_pipeline.storage.media import MediaSpec, MediaStore
+    from traps_pipeline.storage.segments import SegmentLedger
     from traps_pipeline.storage.study import Study
 
     parser = argparse.ArgumentParser(description=__doc__)
@@ -89,7 +89,7 @@ def main() -> None:
 
         study = Study(allow_unknown_prices=True)
         participants = Participants(entries, lambda entry: ApiBackend(entry, account), study, {"a": account})
-        ledger, budget = Ledger(folder, "answers"), Budget(0, {}, {})
+        ledger, budget = SegmentLedger(folder, "answers"), Budget(0, {}, {})
         work = Work("responses", ledger, participants, budget, "1", calls, lambda _: None)
         load_litellm()
         began, cpu = time.perf_counter(), sum(resource.getrusage(resource.RUSAGE_SELF)[:2])

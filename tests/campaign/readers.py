@@ -23,7 +23,7 @@ from traps_pipeline.models.registry import load_accounts, load_models
 from traps_pipeline.models.request import Request
 from traps_pipeline.pocket.recipe import load_recipe
 from traps_pipeline.scenes.spec import load_trajectory
-from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.exchange import checked_answers
 from traps_pipeline.study.experiment import load_experiment
@@ -52,7 +52,7 @@ def _few(path: Path, lines: int = 2) -> bytes:
 
 
 def _ledger(folder: Path) -> Any:
-    ledger = Ledger(folder, "answers")
+    ledger = SegmentLedger(folder, "answers")
     return ledger.read("m").rows, ledger.totals(), ledger.reasoning("m")
 
 
@@ -95,7 +95,7 @@ LABELS = ",".join(LABEL_COLUMNS).encode() + b"".join(
 
 def _segment(folder: Path) -> bytes:
     """A segment with checksums, as this version writes it."""
-    ledger = Ledger(folder, "answers")
+    ledger = SegmentLedger(folder, "answers")
     with ledger.writer("m") as writer:
         for n in range(3):
             writer.append({"key": f"{n}", "outcome": "answer", "text": "left", "cost_usd": 0.25, "latency_s": 1.0})

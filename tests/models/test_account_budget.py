@@ -12,8 +12,9 @@ import pytest
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.budget import Budget, BudgetReached, spending
+from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.registry import get_model
+from traps_pipeline.models.spending import spending
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

@@ -25,14 +25,14 @@ from traps_pipeline.models.budget import (
     Journal,
     check_money,
     most_tokens,
-    spending,
     worst_case_usd,
 )
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.models.spending import spending
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.storage.ledger import Ledger, Totals
+from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -116,17 +116,6 @@ def test_an_unknown_cost_counts_as_the_worst() -> None:
     assert asyncio.run(run()) == pytest.approx(0.4)
 
 
-def test_spend_is_what_the_ledger_holds_repeated_answers_too(tmp_path: Path) -> None:
-    ledger = Ledger(tmp_path, "answers")
-    trap = 'says "cost_usd": 9.5, and "participant": "evil"'
-    for name, cost in (("m__standard__run1", 0.25), ("m__standard__run1", 0.5), ("n__json__run1", 1e-05)):
-        with ledger.writer(name) as writer:
-            about = {"participant": name.split("__")[0]}
-            writer.append({"key": "k", "text": trap, "cost_usd": cost, "components": about})
-            writer.append({"key": "l", "text": None, "cost_usd": None, "components": about})
-    assert ledger.totals() == {"m": Totals(0.75, 0.5), "n": Totals(1e-05, 1e-05)}
-
-
 def test_costs_that_cannot_be_count_as_the_dearest_call_and_are_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -208,7 +197,7 @@ def row_after(kind: str, times: int, cap_usd: float, folder: Path) -> dict[str, 
     participants = Participants(
         {"m": asked}, lambda _: Failing(kind, times), Study(budget_usd=cap_usd), {"a": Account()}
     )
-    ledger, cell = Ledger(folder, "answers"), Cell("occlusion", Evaluation("m", "standard", 1))
+    ledger, cell = SegmentLedger(folder, "answers"), Cell("occlusion", Evaluation("m", "standard", 1))
     calls = [Call(Request("m", "api", {}, "s", "u", {"item_id": "x"}))]
     journal = Journal(folder / "in_flight.jsonl")
     budget = Budget(cap_usd, {}, {}, journal)
@@ -239,7 +228,7 @@ def test_a_call_that_may_be_billed_counts_as_its_worst_case(
     row = row_after(kind, times, cap_usd, tmp_path)
     assert (row and row["outcome"]) == outcome
     assert (row and row["cost_usd"]) == (None if cost_usd is None else pytest.approx(cost_usd))
-    assert sum(its.dollars for its in Ledger(tmp_path, "answers").totals().values()) <= cap_usd
+    assert sum(its.dollars for its in SegmentLedger(tmp_path, "answers").totals().values()) <= cap_usd
 
 
 def test_two_runs_never_spend_from_one_budget_at_once(tmp_path: Path) -> None:

@@ -20,11 +20,11 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.ask import Call, Work, run_work
 from traps_pipeline.models.budget import Budget, BudgetReached, Journal
-from traps_pipeline.models.participants import OVERRUN, Participants, attempt
+from traps_pipeline.models.participants import OVERRUN, Allowed, Participants, attempt
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 
 # litellm serializes what it was given again; what it says of odd values goes to nobody.
@@ -146,13 +146,20 @@ def participants(provider: Provider, entry: Entry, cap_usd: float) -> Participan
     return Participants({"m": entry}, lambda _: asking(provider, entry), Study(budget_usd=cap_usd), {"a": Account()})
 
 
+def allowed_by(budget: Budget) -> Allowed:
+    async def require() -> None:
+        """No other process is there."""
+
+    return Allowed(budget, asyncio.Event(), lambda: False, require)
+
+
 def booked_for(provider: Provider, model: str) -> tuple[Outcome | None, float]:
     """What came of one call, and what the budget says that it cost."""
 
     async def one() -> tuple[Outcome | None, float]:
         budget = Budget(10.0, {}, {})
         participant = participants(provider, entry_of(model), 10.0)["m"]
-        attempted = await attempt(participant, request(), budget, asyncio.Event(), lambda: False)
+        attempted = await attempt(participant, request(), allowed_by(budget))
         return attempted and attempted[0], budget.spent_usd
 
     return asyncio.run(one())
@@ -215,7 +222,9 @@ def work(provider: Provider, entry: Entry, cap_usd: float, items: int, folder: P
     budget = Budget(cap_usd, {}, {}, Journal(folder / "in_flight.jsonl"))
     calls = [Call(request(item)) for item in range(items)]
     asked = participants(provider, entry, cap_usd)
-    done = Work("responses", Ledger(folder, "answers"), asked, budget, "1", lambda _: calls, lambda settled: settled)
+    done = Work(
+        "responses", SegmentLedger(folder, "answers"), asked, budget, "1", lambda _: calls, lambda settled: settled
+    )
     return run_work(done, [Cell("occlusion", Evaluation("m", "standard", 1))])
 
 
@@ -242,7 +251,7 @@ def test_the_cap_holds_against_fuzzed_answers(odd: Provider, tmp_path: Path, con
     async def worker(queue: list[int]) -> None:
         while queue:
             sent = Request("m", "openai/m", entry.params, "You watch.", f"Which, {queue.pop()}?", {})
-            await attempt(participant, sent, budget, asyncio.Event(), lambda: False)
+            await attempt(participant, sent, allowed_by(budget))
 
     async def run() -> bool:
         queue = list(range(calls))

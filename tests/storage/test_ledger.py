@@ -1,4 +1,4 @@
-"""A call is paid for once: what the ledger has taken, no crash, full disk or second run loses."""
+"""A call is paid for once: what holds of every ledger, in a folder of one machine or in a database of several."""
 
 from __future__ import annotations
 
@@ -6,88 +6,99 @@ import asyncio
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from hashlib import blake2b
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any
 
 import pytest
 
+from tests.storage.conftest import Place
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.storage.ledger import Ledger, Totals
+from traps_pipeline.storage.ledger import Ledger, LockGivenUp, Totals
 from traps_pipeline.storage.lines import checked_line
+from traps_pipeline.storage.segments import SegmentLedger
+from traps_pipeline.storage.shared_ledger import SharedLedger
 
 HOLD = """
-import asyncio, sys, time
-from pathlib import Path
-from traps_pipeline.storage.ledger import Ledger
+import asyncio, time
 async def hold():
-    async with Ledger(Path(sys.argv[1]), "answers").lock("m", print):
+    async with ledger.writing("m", print):
         print("held", flush=True)
-        time.sleep(60)
+        time.sleep(600)
 asyncio.run(hold())
 """
-FILL = """
-import resource, sys
-from pathlib import Path
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.storage.ledger import Ledger
-resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
-try:
-    with Ledger(Path(sys.argv[1]), "answers").writer("m") as writer:
-        for n in range(100):
-            writer.append({"key": f"k{n}", "text": "x" * 100})
-except TrapsError as error:
-    print(error)
+WRITE = """
+import asyncio, itertools
+async def write():
+    async with ledger.writing("m", print) as writer:
+        for n in itertools.count():
+            writer.append({"key": f"k{n}", "outcome": "answer", "text": "x" * 500})
+            await writer.kept()
+            print(f"k{n}", flush=True)
+asyncio.run(write())
 """
 
 
-@pytest.fixture
-def ledger(tmp_path: Path) -> Ledger:
-    return Ledger(tmp_path, "answers")
+def write(ledger: Ledger, *rows: Mapping[str, object], evaluation: str = "m") -> None:
+    async def all_of_them() -> None:
+        async with ledger.writing(evaluation, print) as writer:
+            await writer.require()
+            writer.open()
+            for row in rows:
+                writer.append(row)
+            await writer.kept()
+
+    asyncio.run(all_of_them())
 
 
-def segments(ledger: Ledger) -> list[Path]:
-    return sorted(ledger.folder("m").glob("*.jsonl"))
-
-
-def write(ledger: Ledger, *rows: dict[str, object]) -> None:
-    with ledger.writer("m") as writer:
-        for row in rows:
-            writer.append(row)
-
-
-def answer(key: str, text: str) -> dict[str, object]:
+def answer(key: str, text: str) -> dict[str, Any]:
     return {"key": key, "outcome": "answer", "text": text}
 
 
-def test_rows_come_back_by_key_and_evaluation(ledger: Ledger) -> None:
-    write(ledger, {"key": "a", "text": "left – 左"}, {"key": "b", "text": None})
-    assert ledger.read("m").rows == {"a": {"key": "a", "text": "left – 左"}, "b": {"key": "b", "text": None}}
+def paid(key: str, cost: float | None, participant: str = "m") -> dict[str, Any]:
+    return answer(key, "left") | {"cost_usd": cost, "components": {"participant": participant}}
+
+
+def damage(ledger: Ledger, key: str, change: bytes) -> None:
+    """Put something else in the place of the line that begins with a key."""
+    if isinstance(ledger, SegmentLedger):
+        (segment,) = [path for path in ledger.folder("m").glob("*.jsonl") if f'"{key}"' in path.read_text()]
+        lines = segment.read_bytes().splitlines(keepends=True)
+        segment.write_bytes(b"".join(change if f'"{key}"'.encode() in line else line for line in lines))
+    else:
+        assert isinstance(ledger, SharedLedger)
+        sql = """update traps.rows set line = %s where key = %s
+                 and evaluation in (select id from traps.evaluations where study = %s) returning key"""
+        values = [change, key, ledger.session.study_id]
+        assert ledger.session.run(lambda connection: connection.execute(sql, values).fetchall()) == [(key,)]
+
+
+def test_rows_come_back_by_key_and_evaluation(place: Place) -> None:
+    rows = [answer("a", "left – 左 \x00"), {"key": "b", "outcome": "empty", "text": None}]
+    write(place.open(), *rows)
+    ledger = place.open()
+    assert ledger.read("m").rows == {"a": rows[0], "b": rows[1]}
     assert ledger.read("m").notes == {}
     assert ledger.read("another").rows == {}
 
 
-def test_a_writer_that_writes_nothing_leaves_no_file(ledger: Ledger) -> None:
-    with ledger.writer("m"):
-        pass
-    assert segments(ledger) == []
-
-
-def test_the_newest_row_of_a_key_wins_within_and_across_segments(ledger: Ledger) -> None:
-    write(ledger, answer("a", "1"), answer("a", "2"), answer("b", "3"))
-    assert ledger.read("m").rows["a"]["text"] == "2"
-    write(ledger, answer("a", "4"))
-    assert len(segments(ledger)) == 2
-    assert {key: row["text"] for key, row in ledger.read("m").rows.items()} == {"a": "4", "b": "3"}
+def test_a_row_is_kept_as_the_line_that_was_written(place: Place) -> None:
+    ledger, row = place.open(), answer("a", "left – 左")
+    write(ledger, row)
+    if isinstance(ledger, SegmentLedger):
+        (kept,) = [path.read_bytes() for path in ledger.folder("m").glob("*.jsonl")]
+    else:
+        assert isinstance(ledger, SharedLedger)
+        kept = ledger.session.run(lambda c: c.execute("select line from traps.rows order by id").fetchall())[-1][0]
+    assert kept == checked_line(row)
 
 
 def test_a_failure_never_takes_the_place_of_an_answer(ledger: Ledger) -> None:
     failure = {"key": "a", "outcome": "error", "error": "timeout", "text": None}
     write(ledger, failure)
     assert (list(ledger.read("m").rows), ledger.read("m").settled) == (["a"], {})
+    write(ledger, failure | {"error": "http_500"})
+    assert ledger.read("m").rows["a"]["error"] == "http_500"
     write(ledger, answer("a", "left"))
     write(ledger, failure)
     assert ledger.read("m").settled["a"]["text"] == "left"
@@ -96,198 +107,159 @@ def test_a_failure_never_takes_the_place_of_an_answer(ledger: Ledger) -> None:
 def test_of_the_rows_only_those_that_are_wanted_are_read(ledger: Ledger) -> None:
     write(ledger, *(answer(f"k{n}", '"key": "k0"') for n in range(10)))
     assert [*ledger.read("m", {"k3", "k7", "none"}).rows] == ["k3", "k7"]
+    assert [*ledger.read("m", {"k7": None, "k3": None}).rows] == ["k3", "k7"]
     assert ledger.read("m", set()).rows == {}
 
 
-def test_segments_of_one_second_are_read_in_the_order_they_were_begun(ledger: Ledger) -> None:
-    for n in range(20):
-        write(ledger, answer("a", str(n)))
-    assert ledger.read("m").rows["a"]["text"] == "19"
+def test_what_stands_beside_rows_comes_back_by_key(ledger: Ledger) -> None:
+    async def write_both() -> None:
+        async with ledger.writing("m", print) as writer:
+            writer.append(answer("a", "left"), {"reasoning": "It rolls left."})
+            writer.append(answer("b", "right"))
+            await writer.kept()
+
+    asyncio.run(write_both())
+    assert ledger.reasoning("m") == {"a": "It rolls left."}
+    assert ledger.reasoning("m", {"b"}) == {}
 
 
-def test_a_torn_last_line_is_ignored_and_told_with_its_place(ledger: Ledger) -> None:
-    write(ledger, {"key": "a"}, {"key": "b"})
-    segment = segments(ledger)[0]
-    segment.write_bytes(segment.read_bytes()[:-2])
+def test_totals_are_what_every_row_adds_up_to_repeated_answers_too(place: Place) -> None:
+    ledger = place.open()
+    trap = 'says "cost_usd": 9.5, and "participant": "evil"'
+    for evaluation, cost in (("m__standard__run1", 0.25), ("m__standard__run1", 0.5), ("n__json__run1", 1e-05)):
+        name = evaluation.split("__")[0]
+        write(ledger, paid("k", cost, name) | {"text": trap}, paid("l", None, name), evaluation=evaluation)
+    assert place.open().totals() == {"m": Totals(0.75, 0.5), "n": Totals(1e-05, 1e-05)}
+
+
+def test_means_are_of_settled_rows_with_a_possible_value(ledger: Ledger) -> None:
+    rows = [paid(f"k{n}", 0.0) | {"prompt_tokens": tokens} for n, tokens in enumerate((100, 300, None, -1))]
+    failed = paid("f", 0.0) | {"outcome": "error", "prompt_tokens": 10_000}
+    write(ledger, *rows[:2])
+    write(ledger, *rows[2:], failed)
+    assert ledger.totals()["m"].mean("prompt_tokens") == 200
+    assert ledger.totals()["m"].mean("latency_s") is None
+
+
+def test_a_row_that_is_not_what_was_written_is_told_and_asked_again(ledger: Ledger) -> None:
+    write(ledger, answer("a", "left"), answer("b", "right"))
+    assert list(ledger.damage()) == []
+    damage(ledger, "a", checked_line(answer("a", "left")).replace(b"left", b"lift"))
     known = ledger.read("m")
-    assert list(known.rows) == ["a"]
-    assert "torn last line ignored" in known.notes[f"{segment}:2"]
-
-
-@pytest.mark.parametrize("line", ["{not json", '"text"', '{"no": "key"}', ""])
-def test_a_bad_line_of_an_early_segment_is_named_with_the_remedy(ledger: Ledger, line: str) -> None:
-    ledger.folder("m").mkdir(parents=True)
-    segment = ledger.folder("m") / "20261101T000000.jsonl"
-    segment.write_text(f'{{"key": "a"}}\n{line}\n{{"key": "c"}}\n')
-    with pytest.raises(TrapsError, match=rf"{segment.name}:2: not a ledger row .*remove that line and run again"):
-        ledger.read("m")
-
-
-def test_no_bit_of_a_segment_can_flip_unseen(ledger: Ledger) -> None:
-    """Bits all over a small segment: the rows come back as they were, or a place is named."""
-    rows = [answer(f"k{n}", "left") | {"cost_usd": 0.25, "components": {"participant": "m"}} for n in range(3)]
-    write(ledger, *rows)
-    (segment,) = segments(ledger)
-    whole, written = ledger.read("m").rows, segment.read_bytes()
-    silent = []
-    for place in range(0, 8 * len(written), 7):  # in seven of eight bytes, each bit in turn
-        flipped = bytearray(written)
-        flipped[place // 8] ^= 1 << place % 8
-        segment.write_bytes(flipped)
-        known = ledger.read("m")
-        spent = ledger.totals()
-        assert sum(its.dollars + its.unknown * 0.25 for its in spent.values()) >= 0.75
-        if not all(whole.get(key) == row for key, row in known.rows.items()) or (
-            len(known.rows) < 3 and not known.notes
-        ):
-            silent.append(place)
-    assert silent == []
-
-
-def test_the_totals_of_a_long_segment_are_kept_and_counted_again_where_they_are_not_its_own(ledger: Ledger) -> None:
-    row = answer("a", "x" * 1000) | {"cost_usd": 0.25, "components": {"participant": "m"}}
-    write(ledger, *([row] * 300))
-    assert ledger.totals() == {"m": Totals(75.0, 0.25)}
-    (kept,) = ledger.folder("m").glob(".*.totals")
-    written = kept.read_bytes()
-    for damaged in (written.replace(b"75.0", b"15.0"), b"", b"no sums"):
-        kept.write_bytes(damaged)
-        assert ledger.totals() == {"m": Totals(75.0, 0.25)}
-    (segment,) = segments(ledger)
-    with segment.open("ab") as stream:
-        stream.write(checked_line(row))
-    assert ledger.totals() == {"m": Totals(75.25, 0.25)}
+    assert list(known.rows) == ["b"]
+    (note,) = known.notes.values()
+    assert "not what was written: it is not believed; its answer is asked again" in note
+    assert len(list(ledger.damage())) == 1
+    write(ledger, answer("a", "right"))
+    assert ledger.read("m").settled["a"]["text"] == "right"
 
 
 def test_values_that_no_table_holds_are_unknown_and_told(ledger: Ledger) -> None:
-    ledger.folder("m").mkdir(parents=True)
-    segment = ledger.folder("m") / "20261101T000000.jsonl"
     odd = {"prompt_tokens": 2**63, "completion_tokens": -1, "served_model": 5, "cost_usd": -1000.0}
-    segment.write_text(json.dumps(answer("a", "left \ud83d") | odd) + "\n")
+    write(ledger, answer("a", "left"))
+    damage(ledger, "a", checked_line(answer("a", "left") | odd))  # as no version writes it
     known = ledger.read("m")
-    assert known.rows["a"] == answer("a", "left ?") | dict.fromkeys(odd)
-    assert list(known.notes) == [f"{segment}:1"] and "cost_usd" in known.notes[f"{segment}:1"]
+    assert known.rows["a"] == answer("a", "left") | dict.fromkeys(odd)
+    (note,) = known.notes.values()
+    assert "cost_usd" in note and "counted as unknown" in note
 
 
-def test_files_are_there_before_the_first_answer_and_go_if_there_is_none(ledger: Ledger) -> None:
-    with ledger.writer("m") as writer:
-        writer.open()
-        assert len(list(ledger.folder("m").iterdir())) == 3
-        writer.append({"key": "a"})
-    assert len(list(ledger.folder("m").iterdir())) == 1
+def test_a_row_that_no_line_can_hold_is_refused_and_the_others_are_kept(ledger: Ledger) -> None:
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write(ledger, answer("a", "left"), answer("b", "left") | {"cost_usd": float("nan")})
+    assert list(ledger.read("m").rows) == ["a"]
 
 
-def test_reasoning_lies_in_a_sibling_file_and_comes_back_by_key(ledger: Ledger) -> None:
-    with ledger.writer("m") as writer:
-        writer.append({"key": "a", "text": "left"}, {"reasoning": "It rolls left."})
-        writer.append({"key": "b", "text": "right"})
-    assert ledger.reasoning("m") == {"a": "It rolls left."}
-    assert "rolls" not in segments(ledger)[0].read_text()
-    assert [path.name for path in ledger.folder("m").glob("*.reasoning")] == [segments(ledger)[0].name + ".reasoning"]
+def test_rows_from_elsewhere_are_stored_where_their_keys_are_not_settled(ledger: Ledger) -> None:
+    write(ledger, answer("a", "left"), {"key": "b", "outcome": "error", "text": None})
+    failed = {"key": "d", "outcome": "error", "text": None}
+    rows = {
+        "m": [(answer("a", "right"), {}), (answer("b", "right"), {"reasoning": "Because."}), (failed, {})],
+        "n": [(answer("c", "right"), {})],
+    }
+    assert asyncio.run(ledger.store(rows, print)) == 2
+    assert {key: row["text"] for key, row in ledger.read("m").settled.items()} == {"a": "left", "b": "right"}
+    assert ledger.read("m").rows["d"] == failed
+    assert (ledger.reasoning("m"), list(ledger.read("n").rows)) == ({"b": "Because."}, ["c"])
+    assert asyncio.run(ledger.store(rows, print)) == 0
 
 
-def test_a_row_is_in_the_file_before_append_returns(ledger: Ledger) -> None:
-    with ledger.writer("m") as writer:
-        writer.append({"key": "a"})
-        seen = subprocess.run(["cat", str(segments(ledger)[0])], capture_output=True, check=True, text=True)
-        assert seen.stdout == '{"key": "a", "sum": "' + blake2b(b'{"key": "a"', digest_size=8).hexdigest() + '"}\n'
+def test_what_was_kept_survives_the_kill_of_its_writer_and_another_one_goes_on(place: Place) -> None:
+    with place.process(WRITE) as process:
+        assert process.stdout is not None
+        told = [process.stdout.readline().strip() for _ in range(200)]
+        process.kill()
+        told += process.stdout.read().split()
+    ledger = place.open()
+    kept = list(ledger.read("m").rows)
+    assert kept[: len(told)] == told and len(kept) <= len(told) + 1
+    assert set(ledger.read("m").notes.values()) <= {"torn last line ignored (a crash cut it off)"}
+    write(ledger, answer("later", "left"))
+    assert len(ledger.read("m").rows) == len(kept) + 1
 
 
-def test_a_full_disk_loses_no_earlier_row_and_leaves_no_half_line(ledger: Ledger, tmp_path: Path) -> None:
-    ran = subprocess.run([sys.executable, "-c", FILL, str(tmp_path)], capture_output=True, check=True, text=True)
-    assert "could not be written (File too large)" in ran.stdout and "run the same command again" in ran.stdout
-    known = ledger.read("m")
-    line = len('{"key": "k10", "text": "", "sum": "0123456789abcdef"}\n') + 100
-    assert len(known.rows) == 13  # 10 lines of 153 bytes and 3 of 154 are 1,992; a fourth would pass 2,000
-    assert line == 154
-    assert known.notes == {}
-    write(ledger, {"key": "later"})
-    assert len(ledger.read("m").rows) == 14
-
-
-def test_a_disk_that_is_really_full_loses_no_earlier_row(tiny_disk: Path) -> None:
-    ledger, written = Ledger(tiny_disk, "answers"), 0
-    with (
-        pytest.raises(TrapsError, match=r"\.jsonl: .*No space left on device.*free some space"),
-        ledger.writer("m") as w,
-    ):
-        for n in range(1000):
-            w.append({"key": f"k{n}", "text": "x" * 300})
-            written += 1
-    assert written > 50
-    known = ledger.read("m")
-    assert list(known.rows) == [f"k{n}" for n in range(written)]
-    assert known.notes == {}
-
-
-@pytest.fixture
-def fsyncs(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
-    counted: list[int] = []
-    real = os.fsync
-
-    def fsync(descriptor: int) -> None:
-        counted.append(descriptor)
-        real(descriptor)
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    yield counted
-
-
-def test_rows_reach_the_disk_every_hundred_rows_or_half_second(
-    ledger: Ledger, fsyncs: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = [100.0]
-    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
-    with ledger.writer("m") as writer:
-        for n in range(99):
-            writer.append({"key": str(n)})
-        assert len(fsyncs) == 0
-        writer.append({"key": "99"})
-        assert len(fsyncs) == 3  # the file and, once, its folder and the one above
-        writer.append({"key": "100"})
-        clock[0] += 0.49
-        writer.sync_if_due()
-        assert len(fsyncs) == 3
-        clock[0] += 0.01
-        writer.sync_if_due()
-        assert len(fsyncs) == 4
-        writer.sync_if_due()
-        assert len(fsyncs) == 4  # nothing new to sync
-        writer.append({"key": "101"})
-    assert len(fsyncs) == 5  # closing syncs
-
-
-def test_a_segment_to_which_nothing_was_written_asks_for_no_folder(ledger: Ledger) -> None:
-    with ledger.writer("m") as writer:  # of a cell whose answers are all broken: no judge is asked
-        writer.sync()
-    assert not ledger.folder("m").exists()
-
-
-def test_a_second_run_waits_and_says_who_holds_the_lock_until_that_one_is_killed(
-    ledger: Ledger, tmp_path: Path
-) -> None:
-    said: list[str] = []
+def test_a_second_run_waits_and_says_who_writes_until_that_one_is_killed(place: Place) -> None:
+    ledger, said = place.open(), list[str]()
 
     async def take() -> float:
         began = time.monotonic()
-        async with ledger.lock("m", said.append):
+        async with ledger.writing("m", said.append):
             return time.monotonic() - began
 
     async def scenario() -> tuple[float, float]:
-        async with ledger.lock("another", said.append):  # evaluations do not block each other
+        async with ledger.writing("another", said.append):  # evaluations do not block each other
             pass
+        with pytest.raises(LockGivenUp):
+            async with ledger.writing("m", print, lambda: True):
+                pass
         taking = asyncio.create_task(take())
         await asyncio.sleep(0.5)
         assert not taking.done()
         os.kill(holder.pid, signal.SIGKILL)
-        return await asyncio.wait_for(taking, 5), await take()
+        return await asyncio.wait_for(taking, 60), await take()
 
-    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
-    try:
+    with place.process(HOLD) as holder:
         assert holder.stdout is not None and holder.stdout.readline() == "held\n"
         waited, again = asyncio.run(scenario())
-    finally:
-        holder.kill()
-        holder.wait()
     assert again < 0.4 <= waited
-    assert len(said) == 1 and f"answers of m are being asked by process {holder.pid} since" in said[0]
+    assert len(said) == 1 and f"answers of m are being asked by process {holder.pid}" in said[0]
+
+
+def test_two_writers_of_one_process_exclude_each_other(ledger: Ledger) -> None:
+    async def scenario() -> None:
+        async with ledger.writing("m", print):
+            with pytest.raises(LockGivenUp):
+                async with ledger.writing("m", print, lambda: True):
+                    pass
+        async with ledger.writing("m", print):
+            pass
+
+    asyncio.run(scenario())
+
+
+def test_an_import_into_an_evaluation_that_is_being_asked_waits_for_it(ledger: Ledger) -> None:
+    async def scenario() -> list[str]:
+        said = list[str]()
+        async with ledger.writing("m", print) as writer:
+            writer.append(answer("a", "left"))
+            await writer.kept()
+            storing = asyncio.create_task(ledger.store({"m": [(answer("a", "right"), {})]}, said.append))
+            await asyncio.sleep(0.5)
+            assert not storing.done()
+        assert await asyncio.wait_for(storing, 60) == 0
+        return said
+
+    (said,) = asyncio.run(scenario())
+    assert "are being asked by process" in said
+    assert json.dumps(ledger.read("m").rows["a"]["text"]) == '"left"'
+
+
+def test_an_error_in_a_writers_block_is_what_is_raised(ledger: Ledger) -> None:
+    async def scenario() -> None:
+        async with ledger.writing("m", print) as writer:
+            writer.append(answer("a", "left"))
+            raise TrapsError("something else")
+
+    with pytest.raises(TrapsError, match="something else"):
+        asyncio.run(scenario())
+    assert list(ledger.read("m").rows) == ["a"]

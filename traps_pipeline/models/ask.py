@@ -19,13 +19,14 @@ from typing import Any, Generic, TypeVar
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.budget import Budget, BudgetReached, spending
-from traps_pipeline.models.participants import Participant, Participants, Row, attempt, ledger_row
+from traps_pipeline.models.budget import Budget, BudgetReached
+from traps_pipeline.models.participants import Allowed, Participant, Participants, Row, attempt, ledger_row
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
+from traps_pipeline.models.spending import spending
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
-from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, SegmentWriter, settles
+from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, Writer, settles
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -109,8 +110,7 @@ class _Asking:
     """Workers over the missing requests of one evaluation."""
 
     work: Work[Any, Any, Any]
-    writer: SegmentWriter
-    held: Callable[[], None]  # raises when the evaluation's lock was removed
+    writer: Writer
     missing: Sequence[Request]
     stop: asyncio.Event
     rows: dict[str, Row] = field(default_factory=dict)
@@ -127,14 +127,15 @@ class _Asking:
         """Ask and record one request of the queue; False when there is nothing more to do."""
         if not queue or self.halted():
             return False
-        self.held()
         request, name = queue.popleft(), participant.entry.id
-        attempted = await attempt(participant, request, self.work.budget, self.stop, self.halted)
+        allowed = Allowed(self.work.budget, self.stop, self.halted, self.writer.require)
+        attempted = await attempt(participant, request, allowed)
         if attempted is None:
             return False
         row, beside = ledger_row(request, *attempted, self.work.epoch)
         dollars = row["cost_usd"] or 0.0
         self.writer.append(row, beside)
+        await self.writer.kept()
         self.work.budget.booked(name, dollars)
         self.rows[request.key] = _held(row)
         progress.current().called(self.work.stage, name, not settles(row), row["latency_s"], dollars)
@@ -181,10 +182,9 @@ def _held(row: Row) -> Row:
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """What the cells of an evaluation share: its segment, its lock, the places in its ledger that were told of."""
+    """What the cells of an evaluation share: its one writer, the places in its ledger that were told of."""
 
-    writer: SegmentWriter
-    held: Callable[[], None]
+    writer: Writer
     told: set[str]
 
 
@@ -197,15 +197,14 @@ async def settle_evaluation(
     cells share (a steered control stands in two datasets) is found by the second.
     """
     told: set[str] = set()
-    async with work.ledger.lock(evaluation.key, progress.current().note, stop.is_set) as held:
-        with work.ledger.writer(evaluation.key) as writer:
-            for cell in cells:
-                settled = await _settle_cell(work, cell, _Evaluation(writer, held, told), stop)
-                if settled is None:
-                    return  # what was answered is in the ledger
-                yield settled
-                del settled
-                await asyncio.sleep(0)  # a cell that was all known must not keep the loop from those that are asked
+    async with work.ledger.writing(evaluation.key, progress.current().note, stop.is_set) as writer:
+        for cell in cells:
+            settled = await _settle_cell(work, cell, _Evaluation(writer, told), stop)
+            if settled is None:
+                return  # what was answered is in the ledger
+            yield settled
+            del settled
+            await asyncio.sleep(0)  # a cell that was all known must not keep the loop from those that are asked
 
 
 async def _settle_cell(
@@ -215,7 +214,7 @@ async def _settle_cell(
     report = progress.current()
     calls = work.calls(cell)
     wanted = {call.request.key: call.request for call in calls}
-    known = work.ledger.read(cell.evaluation.key, wanted)
+    known = await asyncio.to_thread(work.ledger.read, cell.evaluation.key, wanted)
     for place in sorted({*known.notes} - its.told):
         report.note(f"{place}: {known.notes[place]}")
     its.told.update(known.notes)
@@ -224,12 +223,12 @@ async def _settle_cell(
     new = Counter(request.participant for request in missing)
     for name, count in Counter(request.participant for request in wanted.values()).items():
         report.asking(work.stage, name, new[name], count - new[name])
-    asking = _Asking(work, its.writer, its.held, missing, stop)
+    asking = _Asking(work, its.writer, missing, stop)
     await asking.run()
     rows |= asking.rows
     if stop.is_set() or len(rows) < len(wanted):
         return None
-    its.writer.sync()
+    await asyncio.to_thread(its.writer.sync)
     errors = sum(not settles(row) for row in rows.values())
     tally = Tally(asked=len(missing), cached=len(wanted) - len(missing), errors=errors)
     return Settled(cell, calls, {key: rows[key] for key in wanted}, tally)

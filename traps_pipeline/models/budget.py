@@ -9,25 +9,20 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, require_in_place, try_lock, write_bytes
+from traps_pipeline.files import remedy, write_bytes
 from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.judges import load_judges
-from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry, load_accounts, load_models
+from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Request
-from traps_pipeline.storage.ledger import JOURNAL, Totals
 from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, read_checked
 from traps_pipeline.storage.study import Study
-from traps_pipeline.storage.workspace import Workspace
 
 OVERHEAD_TOKENS = 200  # roles, separators, JSON around the text
 UNKNOWN = "unknown"  # the participant of money that nobody can tell whose call it was
@@ -180,20 +175,32 @@ class Budget:
         if worst_usd <= 0:
             return
         self._held()
-        shared = self._shared.get(participant)
         async with self._changed:
-            while True:
-                full = [slot for slot in self._slots(participant) if self._room(slot) < worst_usd - 1e-9]
-                if hopeless := [slot for slot in full if self._reserved[slot] <= 1e-9]:
-                    raise BudgetReached(self._explain(hopeless[0], worst_usd))
-                if not full and (shared is None or shared.reserve(worst_usd)):
-                    break
-                if not full and shared is not None and not self._in_flight_through(shared):
-                    raise BudgetReached(shared.explain(worst_usd))
-                await self._changed.wait()
+            while not (await self._fits(participant, worst_usd) and self._fits_account(participant, worst_usd)):
+                await self._wait()
             for slot in (None, participant):
                 self._reserved[slot] += worst_usd
         self._note(participant, worst_usd)
+
+    async def _fits(self, participant: str, worst_usd: float) -> bool:
+        """Whether the study has room for a call now. Raises BudgetReached when nothing can make any."""
+        full = [slot for slot in self._slots(participant) if self._room(slot) < worst_usd - 1e-9]
+        if hopeless := [slot for slot in full if self._reserved[slot] <= 1e-9]:
+            raise BudgetReached(self._explain(hopeless[0], worst_usd))
+        return not full
+
+    def _fits_account(self, participant: str, worst_usd: float) -> bool:
+        """Whether the participant's account has room, which is taken then. Raises BudgetReached as `_fits` does."""
+        shared = self._shared.get(participant)
+        if shared is None or shared.reserve(worst_usd):
+            return True
+        if not self._in_flight_through(shared):
+            raise BudgetReached(shared.explain(worst_usd))
+        return False
+
+    async def _wait(self) -> None:
+        """Wait until there may be more room; `_changed` is held."""
+        await self._changed.wait()
 
     async def settle(self, participant: str, worst_usd: float, cost_usd: float | None) -> None:
         """Put a call's cost in the place of its worst case; an unknown cost counts as the worst."""
@@ -220,92 +227,12 @@ class Budget:
             self._journal.add(participant, dollars)
 
     def _explain(self, slot: str | None, worst_usd: float) -> str:
-        whose = "the study" if slot is None else slot
-        return (
-            f"the budget of {whose} is reached: ${self._spent[slot]:.2f} of ${self._caps[slot]:.2f} spent, the next "
-            f"call may cost ${worst_usd:.4f}. Raise it (--budget-usd, or study.yaml) and run the same command to go on"
-        )
+        return reached(slot, self._spent[slot], self._caps[slot], worst_usd)
 
 
-@contextmanager
-def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Budget]:
-    """The study's budget, less what its ledgers say was spent. Where anyone asked has a price, no other process spends
-    from it meanwhile: two that do not see each other's calls would both use the remainder. Raises TrapsError."""
-    _check_names(workspace)
-    if not any(entry.prices for entry in participants):
-        yield Budget(workspace.study.budget_usd, workspace.study.model_budgets_usd, {})
-        return
-    path = workspace.locks / "budget.lock"
-    with _locked(path) as held, ExitStack() as opened:
-        journal = Journal(workspace.answers.root / JOURNAL)
-        opened.callback(journal.close)
-        spent = _spent_usd(workspace, journal)
-        shared = _shared_budgets(workspace, spent)
-        for account in shared.values():
-            opened.callback(account.close)
-        caps = workspace.study.budget_usd, workspace.study.model_budgets_usd
-        yield Budget(*caps, spent, journal, held, shared)
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[Callable[[], None]]:
-    """Hold a lock file; the value raises TrapsError when it is called after the file was removed."""
-    told = False
-    while (descriptor := try_lock(path)) is None:
-        if not told:
-            progress.current().note("another run spends from this study's budget; waiting for it to finish")
-            told = True
-        time.sleep(0.2)
-    try:
-        yield lambda: require_in_place(descriptor, path)
-    finally:
-        os.close(descriptor)
-
-
-def _spent_usd(workspace: Workspace, journal: Journal) -> Mapping[str, float]:
-    """Dollars by participant: what the ledgers hold, and calls that were in flight when a process died."""
-    spent = defaultdict[str, float](float, journal.lost_usd)
-    for ledger in (workspace.answers, workspace.votes):
-        for participant, its in ledger.totals().items():
-            spent[participant] += its.dollars + its.unknown * _at_most_usd(workspace, participant, its)
-    return spent
-
-
-def _shared_budgets(workspace: Workspace, spent_usd: Mapping[str, float]) -> dict[str, AccountBudget]:
-    """By participant, the budget of its account where `study.yaml` names a folder for it. Raises TrapsError."""
-    study, shared = workspace.study, dict[str, AccountBudget]()
-    entries: list[Entry] = [*load_models().values(), *load_judges().values()]
-    for account, folder in study.account_budgets.items():
-        through = [entry.id for entry in entries if entry.account == account]
-        budget = AccountBudget(account, workspace.root / folder, study.name)
-        budget.begin(sum(spent_usd.get(name, 0.0) for name in through))
-        shared |= dict.fromkeys(through, budget)
-    return shared
-
-
-def _at_most_usd(workspace: Workspace, participant: str, its: Totals) -> float:
-    """What a call whose row is damaged, or tells a cost that cannot be, is counted as: the dearest call of the same
-    participant that is known, or all the tokens that its answer may take."""
-    entry = load_models().get(participant) or load_judges().get(participant)
-    most = entry.prices.cost(0, entry.max_tokens) if entry and entry.prices else 0.0
-    each = max(its.dearest, most)
-    if its.unknown:
-        progress.current().note(
-            f"{workspace.answers.root}: {its.unknown} rows of {participant} are damaged or tell a cost that cannot be; "
-            f"each counts as ${each:.4f}"
-        )
-    return each
-
-
-def _check_names(workspace: Workspace) -> None:
-    """A cap for nobody caps nothing. Raises TrapsError."""
-    if unknown := workspace.study.account_budgets.keys() - load_accounts().keys():
-        raise TrapsError(
-            f"{workspace.root / 'study.yaml'}: account_budgets names {', '.join(sorted(unknown))}, no account of "
-            "assets/models.yaml; correct the name, or remove its line"
-        )
-    if unknown := workspace.study.model_budgets_usd.keys() - load_models().keys() - load_judges().keys():
-        raise TrapsError(
-            f"{workspace.root / 'study.yaml'}: model_budgets_usd names {', '.join(sorted(unknown))}, neither a model "
-            "of assets/models.yaml nor a judge of assets/judges.yaml; correct the name, or remove its line"
-        )
+def reached(participant: str | None, spent_usd: float, cap_usd: float, worst_usd: float) -> str:
+    """Why a budget leaves no room for a call; None: the study's."""
+    return (
+        f"the budget of {participant or 'the study'} is reached: ${spent_usd:.2f} of ${cap_usd:.2f} spent, the next "
+        f"call may cost ${worst_usd:.4f}. Raise it (--budget-usd, or study.yaml) and run the same command to go on"
+    )

@@ -10,7 +10,7 @@ import math
 import random
 import resource
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -103,9 +103,18 @@ class Participants:
         return self._meters[account]
 
 
-async def attempt(
-    participant: Participant, request: Request, budget: Budget, stop: asyncio.Event, halted: Callable[[], bool]
-) -> tuple[Outcome, int, float] | None:
+@dataclass(frozen=True)
+class Allowed:
+    """What a call needs besides its participant. stop: set when the run is to end. halted(): no more calls are to be
+    sent. require(): raises TrapsError when nobody but another process may send this one."""
+
+    budget: Budget
+    stop: asyncio.Event
+    halted: Callable[[], bool]
+    require: Callable[[], Awaitable[None]]
+
+
+async def attempt(participant: Participant, request: Request, allowed: Allowed) -> tuple[Outcome, int, float] | None:
     """An outcome, the calls it took, the seconds of the last one; None when halted before anything was spent.
 
     The one retry layer: exponential with full jitter, and never sooner than the provider asks. The outcome's cost holds
@@ -115,12 +124,12 @@ async def attempt(
     lost_usd, seconds, malformed = 0.0, 0.0, 0
     for number in range(1, limits.retries + 2):
         async with participant.gate.connection():
-            await participant.meter.admit(tokens.prompt + tokens.completion, halted)
-            if halted():
+            await participant.meter.admit(tokens.prompt + tokens.completion, allowed.halted)
+            if allowed.halted():
                 return _given_up("interrupted", number - 1, seconds, lost_usd)
             began = time.monotonic()
             try:
-                outcome = await _send(participant, request, budget)
+                outcome = await _send(participant, request, allowed)
             except TransientError as error:
                 failure, seconds = error, time.monotonic() - began
             except BudgetReached:
@@ -146,7 +155,7 @@ async def attempt(
             return _given_up(failure.kind, number, seconds, lost_usd, failure.raw)
         longest = min(limits.backoff_s * 2 ** (number - 1), MAX_BACKOFF_S)
         wait = max(min(failure.retry_after_s or 0.0, MAX_RETRY_AFTER_S), random.uniform(0, longest))
-        if await _stopped_within(stop, wait):
+        if await _stopped_within(allowed.stop, wait):
             return _given_up("interrupted", number, seconds, lost_usd)
     raise AssertionError("unreachable: the last attempt returns")
 
@@ -162,17 +171,20 @@ def _given_up(
     return Outcome("error", error=kind, cost_usd=lost_usd or None), attempts, seconds
 
 
-async def _send(participant: Participant, request: Request, budget: Budget) -> Outcome:
-    """One attempt under a reservation. Raises TransientError and BudgetReached.
+async def _send(participant: Participant, request: Request, allowed: Allowed) -> Outcome:
+    """One attempt under a reservation. Raises TransientError and BudgetReached, and TrapsError before it is sent.
 
     A call that was sent costs its worst case until the provider says otherwise, and in a way that can be believed: one
     that timed out may be billed.
     """
     entry = participant.entry
     worst_usd = worst_case_usd(entry, request)
-    await budget.reserve(entry.id, worst_usd)
-    cost_usd = worst_usd
+    await allowed.budget.reserve(entry.id, worst_usd)
+    cost_usd = 0.0
     try:
+        # Last of all: waiting for a connection, the pace or the budget may have taken long, and a host may have slept.
+        await allowed.require()
+        cost_usd = worst_usd
         async with asyncio.timeout(entry.limits.timeout_s):
             outcome = await participant.backend.ask(request)
         if entry.prices is not None:
@@ -186,7 +198,7 @@ async def _send(participant: Participant, request: Request, budget: Budget) -> O
             cost_usd = 0.0
         raise
     finally:
-        await budget.settle(entry.id, worst_usd, cost_usd)
+        await allowed.budget.settle(entry.id, worst_usd, cost_usd)
 
 
 def _believed(cost_usd: float | None, worst_usd: float) -> float:

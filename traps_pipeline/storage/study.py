@@ -160,6 +160,11 @@ class Study(BaseModel):
     account_budgets: dict[str, str] = Field(
         default={}, description="by account, the folder of a budget that several studies share (docs/models.md)"
     )
+    database: str | None = Field(
+        default=None,
+        pattern=r"^[A-Z][A-Z0-9_]*$",
+        description="variable that holds the address of the PostgreSQL database with the ledger; `traps ledger move`",
+    )
     allow_unknown_prices: bool = Field(default=False, description="ask models without a price: no budget bounds them")
     mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")
     experiments: dict[str, Asked] = Field(

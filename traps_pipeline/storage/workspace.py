@@ -14,8 +14,11 @@ from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
 from traps_pipeline.paths import CHECKOUT, require_checkout
+from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.storage.segments import SegmentLedger
+from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
@@ -130,9 +133,14 @@ class Workspace:
         return self.root / "trajectories"
 
     @property
+    def ledger_folder(self) -> Path:
+        """The ledgers of a study that is on one machine, their locks and the journal of calls in flight."""
+        return self.root / "ledger"
+
+    @property
     def locks(self) -> Path:
         """Lock files of stages that must not run twice at once."""
-        return self.root / "ledger" / "locks"
+        return self.ledger_folder / "locks"
 
     @cached_property
     def tables(self) -> TableStore:
@@ -149,12 +157,22 @@ class Workspace:
     @cached_property
     def answers(self) -> Ledger:
         """Every answer ever paid for."""
-        return Ledger(self.root / "ledger", "answers")
+        return self._ledger("answers")
 
     @cached_property
     def votes(self) -> Ledger:
         """Every vote ever paid for."""
-        return Ledger(self.root / "ledger", "votes")
+        return self._ledger("votes")
+
+    def _ledger(self, kind: str) -> Ledger:
+        shared = self.session
+        return SegmentLedger(self.ledger_folder, kind) if shared is None else SharedLedger(shared, kind)
+
+    @property
+    def session(self) -> Session | None:
+        """The connection to the database with the study's ledger and budget; None where they lie in its folder. Raises
+        TrapsError naming the variable and the remedy."""
+        return session_of(self.study.database, self.study.name) if self.study.database else None
 
     def failed_check(self, stage: str, check: str, key: str | None) -> Path:
         """File that exists while a check of a partition does not pass; it holds the details."""

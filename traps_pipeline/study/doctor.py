@@ -65,7 +65,6 @@ def examine_files(workspace_root: Path) -> Iterator[Finding]:
     workspace = Workspace.open(workspace_root)
     for what, files, damage_of in (
         ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), _damaged_table),
-        ("ledger", sorted((workspace.root / "ledger").rglob("*.jsonl*")), _damaged_lines),
         ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
         ("media", sorted((workspace.root / "media").glob("*/*.json")), _damaged_media),
         (
@@ -78,6 +77,8 @@ def examine_files(workspace_root: Path) -> Iterator[Finding]:
         damaged = [said for path in files if (said := damage_of(path))]
         shown = "; ".join(damaged[:SHOWN]) + (f"; and {len(damaged) - SHOWN} more" if len(damaged) > SHOWN else "")
         yield Finding(not damaged, what, shown or f"{len(files)} files are what was written")
+    said = [*workspace.answers.damage(), *workspace.votes.damage(), *_damaged_journal(workspace.root)]
+    yield Finding(not said, "ledger", "; ".join(said[:SHOWN]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
 
 
@@ -87,11 +88,12 @@ def _damaged_table(path: Path) -> str:
     return altered(path)
 
 
-def _damaged_lines(path: Path) -> str:
-    from traps_pipeline.storage.ledger import damaged_lines
+def _damaged_journal(root: Path) -> Iterator[str]:
+    from traps_pipeline.storage.segments import JOURNAL, damaged_lines
 
-    lines = damaged_lines(path)
-    return f"{path}: line {', '.join(map(str, lines))}: not what was written, and not believed" if lines else ""
+    path = root / "ledger" / JOURNAL
+    if path.exists() and (lines := damaged_lines(path)):
+        yield f"{path}: line {', '.join(map(str, lines))}: not what was written, and not believed"
 
 
 def _damaged_clip(path: Path) -> str:

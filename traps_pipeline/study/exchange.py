@@ -8,11 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-import secrets
-import shutil
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +19,7 @@ from traps_pipeline import progress
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import replacing, sync_folder, write_bytes
+from traps_pipeline.files import replacing, write_bytes
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.models.answers import prepare_media, wanted_questions
 from traps_pipeline.models.judges import load_judges, load_panel
@@ -32,7 +28,7 @@ from traps_pipeline.models.registry import Entry, ModelEntry, account_of, get_mo
 from traps_pipeline.models.request import WITH_TEXT, Outcome, OutcomeKind, Request
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.storage.ledger import Ledger, settles
+from traps_pipeline.storage.ledger import Ledger, Stored
 from traps_pipeline.storage.rows import MOST_TOKENS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.batch import export_batches, failures, is_batch, outcomes_of, read_batch
@@ -312,30 +308,10 @@ def _by_item(given: Iterable[Given], wanted: Mapping[str, Request], whose: Whose
 
 
 async def _store(workspace: Workspace, ledger: Ledger, found: Sequence[_Stored]) -> int:
-    """Store what the ledger does not hold, all of it or nothing: it is written beside the ledger first and then moved
-    in, which takes no more space; the number of new answers. A failed call is stored, too, and is asked again."""
-    new, by_evaluation = 0, defaultdict[Evaluation, list[_Stored]](list)
-    for one in found:
-        by_evaluation[one.evaluation].append(one)
-    staged = Ledger(ledger.root / f"importing-{secrets.token_hex(4)}", ledger.kind)
-    async with AsyncExitStack() as locks:
-        for evaluation in sorted(by_evaluation):
-            await locks.enter_async_context(ledger.lock(evaluation.key, progress.current().note))
-        try:
-            for evaluation, mine in by_evaluation.items():
-                known = ledger.read(evaluation.key).settled
-                with staged.writer(evaluation.key) as writer:
-                    for one in mine:
-                        if one.request.key not in known:
-                            row = ledger_row(one.request, one.outcome, 1, one.latency_s, workspace.study.epoch)
-                            writer.append(*row)
-                            new += settles(row[0])
-            # What stands beside rows goes first: a row without its reasoning would be taken for one that has none.
-            for path in sorted(staged.root.rglob("*.jsonl*"), key=lambda path: path.suffix == ".jsonl"):
-                target = ledger.root / path.relative_to(staged.root)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                path.replace(target)
-                sync_folder(target.parent)
-        finally:
-            shutil.rmtree(staged.root, ignore_errors=True)
-    return new
+    """Store what the ledger does not hold, all of it or nothing; the number of new answers. A failed call is stored,
+    too, and is asked again."""
+    rows: dict[str, list[Stored]] = {}
+    for one in sorted(found, key=lambda one: one.evaluation):
+        row = ledger_row(one.request, one.outcome, 1, one.latency_s, workspace.study.epoch)
+        rows.setdefault(one.evaluation.key, []).append(row)
+    return await ledger.store(rows, progress.current().note)

@@ -31,8 +31,8 @@ from traps_pipeline.models.registry import Limits, ModelEntry, effective_params,
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
-from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.media import MediaStore
+from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 
 pytestmark = pytest.mark.slow
@@ -119,14 +119,20 @@ def test_a_second_run_asks_nothing(tmp_path: Path, batches: list[int]) -> None:
         participants = Participants({of.id: of}, make_backend, Study())
         calls = [Call(request(of, media, question)) for question in QUESTIONS]
         work = Work(
-            "responses", Ledger(tmp_path, "answers"), participants, Budget(0.0, {}, {}), "1", lambda _: calls, finish
+            "responses",
+            SegmentLedger(tmp_path, "answers"),
+            participants,
+            Budget(0.0, {}, {}),
+            "1",
+            lambda _: calls,
+            finish,
         )
         (finished,) = run_work(work, [cell])
         return finished
 
     rows, tally = run()
     assert (tally.asked, tally.cached, batches) == (3, 0, [2, 1])
-    written = Ledger(tmp_path, "answers").read(cell.evaluation.key).settled.values()
+    written = SegmentLedger(tmp_path, "answers").read(cell.evaluation.key).settled.values()
     assert {row["components"]["params"]["checkpoint_digest"] for row in written} == {model(of.id).checkpoint.digest}
     again, tally = run()
     assert (tally.asked, tally.cached, batches) == (0, 3, [2, 1])

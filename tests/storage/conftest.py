@@ -1,0 +1,86 @@
+"""Ledgers of both kinds, here and in processes of their own."""
+
+from __future__ import annotations
+
+import secrets
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+from tests.postgres import LACKING, Postgres, programs
+from traps_pipeline.storage.database import Session
+from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.segments import SegmentLedger
+from traps_pipeline.storage.shared_ledger import SharedLedger
+
+VARIABLE = "TRAPS_TEST_DATABASE"
+
+
+def opened(kind: str, *where: str) -> Ledger:
+    """A ledger of answers: of `segments` in a folder, or of `postgres` at an address, in a study, whose sessions may be
+    silent for so many seconds."""
+    if kind == "segments":
+        return SegmentLedger(Path(where[0]), "answers")
+    return SharedLedger(Session(where[0], VARIABLE, where[1], float(where[2])), "answers")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a ledger is: the arguments of `opened`."""
+
+    where: Sequence[str]
+
+    @property
+    def kind(self) -> str:
+        return self.where[0]
+
+    def open(self) -> Ledger:
+        """The ledger, as another process would open it."""
+        return opened(*self.where)
+
+    @contextmanager
+    def process(self, code: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+        """A process that runs code with `ledger` defined; `arguments` are in its sys.argv[1:]. Killed at the end."""
+        begin = "import sys\nfrom tests.storage.conftest import opened\nledger = opened(*sys.argv.pop(1).split('|'))\n"
+        command = [sys.executable, "-c", begin + code, "|".join(self.where), *arguments]
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.communicate()
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Postgres]:
+    """A server for the tests of a process, each of which uses a study of its own."""
+    if programs() is None:
+        pytest.skip(LACKING)
+    pytest.importorskip("psycopg", reason="psycopg is not installed; `pip install -e '.[dev]'` brings it")
+    with Postgres.running() as server:
+        yield server
+
+
+def in_database(server: Postgres, idle_s: float = 30.0) -> Place:
+    """A new study's ledger."""
+    return Place(("postgres", server.address(), f"study-{secrets.token_hex(4)}", str(idle_s)))
+
+
+@pytest.fixture(params=["segments", "postgres"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
+    """An empty ledger of each kind."""
+    if request.param == "segments":
+        return Place(("segments", str(tmp_path)))
+    return in_database(request.getfixturevalue("postgres"))
+
+
+@pytest.fixture
+def ledger(place: Place) -> Ledger:
+    """An empty ledger of each kind, opened."""
+    return place.open()
