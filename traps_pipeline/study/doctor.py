@@ -157,9 +157,9 @@ def _checkout() -> str:
     from traps_pipeline.benchmark.corrections import read_corrections
     from traps_pipeline.benchmark.records import load_release, load_released
     from traps_pipeline.models.registry import load_models
-    from traps_pipeline.paths import require_checkout
+    from traps_pipeline.paths import require_root
 
-    root, release = require_checkout(), load_release()
+    root, release = require_root(), load_release()
     counts = f"{len(load_released())} scenarios, {len(read_corrections())} corrections, {len(load_models())} models"
     return f"{root}: {release.name} {release.version}, {counts}"
 
