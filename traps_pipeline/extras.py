@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Literal
+from typing import Literal, get_args
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import IS_INSTALLED
@@ -49,7 +49,8 @@ def require(name: ExtraName) -> None:
 def sentence_of(error: ModuleNotFoundError) -> str | None:
     """The same sentence for an import that nobody looked after; None for a module of no extra."""
     module = (error.name or "").partition(".")[0]
-    name = next((name for name, extra in EXTRAS.items() if module in extra.modules), None)
+    known: tuple[ExtraName, ...] = get_args(ExtraName)
+    name = next((name for name in known if module in EXTRAS[name].modules), None)
     return None if name is None else _sentence(name, [module])
 
 
