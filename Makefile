@@ -10,7 +10,7 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test ui bench explorer-vendor lint setup setup-core lock wheel render-packages test-packages clean environments
+.PHONY: demo demo-mechanism check fast-tests test ui bench explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
 
 demo: setup-core ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -85,6 +85,9 @@ lock: ## for maintainers: the locks from pyproject.toml, with uv
 
 wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same files
 	$(BIN)/python -m hatchling build -t wheel
+
+sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
+	$(BIN)/python tools/sbom.py dist/sbom.json
 
 # apt only when something is missing; without root the one line to run is printed.
 render-packages:

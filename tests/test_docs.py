@@ -12,7 +12,7 @@ import yaml
 
 from tests.conftest import ROOT
 
-FOLDERS = ("traps_pipeline", "tests", "bench", "docs", "assets", "scene_specs", ".ci")
+FOLDERS = ("traps_pipeline", "tests", "bench", "docs", "assets", "scene_specs", "tools", ".ci")
 FILES = [path for place in (ROOT.glob("*"), *((ROOT / name).rglob("*") for name in FOLDERS)) for path in place]
 ENDINGS = (".py", ".md", ".yaml", ".toml", ".j2", ".txt", ".cff", "Makefile", ".ci/run")
 TEXTS = [path for path in FILES if str(path).endswith(ENDINGS) and path != Path(__file__)]

@@ -171,17 +171,18 @@ def _rendering() -> str:
 
     from traps_pipeline.scenes.camera import fit_camera
     from traps_pipeline.scenes.kit import Physics, View, add_ball, new_spec
-    from traps_pipeline.scenes.render import Renderer
+    from traps_pipeline.scenes.render import Renderer, gl_version
 
     spec = new_spec(Physics())
     add_ball(spec, "ball", (0, 0, 0.1), 0.1, "red")
     model = spec.compile()
     with Renderer(model, fit_camera(View(), np.array([[-0.3, 0, 0], [0.3, 0, 0.4]]))) as renderer:
         frame = next(renderer.frames([model.qpos0]))
+        drawn_by = gl_version()
     red = int((frame[..., 0].astype(int) - frame[..., 1] > 60).sum())
     if red < 100:
         raise RuntimeError(f"a red ball was drawn with {red} red pixels; this OpenGL does not render MuJoCo scenes")
-    return f"MUJOCO_GL={os.environ['MUJOCO_GL']}, one frame drawn ({red} red pixels of the ball)"
+    return f"MUJOCO_GL={os.environ['MUJOCO_GL']}, {drawn_by}, one frame drawn ({red} red pixels of the ball)"
 
 
 def _encoding() -> str:
