@@ -50,7 +50,7 @@ def component(package: dict[str, Any]) -> dict[str, Any]:
 
 
 def bill(pylock: str, project: dict[str, Any]) -> dict[str, Any]:
-    """The whole bill of the text of a `pylock.toml`. It has no time and no serial number: the content is the identity."""
+    """The whole bill of the text of a `pylock.toml`, without a time and a serial number: it is named by its content."""
     packages = sorted(tomllib.loads(pylock)["packages"], key=lambda one: (one["name"], one["version"]))
     purl = f"pkg:pypi/{project['name']}@{project['version']}"
     ours = {"type": "application", "bom-ref": purl, "name": project["name"], "version": project["version"]}

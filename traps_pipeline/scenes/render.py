@@ -44,8 +44,8 @@ def _make_current(width: int, height: int) -> None:
 
 
 def gl_version() -> str:
-    """What draws here, in its own words, e.g. "4.5 (Compatibility Profile) Mesa 22.3.6": the same scene drawn by another
-    version can differ in single pixels. Only while a Renderer is open."""
+    """What draws here, in its own words, e.g. "4.5 (Compatibility Profile) Mesa 22.3.6": the scene drawn by another
+    version may differ in single pixels. Only while a Renderer is open."""
     from OpenGL.GL import GL_VERSION, glGetString
 
     said = glGetString(GL_VERSION)
