@@ -86,6 +86,11 @@ lock: ## for maintainers: the locks from pyproject.toml, with uv
 wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same files
 	$(BIN)/python -m hatchling build -t wheel
 
+# The time in pages that have one: any will do, as long as it is the same in every build.
+docs: export SOURCE_DATE_EPOCH ?= 1580601600
+docs: setup ## site/index.html: the documentation with its reference; every link is checked, and nothing is fetched
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
 sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
 	$(BIN)/python tools/sbom.py dist/sbom.json
 

@@ -52,7 +52,7 @@ def without_addresses(pylock: str) -> str:
 def main() -> None:
     """Write all three. Versions that are locked stay, unless `--upgrade` is among the arguments."""
     more = sys.argv[1:]
-    everything = ("--extra", "all", "--extra", "dev")
+    everything = ("--extra", "all", "--extra", "dev", "--extra", "docs")
     compile_lock(LOCK, BUILD + TORCH_NEEDS, *everything, "--generate-hashes", *more)
     compile_lock(CORE, BUILD, "--constraints", LOCK, "--generate-hashes", *more)
     with tempfile.TemporaryDirectory() as folder:

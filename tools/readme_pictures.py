@@ -8,6 +8,7 @@ Writes docs/moving_pair.gif and docs/finding.png; the same clips and numbers giv
 from __future__ import annotations
 
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from traps_pipeline.storage.workspace import Workspace
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCENARIO, SHOWN_S = "hidden_drop-0001", 3.2  # the ball lies still from then on
 HOLD_MS = 2600  # the last frame, with the answers
-WIDTH, HEIGHT, HEAD, FOOT, GAP = 420, 315, 62, 62, 8  # px: a clip, the texts above and below it, between the clips
+WIDTH, HEIGHT, HEAD, FOOT, GAP = 420, 315, 100, 62, 8  # px: a clip, the texts above and below it, between the clips
 MOST_BYTES = 1_500_000
 
 
@@ -50,13 +51,13 @@ def moving_pair(workspace: Workspace) -> bytes:
 def _frame(pair: Sequence[np.ndarray], question: str, answers: tuple[str, str] | None) -> Image.Image:
     frame = Image.new("RGB", (2 * WIDTH + GAP, HEAD + HEIGHT + FOOT), "white")
     draw = ImageDraw.Draw(frame)
-    draw.text((0, 8), question, fill=INK, font=_font(16, bold=True))
+    draw.multiline_text((0, 4), textwrap.fill(question, 56), fill=INK, font=_font(22, bold=True))
     for at, (picture, said) in enumerate(zip(pair, ("the outcome can be seen", "a panel hides it"), strict=True)):
         x = at * (WIDTH + GAP)
-        draw.text((x, 36), f"{('control', 'void')[at]}: {said}", fill=SOFT, font=_font(15))
+        draw.text((x, 68), f"{('control', 'void')[at]}: {said}", fill=SOFT, font=_font(21))
         frame.paste(Image.fromarray(picture).resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS), (x, HEAD))
         if answers is not None:
-            draw.text((x, HEAD + HEIGHT + 12), answers[at].partition(": ")[2], fill=INK, font=_font(24, bold=True))
+            draw.text((x, HEAD + HEIGHT + 12), answers[at].partition(": ")[2], fill=INK, font=_font(30, bold=True))
     return frame
 
 
@@ -76,7 +77,7 @@ def finding() -> bytes:
     shares = published_overall().pivot(index="model", columns="regime", values="abs_rec").mul(100)
     shares = shares.loc[:, ["standard", "guided"]].dropna().sort_values("standard")
     with figure_style():
-        figure = new_figure(6.8, 3.5, dpi=200)
+        figure = new_figure(4.6, 3.6, dpi=220)
         axes = figure.add_subplot()
         for y, (model, row) in enumerate(shares.iterrows()):
             colour = family_colour(family_of(str(model)))
@@ -85,7 +86,7 @@ def finding() -> bytes:
             axes.scatter(row["guided"], y, s=26, color=colour, zorder=2)
         axes.set_yticks(range(len(shares)), [str(model) for model in shares.index])
         axes.set_xlim(0, 100)
-        axes.set_xlabel("share of voids abstained on, % (hollow: asked plainly; filled: told not to guess)")
+        axes.set_xlabel("share of voids abstained on, %\nhollow: asked plainly; filled: told not to guess")
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="x", color="#e4e7ec", linewidth=0.6)
         axes.set_axisbelow(True)
