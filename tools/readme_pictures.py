@@ -27,6 +27,7 @@ SCENARIO, SHOWN_S = "hidden_drop-0001", 3.2  # the ball lies still from then on
 HOLD_MS = 2600  # the last frame, with the answers
 WIDTH, HEIGHT, HEAD, FOOT, GAP = 420, 315, 100, 62, 8  # px: a clip, the texts above and below it, between the clips
 MOST_BYTES = 1_500_000
+NEARLY_WHITE = 245
 
 
 def moving_pair(workspace: Workspace) -> bytes:
@@ -40,6 +41,9 @@ def moving_pair(workspace: Workspace) -> bytes:
         _frame((left[at], right[at]), control["question"], answers if at == count - 1 else None) for at in range(count)
     ]
     palette = _beside([frames[0], frames[count // 4], frames[-1]]).quantize(256, kmeans=4)  # of all that is seen
+    colours = np.reshape(palette.getpalette() or [], (-1, 3))
+    colours[(colours > NEARLY_WHITE).all(axis=1)] = 255  # the ground is the page's
+    palette.putpalette(colours.ravel().tolist())
     small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     step = round(1000 * float(times[1] - times[0]))
     out = DOCS / "moving_pair.gif"
