@@ -20,8 +20,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def licences(found: PackageMetadata) -> list[dict[str, Any]]:
     """What a package says of its licence: an SPDX expression, else its classifiers' names, else nothing."""
-    if expression := found.get("License-Expression"):
-        return [{"expression": expression}]
+    if "License-Expression" in found:
+        return [{"expression": found["License-Expression"]}]
     named = [line.split(" :: ")[-1] for line in found.get_all("Classifier", []) if line.startswith("License :: ")]
     return [{"license": {"name": name}} for name in sorted(set(named))]
 

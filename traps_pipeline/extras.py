@@ -50,8 +50,7 @@ def sentence_of(error: ModuleNotFoundError) -> str | None:
     """The same sentence for an import that nobody looked after; None for a module of no extra."""
     module = (error.name or "").partition(".")[0]
     known: tuple[ExtraName, ...] = get_args(ExtraName)
-    name = next((name for name in known if module in EXTRAS[name].modules), None)
-    return None if name is None else _sentence(name, [module])
+    return next((_sentence(name, [module]) for name in known if module in EXTRAS[name].modules), None)
 
 
 def _sentence(name: ExtraName, absent: list[str]) -> str:
