@@ -10,9 +10,9 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test test-cluster ui bench explorer-vendor environments lint setup render-packages test-packages clean
+.PHONY: demo demo-mechanism check fast-tests test test-cluster ui bench explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
 
-demo: setup ## leaderboard of nine models on 32 scenarios, no key needed
+demo: setup-core ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps site
 
@@ -61,15 +61,43 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --warnings
 
-setup: render-packages $(VENV)/.installed
+setup: render-packages $(VENV)/.installed ## everything, as `make test` wants it
 
-$(VENV)/.installed: requirements.lock pyproject.toml
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or later is needed: make PYTHON=/path/to/python3.11")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+setup-core: render-packages $(VENV)/.core ## what the demo wants: no torch, no provider's library, no web server
+
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+$(VENV)/.installed: requirements.lock pyproject.toml hatch_build.py
+	$(make-venv)
+	$(PIP_INSTALL) --no-deps --require-hashes -r requirements.lock
+	$(PIP_INSTALL) $(TORCH)
+	$(PIP_INSTALL) --no-deps --no-build-isolation --editable .
+	touch $(VENV)/.core $@
+
+$(VENV)/.core: requirements-core.lock pyproject.toml hatch_build.py
+	$(make-venv)
+	$(PIP_INSTALL) --no-deps --require-hashes -r requirements-core.lock
+	$(PIP_INSTALL) --no-deps --no-build-isolation --editable .
 	touch $@
+
+define make-venv
+$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and "Python 3.11, 3.12 or 3.13 is needed: make PYTHON=/path/to/python3.11")'
+test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+endef
+
+lock: ## for maintainers: the locks from pyproject.toml, with uv
+	$(PYTHON) tools/lock.py $(LOCK_OPTIONS)
+
+wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same files
+	$(BIN)/python -m hatchling build -t wheel
+
+# The time in pages that have one: any will do, as long as it is the same in every build.
+docs: export SOURCE_DATE_EPOCH ?= 1580601600
+docs: setup ## site/index.html: the documentation with its reference; every link is checked, and nothing is fetched
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
+sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
+	$(BIN)/python tools/sbom.py dist/sbom.json
 
 # apt only when something is missing; without root the one line to run is printed.
 render-packages:

@@ -11,8 +11,9 @@ import pytest
 import yaml
 
 from tests.conftest import ROOT
+from traps_pipeline.scoring.published import published_overall
 
-FOLDERS = ("traps_pipeline", "tests", "bench", "docs", "assets", "scene_specs", ".ci")
+FOLDERS = ("traps_pipeline", "tests", "bench", "docs", "assets", "scene_specs", "tools", ".ci")
 FILES = [path for place in (ROOT.glob("*"), *((ROOT / name).rglob("*") for name in FOLDERS)) for path in place]
 ENDINGS = (".py", ".md", ".yaml", ".toml", ".j2", ".txt", ".cff", "Makefile", ".ci/run")
 TEXTS = [path for path in FILES if str(path).endswith(ENDINGS) and path != Path(__file__)]
@@ -87,3 +88,15 @@ def test_the_verbatim_prompts_carry_the_licence_of_the_papers_release() -> None:
     for name in ("assets/prompts/README.md", "LICENSE-DATA", "README.md", "docs/limits.md"):
         text = " ".join((ROOT / name).read_text().split())
         assert "CC BY-NC 4.0" in text or "non-commercial" in text, name
+
+
+def test_the_finding_in_the_readme_is_what_the_paper_printed() -> None:
+    overall = published_overall().pivot(index="model", columns="regime")
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    plain, guided = (overall["abs_rec"][regime].mul(100).round() for regime in ("standard", "guided"))
+    assert len(overall) == 16
+    assert f"Asked plainly, the paper's sixteen models abstain on {plain.min():.0f} to {plain.max():.0f} %" in readme
+    assert f"Told not to guess, they abstain on {guided.min():.0f} to {guided.max():.0f} %" in readme
+    changed = (overall["acc"]["guided"] - overall["acc"]["standard"]).abs().mul(100).round().max()
+    assert changed == 2 and "their accuracy on the others changes by two points at most" in readme
+    assert (ROOT / "docs" / "moving_pair.gif").stat().st_size < 1_500_000

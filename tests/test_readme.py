@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -69,6 +70,24 @@ def test_every_command_of_the_readme_runs(demo_study: Checkout, provider: Provid
     assert ran == len("".join(blocks("sh")).splitlines()) - 1 - len(ELSEWHERE)
     drawn = study.root / ".workspaces" / "trial" / "released" / "plank_post.jsonl"
     assert len(drawn.read_text().splitlines()) == 1
+
+
+@pytest.mark.parametrize("size", ["lite", "full"])
+def test_what_an_evaluation_costs_in_the_readme_is_what_the_plan_says(size: str, tmp_path: Path) -> None:
+    (row,) = re.findall(rf"^\| {size} \| (.*) \|$", README, re.MULTILINE)
+    scenarios, answers, votes, dollars, batched, width = row.split(" | ")
+    (tokens,) = re.findall(rf"([0-9.]+) million tokens for {size}", " ".join(README.split()))
+    mine = blocks("yaml")[0].partition("scenarios:")[0] + (f"scenarios: {size}\n" if size == "lite" else "")
+    (tmp_path / "mine.yaml").write_text(mine)
+    plan = Checkout(ROOT, tmp_path / "none").traps("plan", tmp_path / "mine.yaml", "--workspace", tmp_path / "mine")
+    assert plan.code == 0, plan.err
+    assert re.search(rf"^my-model +{answers} +0 +{answers} +{votes} ", plan.out, re.MULTILINE)
+    assert re.search(rf"^my-model +{answers} +{tokens}, ", plan.out, re.MULTILINE)
+    expected, low, high = re.findall(r"[0-9.]+", dollars)
+    assert re.search(rf"^all: models, then judges +[0-9,]+ +{low} +{expected} +{high} ", plan.out, re.MULTILINE)
+    assert f"in batches (traps requests export --batch): USD {batched}\n" in plan.out
+    assert f"{width.removeprefix('about ').removesuffix(' wide')} wide" in plan.out
+    assert f"{int(scenarios) * 2:,} pairs" in plan.out
 
 
 def test_the_sample_of_the_leaderboard_in_the_readme_is_what_the_demo_prints(demo_output: str) -> None:

@@ -19,6 +19,7 @@ ROOMS = (
     "files",
     "digests",
     "paths",
+    "extras",
     "terminal",
     "yamlfile",
     "partitions",

@@ -6,13 +6,13 @@ from traps_pipeline import defs as declared
 from traps_pipeline.orchestration.automation import JOBS, SENSORS
 from traps_pipeline.orchestration.graph import DECLARED
 from traps_pipeline.orchestration.stage import WorkspaceResource
-from traps_pipeline.paths import require_checkout
+from traps_pipeline.paths import require_root
 from traps_pipeline.storage.workspace import Workspace
 
 
 def _assets() -> list[dg.AssetsDefinition | dg.SourceAsset]:
     """The assets that `defs/` declares, from Dagster's loader, without the groups that the study does not use."""
-    require_checkout()
+    require_root()
     found = dg.load_definitions_from_package_module(declared).assets or ()
     shown = {one.spec.key for one in DECLARED.values()}
     assets = [one for one in found if isinstance(one, dg.AssetsDefinition | dg.SourceAsset)]

@@ -1,4 +1,8 @@
-"""Where the checkout's data lies. The package runs from a checkout (editable install), never from a wheel alone."""
+"""Where the files that belong to the code lie: `assets/`, `scene_specs/` and `dagster.yaml`.
+
+They are top-level folders of the repository, and a wheel carries them inside the package (`SHIPPED`). Everything that
+reads them asks here, so that the same code runs from a checkout and from a wheel.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +11,43 @@ from pathlib import Path
 
 from traps_pipeline.errors import TrapsError
 
-CHECKOUT = Path(__file__).resolve().parents[1]
-ASSETS = CHECKOUT / "assets"
+PACKAGE = Path(__file__).resolve().parent
+SHIPPED = PACKAGE / "shipped"  # only in an installed wheel; hatch_build.py puts it there
+IS_INSTALLED = SHIPPED.is_dir()
+ROOT = SHIPPED if IS_INSTALLED else PACKAGE.parent
+ASSETS = ROOT / "assets"
 SPECS_VARIABLE = "TRAPS_SCENE_SPECS"  # names the folder of a sampled benchmark
-SCENE_SPECS = Path(os.environ.get(SPECS_VARIABLE) or CHECKOUT / "scene_specs").absolute()
+OWN_SPECS = ROOT / "scene_specs"  # those of this version of the code
+SCENE_SPECS = Path(os.environ.get(SPECS_VARIABLE) or OWN_SPECS).absolute()
 RELEASED = SCENE_SPECS / "released"
 CORRECTIONS = SCENE_SPECS / "corrections"
+# What commands write where they are told no folder: in the checkout, else below the current folder.
+WORKSPACES = (Path.cwd() if IS_INSTALLED else ROOT) / ".workspaces"
 
 
-def require_checkout() -> Path:
-    """The checkout's root. Raises TrapsError with the remedy when the package was installed without one."""
+def require_root() -> Path:
+    """The folder that holds `assets/` and `scene_specs/`. Raises TrapsError with the remedy when one is missing."""
     for folder in (ASSETS, SCENE_SPECS):
         if not folder.is_dir():
             raise TrapsError(
-                f"{folder} is missing: traps runs from a checkout; clone the repository and `pip install -e .` in it"
+                f"{folder} is missing: install the wheel again, or clone the repository and `pip install -e .` in it"
             )
-    return CHECKOUT
+    return ROOT
+
+
+def require_own(path: Path, instead: str) -> Path:
+    """The path, if people may change what lies there. `instead` says what to do where they may not.
+
+    Raises TrapsError for a file or folder of an installed wheel: the next installation would overwrite what was
+    written, and two studies would differ though they name the same version.
+    """
+    if IS_INSTALLED and path.is_relative_to(SHIPPED):
+        raise TrapsError(f"{path}: came with the installed package and is not changed; {instead}")
+    return path
+
+
+def require_own_corrections(folder: Path = CORRECTIONS) -> Path:
+    """The folder of corrections, if decisions may be written into it. Raises TrapsError."""
+    return require_own(
+        folder, f"copy {OWN_SPECS} to a folder of your own, set {SPECS_VARIABLE} to it, and decide there"
+    )

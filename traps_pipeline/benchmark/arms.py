@@ -19,7 +19,7 @@ from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
 from traps_pipeline.partitions import arms_of, sides_of, taxonomy_of_category
-from traps_pipeline.paths import CHECKOUT
+from traps_pipeline.paths import PACKAGE
 from traps_pipeline.scenes.arms import ARMS as KNOWN
 from traps_pipeline.scenes.arms import Question, Scenario
 from traps_pipeline.scenes.clips import Clip, read_clip, save_clip
@@ -103,7 +103,7 @@ def _finding_of(clip: Path) -> Path:
 
 @cache
 def _code() -> str:
-    folder = CHECKOUT / "traps_pipeline" / "scenes"
+    folder = PACKAGE / "scenes"
     return digest([file_digest(folder / name) for name in ("arms.py", "offers.py")])
 
 

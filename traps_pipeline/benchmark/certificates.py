@@ -16,7 +16,7 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
-from traps_pipeline.paths import CHECKOUT
+from traps_pipeline.paths import PACKAGE
 from traps_pipeline.scenes.certify import Verdict, certify
 from traps_pipeline.scenes.sample import Tally, load_tallies
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
@@ -75,7 +75,7 @@ def _case(released: Path, kept: Path, spec: SceneSpec) -> Case:
 @cache
 def code_digest(family: str) -> str:
     """Digest of the code that certifies a family: verdicts of other code are not believed."""
-    folder = CHECKOUT / "traps_pipeline" / "scenes"
+    folder = PACKAGE / "scenes"
     files = [*sorted(folder.glob("*.py")), *sorted(folder.glob("parts/*.py")), folder / "families" / f"{family}.py"]
     return digest([[path.name, file_digest(path)] for path in files])
 

@@ -27,7 +27,7 @@ from traps_pipeline.benchmark.records import load_release, load_released
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import CATEGORIES
-from traps_pipeline.paths import CHECKOUT, CORRECTIONS, SCENE_SPECS, SPECS_VARIABLE
+from traps_pipeline.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS_VARIABLE
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.spec import Answerable, SceneSpec, Slug
 from traps_pipeline.storage.study import Study
@@ -200,7 +200,7 @@ def load_scenarios(study: Study) -> dict[str, Scenario]:
 
 def check_benchmark(study: Study) -> None:
     """Raises TrapsError unless the records in force are of the study's benchmark."""
-    there = "released" if SCENE_SPECS == CHECKOUT / "scene_specs" else load_release().name
+    there = "released" if SCENE_SPECS == OWN_SPECS else load_release().name
     if study.benchmark != there:
         raise TrapsError(
             f"the benchmark of the study is {study.benchmark!r}, the records in {SCENE_SPECS} are {there!r}; "

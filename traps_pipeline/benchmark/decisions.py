@@ -20,7 +20,7 @@ from traps_pipeline.benchmark.corrections import Correction, Scenario, fold, fol
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import sync_folder
-from traps_pipeline.paths import CORRECTIONS
+from traps_pipeline.paths import CORRECTIONS, require_own_corrections
 
 FILE = "review.jsonl"
 Signed = Callable[..., Correction]
@@ -98,8 +98,9 @@ def _require_known(scenario_id: str, seen: int, folder: Path) -> list[Correction
 
 @contextmanager
 def _appending(folder: Path) -> Iterator[Callable[[Sequence[Correction]], None]]:
-    """What appends decisions, while no other process does. Raises TrapsError where a later file would overrule them."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """What appends decisions, while no other process does. Raises TrapsError where a later file would overrule them,
+    and where the folder belongs to an installed wheel."""
+    require_own_corrections(folder).mkdir(parents=True, exist_ok=True)
     later = sorted(path.name for path in folder.glob("*.jsonl") if path.name > FILE)
     if later:
         raise TrapsError(

@@ -18,7 +18,7 @@ from traps_pipeline.benchmark.versions import spec_content, version_of
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
-from traps_pipeline.paths import CHECKOUT, CORRECTIONS, RELEASED
+from traps_pipeline.paths import CORRECTIONS, RELEASED, ROOT
 from traps_pipeline.scenes.kit import Physics, Wording
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory
@@ -70,7 +70,7 @@ def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
     write_text(workspace.trajectories / f"{name}.json", record)  # last, so that it vouches for the trajectory
     progress.current().note(
         f"{scenario.scenario_id}: simulated here after {scenario.where}; to freeze it for other machines copy "
-        f"trajectories/{name}.* of the workspace to {CORRECTIONS.relative_to(CHECKOUT)}/trajectories/"
+        f"trajectories/{name}.* of the workspace to {CORRECTIONS / 'trajectories'}"
     )
     return spec, workspace.trajectories / f"{name}.npz"
 
@@ -178,7 +178,7 @@ def _row(workspace: Workspace, item: Resolved, version: str) -> SceneSpecRow:
         **record,
         scene_hash=spec.scene_hash,
         spec_hash=spec.spec_hash,
-        trajectory=_relative(item.trajectory, workspace.root, CHECKOUT),
+        trajectory=_relative(item.trajectory, workspace.root, ROOT),
         commit_s=float(spec.evidence["commit_s"]),
         margin_m=float(spec.evidence["margin_m"]),
         void_from_s=void_from_s(spec),
@@ -204,7 +204,7 @@ def spec_of(row: dict[str, Any]) -> SceneSpec:
 
 def trajectory_of(workspace: Workspace, row: dict[str, Any], world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
     """The frozen qpos (F, nq) of a row of scene_specs, or its twin's. Raises TrapsError."""
-    candidates: Sequence[Path] = (CHECKOUT / row["trajectory"], workspace.resolve(row["trajectory"]))
+    candidates: Sequence[Path] = (ROOT / row["trajectory"], workspace.resolve(row["trajectory"]))
     path = next((p for p in candidates if p.is_file()), candidates[0])
     try:
         sha256 = row["trajectory_sha256"] if world == "qpos" else json.loads(row["twin"])["trajectory_sha256"]

@@ -35,6 +35,7 @@ from traps_pipeline.cli import (
 )
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, Run
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import sentence_of
 from traps_pipeline.files import remedy
 from traps_pipeline.terminal import plain
 
@@ -53,6 +54,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             return command(arguments)
     except TrapsError as error:
         print("\n".join(plain(line) for line in f"traps: {error}".splitlines()), file=sys.stderr)
+        return FAILED
+    except ModuleNotFoundError as error:
+        if (sentence := sentence_of(error)) is None:
+            raise
+        print(f"traps: {sentence}", file=sys.stderr)
         return FAILED
     except OSError as error:
         if isinstance(error, BrokenPipeError):

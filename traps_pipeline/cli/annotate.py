@@ -8,6 +8,7 @@ import re
 
 from traps_pipeline.cli.command import OK, Commands, add_listening, listening_of, open_workspace
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import require
 
 TOKEN_VARIABLE = "TRAPS_ANNOTATE_TOKEN"
 
@@ -26,6 +27,7 @@ def add(commands: Commands) -> None:
 
 def annotate(arguments: argparse.Namespace) -> int:
     """See `traps annotate --help`."""
+    require("web")
     from traps_pipeline.explorer.annotate import Annotation, annotation_app
     from traps_pipeline.explorer.server import serve
 

@@ -41,10 +41,10 @@ def add(commands: Commands) -> None:
 def certify(arguments: argparse.Namespace) -> int:
     """See `traps certify --help`."""
     from traps_pipeline.benchmark.certificates import certify_all, family_table
-    from traps_pipeline.paths import CHECKOUT, SCENE_SPECS
+    from traps_pipeline.paths import SCENE_SPECS, WORKSPACES
 
     folder = (arguments.specs or SCENE_SPECS).absolute()
-    kept = CHECKOUT / ".workspaces" / "certificates"
+    kept = WORKSPACES / "certificates"
     verdicts, problems = certify_all(
         folder,
         kept,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from traps_pipeline.cli.command import FAILED, OK, Commands, root_of
+from traps_pipeline.extras import require
 from traps_pipeline.terminal import plain
 
 
@@ -28,6 +29,8 @@ def doctor(arguments: argparse.Namespace) -> int:
         for finding in findings:
             print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}", flush=True)
         return OK if all(finding.ok for finding in findings) else FAILED
+    if arguments.local:
+        require("local")
     who, needs = ("local models", "need") if arguments.local else ("the demo", "needs")
     problems = 0
     for finding in examine_local() if arguments.local else examine(root_of(arguments)):

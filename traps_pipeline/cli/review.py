@@ -7,6 +7,7 @@ import os
 
 from traps_pipeline.cli.command import OK, Commands, add_listening, listening_of, open_workspace
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import require
 
 TOKEN_VARIABLE = "TRAPS_REVIEW_TOKEN"
 
@@ -20,12 +21,15 @@ def add(commands: Commands) -> None:
 
 def review(arguments: argparse.Namespace) -> int:
     """See `traps review --help`."""
+    require("web")
     from traps_pipeline.explorer.review import Review, review_app
     from traps_pipeline.explorer.server import serve
+    from traps_pipeline.paths import require_own_corrections
 
     if not arguments.who.strip():
         raise TrapsError("--who: say whose decisions these are, e.g. --who jd")
     listening = listening_of(arguments, "review", TOKEN_VARIABLE, danger="decide about the benchmark's items")
+    require_own_corrections()
     workspace = open_workspace(arguments)
     opened = Review(workspace, arguments.who.strip())
     _ = opened.specs  # a study without scenes is told before the address is

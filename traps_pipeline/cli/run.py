@@ -6,14 +6,17 @@ import argparse
 import re
 import sys
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, add_panel, experiment_of
 from traps_pipeline.cli.init import create
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import require
 from traps_pipeline.terminal import plain
 
 if TYPE_CHECKING:
+    from traps_pipeline.models.registry import Entry
     from traps_pipeline.storage.workspace import Workspace
     from traps_pipeline.study.experiment import Experiment
 
@@ -51,13 +54,19 @@ def run(arguments: argparse.Namespace) -> int:
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
     from traps_pipeline.definitions import defs
+    from traps_pipeline.models.backends import require_libraries
     from traps_pipeline.orchestration.run import dagster_history, failed_checks, stages_until, walk
 
     stages = stages_until(arguments.until)
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
     with reporting(TerminalProgress()) as progress, dagster_history(workspace) as instance:
+        participants = _still_to_ask(workspace, experiment, stages)
+        for entry in (*participants.models, *participants.judges):
+            require_libraries(entry)
+        if experiment.mechanism is not None and "hidden_states" in stages:
+            require("local")
         if not arguments.no_preflight:
-            _preflight(workspace, experiment, stages)
+            _preflight(workspace, participants)
         every_asset = defs.resolve_implicit_global_asset_job_def()
         outcome = walk(instance, every_asset, workspace, stages, experiment=experiment.name)
     problems = [*dict.fromkeys([*outcome.problems, *failed_checks(workspace, experiment.name)])]
@@ -97,15 +106,21 @@ def run(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _preflight(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> None:
-    """Try the models and judges that have something to answer, before a clip is rendered. Raises TrapsError naming all
-    that is wrong."""
+@dataclass(frozen=True)
+class _Participants:
+    """Models and judges that still have something to answer, and whose libraries or keys may be missing here."""
+
+    models: list[Entry]
+    judges: list[Entry]
+
+
+def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> _Participants:
+    """Who is asked over the network or on this machine, as far as the ledger does not hold all of their answers."""
     from traps_pipeline.models.judges import load_panel
-    from traps_pipeline.models.registry import NETWORK, get_model
+    from traps_pipeline.models.registry import LOCAL, NETWORK, get_model
     from traps_pipeline.orchestration.lineage import Lineage
     from traps_pipeline.orchestration.wanted import Wanted
     from traps_pipeline.partitions import Cell
-    from traps_pipeline.study.live_check import preflight, require_sound
 
     lineage, cells = Lineage(workspace), Wanted(workspace, experiment.name).cells
 
@@ -113,16 +128,25 @@ def _preflight(workspace: Workspace, experiment: Experiment, stages: Collection[
         wanted = cells if stage in stages else ()
         return (key for key in wanted if lineage.status(stage, key).kind != "fresh")
 
-    over_network = {name: entry for name in experiment.models if (entry := get_model(name)).backend == NETWORK}
+    asked = {name: entry for name in experiment.models if (entry := get_model(name)).backend in (LOCAL, NETWORK)}
     panel = load_panel(workspace.study.panel) if "votes" in stages else ()
-    judges = [judge for judge in panel if judge.backend == NETWORK]
-    # Whether a cell is behind is looked up for the sake of what is over the network alone.
-    names = {Cell.parse(key).evaluation.model for key in behind("responses")} if over_network else set[str]()
-    models = [entry for name, entry in over_network.items() if name in names]
-    judges = judges if judges and any(behind("votes")) else []
-    if not models and not judges:
+    judges: list[Entry] = [judge for judge in panel if judge.backend == NETWORK]
+    # Whether a cell is behind is looked up for the sake of these alone.
+    names = {Cell.parse(key).evaluation.model for key in behind("responses")} if asked else set[str]()
+    models: list[Entry] = [entry for name, entry in asked.items() if name in names]
+    return _Participants(models, judges if judges and any(behind("votes")) else [])
+
+
+def _preflight(workspace: Workspace, participants: _Participants) -> None:
+    """Try the models and judges over the network, before a clip is rendered. Raises TrapsError naming all that is
+    wrong."""
+    from traps_pipeline.models.registry import NETWORK
+    from traps_pipeline.study.live_check import preflight, require_sound
+
+    models = [entry for entry in participants.models if entry.backend == NETWORK]
+    if not models and not participants.judges:
         return
-    found = preflight(workspace, models, judges)
+    found = preflight(workspace, models, participants.judges)
     for one in found:
         print(one.line, flush=True)
     require_sound(found)

@@ -6,6 +6,7 @@ import argparse
 import os
 
 from traps_pipeline.cli.command import OK, Commands, open_workspace, whole
+from traps_pipeline.extras import require
 
 
 def add(commands: Commands) -> None:
@@ -18,6 +19,7 @@ def add(commands: Commands) -> None:
 
 def ui(arguments: argparse.Namespace) -> int:
     """See `traps ui --help`."""
+    require("ui")
     from traps_pipeline.orchestration.run import dagster_history
     from traps_pipeline.orchestration.webserver import DANGER, TOKEN_VARIABLE, serve_with_dagster
     from traps_pipeline.webguard import token_for

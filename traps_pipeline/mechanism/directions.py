@@ -22,6 +22,7 @@ import numpy as np
 
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import require
 from traps_pipeline.files import write_bytes, write_text
 
 VOID = "void"
@@ -152,6 +153,7 @@ def vector_digest(vector: np.ndarray) -> str:
 def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
     """Write `path` (safetensors: kind -> (draws, layers, d), gaps and residual_norms -> (layers,)), and a JSON file of
     the same name that says what it holds. Raises TrapsError when the disk is full."""
+    require("local")
     from safetensors.numpy import save
 
     tensors = {kind: np.ascontiguousarray(vectors) for kind, vectors in directions.vectors.items()}
@@ -164,6 +166,7 @@ def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
 def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
     """The directions that `save_directions` wrote, and the content of their JSON file. Raises TrapsError when a file is
     missing, or when the digest in the JSON file is another."""
+    require("local")
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 

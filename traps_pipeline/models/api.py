@@ -17,6 +17,7 @@ from importlib import import_module
 from typing import Any
 
 from traps_pipeline import progress
+from traps_pipeline.extras import require
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import (
     MALFORMED,
@@ -42,7 +43,8 @@ TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 
 @cache
 def load_litellm() -> Any:
-    """The library, told to send and to fetch nothing of its own."""
+    """The library, told to send and to fetch nothing of its own. Raises TrapsError where it is not installed."""
+    require("api")
     os.environ["LITELLM_MODE"] = "PRODUCTION"  # else it takes variables from a .env of any folder above
     os.environ["LITELLM_LOCAL_MODEL_COST_MAP"] = "True"
     os.environ["LITELLM_LOCAL_ANTHROPIC_BETA_HEADERS"] = "True"

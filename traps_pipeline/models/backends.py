@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.registry import Entry
+from traps_pipeline.extras import require
+from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Backend
+
+
+def require_libraries(entry: Entry) -> None:
+    """Raises TrapsError with the line to type unless what this entry is asked through is installed."""
+    if entry.backend == NETWORK:
+        require("api")
+    if entry.backend == LOCAL:
+        require("local")
+        if isinstance(entry, ModelEntry) and entry.local_params().quantisation == "nf4":
+            require("nf4")
 
 
 def make_backend(entry: Entry) -> Backend:
     """The entry's backend. Imports are lazy: a study without paid models never loads a provider's library.
 
-    Raises TrapsError when its key is not set, or its weights are not here.
+    Raises TrapsError when its library is not installed, its key is not set, or its weights are not here.
     """
+    require_libraries(entry)
     match entry.backend:
         case "reference":
             from traps_pipeline.models.reference import ReferenceBackend

@@ -11,6 +11,7 @@ from pathlib import Path
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
+from traps_pipeline.paths import require_own
 from traps_pipeline.pocket import evaluate as evaluation
 from traps_pipeline.pocket import inside
 from traps_pipeline.pocket.data import data_digest, render
@@ -82,6 +83,7 @@ def evaluate(
     """
     import torch
 
+    require_own(counts, "name a file of your own with --csv")
     torch.set_num_threads(THREADS)
     _render(recipe, "held-out", data, workers, report)
     asked = list(evaluation.held_out(recipe, data, scenes))
@@ -93,6 +95,7 @@ def evaluate(
 def write_card(counts: Path, workspaces: Sequence[Path]) -> list[str]:
     """Write the figures of finished workspaces to their CSV, and the tables of both CSVs into the model card; returns
     the tables in Markdown. Raises TrapsError if the card lacks the comments between which a table belongs."""
+    require_own(CARD, "write the card in a checkout of the repository")
     figures = [figure for folder in workspaces for figure in inside.figures_of(Workspace.open(folder))]
     if figures:
         inside.write_figures(MECHANISM_FIGURES, figures)

@@ -43,6 +43,15 @@ def _make_current(width: int, height: int) -> None:
     _gl_context.make_current()  # type: ignore[attr-defined]
 
 
+def gl_version() -> str:
+    """What draws here, in its own words, e.g. "4.5 (Compatibility Profile) Mesa 22.3.6": the scene drawn by another
+    version may differ in single pixels. Only while a Renderer is open."""
+    from OpenGL.GL import GL_VERSION, glGetString
+
+    said = glGetString(GL_VERSION)
+    return said.decode(errors="replace") if isinstance(said, bytes) else "an unknown OpenGL"
+
+
 class Renderer:
     """Draws one model from one camera. Use as a context manager; every frame is (360, 480, 3) uint8 RGB."""
 

@@ -13,7 +13,7 @@ import yaml
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
-from traps_pipeline.paths import CHECKOUT, require_checkout
+from traps_pipeline.paths import ROOT, WORKSPACES, require_root
 from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.parquet import TableStore
@@ -42,13 +42,13 @@ class Workspace:
 
     @staticmethod
     def default_root() -> Path:
-        """`$TRAPS_WORKSPACE`, else `.workspaces/default` in the checkout."""
-        return Path(os.environ.get(VARIABLE) or CHECKOUT / ".workspaces" / "default").absolute()
+        """`$TRAPS_WORKSPACE`, else `.workspaces/default` in the checkout, or, without one, in the current folder."""
+        return Path(os.environ.get(VARIABLE) or WORKSPACES / "default").absolute()
 
     @classmethod
     def create(cls, root: Path, study: Study) -> Workspace:
         """Make a workspace, or open it when it is there with the same benchmark. Raises TrapsError when it differs."""
-        require_checkout()
+        require_root()
         root = root.absolute()
         if (root / "study.yaml").exists():
             workspace = cls.open(root)
@@ -110,7 +110,7 @@ class Workspace:
         (another storage, say)."""
         own = (home or self.dagster_home) / "dagster.yaml"
         if own.is_symlink() or not own.exists():
-            write_text(own, (CHECKOUT / "dagster.yaml").read_text(encoding="utf-8"))
+            write_text(own, (ROOT / "dagster.yaml").read_text(encoding="utf-8"))
 
     @property
     def dagster_home(self) -> Path:

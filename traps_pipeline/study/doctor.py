@@ -159,9 +159,9 @@ def _checkout() -> str:
     from traps_pipeline.benchmark.corrections import read_corrections
     from traps_pipeline.benchmark.records import load_release, load_released
     from traps_pipeline.models.registry import load_models
-    from traps_pipeline.paths import require_checkout
+    from traps_pipeline.paths import require_root
 
-    root, release = require_checkout(), load_release()
+    root, release = require_root(), load_release()
     counts = f"{len(load_released())} scenarios, {len(read_corrections())} corrections, {len(load_models())} models"
     return f"{root}: {release.name} {release.version}, {counts}"
 
@@ -173,17 +173,18 @@ def _rendering() -> str:
 
     from traps_pipeline.scenes.camera import fit_camera
     from traps_pipeline.scenes.kit import Physics, View, add_ball, new_spec
-    from traps_pipeline.scenes.render import Renderer
+    from traps_pipeline.scenes.render import Renderer, gl_version
 
     spec = new_spec(Physics())
     add_ball(spec, "ball", (0, 0, 0.1), 0.1, "red")
     model = spec.compile()
     with Renderer(model, fit_camera(View(), np.array([[-0.3, 0, 0], [0.3, 0, 0.4]]))) as renderer:
         frame = next(renderer.frames([model.qpos0]))
+        drawn_by = gl_version()
     red = int((frame[..., 0].astype(int) - frame[..., 1] > 60).sum())
     if red < 100:
         raise RuntimeError(f"a red ball was drawn with {red} red pixels; this OpenGL does not render MuJoCo scenes")
-    return f"MUJOCO_GL={os.environ['MUJOCO_GL']}, one frame drawn ({red} red pixels of the ball)"
+    return f"MUJOCO_GL={os.environ['MUJOCO_GL']}, {drawn_by}, one frame drawn ({red} red pixels of the ball)"
 
 
 def _encoding() -> str:

@@ -17,6 +17,7 @@ from typing import Any
 
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import require
 from traps_pipeline.models.local.checkpoint import Checkpoint, find_checkpoint, require_memory, require_no_code
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import Generated, LocalModel, States
@@ -131,14 +132,7 @@ def _precision(params: LocalParams, device: str) -> dict[str, Any]:
 
     options: dict[str, Any] = {"dtype": getattr(torch, params.dtype)}
     if params.quantisation == "nf4":
-        from importlib.util import find_spec
-
-        missing = [name for name in ("bitsandbytes", "accelerate") if find_spec(name) is None]
-        if missing:
-            raise TrapsError(
-                f"quantisation nf4 needs {' and '.join(missing)}: pip install -e '.[nf4]' "
-                "(quantisation: none is another model)"
-            )
+        require("nf4")
         options["quantization_config"] = load_transformers().BitsAndBytesConfig(
             load_in_4bit=True,
             bnb_4bit_quant_type="nf4",

@@ -9,13 +9,15 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import require
 from traps_pipeline.models.local.settings import Dtype, LocalParams, Quantisation
-from traps_pipeline.paths import CHECKOUT
+from traps_pipeline.paths import ROOT
 
 _FILES = (".json", ".jinja", ".model", ".safetensors", ".txt")  # of a folder, what decides what the model says
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
@@ -35,13 +37,14 @@ class Checkpoint:
 
 
 def as_folder(name: str) -> Path | None:
-    """The folder that a `checkpoint:` names, relative to the checkout; None if there is none and it is a hub id."""
-    folder = CHECKOUT / name
+    """The folder that a `checkpoint:` names, relative to the checkout; None: it is a hub id."""
+    folder = ROOT / name
     return folder if folder.is_dir() or not _HUB_ID.fullmatch(name) else None
 
 
 def find_checkpoint(params: LocalParams) -> Checkpoint:
     """The checkpoint that an entry names. Raises TrapsError, with the command that gets it, when it is not here."""
+    require("local")
     folder = as_folder(params.checkpoint)
     if folder is not None:
         _require_whole(folder, params.checkpoint, f"set checkpoint: to a folder saved by save_pretrained ({folder})")
@@ -82,6 +85,8 @@ def download_command(params: LocalParams) -> str:
 
 def _cached_snapshot(params: LocalParams) -> Path | None:
     """The folder of a hub id in the hub's cache, named by its commit; None when it is not there."""
+    if find_spec("huggingface_hub") is None:
+        return None  # without the extra `local` the model can be planned; `find_checkpoint` then says what is missing
     from huggingface_hub import try_to_load_from_cache
     from huggingface_hub.errors import HFValidationError
 

@@ -12,10 +12,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.extras import require
+
 
 @cache
 def load_transformers() -> Any:
-    """The library, told to send nothing and to say only errors."""
+    """The library, told to send nothing and to say only errors. Raises TrapsError where it is not installed."""
+    require("local")
     os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")  # the tokenizers' own threads would warn at every fork

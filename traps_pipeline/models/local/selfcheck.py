@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import install_line, missing
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
 from traps_pipeline.models.local.checkpoint import download_command, find_checkpoint
 from traps_pipeline.models.local.library import load_transformers
@@ -66,8 +66,8 @@ def check_family(family: Family, folder: Path) -> str:
 
 def check_nf4(folder: Path) -> str:
     """Load a tiny checkpoint in 4 bits, where the libraries for it are installed. Returns what was seen."""
-    if missing := [name for name in ("bitsandbytes", "accelerate") if find_spec(name) is None]:
-        return f"{' and '.join(missing)} not installed (pip install -e '.[nf4]'): entries in NF4 do not load"
+    if absent := missing("nf4"):
+        return f"{' and '.join(absent)} not installed (`{install_line('nf4')}`): entries in NF4 do not load"
     model = _tiny_model("qwen3-vl", folder / "nf4", "nf4")
     model.forward_states(_prompt(model, folder))
     import bitsandbytes

@@ -1,0 +1,91 @@
+"""A command installs what it needs: extras and locks agree with each other, and a missing extra is one sentence."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+from traps_pipeline.extras import EXTRAS, ExtraName, missing, require
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DISTRIBUTIONS = {"dagster_webserver": "dagster-webserver"}  # of modules that have another name
+BLOCK = "import sys; sys.modules.update(dict.fromkeys({blocked!r}))"  # to Python's imports these are not there
+
+
+def named(requirements: list[str]) -> set[str]:
+    return {re.match(r"[\w.-]+", line)[0].lower() for line in requirements}  # type: ignore[index]
+
+
+def pins(lock: Path) -> dict[tuple[str, str], set[str]]:
+    """Hashes of each file that a lock takes, by name and version."""
+    found = {}
+    for entry in re.split(r"\n(?=\w)", lock.read_text()):
+        pin, *hashes = entry.replace("\\\n", "").split("--hash=")
+        (name, version) = re.match(r"([\w.-]+)(?:\[.*\])?==([^ ;]+)", pin).groups()  # type: ignore[union-attr]
+        found[name, version] = {one.strip() for one in hashes}
+    return found
+
+
+def test_every_module_of_an_extra_is_in_that_extra_of_the_package() -> None:
+    extras = PROJECT["optional-dependencies"]
+    for name, extra in EXTRAS.items():
+        assert {DISTRIBUTIONS.get(module, module) for module in extra.modules} <= named(extras[name]), name
+    (everything,) = extras["all"]
+    assert {*EXTRAS} <= set(re.findall(r"[\w-]+", everything.partition("[")[2]))
+
+
+def test_the_lock_of_the_demo_is_a_part_of_the_whole_lock_and_holds_what_the_package_names() -> None:
+    core, everything = pins(ROOT / "requirements-core.lock"), pins(ROOT / "requirements.lock")
+    assert {pin: everything.get(pin) for pin in core} == core
+    distributions = {name for name, _ in core}
+    assert named(PROJECT["dependencies"]) <= distributions
+    optional = {DISTRIBUTIONS.get(module, module) for extra in EXTRAS.values() for module in extra.modules}
+    assert not optional & distributions
+    assert optional - {"torch"} <= {name for name, _ in everything}
+    assert all(everything.values())
+
+
+def test_pylock_holds_the_pins_and_hashes_of_the_lock_and_no_address() -> None:
+    text = (ROOT / "pylock.toml").read_text()
+    assert "://" not in text
+    locked = pins(ROOT / "requirements.lock")
+    packages = tomllib.loads(text)["packages"]
+    assert {(one["name"], one["version"]) for one in packages} == {*locked}
+    for one in packages:
+        files = [*one.get("wheels", ()), *filter(None, [one.get("sdist")])]
+        hashes = {f"sha256:{file['hashes']['sha256']}" for file in files}
+        assert hashes and hashes <= locked[one["name"], one["version"]]
+        assert all(re.fullmatch(r"wheels/[^/]+", file["path"]) for file in files)
+
+
+def test_nothing_is_missing_where_everything_is_installed_but_perhaps_nf4() -> None:
+    assert [name for name in EXTRAS if name != "nf4" and missing(name)] == []
+    require("web")  # raises nothing
+
+
+@pytest.mark.parametrize(
+    ("name", "blocked", "said"),
+    [
+        ("api", ["litellm"], "asking models over the network needs litellm, which is not installed: `make setup`"),
+        ("web", ["fastapi", "uvicorn"], "a page that listens needs fastapi and uvicorn, which are not installed: "),
+    ],
+)
+def test_a_missing_extra_is_one_sentence_with_the_line_to_type(name: ExtraName, blocked: list[str], said: str) -> None:
+    code = f"{BLOCK.format(blocked=blocked)}\nfrom traps_pipeline.extras import require; require({name!r})"
+    finished = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert finished.returncode == 1
+    assert said in finished.stderr.splitlines()[-1]
+
+
+def test_an_import_that_nobody_looked_after_is_told_in_the_same_sentence(tmp_path: Path) -> None:
+    code = f"{BLOCK.format(blocked=['torch'])}\nfrom traps_pipeline.cli import main; sys.exit(main(sys.argv[1:]))"
+    arguments = ["pocket", "train", "--data", tmp_path / "data", "--out", tmp_path / "out"]
+    finished = subprocess.run([sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True)
+    assert (finished.returncode, finished.stdout) == (1, "")
+    assert finished.stderr == "traps: a model on this machine needs torch, which is not installed: `make setup`\n"

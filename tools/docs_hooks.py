@@ -1,0 +1,142 @@
+"""What mkdocs does for this project beyond its settings: README as the first page, files that pages link to, reference.
+
+A page of `docs/` links to the rest of the repository (`../CONTRIBUTING.md`); on the site such a file lies below
+`repository/`. The reference is written from the docstrings of the package, a page a room, without importing it.
+"""
+
+from __future__ import annotations
+
+import ast
+import posixpath
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "traps_pipeline"
+LINK = re.compile(r"(\]\()(?!\w+:|#)([^)\s#]+)")
+OUTSIDE = "repository"
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the first page, every file of the repository that a page links to, and the reference."""
+    waiting = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    seen = set(waiting)
+    while waiting:
+        page = waiting.pop()
+        for target in _targets(page):
+            if target not in seen and target.is_file():
+                seen.add(target)
+                waiting += [target] if target.suffix == ".md" else []
+    for path in sorted(seen):
+        if not path.is_relative_to(ROOT / "docs"):  # mkdocs finds these itself
+            files.append(File.generated(config, _place(path), content=path.read_bytes()))
+    for name, text in reference().items():
+        files.append(File.generated(config, f"reference/{name}.md", content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Point links at where the files lie on the site. Links in code are left alone."""
+    source = _source(page.file.src_uri)
+    if source is None:
+        return markdown
+    here = posixpath.dirname(page.file.src_uri)
+
+    def moved(found: re.Match[str]) -> str:
+        target = (source.parent / found[2]).resolve()
+        return found[1] + (posixpath.relpath(_place(target), here or ".") if target.is_relative_to(ROOT) else found[2])
+
+    parts = re.split(r"(^```.*?^```$)", markdown, flags=re.DOTALL | re.MULTILINE)
+    return "".join(part if part.startswith("```") else LINK.sub(moved, part) for part in parts)
+
+
+def _targets(page: Path) -> Iterator[Path]:
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    yield from ((page.parent / found[2]).resolve() for found in LINK.finditer(text))
+
+
+def _place(path: Path) -> str:
+    """Where a file of the repository lies on the site."""
+    if path == ROOT / "README.md":
+        return "index.md"
+    if path.is_relative_to(ROOT / "docs"):
+        return path.relative_to(ROOT / "docs").as_posix()
+    return f"{OUTSIDE}/{path.relative_to(ROOT).as_posix()}"
+
+
+def _source(place: str) -> Path | None:
+    """The file of the repository behind a page of the site; None for a page of the reference."""
+    if place == "index.md":
+        return ROOT / "README.md"
+    if place.startswith("reference/"):
+        return None
+    return ROOT / place.removeprefix(f"{OUTSIDE}/") if place.startswith(f"{OUTSIDE}/") else ROOT / "docs" / place
+
+
+# --- the reference ----------------------------------------------------------------------------------------------------
+
+
+def reference() -> dict[str, str]:
+    """The text of each page by its name: one a room of the package, and `index`."""
+    rooms = {}
+    for path in sorted(PACKAGE.iterdir()):
+        modules = sorted(path.rglob("*.py")) if path.is_dir() else [path] if path.suffix == ".py" else []
+        if text := "\n".join(filter(None, map(_module, modules))):
+            rooms[path.stem] = f"# traps_pipeline.{path.stem}\n\n{text}"
+    rooms.pop("__init__", None)
+    listed = "\n".join(f"- [traps_pipeline.{name}]({name}.md): {_first_line(name)}" for name in rooms)
+    head = "# Reference\n\nWhat is public in each room of the package, from its docstrings. Notebooks use"
+    return {"index": f"{head} [inside](inside.md).\n\n{listed}\n"} | rooms
+
+
+def _first_line(room: str) -> str:
+    path = PACKAGE / room / "__init__.py" if (PACKAGE / room).is_dir() else PACKAGE / f"{room}.py"
+    return _escaped((ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n")[0])
+
+
+def _module(path: Path) -> str:
+    """The section of a module: its docstring, and its public classes and functions."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    members = "\n".join(_members(tree, ""))
+    about = ast.get_docstring(tree)
+    return f"## {name}\n\n{_prose(about)}\n\n{members}" if members else ""
+
+
+def _members(tree: ast.Module | ast.ClassDef, owner: str) -> Iterator[str]:
+    for node in tree.body:
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) or node.name.startswith("_"):
+            continue
+        about = ast.get_docstring(node)
+        if about is None:
+            continue
+        head = f"{'####' if owner else '###'} `{owner}{node.name}`"
+        yield f"{head}\n\n```python\n{_signature(node)}\n```\n\n{_prose(about)}\n"
+        if isinstance(node, ast.ClassDef):
+            yield from _members(node, f"{node.name}.")
+
+
+def _signature(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> str:
+    if isinstance(node, ast.ClassDef):
+        fields = [f"    {ast.unparse(one)}" for one in node.body if isinstance(one, ast.AnnAssign)]
+        bases = f"({', '.join(map(ast.unparse, node.bases))})" if node.bases else ""
+        return "\n".join([f"class {node.name}{bases}:" if fields else f"class {node.name}{bases}", *fields])
+    kind = "async def" if isinstance(node, ast.AsyncFunctionDef) else "def"
+    returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
+    return f"{kind} {node.name}({ast.unparse(node.args)}){returns}"
+
+
+def _prose(text: str | None) -> str:
+    """A docstring as Markdown: paragraphs as they are, indented parts as code."""
+    paragraphs = (text or "").split("\n\n")
+    return "\n\n".join(one if one.startswith("    ") else _escaped(one) for one in paragraphs)
+
+
+def _escaped(text: str) -> str:
+    """Prose that Markdown takes for nothing else; code in backticks stays code."""
+    parts = re.split(r"(`[^`]*`)", text)
+    return "".join(part if part.startswith("`") else re.sub(r"([*_<>\[\]#|])", r"\\\1", part) for part in parts)

@@ -1,0 +1,58 @@
+"""What is installed only where it is used: the extras of `pyproject.toml`; a missing one is named in a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Literal, get_args
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.paths import IS_INSTALLED
+
+ExtraName = Literal["api", "local", "nf4", "ui", "web"]
+
+
+@dataclass(frozen=True)
+class Extra:
+    """What an extra is for, and the modules that this code imports from it."""
+
+    purpose: str
+    modules: tuple[str, ...]
+
+
+EXTRAS: Mapping[ExtraName, Extra] = {
+    "api": Extra("asking models over the network", ("litellm", "mcp")),
+    "local": Extra("a model on this machine", ("torch", "torchvision", "transformers", "safetensors")),
+    "nf4": Extra("quantisation nf4", ("bitsandbytes", "accelerate")),
+    "ui": Extra("Dagster's web server", ("dagster_webserver",)),
+    "web": Extra("a page that listens", ("fastapi", "uvicorn")),
+}
+
+
+def install_line(name: ExtraName) -> str:
+    """What to type to get an extra."""
+    return f"python -m pip install 'traps-pipeline[{name}]'" if IS_INSTALLED else "make setup"
+
+
+def missing(name: ExtraName) -> list[str]:
+    """The modules of an extra that are not installed. None of them is imported."""
+    return [module for module in EXTRAS[name].modules if find_spec(module) is None]
+
+
+def require(name: ExtraName) -> None:
+    """Raises TrapsError with the line to type unless an extra is installed. Call it before the first import of it."""
+    if absent := missing(name):
+        raise TrapsError(_sentence(name, absent))
+
+
+def sentence_of(error: ModuleNotFoundError) -> str | None:
+    """The same sentence for an import that nobody looked after; None for a module of no extra."""
+    module = (error.name or "").partition(".")[0]
+    known: tuple[ExtraName, ...] = get_args(ExtraName)
+    return next((_sentence(name, [module]) for name in known if module in EXTRAS[name].modules), None)
+
+
+def _sentence(name: ExtraName, absent: list[str]) -> str:
+    are = "is" if len(absent) == 1 else "are"
+    return f"{EXTRAS[name].purpose} needs {' and '.join(absent)}, which {are} not installed: `{install_line(name)}`"
