@@ -14,7 +14,8 @@ from tests.conftest import ROOT
 from traps_pipeline.extras import EXTRAS, ExtraName, missing, require
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-DISTRIBUTIONS = {"dagster_webserver": "dagster-webserver"}  # of modules that have another name
+# Of modules whose package has another name.
+DISTRIBUTIONS = {"dagster_webserver": "dagster-webserver", "model_signing": "model-signing"}
 BLOCK = "import sys; sys.modules.update(dict.fromkeys({blocked!r}))"  # to Python's imports these are not there
 
 
@@ -37,7 +38,7 @@ def test_every_module_of_an_extra_is_in_that_extra_of_the_package() -> None:
     for name, extra in EXTRAS.items():
         assert {DISTRIBUTIONS.get(module, module) for module in extra.modules} <= named(extras[name]), name
     (everything,) = extras["all"]
-    assert {*EXTRAS} <= set(re.findall(r"[\w-]+", everything.partition("[")[2]))
+    assert {*EXTRAS} - {"sign"} == set(re.findall(r"[\w-]+", everything.partition("[")[2]))
 
 
 def test_the_lock_of_the_demo_is_a_part_of_the_whole_lock_and_holds_what_the_package_names() -> None:
@@ -47,7 +48,7 @@ def test_the_lock_of_the_demo_is_a_part_of_the_whole_lock_and_holds_what_the_pac
     assert named(PROJECT["dependencies"]) <= distributions
     optional = {DISTRIBUTIONS.get(module, module) for extra in EXTRAS.values() for module in extra.modules}
     assert not optional & distributions
-    assert optional - {"torch"} <= {name for name, _ in everything}
+    assert optional - {"torch", "model-signing"} <= {name for name, _ in everything}
     assert all(everything.values())
 
 
@@ -64,8 +65,8 @@ def test_pylock_holds_the_pins_and_hashes_of_the_lock_and_no_address() -> None:
         assert all(re.fullmatch(r"wheels/[^/]+", file["path"]) for file in files)
 
 
-def test_nothing_is_missing_where_everything_is_installed_but_perhaps_nf4() -> None:
-    assert [name for name in EXTRAS if name != "nf4" and missing(name)] == []
+def test_nothing_is_missing_where_everything_is_installed_but_nf4_and_signatures() -> None:
+    assert [name for name in EXTRAS if name not in ("nf4", "sign") and missing(name)] == []
     require("web")  # raises nothing
 
 

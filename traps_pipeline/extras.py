@@ -10,7 +10,7 @@ from typing import Literal, get_args
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import IS_INSTALLED
 
-ExtraName = Literal["api", "local", "nf4", "ui", "web"]
+ExtraName = Literal["api", "local", "nf4", "sign", "ui", "web"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,7 @@ EXTRAS: Mapping[ExtraName, Extra] = {
     "api": Extra("asking models over the network", ("litellm", "mcp")),
     "local": Extra("a model on this machine", ("torch", "torchvision", "transformers", "safetensors")),
     "nf4": Extra("quantisation nf4", ("bitsandbytes", "accelerate")),
+    "sign": Extra("a signature", ("model_signing",)),
     "ui": Extra("Dagster's web server", ("dagster_webserver",)),
     "web": Extra("a page that listens", ("fastapi", "uvicorn")),
 }

@@ -59,12 +59,13 @@ def add(commands: Commands) -> None:
 
 def release(arguments: argparse.Namespace) -> int:
     """See `traps release --help`."""
+    from traps_pipeline.extras import require
     from traps_pipeline.release.content import content_of
     from traps_pipeline.release.folder import CARD, Options, write_release
-    from traps_pipeline.release.signing import require_signing, sign
+    from traps_pipeline.release.signing import sign
 
     if arguments.sign:
-        require_signing()  # before anything is written
+        require("sign")  # before anything is written
     workspace, target = open_workspace(arguments), arguments.folder.absolute()
     options = Options(
         arms=arguments.arms,

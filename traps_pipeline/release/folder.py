@@ -14,7 +14,7 @@ import yaml
 from traps_pipeline.benchmark.held_out import held_out_key, opaque
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_bytes, write_text
-from traps_pipeline.paths import ASSETS
+from traps_pipeline.paths import ASSETS, ROOT
 from traps_pipeline.release import content as rows_of
 from traps_pipeline.release.card import card, dictionary
 from traps_pipeline.release.checksums import CHECKSUMS, SIGNATURE, write_checksums
@@ -53,7 +53,6 @@ PLACES: Mapping[str, str] = {
     SPLITS.name: "splits.jsonl",
     PROMPTS.name: "prompts.jsonl",
 }
-_ROOT = ASSETS.parent
 
 
 @dataclass(frozen=True)
@@ -156,11 +155,11 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
     """Everything but tables and clips."""
     canary = content.release.canary
     tables = OPEN if options.held_out is None else HELD_OUT
-    licence = (_ROOT / LICENCE).read_text(encoding="utf-8")
+    licence = (ROOT / LICENCE).read_text(encoding="utf-8")
     prompts = (ASSETS / "prompts" / "README.md").read_text(encoding="utf-8")
     folder.text(LICENCE, f"{licence.rstrip()}\n\n{canary}\n")
     folder.text(PROMPTS_LICENCE, f"{prompts.rstrip()}\n\n{canary}\n")
-    citation = yaml.safe_dump(ANONYMOUS_CITATION) if options.anonymous else (_ROOT / CITATION).read_text("utf-8")
+    citation = yaml.safe_dump(ANONYMOUS_CITATION) if options.anonymous else (ROOT / CITATION).read_text("utf-8")
     folder.text(CITATION, f"# {canary}\n{citation}")
     if options.commitment is not None:
         folder.text(COMMITMENT, options.commitment.read_text(encoding="utf-8"))
@@ -198,7 +197,7 @@ ANONYMOUS_CITATION = {
 
 def identifying() -> dict[str, str]:
     """What tells who made the benchmark, and what stands in its place for double-blind review."""
-    data = yaml.safe_load((_ROOT / CITATION).read_text(encoding="utf-8"))
+    data = yaml.safe_load((ROOT / CITATION).read_text(encoding="utf-8"))
     paper = data["preferred-citation"]
     names = [f"{one['given-names']} {one['family-names']}" for one in paper["authors"]]
     words = {paper["url"]: "(address withheld)", paper["title"]: "(title withheld)", data["title"]: "(title withheld)"}

@@ -11,22 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import require
 from traps_pipeline.release.checksums import SIGNATURE
 from traps_pipeline.terminal import plain
 
 
 def _library() -> Any:
-    try:
-        return import_module("model_signing")
-    except ImportError as error:
-        raise TrapsError(
-            f"a signature needs the package model_signing ({error}); install it: pip install 'traps-pipeline[sign]'"
-        ) from None
-
-
-def require_signing() -> None:
-    """Raises TrapsError with the line to type where the library is missing."""
-    _library()
+    require("sign")
+    return import_module("model_signing")
 
 
 def sign(folder: Path, private_key: Path) -> Path:
