@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, LiteralString, TypeVar
 from urllib.parse import urlsplit
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import require
 
 if TYPE_CHECKING:
     from psycopg import Connection
@@ -282,11 +283,5 @@ def session_of(variable: str, study: str) -> Session:
 
 @cache
 def _session_of(_pid: int, address: str, variable: str, study: str) -> Session:
-    try:
-        import psycopg  # noqa: F401 - whether it is there
-    except ImportError:
-        raise TrapsError(
-            f"study.yaml of {study} names a PostgreSQL database ({variable}), and psycopg is not installed; "
-            "pip install 'traps-pipeline[cluster]'"
-        ) from None
+    require("cluster")
     return Session(address, variable, study)

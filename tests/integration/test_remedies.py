@@ -1,0 +1,144 @@
+"""Each remedy that an error names is carried out as it is written, and the same command then goes on to the same
+tables."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import EXPERIMENT, Checkout, Finished
+from tests.integration.test_crashes import assert_same_tables
+from tests.integration.test_errors import edit_record
+
+pytestmark = pytest.mark.slow
+CELL = "occlusion|oracle__json__run1"
+FOLDER = "dataset=occlusion/model=oracle/regime=json/run=1"
+
+
+def released(study: Checkout) -> Path:
+    return study.root / "scene_specs" / "released"
+
+
+def halve(path: Path) -> Path:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return path
+
+
+def cut_record(study: Checkout) -> Path:
+    path = released(study) / "plinko.jsonl"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], lines[1][:50], *lines[2:]]) + "\n")
+    return path
+
+
+def doubled_record(study: Checkout) -> Path:
+    path = released(study) / "plinko.jsonl"
+    path.write_text(path.read_text() + path.read_text().splitlines()[0] + "\n")
+    return path
+
+
+def without_last_line(path: Path) -> None:
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+
+
+def swapped_trajectory(study: Checkout) -> Path:
+    edit_record(study, "plinko", 1, ill_posed_question="How heavy is the moon in the picture?")  # is read again
+    path = released(study) / "trajectories" / "plinko-0001.npz"
+    shutil.copy(path.with_name("plinko-0002.npz"), path)
+    return path
+
+
+def empty_prompt(study: Checkout) -> Path:
+    path = study.root / "assets" / "prompts" / "json_suffix.txt"
+    path.write_text("")
+    return path
+
+
+def altered_note(study: Checkout) -> Path:
+    path = next((study.workspace / "clips" / "hidden_race-0001").glob("void-*.json"))
+    path.write_text(path.read_text().replace("1", "2", 1))
+    shutil.rmtree(study.workspace / "tables" / "videos")  # so that clips and their notes are looked at
+    return path
+
+
+def halved_clip(study: Checkout) -> Path:
+    return halve(next((study.workspace / "clips" / "hidden_race-0001").glob("control-*.mp4")))
+
+
+def wrong_correction(study: Checkout) -> Path:
+    study.correct("domino_chain-0777", action="keep")
+    return study.root / "scene_specs" / "corrections" / "review.jsonl"
+
+
+# What is done to a study, and what the error then says to do, in its words.
+RESTORE = r"restore (it|the file|the line) from git"
+FAULTS: dict[str, tuple[Callable[[Checkout], Path], str]] = {
+    "a record cut short": (cut_record, RESTORE),
+    "a record that occurs twice": (doubled_record, "remove one of the lines"),
+    "another scene's trajectory": (swapped_trajectory, RESTORE),
+    "an empty prompt": (empty_prompt, RESTORE),
+    "an altered note of a clip": (altered_note, "delete it and run again"),
+    "half of a clip": (halved_clip, "delete it and run again"),
+    "a correction of no scene": (wrong_correction, "name a scenario of the benchmark"),
+}
+
+
+def carried_out(words: str, study: Checkout, path: Path, kept: Path) -> None:
+    if re.fullmatch(RESTORE, words):
+        for folder in ("scene_specs", "assets"):
+            shutil.copytree(kept / folder, study.root / folder, dirs_exist_ok=True)
+    elif words.startswith("remove"):
+        without_last_line(path)
+    elif words.startswith("name"):
+        path.write_text(path.read_text().replace("domino_chain-0777", "domino_chain-0001"))
+    else:
+        path.unlink()
+
+
+def told(finished: Finished, path: Path, remedy: str) -> str:
+    """The remedy in the words of the error, which names the file."""
+    assert finished.code == 1, finished.out
+    assert "Traceback" not in finished.err, finished.err
+    assert str(path) in finished.err, finished.err
+    found = re.search(remedy, finished.err)
+    assert found, finished.err
+    return found[0]
+
+
+def test_each_remedy_for_a_file_lets_the_same_command_go_on(study: Checkout, small: Checkout, tmp_path: Path) -> None:
+    for folder in ("scene_specs", "assets"):
+        shutil.copytree(study.root / folder, tmp_path / "kept" / folder)
+    for name, (damaged, remedy) in FAULTS.items():
+        path = damaged(study)
+        words = told(study.score(EXPERIMENT), path, remedy)
+        carried_out(words, study, path, tmp_path / "kept")
+        again = study.score(EXPERIMENT)
+        assert again.code == 0, f"{name}: {again.err}"
+        counts = again.counts()
+        assert (counts["answers"], counts["votes"]) == (0, 0), f"{name}: {json.dumps(counts)}"
+    assert_same_tables(study.workspace, small.workspace)
+
+
+def test_the_stage_that_an_error_names_is_the_one_to_materialize(study: Checkout, small: Checkout) -> None:
+    def materialize(stage: str) -> Finished:
+        command = ("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", stage)
+        return study.dagster(*command, "--partition", CELL)
+
+    tables = study.workspace / "tables"
+    (tables / "votes" / FOLDER / "part-0.parquet").unlink()
+    halve(tables / "responses" / FOLDER / "part-0.parquet")
+    stage, made = "verdicts", []
+    while (finished := materialize(stage)).code:
+        assert len(made) < 4, finished.err[-3000:]
+        named = re.findall(r"materialize (\w+) for (?:it again|this partition first)", finished.err + finished.out)
+        assert named, finished.err[-3000:]
+        made.append(named[-1])
+        stage = named[-1] if materialize(named[-1]).code else "verdicts"
+    assert set(made) <= {"responses", "votes"}
+    assert made
+    assert_same_tables(study.workspace, small.workspace)
