@@ -10,7 +10,7 @@ from typing import Literal, get_args
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.paths import IS_INSTALLED
 
-ExtraName = Literal["api", "local", "nf4", "sign", "ui", "web"]
+ExtraName = Literal["api", "local", "nf4", "sign", "cluster", "ui", "web"]
 
 
 @dataclass(frozen=True)
