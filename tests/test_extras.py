@@ -38,7 +38,7 @@ def test_every_module_of_an_extra_is_in_that_extra_of_the_package() -> None:
     for name, extra in EXTRAS.items():
         assert {DISTRIBUTIONS.get(module, module) for module in extra.modules} <= named(extras[name]), name
     (everything,) = extras["all"]
-    assert {*EXTRAS} - {"sign"} == set(re.findall(r"[\w-]+", everything.partition("[")[2]))
+    assert {*EXTRAS} - {"sign", "cluster"} == set(re.findall(r"[\w-]+", everything.partition("[")[2]))
 
 
 def test_the_lock_of_the_demo_is_a_part_of_the_whole_lock_and_holds_what_the_package_names() -> None:
