@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 import traps_pipeline.definitions  # noqa: F401 - declares the graph
+from tests.postgres import LACKING, Postgres, programs
 from tests.providers.server import Provider
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -274,3 +275,13 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
         yield folder
     finally:
         subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Postgres]:
+    """A server for the tests of a process, each of which uses a study of its own."""
+    if programs() is None:
+        pytest.skip(LACKING)
+    pytest.importorskip("psycopg", reason="psycopg is not installed; `pip install -e '.[dev]'` brings it")
+    with Postgres.running() as server:
+        yield server

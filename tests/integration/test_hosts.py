@@ -16,7 +16,7 @@ from tests.conftest import Checkout, copy_workspace
 from tests.integration.test_network import ITEMS, ask, entry, experiment, register, responses, settled
 from tests.postgres import Postgres
 from tests.providers.server import Provider
-from tests.storage.conftest import VARIABLE, postgres  # noqa: F401 - a fixture
+from tests.storage.conftest import VARIABLE
 from traps_pipeline.models.budget import Journal
 
 pytestmark = pytest.mark.slow
@@ -27,7 +27,7 @@ WANTED = 2 * ITEMS
 def hosts(
     unasked: Checkout,
     provider: Provider,
-    postgres: Postgres,  # noqa: F811
+    postgres: Postgres,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> tuple[Checkout, Checkout]:

@@ -14,7 +14,7 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.postgres import Postgres
-from tests.storage.conftest import VARIABLE, postgres  # noqa: F401 - a fixture
+from tests.storage.conftest import VARIABLE
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.models.shared_budget import SharedBudget
 from traps_pipeline.storage.database import Session
@@ -101,7 +101,7 @@ def reserve(budget: SharedBudget, *calls: tuple[str, float]) -> None:
     asyncio.run(all_of_them())
 
 
-def test_two_processes_use_a_cap_up_to_the_last_worst_case_and_never_pass_it(postgres: Postgres) -> None:  # noqa: F811
+def test_two_processes_use_a_cap_up_to_the_last_worst_case_and_never_pass_it(postgres: Postgres) -> None:
     session = opened(postgres)
     running = [spender(postgres, session.study, name, 10.0, 0.002) for name in ("one", "two")]
     begin(*running)
@@ -115,7 +115,7 @@ def test_two_processes_use_a_cap_up_to_the_last_worst_case_and_never_pass_it(pos
 
 
 @pytest.mark.slow
-def test_what_a_killed_process_may_have_spent_is_counted_and_the_cap_holds(postgres: Postgres) -> None:  # noqa: F811
+def test_what_a_killed_process_may_have_spent_is_counted_and_the_cap_holds(postgres: Postgres) -> None:
     session = opened(postgres)
     killed = spender(postgres, session.study, "one", 10.0, 30.0)
     begin(killed)
@@ -146,7 +146,7 @@ def rows_of_blocks(session: Session) -> Sequence[tuple[float, float, float]]:
     return session.run(lambda connection: connection.execute(sql, [session.study_id]).fetchall())
 
 
-def test_free_room_of_one_process_is_no_reason_to_stop_another(postgres: Postgres) -> None:  # noqa: F811
+def test_free_room_of_one_process_is_no_reason_to_stop_another(postgres: Postgres) -> None:
     one = opened(postgres)
     two = opened(postgres, one.study)
     first, second = budget_of(one, 1.0), budget_of(two, 1.0)
@@ -169,7 +169,7 @@ def test_free_room_of_one_process_is_no_reason_to_stop_another(postgres: Postgre
     asyncio.run(both())
 
 
-def test_a_models_own_cap_stops_it_on_every_host_and_not_the_others(postgres: Postgres) -> None:  # noqa: F811
+def test_a_models_own_cap_stops_it_on_every_host_and_not_the_others(postgres: Postgres) -> None:
     one = opened(postgres)
     two = opened(postgres, one.study)
     first, second = budget_of(one, 10.0, {"m": 0.10}), budget_of(two, 10.0, {"m": 0.10})
@@ -181,7 +181,7 @@ def test_a_models_own_cap_stops_it_on_every_host_and_not_the_others(postgres: Po
     reserve(second, ("other", 0.06))
 
 
-def test_a_call_that_was_given_up_is_spent_though_no_row_tells_of_it(postgres: Postgres) -> None:  # noqa: F811
+def test_a_call_that_was_given_up_is_spent_though_no_row_tells_of_it(postgres: Postgres) -> None:
     session = opened(postgres)
     budget = budget_of(session, 1.0)
     reserve(budget, ("m", 0.25), ("m", 0.25))
@@ -194,7 +194,7 @@ def test_a_call_that_was_given_up_is_spent_though_no_row_tells_of_it(postgres: P
     assert spent_usd(session) == pytest.approx(0.5)
 
 
-def test_a_cost_above_the_worst_case_is_spent_and_asked_for_no_more(postgres: Postgres) -> None:  # noqa: F811
+def test_a_cost_above_the_worst_case_is_spent_and_asked_for_no_more(postgres: Postgres) -> None:
     session = opened(postgres)
     budget = budget_of(session, 1.0)
     reserve(budget, ("m", 0.01))
@@ -205,7 +205,7 @@ def test_a_cost_above_the_worst_case_is_spent_and_asked_for_no_more(postgres: Po
     assert spent_usd(session) == pytest.approx(0.95)
 
 
-def test_purses_of_one_process_wait_for_each_other(postgres: Postgres) -> None:  # noqa: F811
+def test_purses_of_one_process_wait_for_each_other(postgres: Postgres) -> None:
     session = opened(postgres)
     budget, purse = budget_of(session, 1.0), Purse(session)
     opening = threading.Thread(target=purse.open)

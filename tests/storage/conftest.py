@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from tests.postgres import LACKING, Postgres, programs
+from tests.postgres import Postgres
 from traps_pipeline.storage.database import Session
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.segments import SegmentLedger
@@ -55,16 +55,6 @@ class Place:
         finally:
             process.kill()
             process.communicate()
-
-
-@pytest.fixture(scope="session")
-def postgres() -> Iterator[Postgres]:
-    """A server for the tests of a process, each of which uses a study of its own."""
-    if programs() is None:
-        pytest.skip(LACKING)
-    pytest.importorskip("psycopg", reason="psycopg is not installed; `pip install -e '.[dev]'` brings it")
-    with Postgres.running() as server:
-        yield server
 
 
 def in_database(server: Postgres, idle_s: float = 30.0) -> Place:

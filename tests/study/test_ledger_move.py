@@ -10,7 +10,7 @@ import pytest
 
 from tests.models.test_budget import PRICED
 from tests.postgres import Postgres
-from tests.storage.conftest import VARIABLE, postgres  # noqa: F401 - a fixture
+from tests.storage.conftest import VARIABLE
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.budget import Journal
@@ -21,7 +21,7 @@ from traps_pipeline.study.ledger_move import move_back, move_to_database
 
 
 @pytest.fixture
-def study(tmp_path: Path, postgres: Postgres, monkeypatch: pytest.MonkeyPatch) -> Workspace:  # noqa: F811
+def study(tmp_path: Path, postgres: Postgres, monkeypatch: pytest.MonkeyPatch) -> Workspace:
     """A study that has asked: two rows of one key, a failed call, a trace, a damaged row, and a call that a kill cut
     off. It has spent 0.25 + 0.5 + 0.125, 0.5 for the damaged row (the dearest), and 2 in flight."""
     monkeypatch.setenv(VARIABLE, postgres.address())
