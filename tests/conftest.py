@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -139,6 +140,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if SERVICES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: bool(SERVICES & set(getattr(item, "fixturenames", ()))))
+
+
+def pytest_sessionstart() -> None:
+    """What tests start is stopped by signals, also where this run was itself started in the background."""
+    for stop in (signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(stop) is signal.SIG_IGN:
+            signal.signal(stop, signal.default_int_handler if stop is signal.SIGINT else signal.SIG_DFL)
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

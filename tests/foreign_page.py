@@ -11,6 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 from playwright.sync_api import sync_playwright
 
+from tests.pages import patient
+
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 QUIET = [
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
@@ -104,11 +106,11 @@ def _attack(port: int, queries: Sequence[str], cookies: Sequence[tuple[str, str]
         context.add_cookies([{"name": name, "value": value, "url": own} for name, value in cookies])
         seen = list[str]()
         for path in served:
-            page = context.new_page()
+            page = patient(context.new_page())
             page.goto(f"http://attacker.test:{server.server_port}{path}")
             page.wait_for_function("document.body.dataset.seen", timeout=60_000)
             seen += json.loads(str(page.evaluate("document.body.dataset.seen")))
-        answer = context.new_page().goto(f"{rebound}/")  # what a rebound name shows as its own page
+        answer = patient(context.new_page()).goto(f"{rebound}/")  # what a rebound name shows as its own page
         seen.append("refused" if answer is None or answer.status >= 400 else "read: its page")
         browser.close()
         server.shutdown()

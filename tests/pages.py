@@ -6,8 +6,16 @@ import time
 
 from playwright.sync_api import Error, Page
 
+PATIENCE_S = 270  # nine times what Playwright itself would wait
 
-def until(page: Page, condition: str, seconds: float = 30) -> None:
+
+def patient(page: Page) -> Page:
+    """The page, whose actions wait for as long as a slow machine may need."""
+    page.set_default_timeout(1000 * PATIENCE_S)
+    return page
+
+
+def until(page: Page, condition: str, seconds: float = PATIENCE_S) -> None:
     """Wait until a JavaScript expression holds. Playwright's own `wait_for_function` evaluates a text inside the page,
     which a page without `unsafe-eval` forbids."""
     end = time.monotonic() + seconds

@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 
 USER, PASSWORD = "traps", "a-password-0123"
-START_S = 120
+START_S = 600
 LACKING = "PostgreSQL's initdb was not found; Debian's package `postgresql` brings it"
 
 

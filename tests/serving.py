@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
 
-START_S = 120
+START_S = 600
 
 
 @contextmanager

@@ -126,7 +126,7 @@ def test_two_reviewers_at_once_of_whom_one_is_killed_lose_nothing_confirmed(tmp_
     reviewers = [context.Process(target=review_many, args=(folder, f.name, f)) for f in confirmed]
     for each in reviewers:
         each.start()
-    until = time.monotonic() + 20
+    until = time.monotonic() + 180
     while not all(f.exists() and f.read_text().count("\n") >= 5 for f in confirmed) and time.monotonic() < until:
         time.sleep(0.01)
     for each in reviewers:

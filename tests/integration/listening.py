@@ -20,7 +20,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from tests.conftest import Checkout
 from tests.foreign_page import CHROMIUM, QUIET
-from tests.pages import until
+from tests.pages import patient, until
 
 TOKEN = "token-of-a-reviewer-0123"
 
@@ -72,7 +72,7 @@ def listening(study: Checkout, command: str, *people: str, port: int = 0) -> Ite
             found = re.fullmatch(r"(?:(.+): )?open (http://127\.0\.0\.1:\d+/\?token=\S+)\n", line)
             assert found, line + process.stderr.read()
             server.addresses[found[1] or ""] = found[2]
-        end = time.monotonic() + 60
+        end = time.monotonic() + 540
         while time.monotonic() < end:
             with socket.socket() as probe:
                 if probe.connect_ex(("127.0.0.1", port)) == 0:
@@ -98,7 +98,7 @@ def watched(browser: Browser, recording: Path | None = None) -> tuple[Page, list
     context = browser.new_context(
         viewport={"width": 1280, "height": 1000}, record_har_path=recording, record_har_content="embed"
     )
-    page, problems = context.new_page(), list[str]()
+    page, problems = patient(context.new_page()), list[str]()
     page.on("console", lambda message: problems.append(message.text))
     page.on("pageerror", lambda error: problems.append(str(error)))
     own = ("http://127.0.0.1:", "data:,", "blob:http://127.0.0.1:")  # blob: a clip that is held in memory

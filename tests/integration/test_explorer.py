@@ -19,7 +19,7 @@ from scipy.stats import binomtest
 
 from tests.conftest import Checkout
 from tests.foreign_page import CHROMIUM, QUIET
-from tests.pages import until
+from tests.pages import patient, until
 from tests.report.test_items import row, write_cell
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.explorer.site import write_site
@@ -98,7 +98,7 @@ def browser() -> Iterator[Browser]:
 @contextmanager
 def visit(browser: Browser, address: str, width: int = 1280) -> Iterator[Visit]:
     """A new page at an address; at the end it must have said nothing and asked for nothing outside."""
-    page = browser.new_page(viewport={"width": width, "height": 900})
+    page = patient(browser.new_page(viewport={"width": width, "height": 900}))
     problems: list[str] = []
     inside = address.rpartition("/")[0], "data:,", "blob:"  # a clip that is held in memory
     page.on("console", lambda message: problems.append(message.text))
@@ -351,7 +351,7 @@ def test_what_was_not_run_or_cannot_be_read_says_so(browser: Browser, tmp_path: 
         assert "did not ask it" in visited.go("#/model/nobody").inner_text("main")
         assert "no page “nowhere”" in visited.go("#/nowhere").inner_text("main")
     (tmp_path / "site" / "data" / "items.js").unlink()
-    page = browser.new_page()
+    page = patient(browser.new_page())
     page.goto(address + "#/matrix")
     page.wait_for_selector("[role=alert]")
     assert "items.js cannot be read: copy the whole folder" in page.inner_text("main")

@@ -10,6 +10,7 @@ import pytest
 from playwright.sync_api import Page, sync_playwright
 
 from tests.conftest import Checkout
+from tests.pages import patient
 from tests.report.test_items import CELL, HOSTILE, write_cell
 from traps_pipeline.report.items import item_page
 from traps_pipeline.storage.study import Study
@@ -33,7 +34,7 @@ def test_the_report_opens_from_disk_at_both_widths_and_its_links_lead_to_items(d
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
         for width in (1280, 1920):
-            page = browser.new_page(viewport={"width": width, "height": 1000})
+            page = patient(browser.new_page(viewport={"width": width, "height": 1000}))
             found = problems(page)
             page.goto((reports / "report.html").as_uri())
             assert page.evaluate("document.documentElement.scrollWidth") <= width

@@ -20,6 +20,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 
 from tests.conftest import EXPERIMENT, Checkout, copied
 from tests.foreign_page import CHROMIUM, QUIET, attack
+from tests.pages import patient
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.tables import RESPONSES
@@ -86,8 +87,7 @@ def _answers(url: str) -> bool:
 def page(server: str) -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
-        page = browser.new_page(viewport={"width": 1600, "height": 1000})
-        page.set_default_timeout(60_000)
+        page = patient(browser.new_page(viewport={"width": 1600, "height": 1000}))
         page.goto(f"{server}/?token={TOKEN}")
         expect.set_options(timeout=60_000)
         yield page

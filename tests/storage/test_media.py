@@ -459,7 +459,7 @@ def test_two_processes_at_once_make_one_good_file(clip: tuple[Path, str], store:
         processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
         for process in processes:
             assert process.stdout is not None and process.stdout.readline() == "ready\n"
-    said = [process.communicate(timeout=60)[0].split() for process in processes]
+    said = [process.communicate(timeout=540)[0].split() for process in processes]
     made = store.known(clip[1], VIDEO)
     assert made is not None and sorted(count for count, _ in said) == ["0", "1"]
     assert {sha256 for _, sha256 in said} == {made.sha256} and len(payload(made)) == 1
