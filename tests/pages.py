@@ -26,7 +26,7 @@ def until(page: Page, condition: str, seconds: float = PATIENCE_S) -> None:
 
 def _holds(page: Page, condition: str) -> bool:
     try:
-        return bool(page.evaluate(condition))
+        return bool(page.evaluate(f"document.readyState !== 'loading' && ({condition})"))
     except Error as error:
         if "context was destroyed" in str(error):  # the page was just being left
             return False
