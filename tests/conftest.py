@@ -133,13 +133,20 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what needs a service as slow, and put it last: of two workers that steal from each other the second one
-    begins with a study that others wait for, while the first one has all the rest to do."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what needs a service as slow, and let the last worker begin with it: the studies that others wait for are
+    made while these have all the rest to do. What waits most, for Dagster's daemon, comes first of all."""
+    rest, services = list[pytest.Item](), list[pytest.Item]()
     for item in items:
         if SERVICES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
-    items.sort(key=lambda item: bool(SERVICES & set(getattr(item, "fixturenames", ()))))
+            services.append(item)
+        else:
+            rest.append(item)
+    services.sort(key=lambda item: "test_ui" not in item.nodeid)
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    before = len(items) * (workers - 1) // workers  # that many are dealt to the other workers at first
+    items[:] = [*rest[:before], *services, *rest[before:]]
 
 
 def pytest_sessionstart() -> None:
