@@ -62,18 +62,28 @@ class Released:
 
     @cached_property
     def void(self) -> np.ndarray:
-        """`void_frames` with the panel's own colour."""
-        return self.void_frames()
-
-    def void_frames(self, panel_rgb: tuple[float, float, float] | None = None) -> np.ndarray:
-        """The void as it is sampled; its panel in another colour if one is given."""
+        """The void as it is sampled, (n, 360, 480, 3)."""
         if self.panel is None:
             return self.control_frames[: -(-self.spec.void["cut_frame"] // 2)]
-        model, _ = compile_scene(self.family, self.params, self.physics, self.panel)
+        return self._behind(self.panel, self.qpos[SAMPLED])
+
+    def void_behind(self, panel_rgb: tuple[float, float, float]) -> np.ndarray:
+        """The void with its panel in another colour. Only the first frame is drawn: nothing passes before a panel, so
+        its pixels are the same in all frames, but for a few at its edges where something is seen to move."""
+        assert self.panel is not None
+        first = self._behind(self.panel, self.qpos[:1], panel_rgb)[0]
+        frames, changed = self.void.copy(), (first != self.void[0]).any(axis=-1)
+        frames[:, changed] = first[changed]
+        return frames
+
+    def _behind(
+        self, panel: Panel, qpos: np.ndarray, panel_rgb: tuple[float, float, float] | None = None
+    ) -> np.ndarray:
+        model, _ = compile_scene(self.family, self.params, self.physics, panel)
         if panel_rgb is not None:
             model.geom_rgba[model.geom("cover_panel").id, :3] = panel_rgb
         with Renderer(model, self.camera) as renderer:
-            return np.stack(list(renderer.frames(self.qpos[SAMPLED], panel=True)))
+            return np.stack(list(renderer.frames(qpos, panel=True)))
 
 
 def load(scenario_id: str, folder: Path = RELEASED) -> Released:

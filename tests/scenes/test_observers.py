@@ -38,7 +38,7 @@ def test_the_observer_answers_the_control_and_abstains_on_every_void_as_frozen(s
         padded = np.concatenate([void, np.repeat(void[-1:], len(case.control_frames) - len(void), axis=0)])
         assert observe(padded, question) is None
     else:  # the colour of the panel tells it nothing
-        assert observe(case.void_frames(OTHER_PANEL[ALL.index(scenario_id) % 2]), question) is None
+        assert observe(case.void_behind(OTHER_PANEL[ALL.index(scenario_id) % 2]), question) is None
     assert fingerprints.observed(case) == fingerprints.frozen()["families"][case.family.name]["observed"]
 
 

@@ -91,7 +91,7 @@ def test_the_family_of_the_page_is_drawn_certified_rendered_and_observed(add: Ad
         shown = Released(spec, found.qpos, found.twin)
         assert family.observe is not None
         assert family.observe(shown.control_frames, spec.question) == answer
-        assert family.observe(shown.void_frames(), spec.question) is None
+        assert family.observe(shown.void, spec.question) is None
         assert family_asking(spec.question) is family
 
 
