@@ -128,6 +128,14 @@ def test_evidence_beyond_its_threshold_is_found(evidence: dict[str, Any], found:
     assert said.startswith(f"domino_chain-0001: {found}")
 
 
+def test_a_record_whose_cut_was_moved_is_found_without_a_trajectory() -> None:
+    spec = load_released()["plinko-0001"]
+    assert list(answerable_voids([spec])) == []
+    early = spec.model_copy(update={"void": spec.void | {"cut_frame": 9}})  # its last frame is shown at 0.8 s
+    (said,) = answerable_voids([early])
+    assert said == "plinko-0001: cut: the cut at 0.9 s is before 1.0 s or after commitment"
+
+
 def test_a_record_without_evidence_loses_every_certificate_that_stores_some() -> None:
     bare = load_released()["domino_chain-0001"].model_copy(update={"evidence": {}})
     lost = [said.split(": ")[1:] for said in (*unanswerable_controls([bare]), *answerable_voids([bare]))]

@@ -307,6 +307,11 @@ def test_evidence_beyond_a_threshold_is_not(name: str, worse: dict[str, Any], sa
     assert found is not None and said in found
 
 
+def test_a_twin_that_ends_as_its_scenario_does_is_refused_though_its_record_says_so_too() -> None:
+    alike, good = replace(CLAIM, twin_answer=CLAIM.answer), GOOD["twin behind panel"] | {"twin_answer": CLAIM.answer}
+    assert "the twin ends in" in str(JUDGES["twin behind panel"].failure(good, alike))
+
+
 def test_three_answers_need_less_entropy_than_two() -> None:
     evidence = GOOD["open"] | {"entropy_bits": 0.9}
     assert OPEN.failure(evidence, replace(CHAOTIC, labels=3)) is None
