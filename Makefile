@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DEMO := $(CURDIR)/.workspaces/demo
 RENDER_PACKAGES := libosmesa6 python3-venv
 TEST_PACKAGES := $(RENDER_PACKAGES) chromium postgresql strace
-# Outside the lock, so that a machine may bring the build that suits it; a CPU build is enough: make TORCH="torch==2.13.0 --index-url ..."
+# Outside the lock, so that a machine may bring the build that suits it; a CPU build is enough: make setup TORCH="torch==2.13.0 --index-url ..."
 TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -63,6 +64,19 @@ def test_pylock_holds_the_pins_and_hashes_of_the_lock_and_no_address() -> None:
         hashes = {f"sha256:{file['hashes']['sha256']}" for file in files}
         assert hashes and hashes <= locked[one["name"], one["version"]]
         assert all(re.fullmatch(r"wheels/[^/]+", file["path"]) for file in files)
+
+
+def test_the_bill_of_materials_names_every_pin_and_is_written_twice_to_the_same_bytes(tmp_path: Path) -> None:
+    for out in (tmp_path / "a.json", tmp_path / "b.json"):
+        subprocess.run([sys.executable, "tools/sbom.py", out], cwd=ROOT, check=True, capture_output=True)
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+    components = json.loads((tmp_path / "a.json").read_text())["components"]
+    hashes = {
+        (one["name"], one["version"]): {f"sha256:{file['hashes'][0]['content']}" for file in one["externalReferences"]}
+        for one in components
+    }
+    assert len(components) == len(hashes) and all(one["licenses"] for one in components if one["name"] == "numpy")
+    assert hashes == {pin: found & hashes[pin] for pin, found in pins(ROOT / "requirements.lock").items()}
 
 
 def test_nothing_is_missing_where_everything_is_installed_but_nf4_and_signatures() -> None:

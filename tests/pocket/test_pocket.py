@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 from tests.mechanism.study import filled
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
+from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.rules import judge_abstention, judge_correctness
 from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
@@ -233,8 +235,6 @@ def test_training_interrupted_inside_a_step_goes_on_from_the_step_before(
 def test_the_shipped_weights_are_small_and_are_those_of_the_facts() -> None:
     from safetensors import safe_open
 
-    from traps_pipeline.digests import digest, file_digest
-
     weights = POCKET / WEIGHTS / "model.safetensors"
     facts = json.loads((POCKET / FACTS).read_text())
     with safe_open(weights, "np") as file:
@@ -277,6 +277,23 @@ def test_it_reads_a_held_out_clip_through_the_adapter(recipe: Recipe, data: Path
     write_cells(tmp_path / "cells.csv", cells)
     write_cells(tmp_path / "cells.csv", cells)  # the same seed again takes its own place
     assert read_cells(tmp_path / "cells.csv") == cells
+
+
+def test_the_commands_draw_train_and_count_and_what_is_there_is_not_made_again(
+    recipe: Recipe, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    counts, scenes = tmp_path / "counts.csv", shutil.copytree(data, tmp_path / "scenes")
+    (tmp_path / "recipe.yaml").write_text(json.dumps(recipe.content()))  # JSON is YAML
+    given = ["--recipe", str(tmp_path / "recipe.yaml"), "--data", str(scenes), "--workers", "1"]
+    before = {path: path.stat().st_mtime_ns for path in scenes.rglob("*") if path.is_file()}
+    assert main(["pocket", "render", *given]) == 0
+    assert main(["pocket", "train", *given, "--out", str(tmp_path / "out"), "--seed", "3"]) == 0
+    assert main(["pocket", "evaluate", *given, "--out", str(tmp_path / "out"), "--seed", "3", "--csv", str(counts)]) == 0
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    facts = json.loads((tmp_path / "out" / FACTS).read_text())
+    assert facts["weights"] == file_digest(tmp_path / "out" / WEIGHTS / "model.safetensors") and facts["seed"] == 3
+    # A control, its void, its ill-posed question and one that the void answers too, under three prompts.
+    assert sum(cell.n for cell in read_cells(counts)) == 12 and markdown(read_cells(counts)) in capsys.readouterr().out
 
 
 def test_the_card_command_needs_its_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

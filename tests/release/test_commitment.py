@@ -11,10 +11,10 @@ import pytest
 
 from tests.conftest import Checkout, once
 from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.release.commitment import (
     broken_seals,
-    commit,
     read_commitment,
     read_reveal,
     revealed_specs,
@@ -31,7 +31,8 @@ def committed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def make(folder: Path) -> str:
         sample_benchmark(folder / "private", {"hidden_drop": 1}, 2026, "private", workers=1)
-        commit(folder / "private", folder / "commitment.json", folder / "reveal.json")
+        files = ("--out", folder / "commitment.json", "--reveal", folder / "reveal.json")
+        assert main(["commit", *map(str, (folder / "private", *files))]) == 0
         return ""
 
     return once(tmp_path_factory, "committed", make)

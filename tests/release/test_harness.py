@@ -19,7 +19,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.release.harness.scoring import FIGURES, figures, judge
-from traps_pipeline.release.harness.write import _SPECS, copied, write_harness
+from traps_pipeline.release.harness.write import SHOWN, copied, shown, write_harness
 from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.media import payload
 from traps_pipeline.storage.workspace import Workspace
@@ -99,7 +99,7 @@ def test_its_items_prompts_and_frames_are_those_that_a_model_is_sent(
     asked = workspace.tables.read_all(ITEMS).to_dict("records")
     assert {*items} == {row["item_id"] for row in asked}
     for row in asked[::16]:
-        sent = workspace.media.prepare(workspace.resolve(row["clip"]), row["media_digest"], _SPECS["images"])
+        sent = workspace.media.prepare(workspace.resolve(row["clip"]), row["media_digest"], SHOWN["images"])
         assert [(package / name).read_bytes() for name in items[row["item_id"]]["media"]] == payload(sent)
         assert items[row["item_id"]]["question"] == row["question"]
 
@@ -125,6 +125,8 @@ def test_a_harness_is_made_of_a_whole_open_release_alone(released: Path, tmp_pat
         write_harness(copy, tmp_path / "out")
     with pytest.raises(TrapsError, match="holds other files"):
         write_harness(released, copy)
+    with pytest.raises(TrapsError, match="--uniform: goes with --media images"):
+        shown("video", 2)
 
 
 # --- the real harnesses, in environments of their own -----------------------------------------------------------------

@@ -41,6 +41,10 @@ def add(commands: Commands) -> None:
     parser.add_argument("release", type=Path, help="a folder that `traps release` wrote")
     parser.add_argument("folder", type=Path, help="an empty or new one")
     parser.add_argument("--media", choices=["images", "video"], default="images", help="what models are shown")
+    parser.add_argument(
+        "--uniform", type=whole(1, 1000), metavar="N",
+        help="so many evenly spaced frames of a clip, for a model whose entry says so (default: 25, at 5 a second)",
+    )  # fmt: skip
 
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
     parser = commands.add("commit", commit_benchmark, text, workspace=False)
@@ -120,10 +124,10 @@ def verify(arguments: argparse.Namespace) -> int:
 
 def harness(arguments: argparse.Namespace) -> int:
     """See `traps harness --help`."""
-    from traps_pipeline.release.harness.write import LMMS, write_harness
+    from traps_pipeline.release.harness.write import LMMS, shown, write_harness
 
     target = arguments.folder.absolute()
-    count = write_harness(arguments.release, target, arguments.media)
+    count = write_harness(arguments.release, target, shown(arguments.media, arguments.uniform))
     print(f"{count} items in {target}")
     print(f"next: inspect eval {target / 'traps_task.py'} -T regime=standard --model MODEL")
     print(f"or: python -m lmms_eval --include_path {target / LMMS} --tasks traps_standard --model MODEL --log_samples")

@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -38,16 +38,28 @@ _COPIED = {
 }
 _IMPORT = re.compile(r"(?m)^( *)from traps_pipeline\.([\w.]+) import ")
 _SHOWN = ("item_id", "dataset", "side", "question", "labels", "aliases", "answer_type", "ground_truth", "canary")
-_SPECS: Mapping[str, MediaSpec] = {
+SHOWN: Mapping[Literal["images", "video"], MediaSpec] = {
     "images": MediaSpec(profile="images", fps=5, most=25),
     "video": MediaSpec(profile="video", fps=5, most=25),
 }
 
 
-def write_harness(release: Path, target: Path, media: str = "images") -> int:
+def shown(media: Literal["images", "video"], uniform: int | None = None) -> MediaSpec:
+    """What a harness shows of a clip: the protocol's 25 frames, or evenly spaced ones as an entry's `media` has them.
+
+    Raises TrapsError for a video of evenly spaced frames, which would play at no constant rate.
+    """
+    if uniform is None:
+        return SHOWN[media]
+    if media == "video":
+        raise TrapsError("--uniform: goes with --media images; a video plays the protocol's 5 frames a second")
+    return MediaSpec(profile="images", uniform=uniform)
+
+
+def write_harness(release: Path, target: Path, media: MediaSpec = SHOWN["images"]) -> int:
     """Write the harness of a released folder's pairs to an empty folder; returns the number of items.
 
-    media: `images`, the 25 JPEGs that the pipeline sends, or `video`, the mp4 that it sends; the same bytes. Raises
+    media: what is shown of a clip, of `shown`: the JPEGs or the mp4 that the pipeline sends, the same bytes. Raises
     TrapsError for a release that was altered or has no answers, and for a folder that holds other files.
     """
     if target.exists() and any(target.iterdir()):
@@ -64,7 +76,7 @@ def write_harness(release: Path, target: Path, media: str = "images") -> int:
     about = {
         **{name: manifest[name] for name in ("name", "version", "canary", "versions")},
         "panel": panel_id(RULES_PANEL),
-        "media": media,
+        "media": media.model_dump(mode="json", exclude_none=True),
         "prompts": {row["name"]: row["text"] for row in prompts if row["role"] == SYSTEM},
         "parameters": {name: value for name, (_, value) in PROTOCOL.items()},
         "items": digest(sorted(items)),
@@ -84,7 +96,7 @@ def copied(source: str) -> str:
     return _IMPORT.sub(lambda m: f"{m[1]}from {PACKAGE}.{m[2].rpartition('.')[2]} import ", source)
 
 
-def _items(release: Path, package: Path, media: str) -> list[str]:
+def _items(release: Path, package: Path, media: MediaSpec) -> list[str]:
     """Write items and what is shown of their clips; returns the digests of the items."""
     store, made, lines, hashes = MediaStore(package / ".prepared"), dict[str, list[str]](), list[str](), list[str]()
     for _, line in read_lines(release / CLIPS / "metadata.jsonl"):
@@ -93,10 +105,10 @@ def _items(release: Path, package: Path, media: str) -> list[str]:
             continue
         clip = row["media_digest"]
         if clip not in made:
-            sent = store.prepare(release / CLIPS / row["file_name"], clip, _SPECS[media])
+            sent = store.prepare(release / CLIPS / row["file_name"], clip, media)
             made[clip] = []
             for number, part in enumerate(payload(sent)):
-                name = f"{MEDIA}/{clip[:32]}" + (f"/{number:02d}.jpg" if media == "images" else ".mp4")
+                name = f"{MEDIA}/{clip[:32]}" + (f"/{number:02d}.jpg" if media.profile == "images" else ".mp4")
                 write_bytes(package / name, part)
                 made[clip].append(name)
         item = {name: row[name] for name in _SHOWN} | {"media": made[clip]}
