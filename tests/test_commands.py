@@ -30,6 +30,7 @@ TESTS = {path.relative_to(ROOT / "tests").as_posix(): path.read_text() for path 
 # A test runs these by other words: the file, and the words.
 RUN_AS = {
     "traps votes import": ("integration/test_batches.py", 'study.traps(what, "import"'),
+    "inspect eval": ("release/test_pocket_harness.py", '"-m", "inspect_ai", "eval"'),
     "make docs": ("test_docs_site.py", '"mkdocs", "build"'),
     "make sbom": ("test_extras.py", '"tools/sbom.py"'),
     "make ui": ("integration/test_ui.py", '"ui",'),
@@ -94,11 +95,11 @@ def test_every_target_of_make_exists() -> None:
 def test_stages_partitions_and_jobs_that_dagster_is_asked_for_exist() -> None:
     graph, jobs, seen = the_graph(), {job.name for job in JOBS}, 0
     for words in (words for _, words, _ in COMMANDS if words[0] == "dagster"):
-        given = dict(zip(words[3:], words[4:], strict=False))
+        given = dict(itertools.pairwise(words))
+        asked = {*given.get("--partition-range", given.get("--partition", "")).split("...")} - {""}
         for stage in given.get("--select", "").split(",") if "--select" in given else ():
             keys = graph.keys(stage)
-            asked = [given["--partition"]] if "--partition" in given else given.get("--partition-range", "").split("...")
-            assert {*filter(None, asked)} <= {*keys} if any(asked) else keys == [None], (words, stage)
+            assert asked <= {*keys} if asked else keys == [None], (words, stage)
             seen += 1
         assert given.get("-j", "everything") in jobs
     assert seen >= 8

@@ -287,8 +287,9 @@ def test_the_commands_draw_train_and_count_and_what_is_there_is_not_made_again(
     given = ["--recipe", str(tmp_path / "recipe.yaml"), "--data", str(scenes), "--workers", "1"]
     before = {path: path.stat().st_mtime_ns for path in scenes.rglob("*") if path.is_file()}
     assert main(["pocket", "render", *given]) == 0
-    assert main(["pocket", "train", *given, "--out", str(tmp_path / "out"), "--seed", "3"]) == 0
-    assert main(["pocket", "evaluate", *given, "--out", str(tmp_path / "out"), "--seed", "3", "--csv", str(counts)]) == 0
+    seed = ["--out", str(tmp_path / "out"), "--seed", "3"]
+    assert main(["pocket", "train", *given, *seed]) == 0
+    assert main(["pocket", "evaluate", *given, *seed, "--csv", str(counts)]) == 0
     assert {path: path.stat().st_mtime_ns for path in before} == before
     facts = json.loads((tmp_path / "out" / FACTS).read_text())
     assert facts["weights"] == file_digest(tmp_path / "out" / WEIGHTS / "model.safetensors") and facts["seed"] == 3

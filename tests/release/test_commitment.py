@@ -15,6 +15,7 @@ from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.release.commitment import (
     broken_seals,
+    commit,
     read_commitment,
     read_reveal,
     revealed_specs,
