@@ -1,5 +1,5 @@
-# The demo, or any study, in a container. Not tested: no container engine was at hand when it was written; the same
-# commands ran in a bare chroot of the same Debian.
+# The demo, or any study, in a container. Not built: no container engine was at hand when it was written. Its RUN lines ran
+# as they stand in a bare chroot of the same Debian, with a mirror in place of the snapshot, which could not be reached.
 #
 #   docker build -t trapsbench .
 #   docker run --rm -v "$PWD/studies:/studies" trapsbench run demo

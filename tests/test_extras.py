@@ -79,6 +79,13 @@ def test_the_bill_of_materials_names_every_pin_and_is_written_twice_to_the_same_
     assert hashes == {pin: found & hashes[pin] for pin, found in pins(ROOT / "requirements.lock").items()}
 
 
+def test_the_version_has_a_section_in_the_changelog_and_the_wheel_that_pages_name_is_of_it() -> None:
+    released = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert released and released[1] == PROJECT["version"]
+    named_wheels = re.findall(r"traps_pipeline-([\d.]+)-py3", (ROOT / "docs" / "install.md").read_text())
+    assert named_wheels and {*named_wheels} == {PROJECT["version"]}
+
+
 def test_nothing_is_missing_where_everything_is_installed_but_nf4_and_signatures() -> None:
     assert [name for name in EXTRAS if name not in ("nf4", "sign") and missing(name)] == []
     require("web")  # raises nothing
