@@ -1,5 +1,5 @@
-"""Every command that a page names exists, with the options that the page gives it; and a test runs it, or docs/ci.md
-says what it needs that tests do not have."""
+"""Every command that a page, an error or a help text names exists, with the options that it is given there; and a test
+runs it, or docs/ci.md says what it needs that tests do not have."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def in_blocks(text: str) -> Iterator[list[str]]:
 def in_spans(text: str) -> Iterator[list[str]]:
     """The words of each command that stands in a sentence; what it needs may be left out there."""
     for span in SPAN.findall(text):
-        yield shlex.split(re.sub(r"[\[\]<>]", "", span))
+        yield shlex.split(re.sub(r"[\[\]<>]|\.\.\.", "", span))
 
 
 def name(words: list[str]) -> str:
@@ -64,6 +64,9 @@ def name(words: list[str]) -> str:
 
 COMMANDS = [(page, words, True) for page in PAGES for words in in_blocks(page.read_text())]
 COMMANDS += [(page, words, False) for page in PAGES for words in in_spans(page.read_text())]
+# What the package's errors and help tell to type; a value that is only known then stands in braces.
+TOLD = [re.sub(r"\{[^{}]*\}", "X", path.read_text()) for path in (ROOT / "traps_pipeline").rglob("*.py")]
+COMMANDS += [(ROOT / "traps_pipeline", words, False) for text in TOLD for words in in_spans(text)]
 OF_TRAPS = {(shlex.join(words), whole) for _, words, whole in COMMANDS if words[0] == "traps"}
 
 
