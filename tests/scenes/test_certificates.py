@@ -26,7 +26,7 @@ from traps_pipeline.scenes.certificates import (
 )
 from traps_pipeline.scenes.certify import certify
 from traps_pipeline.scenes.evidence import Certificate, Claim, Evidence, Number
-from traps_pipeline.scenes.kit import Reading
+from traps_pipeline.scenes.kit import Motion, Reading
 from traps_pipeline.scenes.outcome import Rejected, compile_scene
 from traps_pipeline.scenes.resolve import resolve
 from traps_pipeline.scenes.simulate import replay
@@ -138,6 +138,41 @@ def test_what_is_too_small_in_a_frame_that_any_model_is_shown_is_not_legible(rac
     far = race.spec.camera | {"distance": 4 * race.spec.camera["distance"]}
     pair = pair_of(altered(race.spec, camera=far), race.qpos, race.twin)
     assert "too small at the end" in str(LEGIBLE.failure(LEGIBLE.measured(pair), pair.claim))
+
+
+def test_groups_of_a_familys_own_are_measured_and_told_by_name(race: Released) -> None:
+    pair = pair_of(race.spec, race.qpos, race.twin, frame_step=10)
+    least = {"colour": 0.0}
+
+    def legible(motion: Motion, params: Any) -> list[tuple[tuple[str, ...], float]]:
+        assert motion.pos("ball_0").shape == (len(race.qpos), 3) and params == race.params
+        return [(("ball_0",), least["colour"])]
+
+    own = replace(pair.control.family, legible=legible)
+    pair = replace(pair, control=replace(pair.control, family=own), claim=replace(pair.claim, family=own))
+    pixels = LEGIBLE.measured(pair)["least_visible_px"]
+    least["colour"] = pixels  # as many as there are is enough
+    assert LEGIBLE.failure(LEGIBLE.measured(pair), pair.claim) is None
+    least["colour"] = pixels + 1
+    said = f"too small at the end: {pixels:.0f} of {pixels + 1:.0f} pixels of ball_0"
+    assert LEGIBLE.failure(LEGIBLE.measured(pair), pair.claim) == said
+
+
+@pytest.mark.parametrize(("hidden_from", "step", "first"), [(5, 2, 3), (6, 2, 3), (0, 5, 0), (11, 10, 2)])
+def test_what_is_hidden_is_looked_at_from_the_first_frame_that_hides_it(
+    race: Released, hidden_from: int, step: int, first: int
+) -> None:
+    pair = replace(pair_of(race.spec, race.qpos, race.twin, frame_step=step), void_frame=hidden_from)
+    assert certificates._first_hidden(pair) == first
+
+
+def test_what_the_question_names_is_measured_as_the_record_says(race: Released) -> None:
+    measured, stored = REFERENTS.measured(pair_of(race.spec, race.qpos, race.twin)), race.spec.evidence
+    assert set(measured["referents"].values()) == {"in view", "seen moving"}
+    names = ("referents", "referents_moving_s", "cause_moving_s")
+    assert {name: measured[name] for name in names} == {name: stored[name] for name in names}
+    assert measured["referents_px"] == pytest.approx(stored["referents_px"], rel=0.05)  # another Mesa draws other edges
+    assert measured["panel_covers"] == pytest.approx(stored["panel_covers"], abs=0.01)
 
 
 def test_an_order_that_two_frames_a_second_do_not_show_is_lost(race: Released) -> None:
