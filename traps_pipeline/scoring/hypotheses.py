@@ -78,7 +78,7 @@ HYPOTHESES = (
             _void("magenta", "panel_magenta"),
             _void("small", "panel_small"),
             _void("large", "panel_large"),
-            _no_void("alpha 0.95", "panel_alpha_95"),
+            Dose("alpha 0.95", ("panel_alpha_95",), "void", "void: at most 7 of 255 levels show through"),
             _no_void("alpha 0.8", "panel_alpha_80"),
             _no_void("alpha 0.5", "panel_alpha_50"),
         ),
