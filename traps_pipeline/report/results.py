@@ -140,8 +140,7 @@ class Results:
         derive=lambda results: effects.family_asymmetry(results.effects),
     )
     steering_domains = Made(
-        "Rows of `mechanism.effects.domains`, and `mark` for those judged in another way.",
-        derive=lambda results: effects.domains(results.effects).assign(mark=""),
+        "Rows of `mechanism.effects.domains`.", derive=lambda results: effects.domains(results.effects)
     )
     steering_layers = Made("Rows of `mechanism.effects.sweep`.", derive=lambda results: effects.sweep(results.effects))
 

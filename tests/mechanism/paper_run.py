@@ -1,0 +1,77 @@
+"""The paper's mechanistic experiment on tiny checkpoints of its three families, as deep as the paper's models are.
+
+The section `mechanism` is that of `assets/experiments/paper.yaml`, word for word but for the number of steered pairs
+and the length of their answers: a random model never ends one by itself.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from traps_pipeline.models.local.tiny import Family, build_tiny
+from traps_pipeline.models.prompts import PROMPTS
+from traps_pipeline.study.experiment import EXPERIMENTS
+
+if TYPE_CHECKING:
+    from tokenizers import Tokenizer
+
+NEW_TOKENS = 2
+# Model of the paper -> family and blocks: with the embeddings, 37, 43 and 33 layers (docs/spec.md 7.1).
+DEPTHS: Mapping[str, tuple[Family, int]] = {
+    "qwen3-vl-8b": ("qwen3-vl", 36),
+    "gemma-4-e4b": ("gemma-4", 42),
+    "llava-next-video-7b": ("llava-next-video", 32),
+}
+_GEMMA = {"layer_types": ([*["sliding_attention"] * 5, "full_attention"]) * 7, "num_kv_shared_layers": 18}
+
+
+def paper() -> dict[str, Any]:
+    """The experiment of the paper as it stands in its file."""
+    return yaml.safe_load((EXPERIMENTS / "paper.yaml").read_text(encoding="utf-8"))
+
+
+def shallow_media(entry: dict[str, Any], checkpoint: Path) -> dict[str, Any]:
+    """An entry of the paper's, asked of a tiny checkpoint on the CPU: two small frames, and nothing quantised."""
+    params = {"checkpoint": str(checkpoint), "dtype": "float32", "quantisation": "none", "do_sample": False}
+    params["max_new_tokens"] = NEW_TOKENS
+    media = {"profile": "frames", "uniform": 2, "size": [32, 32]}
+    waivers = {"media": "two small frames for a tiny checkpoint"}
+    return {"id": entry["id"], "backend": "local", "device": "cpu", "media": media, "params": params, "runs": 1,
+            "waivers": waivers, "groups": entry["groups"]}  # fmt: skip
+
+
+def words() -> Tokenizer:
+    """A tokenizer with a token a word of the prompts: with one a byte, prompts are six times as long."""
+    from tokenizers import Tokenizer
+    from tokenizers.models import WordLevel
+    from tokenizers.pre_tokenizers import Whitespace
+
+    spoken = " ".join(file.read_text(encoding="utf-8") for file in sorted(PROMPTS.glob("*.txt")))
+    known = ["[unknown]", *sorted({*re.findall(r"\w+|[^\w\s]+", spoken)})]
+    tokenizer = Tokenizer(WordLevel({word: k for k, word in enumerate(known)}, unk_token="[unknown]"))
+    tokenizer.pre_tokenizer = Whitespace()
+    return tokenizer
+
+
+def write(registry: Path, folder: Path, scenarios: list[str]) -> Path:
+    """Build the checkpoints below a folder, let a registry's entries of the three models name them, and write the
+    experiment; returns its file."""
+    known = yaml.safe_load(registry.read_text(encoding="utf-8"))
+    for model, (family, blocks) in DEPTHS.items():
+        text = {"num_hidden_layers": blocks} | (_GEMMA if family == "gemma-4" else {})
+        build_tiny(family, folder / model, text=text, tokenizer=words())
+        place = next(k for k, entry in enumerate(known["models"]) if entry["id"] == model)
+        known["models"][place] = shallow_media(known["models"][place], folder / model)
+    registry.write_text(yaml.safe_dump(known, sort_keys=False), encoding="utf-8")
+    mechanism = paper()["mechanism"]
+    mechanism["steering"] |= {"max_new_tokens": NEW_TOKENS, "pairs": 1}
+    experiment = {"name": "paper-inside", "models": [*DEPTHS], "regimes": ["standard"], "panel": "rules"}
+    experiment |= {"judged_by_rules": True, "epoch": "tiny", "scenarios": scenarios, "mechanism": mechanism}
+    path = folder / "paper-inside.yaml"
+    path.write_text(yaml.safe_dump(experiment, sort_keys=False), encoding="utf-8")
+    return path
