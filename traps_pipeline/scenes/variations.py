@@ -30,7 +30,7 @@ from traps_pipeline.scenes.world import World
 # --- thresholds -------------------------------------------------------------------------------------------------------
 
 NOTICED = 8  # levels of 255 by which a channel must differ for a pixel to count as seen through a panel
-LARGER = 1.3  # by which the large panel is wider and higher
+WIDER = 1.4  # by which the large panel is wider: a higher one would hide the flags of what the question names
 SMALLER = (0.7, 0.8, 0.9, 0.95)  # by which the small panel may be, the smallest first
 GREY, MAGENTA = (0.55, 0.55, 0.57), (1.0, 0.0, 1.0)  # a colour near the floor's; one that nothing in any scene has
 END_S = 0.5  # of the control's end, in which frames shown later must show the outcome
@@ -100,19 +100,20 @@ def _offered(scenario: Scenario) -> Take:
 
 @dataclass(frozen=True)
 class Look:
-    """How a panel looks. colour: RGB in [0, 1], None for the panel's own; alpha: 1 is opaque; scale: of width and
-    height, from the floor up."""
+    """How a panel looks. colour: RGB in [0, 1], None for the panel's own; alpha: 1 is opaque; wide, high: in terms of
+    its own width and its own height above the floor."""
 
     colour: tuple[float, float, float] | None = None
     alpha: float = 1.0
-    scale: float = 1.0
+    wide: float = 1.0
+    high: float = 1.0
 
 
 def _renderer(world: World, look: Look) -> Renderer:
     """A renderer of a world whose panel has another look, from the pair's camera."""
     assert world.panel is not None, "an occlusion scenario has a panel"
     (across, thickness, up), (x, y, _) = world.panel.half, world.panel.centre
-    half = (round(across * look.scale, 6), thickness, round(up * look.scale, 6))
+    half = (round(across * look.wide, 6), thickness, round(up * look.high, 6))
     panel = Panel((x, y, half[2]), half, world.panel.yaw_deg)
     model, _ = compile_scene(world.family, world.params, world.physics, panel)
     model.geom("cover_panel").rgba[:] = (*(look.colour or COLOURS["navy"]), look.alpha)
@@ -135,7 +136,7 @@ def _void_with(scenario: Scenario, look: Look) -> Take:
     if cause < SEEN_PX:
         raise Rejected(f"past this panel at most {cause:.0f} pixels of what moves are seen, {SEEN_PX:.0f} are wanted")
     evidence = {"panel_px": shown, "cause_px": cause, "twin_px": differing, "twin_levels": levels}
-    looks = {"scale": look.scale, "contrast": _contrast(frames[0], scenario.control_frames[0])}
+    looks = {"wide": look.wide, "high": look.high, "contrast": _contrast(frames[0], scenario.control_frames[0])}
     return Take(frames, evidence | looks)
 
 
@@ -153,14 +154,14 @@ def _coloured(colour: tuple[float, float, float]) -> Callable[[Scenario], Take]:
 
 
 def _large(scenario: Scenario) -> Take:
-    return _void_with(scenario, Look(scale=LARGER))
+    return _void_with(scenario, Look(wide=WIDER))
 
 
 def _small(scenario: Scenario) -> Take:
     reason = ""
     for scale in SMALLER:
         try:
-            return _void_with(scenario, Look(scale=scale))
+            return _void_with(scenario, Look(wide=scale, high=scale))
         except Rejected as why:
             reason = str(why)
     raise Rejected(f"no smaller panel hides the outcome (at {SMALLER[-1]:g} of its size: {reason})")
@@ -229,7 +230,7 @@ _CHANGES: Mapping[str, str] = {
     "panel_grey": "the panel is grey, near the floor's colour",
     "panel_magenta": "the panel is magenta, which nothing in any scene is",
     "panel_small": f"the panel is as small as hides the outcome, {SMALLER[0]:g} to {SMALLER[-1]:g} of its size",
-    "panel_large": f"the panel is {LARGER:g} times as wide and as high",
+    "panel_large": f"the panel is {WIDER:g} times as wide",
     "panel_alpha_95": f"the panel has alpha {_FAINT:g}",
     "schema_answer": 'the prompt asks for the object `{"final_answer"}`',
     "schema_reason": 'it asks for `{"reason", "final_answer"}`: the request of the regime `json`',
