@@ -1,7 +1,7 @@
-"""The paper's mechanistic experiment on tiny checkpoints of its three families, as deep as the paper's models are.
+"""The paper's mechanistic experiment on tiny checkpoints of its three families.
 
-The section `mechanism` is that of `assets/experiments/paper.yaml`, word for word but for the number of steered pairs
-and the length of their answers: a random model never ends one by itself.
+The section `mechanism` is that of `assets/experiments/paper.yaml` but for three things: layers are those of four blocks
+at the same share of the depth, one pair a cell is steered, and answers are short, since a random model never ends one.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from tokenizers import Tokenizer
 
 NEW_TOKENS = 2
-# Model of the paper -> family and blocks: with the embeddings, 37, 43 and 33 layers (docs/spec.md 7.1).
+BLOCKS = 4  # of a tiny checkpoint; with all blocks of the paper's models the run takes four times as long
+# Model of the paper -> family and its blocks: with the embeddings, 37, 43 and 33 layers (docs/spec.md 7.1).
 DEPTHS: Mapping[str, tuple[Family, int]] = {
     "qwen3-vl-8b": ("qwen3-vl", 36),
     "gemma-4-e4b": ("gemma-4", 42),
     "llava-next-video-7b": ("llava-next-video", 32),
 }
-_GEMMA = {"layer_types": ([*["sliding_attention"] * 5, "full_attention"]) * 7, "num_kv_shared_layers": 18}
 
 
 def paper() -> dict[str, Any]:
@@ -35,7 +35,25 @@ def paper() -> dict[str, Any]:
     return yaml.safe_load((EXPERIMENTS / "paper.yaml").read_text(encoding="utf-8"))
 
 
-def shallow_media(entry: dict[str, Any], checkpoint: Path) -> dict[str, Any]:
+def shallow(layer: int, blocks: int) -> int:
+    """The layer of a tiny checkpoint at the same share of the depth: 20 of 36 is 2 of 4."""
+    return max(1, round(layer * BLOCKS / blocks))
+
+
+def mechanism() -> dict[str, Any]:
+    """The section `mechanism` for the tiny checkpoints."""
+    section = paper()["mechanism"]
+    for model, (_, blocks) in DEPTHS.items():
+        layers = section["models"][model]
+        for name, layer in layers.items():
+            deep = layer if isinstance(layer, list) else [layer]
+            found = sorted({shallow(one, blocks) for one in deep})
+            layers[name] = found if isinstance(layer, list) else found[0]
+    section["steering"] |= {"max_new_tokens": NEW_TOKENS, "pairs": 1}
+    return section
+
+
+def tiny(entry: dict[str, Any], checkpoint: Path) -> dict[str, Any]:
     """An entry of the paper's, asked of a tiny checkpoint on the CPU: two small frames, and nothing quantised."""
     params = {"checkpoint": str(checkpoint), "dtype": "float32", "quantisation": "none", "do_sample": False}
     params["max_new_tokens"] = NEW_TOKENS
@@ -62,16 +80,13 @@ def write(registry: Path, folder: Path, scenarios: list[str]) -> Path:
     """Build the checkpoints below a folder, let a registry's entries of the three models name them, and write the
     experiment; returns its file."""
     known = yaml.safe_load(registry.read_text(encoding="utf-8"))
-    for model, (family, blocks) in DEPTHS.items():
-        text = {"num_hidden_layers": blocks} | (_GEMMA if family == "gemma-4" else {})
-        build_tiny(family, folder / model, text=text, tokenizer=words())
+    for model, (family, _) in DEPTHS.items():
+        build_tiny(family, folder / model, tokenizer=words())
         place = next(k for k, entry in enumerate(known["models"]) if entry["id"] == model)
-        known["models"][place] = shallow_media(known["models"][place], folder / model)
+        known["models"][place] = tiny(known["models"][place], folder / model)
     registry.write_text(yaml.safe_dump(known, sort_keys=False), encoding="utf-8")
-    mechanism = paper()["mechanism"]
-    mechanism["steering"] |= {"max_new_tokens": NEW_TOKENS, "pairs": 1}
     experiment = {"name": "paper-inside", "models": [*DEPTHS], "regimes": ["standard"], "panel": "rules"}
-    experiment |= {"judged_by_rules": True, "epoch": "tiny", "scenarios": scenarios, "mechanism": mechanism}
+    experiment |= {"judged_by_rules": True, "epoch": "tiny", "scenarios": scenarios, "mechanism": mechanism()}
     path = folder / "paper-inside.yaml"
     path.write_text(yaml.safe_dump(experiment, sort_keys=False), encoding="utf-8")
     return path

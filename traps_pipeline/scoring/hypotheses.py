@@ -151,7 +151,9 @@ def _items_of(group: pd.DataFrame, dose: Dose) -> pd.DataFrame:
     return group.loc[chosen if dose.side is None else chosen & (group["side"] == dose.side)]
 
 
-def _row(hypothesis: Hypothesis, dose: Dose, items: pd.DataFrame, reference: pd.DataFrame, drawn: Drawn) -> dict:
+def _row(
+    hypothesis: Hypothesis, dose: Dose, items: pd.DataFrame, reference: pd.DataFrame, drawn: Drawn
+) -> dict[str, Any]:
     """The columns of a dose's row, those of rules aside."""
     figures = _figures(items, drawn)
     control = items["side"] == "control"
