@@ -1,7 +1,8 @@
 """The paper's mechanistic experiment on tiny checkpoints of its three families.
 
-The section `mechanism` is that of `assets/experiments/paper.yaml` but for three things: layers are those of four blocks
-at the same share of the depth, one pair a cell is steered, and answers are short, since a random model never ends one.
+The section `mechanism` is that of `assets/experiments/paper.yaml` but for four things: layers are those of four blocks
+at the same share of the depth, the scenarios are too few for five folds, one pair a cell is steered, and answers are
+short, since a random model never ends one.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ def mechanism() -> dict[str, Any]:
             deep = layer if isinstance(layer, list) else [layer]
             found = sorted({shallow(one, blocks) for one in deep})
             layers[name] = found if isinstance(layer, list) else found[0]
+    section["probes"]["folds"] = 2
     section["steering"] |= {"max_new_tokens": NEW_TOKENS, "pairs": 1}
     return section
 

@@ -17,7 +17,8 @@ SCENARIOS = ["domino_chain-0001", "domino_chain-0002", "plinko-0001", "plinko-00
 
 def test_the_tiny_checkpoints_are_asked_what_the_papers_models_are() -> None:
     tiny, real = mechanism(), paper()["mechanism"]
-    assert {name for name in real if tiny[name] != real[name]} == {"models", "steering"}
+    assert {name for name in real if tiny[name] != real[name]} == {"models", "probes", "steering"}
+    assert tiny["probes"] == real["probes"] | {"folds": 2}
     differ = {name for name in real["steering"] if tiny["steering"][name] != real["steering"][name]}
     assert differ == {"pairs", "max_new_tokens"}
     layers = {model: (each["steering"], each.get("sweep")) for model, each in tiny["models"].items()}
@@ -33,7 +34,7 @@ def test_the_papers_layers_sweep_doses_and_paths_are_run_on_all_three_families(s
     own = Checkout(study.root, tmp_path / "inside")
     (tmp_path / "inside").mkdir()
     (study.workspace / "clips").rename(own.workspace / "clips")
-    run = own.traps("run", path, "--until", "probes,cosines,steering_shares")
+    run = own.traps("run", path, "--until", "probes,cosines,steering_effects,steering_shares")
     assert run.code == 0, run.out + run.err
     tables, settings = Workspace.open(own.workspace).tables, mechanism()
     probes, effects = tables.read_all(PROBES), tables.read(STEERING_EFFECTS, {})
