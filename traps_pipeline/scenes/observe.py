@@ -9,9 +9,9 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-from traps_pipeline.scenes.encode import decode
+from traps_pipeline.scenes.encode import decode_sampled
 from traps_pipeline.scenes.kit import Family
-from traps_pipeline.scenes.policies import FramePolicy
+from traps_pipeline.scenes.policies import SAMPLED, FramePolicy
 from traps_pipeline.scenes.registry import families
 from traps_pipeline.scenes.wording import asked
 
@@ -22,14 +22,10 @@ def family_asking(question: str) -> Family | None:
     return next((family for family in families() if asked(family.questions, question) is not None), None)
 
 
-SAMPLED = FramePolicy(fps=5)
-
-
 def observe(clip: Path, question: str, shown: FramePolicy = SAMPLED) -> str | None:
     """The answer that is seen in a clip, of which these frames are shown; None where the decisive thing is not to be
     seen. What follows something from frame to frame was made for 5 frames a second."""
     family = family_asking(question)
     if family is None or family.observe is None:
         return None
-    frames, times = decode(clip)
-    return family.observe(frames[shown.pick(times)], question)
+    return family.observe(decode_sampled(clip, shown), question)

@@ -127,7 +127,7 @@ def hypotheses(
     """
     items = pd.concat([verdicts[_KEPT], decision_counts(verdicts)], axis=1)
     items["taxonomy"] = [datasets_of_category(category)[0] for category in verdicts["category"]]
-    items["offered"] = items["item_id"].map(offered)
+    items["offered"] = [offered[id_] for id_ in items["item_id"]]
     drawn = with_observed(draw_scenarios(items, resamples, seed))
     rows: list[dict[str, Any]] = []
     for (model, regime), group in cast(Any, items.groupby(["model", "regime"], sort=True)):
@@ -156,7 +156,7 @@ def _row(
 ) -> dict[str, Any]:
     """The columns of a dose's row, those of rules aside."""
     figures = _figures(items, drawn)
-    control = items["side"] == "control"
+    control = items["side"].eq("control").to_numpy()
     decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
     row: dict[str, Any] = {
         "dose": dose.name,
