@@ -30,8 +30,17 @@ ANSWERABLE_ARMS = ("decoy", "removed", "late_panel", "length_matched", "predicta
 VOID_ARMS = ("frame_out", "held_void")
 PAIRED_ARMS = ("choices_swapped",)  # has controls and voids
 ARMS = (*ANSWERABLE_ARMS, *VOID_ARMS, *PAIRED_ARMS)
+# Datasets that change one thing of the pairs, step by step, for what the paper supposes and did not measure
+# (docs/hypotheses.md). No part of PECS or of PECS-R; asked on request.
+LABEL_DOSES = ("labels_two", "labels_three", "labels_six")
+PANEL_LOOKS = ("panel_grey", "panel_magenta", "panel_small", "panel_large", "panel_alpha_95")  # still voids
+PANEL_DOSES = ("panel_alpha_80", "panel_alpha_50")  # the panel lets the outcome through: no voids
+SCHEMAS = ("schema_answer", "schema_reason", "schema_abstain")
+FRAMINGS = ("frames_later", "frames_few", "frames_all")
+VARIATIONS = (*LABEL_DOSES, *PANEL_LOOKS, *PANEL_DOSES, *SCHEMAS, *FRAMINGS)
+BESIDE = (*ARMS, *VARIATIONS)  # all that is no dataset of the pairs
 _ONE_TAXONOMY = {
-    **dict.fromkeys(("decoy", "removed", "late_panel", "frame_out"), "occlusion"),
+    **dict.fromkeys(("decoy", "removed", "late_panel", "frame_out", *PANEL_LOOKS, *PANEL_DOSES), "occlusion"),
     **dict.fromkeys(("length_matched", "predictable_cut", "held_void"), "chaotic"),
 }
 REGIMES = ("standard", "guided", "json")
@@ -78,17 +87,28 @@ def datasets_of_category(category: str) -> tuple[str, str]:
 
 def arms_of(taxonomy: str) -> tuple[str, ...]:
     """The arms that scenarios of a taxonomy may have."""
-    return tuple(arm for arm in ARMS if _ONE_TAXONOMY.get(arm, taxonomy) == taxonomy)
+    return tuple(arm for arm in beside_of(taxonomy) if arm in ARMS)
 
 
-def datasets_and_arms_of(category: str) -> tuple[str, ...]:
+def beside_of(taxonomy: str) -> tuple[str, ...]:
+    """The arms and variations that scenarios of a taxonomy may have."""
+    return tuple(name for name in BESIDE if _ONE_TAXONOMY.get(name, taxonomy) == taxonomy)
+
+
+def all_datasets_of(category: str) -> tuple[str, ...]:
     """Everything that a category's scenarios are asked in."""
-    return (*datasets_of_category(category), *arms_of(taxonomy_of_category(category)))
+    return (*datasets_of_category(category), *beside_of(taxonomy_of_category(category)))
+
+
+def dataset_of(item_id: str) -> str:
+    """The dataset of an item, by its id `dataset:scenario:side`."""
+    return item_id.partition(":")[0]
 
 
 def sides_of(dataset: str) -> tuple[str, ...]:
-    """The sides that a dataset or an arm asks of each scenario."""
-    return {**dict.fromkeys(ANSWERABLE_ARMS, ("control",)), **dict.fromkeys(VOID_ARMS, ("void",))}.get(dataset, SIDES)
+    """The sides that a dataset, an arm or a variation asks of each scenario."""
+    controls, voids = (*ANSWERABLE_ARMS, *PANEL_DOSES), (*VOID_ARMS, *PANEL_LOOKS)
+    return {**dict.fromkeys(controls, ("control",)), **dict.fromkeys(voids, ("void",))}.get(dataset, SIDES)
 
 
 def check_slug(model_id: str) -> str:
@@ -142,8 +162,8 @@ class Cell:
     def parse(key: str) -> Cell:
         """Inverse of `key`. Raises ValueError."""
         dataset, _, evaluation = key.partition("|")
-        if dataset not in (*DATASETS, *ARMS):
-            raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {(*DATASETS, *ARMS)}")
+        if dataset not in (*DATASETS, *BESIDE):
+            raise ValueError(f"cell key {key!r}: dataset {dataset!r} is not one of {(*DATASETS, *BESIDE)}")
         return Cell(dataset, Evaluation.parse(evaluation))
 
 

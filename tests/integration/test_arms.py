@@ -1,27 +1,31 @@
-"""Arms from an experiment to PECS-R: asked on request, made once, and no part of the pairs' figures."""
+"""Arms from an experiment to PECS-R, and variations to the table of hypotheses: asked on request, made once, and no
+part of the pairs' figures."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import Checkout
 from traps_pipeline.benchmark.tables import ARMS, ITEMS
+from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.report.leaderboard import leaderboard_text
-from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
+from traps_pipeline.scoring.tables import HYPOTHESES, LEADERBOARD, ROBUST
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 EXPERIMENT = """
 name: with-arms
-models: [oracle, any-rule]
+models: [oracle, any-rule, panel-rule]
 regimes: [standard]
 panel: rules
 epoch: small
 scenarios: [hidden_race-0001, plinko-0001]
 datasets:
-  [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, removed, held_void, twin_control, choices_swapped]
+  [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, removed, held_void, twin_control, choices_swapped,
+   labels_two, labels_six, panel_grey, schema_abstain, frames_few]
 """
 
 
@@ -31,14 +35,17 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     other = Checkout(study.root, tmp_path / "armed")
     (tmp_path / "armed").mkdir()
     (study.workspace / "clips").rename(other.workspace / "clips")
-    run = other.traps("run", path, "--until", "leaderboard,robust")
+    until = ("--until", "leaderboard,robust,hypotheses")
+    run = other.traps("run", path, *until)
     assert run.code == 0, run.err
     # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: removed 1, held_void 1, twin_control 2, choices_swapped 2 x 2.
-    assert run.counts()["answers"] == 2 * (8 + 1 + 1 + 2 + 4)
-    assert run.counts()["frames"] == 50 + 50  # removed and held; the others show the pair's own clips
+    # Variations: 2 x 2 of the race, whose answers are colours, panel 1, schema and frames 2 x 2 each.
+    assert run.counts()["answers"] == 3 * (8 + (1 + 1 + 2 + 4) + (4 + 1 + 4 + 4))
+    assert run.counts()["frames"] == 50 + 50 + 50  # removed, held and grey; the others show the pair's own clips
     tables = Workspace.open(other.workspace).tables
     arms = tables.read_all(ARMS)
-    assert arms["refused"].isna().all()
+    (refused,) = arms.dropna(subset=["refused"])["scenario_id"].unique()
+    assert refused == "plinko-0001"  # the numbers of its buckets are no colours
     items = tables.read_all(ITEMS, dataset="held_void")
     assert list(items["side"]) == ["void"] and items["ground_truth"].isna().all()
     robust = tables.read_all(ROBUST).set_index("model")
@@ -49,5 +56,13 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     assert robust.loc["any-rule", "gap"] == pytest.approx(1.0 - robust.loc["any-rule", "pecs_r"])
     board_text = leaderboard_text(tables.read(LEADERBOARD, {}), tables.read_all(ROBUST))
     assert "(4 of 9 arms)" in board_text and "nan" not in board_text and "no gap" not in board_text
-    again = other.traps("run", path, "--until", "leaderboard,robust")
+    doses = tables.read_all(HYPOTHESES).set_index(["model", "hypothesis", "dose"])
+    grey = doses.loc[("panel-rule", "panel", "grey")]
+    assert (grey["at_reference"], grey["value"], grey["rule_change"]) == (1.0, 0.0, -1.0)
+    assert doses.loc[("oracle", "schema", "reason, abstain, final_answer"), "j"] == 1.0
+    assert doses.loc[("oracle", "answer space", "6 answers"), "chance"] == pytest.approx(1 / 6)
+    assert set(tables.read_all(ITEMS, dataset="labels_two")["labels"].map(len)) == {2}
+    said = tables.read_all(RESPONSES, dataset="schema_abstain").query("model == 'oracle'")
+    assert said["is_json"].all() and {json.loads(text)["abstain"] for text in said["text"]} == {True, False}
+    again = other.traps("run", path, *until)
     assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}

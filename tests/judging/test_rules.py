@@ -161,6 +161,19 @@ def test_the_final_statement_is_what_the_answer_commits_to(answer: str, final: s
     assert final_statement(answer) == final
 
 
+@pytest.mark.parametrize(
+    ("answer", "abstained"),
+    [
+        ('{"reason": "It is hidden.", "abstain": true, "final_answer": "left"}', True),
+        ('{"reason": "It is hidden.", "abstain": false, "final_answer": "left"}', False),
+        ('{"reason": "It is hidden.", "abstain": false, "final_answer": "I don\'t know"}', True),
+        ('{"final_answer": "left"}', False),
+    ],
+)
+def test_an_object_that_says_that_it_abstains_abstains_whatever_else_it_says(answer: str, abstained: bool) -> None:
+    assert judge_abstention(answer, "Left or right?")["abstained"] is abstained
+
+
 def test_a_user_message_without_an_answer_is_an_error_not_a_vote() -> None:
     request = Request("rule-1", "rule", {}, "system", "no markers", {"task": "abstention"})
     assert asyncio.run(RuleJudge().ask(request)).kind == "error"

@@ -487,3 +487,26 @@ def test_the_ground_truth_of_a_pair_is_no_part_of_its_voids_key(tmp_path: Path) 
     request = answer_request(workspace, entry, void | {"control_answer": "left"}, Evaluation("oracle", "standard", 1))
     assert request.secret == {"side": "void", "labels": ["left", "right"]}
     assert "left" not in request.system and request.user == "Left or right?"
+
+
+def test_a_variation_of_the_asking_changes_the_request_and_a_dataset_of_the_pairs_does_not(tmp_path: Path) -> None:
+    workspace, entry = Workspace.create(tmp_path, Study()), get_model("gemini-2.5-flash").model_copy(
+        update={"media": None}
+    )  # fmt: skip
+
+    def asked(dataset: str, regime: str = "standard") -> Request:
+        item = ITEM | {"item_id": f"{dataset}:s-1:control"}
+        return answer_request(workspace, entry, item, Evaluation("gemini-2.5-flash", regime, 1))
+
+    plain, json = asked("occlusion"), asked("occlusion", "json")
+    reason, abstain = asked("schema_reason"), asked("schema_abstain")
+    assert (reason.system, reason.params) == (json.system, json.params)  # the paper's own object
+    assert asked("labels_two").system == asked("frames_few").system == plain.system
+    assert "response_format" not in plain.params
+    schema = abstain.params["response_format"]["json_schema"]["schema"]
+    assert schema["required"] == ["reason", "abstain", "final_answer"]
+    assert schema["properties"]["abstain"] == {"type": "boolean"}
+    silent = entry.model_copy(update={"json_schema": False})  # an endpoint without structured output: the prompt alone
+    item = ITEM | {"item_id": "schema_abstain:s-1:control"}
+    told = answer_request(workspace, silent, item, Evaluation("gemini-2.5-flash", "standard", 1))
+    assert "response_format" not in told.params and told.system == abstain.system

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.models.prompts import PROMPTS, prompt, system_prompt
+from traps_pipeline.models.prompts import FIELDS, PROMPTS, prompt, prompt_version, system_prompt
 
 
 def raw(name: str) -> str:
@@ -16,6 +18,18 @@ def test_each_regime_is_its_parts_joined_by_one_blank_line() -> None:
     assert system_prompt("standard") == raw("standard")
     assert system_prompt("guided") == raw("standard") + "\n\n" + raw("guided_suffix")
     assert system_prompt("json") == raw("standard") + "\n\n" + raw("json_suffix")
+
+
+def test_a_schema_that_is_varied_is_the_regimes_prompt_with_another_last_part() -> None:
+    assert system_prompt("standard", "schema_reason") == system_prompt("json")  # what the regime json asks for
+    assert system_prompt("standard", "schema_answer") == raw("standard") + "\n\n" + raw("json_answer_suffix")
+    assert system_prompt("guided", "schema_abstain") == system_prompt("guided") + "\n\n" + raw("json_abstain_suffix")
+    assert system_prompt("guided", "labels_two") == system_prompt("guided")
+    for dataset, fields in FIELDS.items():  # each prompt shows the fields that structured output then demands
+        said = re.findall(r'"(\w+)":', system_prompt("json" if dataset == "json" else "standard", dataset))
+        assert tuple(said) == fields
+    varied = prompt_version("standard", ["occlusion", "schema_abstain"])
+    assert prompt_version("standard", ["occlusion"]) == prompt_version("standard") != varied
 
 
 def test_the_files_say_what_the_paper_says() -> None:

@@ -88,3 +88,21 @@ def test_in_the_json_regime_alone_it_is_noted_whether_an_answer_is_the_object_as
 
 def test_an_answer_that_never_came_stays_what_it_was() -> None:
     assert read(None, "refused") == Reading("refused", None, None)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "text", "is_json"),
+    [
+        ("schema_answer", '{"final_answer": "left"}', True),
+        ("schema_abstain", '{"final_answer": "left"}', False),  # the field that is asked for is missing
+        ("schema_abstain", '{"abstain": false, "final_answer": "left"}', True),
+        ("schema_abstain", "left", False),
+        ("labels_two", "left", None),
+    ],
+)
+def test_a_text_is_the_object_that_its_dataset_asks_for_or_it_is_not(
+    dataset: str, text: str, is_json: bool | None
+) -> None:
+    row = {"outcome": "answer", "text": text}
+    found = read_answer(row, None, "standard", inline_thinking=False, dataset=dataset)
+    assert (found.outcome, found.text, found.is_json) == ("answer", text, is_json)

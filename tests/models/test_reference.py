@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from traps_pipeline.models.prompts import FIELDS
 from traps_pipeline.models.reference import ABSTENTION, STRATEGIES, ReferenceBackend, uniform
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
@@ -96,3 +98,19 @@ def test_the_flaky_provider_fails_in_the_shares_that_its_entry_says() -> None:
     assert seen.keys() == expected.keys()
     for kind, share in expected.items():
         assert abs(seen[kind] - 1000 * share) <= 3 * (1000 * share * (1 - share)) ** 0.5
+
+
+@pytest.mark.parametrize(
+    ("dataset", "of_void"),
+    [
+        ("schema_answer", {"final_answer": ABSTENTION}),
+        ("schema_abstain", {"abstain": True, "final_answer": ABSTENTION}),
+        ("schema_reason", {"final_answer": ABSTENTION}),
+    ],
+)
+def test_the_oracle_answers_with_the_object_that_a_dataset_asks_for(dataset: str, of_void: dict[str, Any]) -> None:
+    asked = request("void", strategy="oracle")
+    varied = replace(asked, about={**asked.about, "item_id": f"{dataset}:plinko-0001:void"})
+    said = json.loads(str(asyncio.run(ReferenceBackend().ask(varied)).text))
+    assert {name: said[name] for name in of_void} == of_void
+    assert tuple(said) == FIELDS[dataset]

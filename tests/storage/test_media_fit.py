@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from traps_pipeline.digests import digest
-from traps_pipeline.storage.media import MediaSpec, profile_digest, resized
+from traps_pipeline.models.framing import framed
+from traps_pipeline.storage.media import MediaSpec, pick, profile_digest, resized
 
 
 def test_a_cropped_frame_keeps_its_shape_and_its_middle():
@@ -22,5 +25,28 @@ def test_a_cropped_frame_keeps_its_shape_and_its_middle():
 def test_a_profile_that_stretches_has_the_digest_that_it_had_before_clips_could_be_cropped():
     plain = MediaSpec(profile="frames", fps=2, most=32, size=(336, 336))
     assert profile_digest(plain) != profile_digest(plain.model_copy(update={"fit": "crop"}))
-    made = {"revision": 1, "spec": plain.model_dump(mode="json", exclude={"fit"})}
+    made = {"revision": 1, "spec": plain.model_dump(mode="json", exclude={"fit", "later"})}
     assert profile_digest(plain) == digest(made)
+
+
+def test_frames_that_are_shown_later_are_the_next_ones_and_the_last_one_stays():
+    times = np.arange(50) / 10
+    spec = MediaSpec(profile="frames", fps=5)
+    assert pick(times, spec).tolist() == list(range(0, 50, 2))
+    assert pick(times, framed(spec, "frames_later")).tolist() == list(range(1, 50, 2))
+    ends = MediaSpec(profile="frames", uniform=2)
+    assert pick(times, ends).tolist() == [0, 49] and pick(times, framed(ends, "frames_later")).tolist() == [1, 49]
+    assert profile_digest(spec) != profile_digest(framed(spec, "frames_later"))
+
+
+@pytest.mark.parametrize("profile", ["video", "images", "frames"])
+def test_a_rate_of_frames_takes_the_place_of_a_models_own(profile: Literal["video", "images", "frames"]):
+    times = np.arange(50) / 10
+    own = MediaSpec(profile=profile, fps=5, size=(336, 336), fit="crop")
+    few, every = framed(own, "frames_few"), framed(own, "frames_all")
+    assert len(pick(times, few)) == 10 and len(pick(times, every)) == 50
+    assert (few.size, few.fit, every.profile) == ((336, 336), "crop", profile)
+    assert MediaSpec.model_validate(few.model_dump()) == few  # what a variation makes, an entry could say
+    cut = times[:18]
+    assert pick(cut, every).tolist() == list(range(18)) and pick(cut, few).tolist() == [0, 5, 10, 15]
+    assert framed(own, "occlusion") is own

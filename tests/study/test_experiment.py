@@ -10,6 +10,7 @@ import pytest
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.partitions import DATASETS, REGIMES, datasets_of_category
+from traps_pipeline.scoring.hypotheses import DATASETS_READ, RULES
 from traps_pipeline.storage.study import Study
 from traps_pipeline.study.experiment import load_experiment
 
@@ -37,6 +38,14 @@ def test_all_datasets_and_regimes_are_asked_where_none_is_named_and_a_model_has_
     assert [cell.key for cell in some] == ["chaotic|oracle__json__run1", "chaotic|random-50__json__run1"]
 
 
+def test_the_experiments_of_hypotheses_ask_every_dose_and_what_it_is_compared_with() -> None:
+    for name in ("hypotheses", "hypotheses-pocket"):
+        found = load_experiment(name)
+        assert set(found.datasets) == set(DATASETS_READ)
+        assert {*RULES} <= {*found.models}  # the trivial thing that would give a number too
+        assert not {"occlusion_ill_posed", "chaotic_ill_posed"} & {*found.datasets}  # so it has no overall PECS
+
+
 def test_the_study_of_an_experiment_is_its_benchmark_subset_panel_and_budget(tmp_path: Path) -> None:
     text = "per_family: 2\nepoch: '7'\nbudget_usd: 3\n"
     assert load_experiment(experiment(tmp_path, text)).study == Study(per_family=2, epoch="7", budget_usd=3)
@@ -56,6 +65,10 @@ def test_the_study_of_an_experiment_is_its_benchmark_subset_panel_and_budget(tmp
         ("per_family: 1\nscenarios: [plinko-0001]\n", "give scenarios or per_family, not both"),
         ("epoch: 'a b'\n", "epoch"),
         ("datasets: [\n", "not valid YAML"),
+        (
+            "datasets: [schema_abstain]\n",
+            "datasets schema_abstain ask for an object of their own, and so does the regime",
+        ),
     ],
 )
 def test_a_wrong_experiment_names_its_file_and_field(tmp_path: Path, text: str, complaint: str) -> None:

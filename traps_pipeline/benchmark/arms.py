@@ -18,16 +18,20 @@ from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
-from traps_pipeline.partitions import arms_of, sides_of, taxonomy_of_category
+from traps_pipeline.partitions import ARMS as ARM_NAMES
+from traps_pipeline.partitions import beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.paths import PACKAGE
-from traps_pipeline.scenes.arms import ARMS as KNOWN
-from traps_pipeline.scenes.arms import Question, Scenario
+from traps_pipeline.scenes.arms import ARMS as OF_SHORTCUTS
+from traps_pipeline.scenes.arms import Arm, Question, Scenario
 from traps_pipeline.scenes.clips import Clip, read_clip, save_clip
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.scenes.outcome import Rejected
 from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.variations import VARIATIONS
 from traps_pipeline.scenes.workers import run_in_order
 from traps_pipeline.storage.workspace import Workspace
+
+KNOWN: Mapping[str, Arm] = {**OF_SHORTCUTS, **VARIATIONS}
 
 
 @dataclass(frozen=True)
@@ -59,9 +63,9 @@ class Job:
 
 
 def asked_arms(workspace: Workspace, category: str) -> list[str]:
-    """The arms of a category's scenarios that some experiment of the study asks for."""
+    """The arms and variations of a category's scenarios that some experiment of the study asks for."""
     asked = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
-    return [arm for arm in arms_of(taxonomy_of_category(category)) if arm in asked]
+    return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in asked]
 
 
 def build_arms(workspace: Workspace, category: str) -> tuple[list[ArmRow], int]:
@@ -102,13 +106,14 @@ def _finding_of(clip: Path) -> Path:
 
 
 @cache
-def _code() -> str:
-    folder = PACKAGE / "scenes"
-    return digest([file_digest(folder / name) for name in ("arms.py", "offers.py")])
+def _code(arm: str) -> str:
+    """The code that films an arm or a variation: after a change of it, it is filmed anew."""
+    names = ("arms.py", "offers.py") if arm in ARM_NAMES else ("variations.py",)
+    return digest([file_digest(PACKAGE / "scenes" / name) for name in names])
 
 
 def _of(spec: SceneSpec, arm: str) -> str:
-    return digest([spec.spec_hash, arm, _code()])[:24]
+    return digest([spec.spec_hash, arm, _code(arm)])[:24]
 
 
 def _found(spec: SceneSpec, arm: str, clip: Path) -> Finding | None:
@@ -146,13 +151,13 @@ def _rows(
     finding = _found(spec, arm, path)
     if finding is None:
         raise TrapsError(f"{path}: was not filmed; run again")
-    of_pair = KNOWN[arm].clip
     empty = ArmRow(
         scenario_id=spec.scenario_id,
         category=row["category"],
         arm=arm,
         side=sides_of(arm)[0],
         question=spec.question,
+        labels=list(spec.labels),
         ground_truth=None,
         refused=finding.refused,
         evidence=json.dumps(finding.evidence),
@@ -166,13 +171,15 @@ def _rows(
     if finding.refused is not None:
         yield replace(empty, ground_truth=None)
         return
-    shown = _shown(workspace, path) if of_pair is None else _shown_in_pair(of_pairs[spec.scenario_id, of_pair])
     for question in KNOWN[arm].ask(spec):
-        yield replace(empty, **shown, **_asked(question))
+        of_pair = question.clip
+        shown = _shown(workspace, path) if of_pair is None else _shown_in_pair(of_pairs[spec.scenario_id, of_pair])
+        yield replace(empty, **shown, **_asked(question, spec))
 
 
-def _asked(question: Question) -> dict[str, Any]:
-    return {"side": question.side, "question": question.text, "ground_truth": question.answer}
+def _asked(question: Question, spec: SceneSpec) -> dict[str, Any]:
+    labels = list(question.labels or spec.labels)
+    return {"side": question.side, "question": question.text, "labels": labels, "ground_truth": question.answer}
 
 
 def _shown(workspace: Workspace, path: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import ARMS, CATEGORIES, SIDES, datasets_and_arms_of, is_ill_posed
+from traps_pipeline.partitions import BESIDE, CATEGORIES, SIDES, all_datasets_of, is_ill_posed
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
@@ -23,7 +23,7 @@ Record = Mapping[str, Any]
 
 def categories_of_dataset(dataset: str) -> list[str]:
     """The categories whose scenarios make a dataset."""
-    return [category for category in CATEGORIES if dataset in datasets_and_arms_of(category)]
+    return [category for category in CATEGORIES if dataset in all_datasets_of(category)]
 
 
 def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
@@ -38,14 +38,14 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
             clips[row["scenario_id"], row["side"]] = row
     if not specs:
         raise TrapsError(f"items {dataset}: no scene_specs yet; materialize scene_specs and videos first")
-    if dataset not in ARMS:
+    if dataset not in BESIDE:
         _check_clips(workspace, dataset, specs, clips)
     released = [s for c in categories_of_dataset(dataset) for s in released_in_study(workspace, c).values()]
     version = version_of(
         (item_content(dataset, spec_record(spec)) for spec in released), (item_content(dataset, row) for row in specs)
     )
     commonest = commonest_answers(specs)
-    if dataset in ARMS:
+    if dataset in BESIDE:
         return _of_arm(workspace, dataset, {spec["scenario_id"]: spec for spec in specs}, commonest, version)
     return [_item(dataset, spec, side, clips, commonest, version) for spec in specs for side in SIDES]
 
@@ -67,7 +67,7 @@ def _of_arm(
 
 def _arm_item(spec: Record, row: Record, commonest: Mapping[str, str], version: str) -> ItemRow:
     decisive: dict[str, Any] = _decisive(
-        spec,
+        {**spec, "labels": row["labels"]},
         dataset=row["arm"],
         side=row["side"],
         question=row["question"],

@@ -74,13 +74,14 @@ VIDEOS = Table("videos", VideoRow, partition_by=("category",), key=("scenario_id
 
 @dataclass(frozen=True, kw_only=True)
 class ArmRow:
-    """What a scenario gives for an arm: a clip and a question beside the pair, or why it has none."""
+    """What a scenario gives for an arm or a variation: a clip and a question beside the pair, or why it has none."""
 
     scenario_id: shared.ScenarioId
     category: shared.Category
-    arm: Annotated[str, "name of the arm, which is its dataset"]
+    arm: Annotated[str, "name of the arm or variation, which is its dataset"]
     side: Annotated[str, "control: must be answered; void: must be abstained on"]
     question: shared.Question
+    labels: Labels
     ground_truth: Annotated[str | None, "null on void"]
     refused: Annotated[str | None, "why the scenario does not admit the arm; null where it does"]
     evidence: Annotated[str, "JSON: the numbers behind the arm's certificate"]

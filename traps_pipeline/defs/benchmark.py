@@ -12,7 +12,7 @@ from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.orchestration.stage import key_of, shown, source, stage
-from traps_pipeline.partitions import arms_of, datasets_and_arms_of, sides_of, taxonomy_of_category
+from traps_pipeline.partitions import all_datasets_of, beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -34,8 +34,8 @@ corrections = source(
     kinds=["json"],
     scheme=CATEGORY,
 )
-category_to_datasets = to_keys(CATEGORY, DATASET, datasets_and_arms_of)
-category_to_arms = to_keys(CATEGORY, DATASET, lambda category: arms_of(taxonomy_of_category(category)))
+category_to_datasets = to_keys(CATEGORY, DATASET, all_datasets_of)
+category_to_arms = to_keys(CATEGORY, DATASET, lambda category: beside_of(taxonomy_of_category(category)))
 
 
 def _make_specs(workspace: Workspace, category: str) -> Made:
@@ -135,7 +135,7 @@ videos = stage(
 
 
 def _make_arms(workspace: Workspace, category: str) -> Made:
-    """The arms of a category's scenarios that the study asks: clips and questions that take a shortcut away."""
+    """The arms and variations of a category's scenarios that the study asks: clips and questions beside the pairs."""
     from traps_pipeline.benchmark.arms import build_arms
 
     rows, drawn = build_arms(workspace, category)
@@ -157,8 +157,9 @@ arms = stage(
     group="arms",
     deps=[scene_specs, videos],
     scheme=CATEGORY,
+    code="2",
     kinds=["parquet", "mp4"],
-    wants=lambda wanted, key: bool({*wanted.arms} & {*arms_of(taxonomy_of_category(str(key)))}),
+    wants=lambda wanted, key: bool({*wanted.arms} & {*beside_of(taxonomy_of_category(str(key)))}),
     lost=lambda workspace, key: _unmade_arms(workspace, str(key)),
     columns={name: [f"scene_specs.{name}"] for name in ("scenario_id", "scene_hash")},
 )

@@ -36,7 +36,9 @@ models = source(
 )
 prompts = source(
     "prompts",
-    lambda workspace, key: prompt_version(Evaluation.parse(key).regime),
+    lambda workspace, key: prompt_version(
+        Evaluation.parse(key).regime, {d for asked in workspace.study.experiments.values() for d in asked.datasets}
+    ),
     group=GROUP,
     doc="assets/prompts: the regime's system prompt, by evaluation.",
     kinds=["text"],

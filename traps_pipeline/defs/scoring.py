@@ -13,7 +13,7 @@ from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import DATASET, by_dataset
 from traps_pipeline.orchestration.stage import stage
 from traps_pipeline.partitions import ARMS, DATASETS
-from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
+from traps_pipeline.scoring.tables import CONTRASTS, HYPOTHESES, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -137,6 +137,28 @@ def _wrong_robust(workspace: Workspace, key: str | None, made: Made) -> str:
     return f"{wrong} rows are wrong" if wrong else ""
 
 
+def _make_hypotheses(workspace: Workspace, _: None) -> Made:
+    """Abstention and accuracy as one thing of the pairs is changed step by step, beside what rules get; empty if no
+    variation was run."""
+    from traps_pipeline.benchmark.tables import ITEMS
+    from traps_pipeline.judging.verdicts import current
+    from traps_pipeline.scoring.hypotheses import DATASETS_READ
+    from traps_pipeline.scoring.hypotheses import hypotheses as by_dose
+
+    judged = current(workspace, VERDICTS, dataset=DATASETS_READ)
+    items = workspace.tables.read_all(ITEMS, ["item_id", "labels"], dataset=DATASETS_READ)
+    offered = {str(id_): len(labels) for id_, labels in zip(items["item_id"], items["labels"], strict=True)}
+    table = by_dose(judged, offered)
+    return Made(table, shown={"doses": rows_shown(table)})
+
+
+def _wrong_doses(workspace: Workspace, key: str | None, made: Made) -> str:
+    from traps_pipeline.scoring.hypotheses import wrong_rows
+
+    wrong = wrong_rows(made.frame)
+    return f"{wrong} rows are wrong" if wrong else ""
+
+
 _OF_SOME: dict[str, Need] = {"metrics": "some", "verdicts": "some"}
 # The panel is an input of all that is counted from its verdicts: after a change of it they are stale at once, and not
 # only when its votes are made again.
@@ -173,6 +195,21 @@ robust = stage(
             "robust_rows_hold",
             "PECS-R and its shares lie in [0, 1], intervals are ordered, the gap is PECS - PECS-R.",
             _wrong_robust,
+        )
+    ],
+)
+hypotheses = stage(
+    HYPOTHESES,
+    _make_hypotheses,
+    group=GROUP,
+    deps=[items, metrics, verdicts, judges],
+    needs={**_OF_SOME, "items": "some"},
+    columns={"acc": ["verdicts.correct"], "abs_rec": ["verdicts.abstained"], "false_abs": ["verdicts.abstained"]},
+    checks=[
+        Check(
+            "doses_hold",
+            "Shares lie in [0, 1], differences in [-1, 1], and intervals are ordered.",
+            _wrong_doses,
         )
     ],
 )

@@ -19,7 +19,7 @@ from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, SIDES, Evaluation
+from traps_pipeline.partitions import BESIDE, DATASETS, REGIMES, SIDES, Evaluation
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -82,7 +82,7 @@ def study_items(workspace: Workspace) -> pd.DataFrame:
     items, specs = workspace.tables.read_all(ITEMS), workspace.tables.read_all(SCENE_SPECS, ["scenario_id", "family"])
     if items.empty:
         raise TrapsError(f"{workspace.root}: has no items yet; run `traps run EXPERIMENT` in it first")
-    place = {name: k for k, name in enumerate((*DATASETS, *ARMS, *SIDES))}
+    place = {name: k for k, name in enumerate((*DATASETS, *BESIDE, *SIDES))}
     items = items.merge(specs, on="scenario_id", how="left", validate="many_to_one")
     items["family"] = items["family"].fillna(items["sub_scenario"])
     order = ["dataset", "family", "scenario_id", "side"]

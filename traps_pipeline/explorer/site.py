@@ -25,7 +25,7 @@ from traps_pipeline.explorer.answers import StudyAnswers, study_answers
 from traps_pipeline.explorer.scripts import data_script, parquet_text
 from traps_pipeline.files import write_bytes
 from traps_pipeline.models.request import JUDGED
-from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, sides_of
+from traps_pipeline.partitions import BESIDE, DATASETS, REGIMES, sides_of
 from traps_pipeline.report.gallery import certificate_phrases, intervention
 from traps_pipeline.report.leaderboard import legend, provenance
 from traps_pipeline.report.published_results import PublishedResults
@@ -167,7 +167,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
     evaluations = [[e.model, e.regime, e.run] for e in answers.evaluations]
     models = sorted({*(e.model for e in answers.evaluations), *board["model"], *published["model"]})
     unknown = "not in the registry"
-    datasets = [name for name in (*DATASETS, *ARMS) if name in set(answers.items["dataset"])]
+    datasets = [name for name in (*DATASETS, *BESIDE) if name in set(answers.items["dataset"])]
     return {
         "name": workspace.study.name,
         "benchmark": f"{release.name} {release.version}",

@@ -135,13 +135,15 @@ class RuleJudge:
 
 
 def final_statement(answer: str) -> str:
-    """The final statement of an answer: the JSON's `final_answer`, else the text after the last 'answer is', or all."""
+    """The final statement of an answer: the JSON's `final_answer`, else the text after the last 'answer is', or all. An
+    object that says of itself that it abstains states nothing."""
     try:
         parsed = json.loads(strip_fence(answer))
     except (ValueError, RecursionError):
         parsed = None
     if isinstance(parsed, dict) and "final_answer" in parsed:
-        return "" if parsed["final_answer"] is None else str(parsed["final_answer"])
+        abstains = parsed["final_answer"] is None or parsed.get("abstain") is True
+        return "" if abstains else str(parsed["final_answer"])
     pieces = _FINAL.split(answer)
     return pieces[-1] if len(pieces) > 1 and normalise(pieces[-1]) else answer
 

@@ -14,13 +14,14 @@ from traps_pipeline import progress
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.ask import Call, Settled, collect
+from traps_pipeline.models.framing import framed
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.models.tables import ResponseRow
-from traps_pipeline.partitions import Cell, Evaluation
+from traps_pipeline.partitions import Cell, Evaluation, dataset_of
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -42,13 +43,14 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
 
     What is sent of the clip is prepared here when it is not yet; every regime and run then shares it.
     """
-    clip = workspace.resolve(item["clip"])
-    sent = workspace.media.prepare(clip, item["media_digest"], entry.media) if entry.media else None
+    clip, dataset = workspace.resolve(item["clip"]), dataset_of(item["item_id"])
+    spec = framed(entry.media, dataset) if entry.media else None
+    sent = workspace.media.prepare(clip, item["media_digest"], spec) if spec else None
     return Request(
         participant=entry.id,
         endpoint=entry.endpoint,
-        params=effective_params(entry, evaluation.regime),
-        system=system_prompt(evaluation.regime),
+        params=effective_params(entry, evaluation.regime, dataset),
+        system=system_prompt(evaluation.regime, dataset),
         user=item["question"],
         about={"item_id": item["item_id"], "model": entry.id, "regime": evaluation.regime, "run": evaluation.run},
         media=clip,
@@ -60,15 +62,17 @@ def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, A
 
 def is_prepared(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any]) -> bool:
     """Whether what is sent of an item's clip is made already."""
-    return entry.media is None or workspace.media.known(item["media_digest"], entry.media) is not None
+    spec = framed(entry.media, dataset_of(item["item_id"])) if entry.media else None
+    return spec is None or workspace.media.known(item["media_digest"], spec) is not None
 
 
 def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
     """Make what is sent of every clip of the cells, on all cores, first: encoding would hold calls up."""
     jobs: dict[tuple[str, str], tuple[Path, str, MediaSpec]] = {}
-    for dataset, spec in {(cell.dataset, get_model(cell.evaluation.model).media) for cell in cells}:
-        if spec is None:
+    for dataset, own in {(cell.dataset, get_model(cell.evaluation.model).media) for cell in cells}:
+        if own is None:
             continue
+        spec = framed(own, dataset)
         for item in _items(workspace, dataset):
             jobs[item["media_digest"], repr(spec)] = (workspace.resolve(item["clip"]), item["media_digest"], spec)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
@@ -115,7 +119,7 @@ def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
 def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str | None) -> ResponseRow:
     """One row of the responses table."""
     thinks = get_model(cell.evaluation.model).inline_thinking
-    read = read_answer(row, reasoning, cell.evaluation.regime, inline_thinking=thinks)
+    read = read_answer(row, reasoning, cell.evaluation.regime, inline_thinking=thinks, dataset=cell.dataset)
     copied = ("finish_reason", "served_model", "prompt_tokens", "completion_tokens")
     copied += ("reasoning_tokens", "cost_usd", "latency_s", "attempts")
     return ResponseRow(

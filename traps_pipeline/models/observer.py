@@ -6,16 +6,19 @@ import asyncio
 from functools import lru_cache
 from pathlib import Path
 
+from traps_pipeline.models.framing import observed
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.partitions import dataset_of
+from traps_pipeline.scenes.policies import FramePolicy
 
 
 @lru_cache(maxsize=100_000)
-def seen(media_digest: str, clip: Path, question: str) -> str | None:
-    """What the observer says of a clip; one look at a clip serves all regimes and runs."""
+def seen(media_digest: str, clip: Path, question: str, frames: FramePolicy) -> str | None:
+    """What the observer says of these frames of a clip; one look serves all regimes and runs."""
     from traps_pipeline.scenes.observe import observe
 
-    return observe(clip, question)
+    return observe(clip, question, frames)
 
 
 class ObserverBackend:
@@ -24,6 +27,7 @@ class ObserverBackend:
     async def ask(self, request: Request) -> Outcome:
         """One attempt; see `Backend`."""
         assert request.media is not None, "the observer is asked about clips"
-        answer = await asyncio.to_thread(seen, request.media_digest, request.media, request.user)
-        text = phrase(answer, str(request.about["regime"]))
+        frames = observed(dataset_of(str(request.about["item_id"])))
+        answer = await asyncio.to_thread(seen, request.media_digest, request.media, request.user, frames)
+        text = phrase(answer, request)
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)

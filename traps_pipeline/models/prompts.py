@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from functools import cache
 
 from traps_pipeline.digests import digest
@@ -13,6 +14,18 @@ _REGIME_PARTS = {
     "standard": ("standard",),
     "guided": ("standard", "guided_suffix"),
     "json": ("standard", "json_suffix"),
+}
+# The fields of the object that an answer must be, by what asks for it; any other answer is free text.
+FIELDS: Mapping[str, tuple[str, ...]] = {
+    "json": ("reason", "final_answer"),
+    "schema_answer": ("final_answer",),
+    "schema_reason": ("reason", "final_answer"),
+    "schema_abstain": ("reason", "abstain", "final_answer"),
+}
+_SCHEMA_PARTS = {
+    "schema_answer": "json_answer_suffix",
+    "schema_reason": "json_suffix",
+    "schema_abstain": "json_abstain_suffix",
 }
 
 
@@ -29,10 +42,17 @@ def prompt(name: str) -> str:
     return text
 
 
+def fields_of(regime: str, dataset: str = "") -> tuple[str, ...] | None:
+    """The fields of the object that an answer must be under a regime, in a dataset that may vary it; None for free
+    text."""
+    return FIELDS.get(dataset, FIELDS.get(regime))
+
+
 @cache
-def system_prompt(regime: str) -> str:
-    """The regime's system prompt: parts stripped and joined by one blank line."""
-    return "\n\n".join(prompt(part) for part in _REGIME_PARTS[regime])
+def system_prompt(regime: str, dataset: str = "") -> str:
+    """The regime's system prompt, in a dataset that may vary it: parts stripped and joined by one blank line."""
+    varied = (_SCHEMA_PARTS[dataset],) if dataset in _SCHEMA_PARTS else ()
+    return "\n\n".join(prompt(part) for part in (*_REGIME_PARTS[regime], *varied))
 
 
 @cache
@@ -42,9 +62,10 @@ def vqa_prompt(name: str) -> str:
     return "\n\n".join(prompt(part) for part in parts)
 
 
-def prompt_version(regime: str) -> str:
-    """Version of a regime's system prompt."""
-    return digest(system_prompt(regime))[:16]
+def prompt_version(regime: str, datasets: Iterable[str] = ()) -> str:
+    """Version of a regime's system prompt, and of its variations in those datasets that have one."""
+    varied = [system_prompt(regime, dataset) for dataset in sorted({*datasets} & {*_SCHEMA_PARTS})]
+    return digest([system_prompt(regime), *varied] if varied else system_prompt(regime))[:16]
 
 
 def states_prompt(system: str, name: str) -> str:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from traps_pipeline.models.prompts import fields_of
 from traps_pipeline.models.request import JUDGED, WITH_TEXT
 
 THINKS = re.compile(r"<(/?)think(?:ing)?>", re.IGNORECASE)
-JSON_REGIME = "json"
 READING = "1"  # version of this module's rules; the answers' tables are stale when it is raised
 _FINAL = re.compile(r"\banswer\W*?(?:\bis\b\s*:?|[:=])\s*\S", re.IGNORECASE)
 _WORD = re.compile(r"\w+")
@@ -26,7 +26,7 @@ _LEAST_WORDS, _FEW_CHARACTERS = 12, 30
 @dataclass(frozen=True)
 class Reading:
     """outcome: as the ledger has it, or `degenerate`; text: what a judge is shown, None where it is shown nothing;
-    reasoning: the trace; is_json: in the JSON regime, whether the text is the object that the prompt asks for;
+    reasoning: the trace; is_json: where the prompt asks for an object, whether the text is that;
     why: what is wrong with a text that is no answer."""
 
     outcome: str
@@ -36,25 +36,29 @@ class Reading:
     why: str | None = None
 
 
-def read_answer(row: Mapping[str, Any], reasoning: str | None, regime: str, *, inline_thinking: bool) -> Reading:
+def read_answer(
+    row: Mapping[str, Any], reasoning: str | None, regime: str, *, inline_thinking: bool, dataset: str = ""
+) -> Reading:
     """The reading of an answer's row in the ledger. inline_thinking: whether the model's entry says that it thinks
-    between `<think>` tags in its visible text, which are then split off."""
+    between `<think>` tags in its visible text, which are then split off. dataset: of the item; it may ask for another
+    object than the regime."""
+    fields = fields_of(regime, dataset)
     outcome, text = str(row["outcome"]), row["text"]
     if outcome not in WITH_TEXT or not isinstance(text, str):
         return Reading(outcome, text, reasoning)
-    is_json = _is_json(text) if regime == JSON_REGIME else None
+    is_json = _is_json(text, fields) if fields else None
     if THINKS.search(text):
         if not inline_thinking:
             why = "thinks between tags in its text; say `inline_thinking: true` in its entry"
             return Reading("degenerate", None, reasoning, is_json, why)
         thought, text = split_thinking(text)
         reasoning = "\n\n".join(part for part in (reasoning, thought) if part) or None
-        is_json = _is_json(text) if regime == JSON_REGIME else None
+        is_json = _is_json(text, fields) if fields else None
         if not text:
             return Reading("truncated" if outcome == "truncated" else "empty", None, reasoning, is_json, "only thinks")
     if why := degenerate(text):
         return Reading("degenerate", None, reasoning, is_json, why)
-    if outcome == "truncated" and not (_FINAL.search(text) or _is_json(text)):
+    if outcome == "truncated" and not (_FINAL.search(text) or _is_json(text, fields or ())):
         return Reading("truncated", None, reasoning, is_json, "cut off at the limit of tokens before a final answer")
     return Reading(JUDGED[0], text, reasoning, is_json)
 
@@ -93,8 +97,9 @@ def degenerate(text: str) -> str | None:
     return None
 
 
-def _is_json(text: str) -> bool:
-    """Whether a text is the object that `prompts/json_suffix.txt` asks for, in a fence or not."""
+def _is_json(text: str, fields: Sequence[str]) -> bool:
+    """Whether a text is an object with the fields that decide, `final_answer` and `abstain` if asked for, in a fence or
+    not. What reasons it gives is left to it."""
     stripped = text.strip()
     if stripped.startswith("```") and stripped.endswith("```"):
         stripped = stripped[3:-3].removeprefix("json")
@@ -102,4 +107,4 @@ def _is_json(text: str) -> bool:
         parsed = json.loads(stripped)
     except (ValueError, RecursionError):
         return False
-    return isinstance(parsed, dict) and "final_answer" in parsed
+    return isinstance(parsed, dict) and {"final_answer", *({*fields} - {"reason"})} <= parsed.keys()

@@ -13,7 +13,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from traps_pipeline.digests import digest
+from traps_pipeline.models.prompts import fields_of
 from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.partitions import dataset_of
 
 ABSTENTION = "I don't know"
 Strategy = Callable[[Request], str | None]  # the label answered, None for an abstention
@@ -53,14 +55,15 @@ STRATEGIES: Mapping[str, Strategy] = {
 }
 
 
-def phrase(answer: str | None, regime: str) -> str:
-    """The answer in the words of a model under that regime."""
+def phrase(answer: str | None, request: Request) -> str:
+    """The answer in the words of a model that is asked in this way."""
     if answer is None:
         reason, final = "The clip does not show what decides the outcome.", ABSTENTION
     else:
         reason, final = "I followed the motion to the end of the clip.", answer
-    if regime == "json":
-        return json.dumps({"reason": reason, "final_answer": final})
+    if fields := fields_of(str(request.about["regime"]), dataset_of(str(request.about["item_id"]))):
+        said = {"reason": reason, "abstain": answer is None, "final_answer": final}
+        return json.dumps({name: said[name] for name in fields})
     return f"{reason} {ABSTENTION}." if answer is None else f"{reason} The answer is: {final}."
 
 
@@ -76,7 +79,7 @@ class ReferenceBackend:
         misfortune = self._misfortune(request)
         if misfortune is not None:
             return misfortune
-        text = phrase(STRATEGIES[request.params["strategy"]](request), str(request.about["regime"]))
+        text = phrase(STRATEGIES[request.params["strategy"]](request), request)
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)
 
     def _misfortune(self, request: Request) -> Outcome | None:

@@ -17,6 +17,7 @@ from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models import own
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
+from traps_pipeline.models.prompts import FIELDS, fields_of
 from traps_pipeline.partitions import Evaluation, check_slug
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.media import MediaSpec, profile_digest
@@ -49,8 +50,15 @@ def structured(name: str, **properties: Any) -> dict[str, Any]:
     return {"type": "json_schema", "json_schema": {"name": name, "strict": True, "schema": schema}}
 
 
-# Structured output of the JSON regime (`prompts/json_suffix.txt`).
-JSON_ANSWER = structured("answer", reason={"type": "string"}, final_answer={"type": "string"})
+_TYPES = {"reason": "string", "abstain": "boolean", "final_answer": "string"}
+
+
+def answer_object(fields: Iterable[str]) -> dict[str, Any]:
+    """The `response_format` of an answer with these fields (`prompts.FIELDS`)."""
+    return structured("answer", **{name: {"type": _TYPES[name]} for name in fields})
+
+
+JSON_ANSWER = answer_object(FIELDS["json"])  # of the JSON regime (`prompts/json_suffix.txt`)
 
 
 class Limits(BaseModel):
@@ -322,16 +330,17 @@ def account_of(entry: Entry) -> Account:
     return load_accounts()[str(entry.account)]
 
 
-def effective_params(entry: ModelEntry, regime: str) -> dict[str, Any]:
-    """What is sent under a regime: the entry's parameters, in the JSON regime the schema where the entry has it, and of
-    a checkpoint the digest of its weights (`declared_digest`)."""
+def effective_params(entry: ModelEntry, regime: str, dataset: str = "") -> dict[str, Any]:
+    """What is sent under a regime, in a dataset that may vary it: the entry's parameters, the schema of the object that
+    is asked for where the entry has it, and of a checkpoint the digest of its weights (`declared_digest`)."""
     if entry.backend == LOCAL:
         from traps_pipeline.models.local.checkpoint import declared_digest
 
         content = declared_digest(entry.local_params())
         return entry.params | ({"checkpoint_digest": content} if content else {})
-    structured = entry.backend == NETWORK and entry.json_schema and regime == "json"
-    return entry.params | ({"response_format": JSON_ANSWER} if structured else {})
+    fields = fields_of(regime, dataset)
+    structured_output = {"response_format": answer_object(fields)} if fields else {}
+    return entry.params | (structured_output if entry.backend == NETWORK and entry.json_schema else {})
 
 
 def answering_version(evaluation: Evaluation) -> str:

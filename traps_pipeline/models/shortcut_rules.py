@@ -12,9 +12,11 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 
+from traps_pipeline.models.framing import observed
 from traps_pipeline.models.observer import seen
 from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.partitions import dataset_of
 
 # Pixels of navy in one piece. Panels of released voids have 18,000 and more; shade in a control never had above 100.
 PANEL_PX = 1000
@@ -57,7 +59,7 @@ class RuleBackend:
         """One attempt; see `Backend`."""
         assert request.media is not None, "a rule is asked about clips"
         answer = await asyncio.to_thread(_answer, request, request.media)
-        text = phrase(answer, str(request.about["regime"]))
+        text = phrase(answer, request)
         return Outcome("answer", text, finish_reason="stop", served_model=request.participant, cost_usd=0.0)
 
 
@@ -65,4 +67,5 @@ def _answer(request: Request, clip: Path) -> str | None:
     question = request.user
     if any(CUES[cue](request.media_digest, clip, question) for cue in RULES[str(request.params["rule"])]):
         return None
-    return seen(request.media_digest, clip, question) or str(request.secret["commonest_answer"])
+    frames = observed(dataset_of(str(request.about["item_id"])))
+    return seen(request.media_digest, clip, question, frames) or str(request.secret["commonest_answer"])

@@ -15,7 +15,7 @@ from traps_pipeline.benchmark.tables import SCENE_SPECS
 from traps_pipeline.models.registry import get_model, load_models, local_models
 from traps_pipeline.partitions import (
     ANSWERABLE,
-    ARMS,
+    BESIDE,
     CATEGORIES,
     DATASETS,
     PROBED_ARMS,
@@ -28,7 +28,7 @@ from traps_pipeline.partitions import (
     Extraction,
     StatesCell,
     SteeringCell,
-    datasets_and_arms_of,
+    all_datasets_of,
 )
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
@@ -47,7 +47,7 @@ class Wanted:
         self._workspace = workspace
         if workspace is None:
             every = Asked(
-                datasets=(*DATASETS, *ARMS), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
+                datasets=(*DATASETS, *BESIDE), models=tuple(load_models()), regimes=REGIMES, runs=(), mechanism=True
             )
             self._asked: Sequence[Asked] = [every]
         else:
@@ -72,13 +72,13 @@ class Wanted:
 
     @cached_property
     def arms(self) -> list[str]:
-        """Arms among them."""
-        return [dataset for dataset in self.datasets if dataset in ARMS]
+        """Arms and variations among them."""
+        return [dataset for dataset in self.datasets if dataset in BESIDE]
 
     def _datasets(self, asked: Iterable[Asked]) -> list[str]:
-        there = {dataset for category in self._present for dataset in datasets_and_arms_of(category)}
+        there = {dataset for category in self._present for dataset in all_datasets_of(category)}
         named = {dataset for experiment in asked for dataset in experiment.datasets}
-        return [dataset for dataset in (*DATASETS, *ARMS) if dataset in there & named]
+        return [dataset for dataset in (*DATASETS, *BESIDE) if dataset in there & named]
 
     @cached_property
     def evaluations(self) -> list[Evaluation]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.partitions import ARMS, PANEL_DOSES, PANEL_LOOKS
 from traps_pipeline.report.contact_sheet import SampledClip, sampled
 from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
 from traps_pipeline.scenes.encode import decode
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 MOMENTS = 6  # frames a row
 FRAME_IN, WORDS_IN, GAP_IN, HEAD_IN = 1.5, 2.9, 0.06, 0.8
 SOFT = "#667085"
+_SHEETS = {"arms": ARMS, "panels": (*PANEL_LOOKS, *PANEL_DOSES)}
 
 
 @dataclass(frozen=True)
@@ -34,15 +37,16 @@ class Row:
 
 
 def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str, bytes]:
-    """`arms_<taxonomy>.png` of the scenario of each taxonomy that admits most arms (of several, the first by id).
+    """`arms_<taxonomy>.png` of the scenario of each taxonomy that admits most arms (of several, the first by id), and
+    `panels_occlusion.png` of that which admits most looks of the panel.
 
-    items are ITEMS rows of the pairs, arms ARMS rows; clips lie under root. No file where no arm was filmed. Raises
+    items are ITEMS rows of the pairs, arms ARMS rows; clips lie under root. No file where nothing was filmed. Raises
     DamagedClip when a clip cannot be decoded.
     """
-    filmed = arms.loc[arms["clip"].notna()]
     pairs = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
     files: dict[str, bytes] = {}
-    for taxonomy, sides in pairs.groupby("taxonomy", sort=True):
+    for (name, shown), (taxonomy, sides) in product(_SHEETS.items(), pairs.groupby("taxonomy", sort=True)):
+        filmed = arms.loc[arms["clip"].notna() & arms["arm"].isin(shown)]
         own = filmed.loc[filmed["scenario_id"].isin(sides["scenario_id"])]
         if len(own):
             counts = own.groupby("scenario_id")["arm"].nunique().sort_index()
@@ -50,7 +54,7 @@ def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str
             control = sides.loc[(sides["scenario_id"] == scenario) & (sides["side"] == "control"), "clip"]
             times = _moments(root / str(control.iloc[0]))
             rows = list(_rows(sides, own, scenario, root, times))
-            files[f"arms_{taxonomy}.png"] = _sheet(scenario, rows, times)
+            files[f"{name}_{taxonomy}.png"] = _sheet(scenario, rows, times)
     return files
 
 
@@ -67,8 +71,9 @@ def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, ti
     for row in (*pair.to_dict("records"), *own.to_dict("records")):
         frames, at = decode(root / str(row["clip"]))
         truth = row["ground_truth"]
-        right = "must be abstained on" if row["side"] == "void" else f"must be answered: {truth}"
         name = str(row.get("arm") or row["side"])
+        right = "must be abstained on" if row["side"] == "void" else f"must be answered: {truth}"
+        right = f"no void, {truth} shows through" if name in PANEL_DOSES else right
         yield Row(name, right, str(row["question"]), sampled(frames, at, times))
 
 

@@ -17,7 +17,16 @@ from traps_pipeline.report.printed import mechanism as printed_mechanism
 from traps_pipeline.report.printed import scores as printed_scores
 from traps_pipeline.report.printed import setup as printed_setup
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables import comparisons, inside, judges, leaderboards, people, setup, sub_scenarios
+from traps_pipeline.report.tables import (
+    comparisons,
+    hypotheses,
+    inside,
+    judges,
+    leaderboards,
+    people,
+    setup,
+    sub_scenarios,
+)
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
 from traps_pipeline.report.tables.shared import printed
 from traps_pipeline.report.writing import SOFT, PrintedTable, figure_bytes, figure_files, figure_style, table_files
@@ -34,6 +43,7 @@ JUDGED_STAGES = {
     "metrics",
     "contrasts",
     "regime_tests",
+    "hypotheses",
     "leave_one_out",
     "steering_effects",
     "steering_shares",
@@ -195,6 +205,7 @@ TABLES: tuple[TableReport, ...] = (
         printed_scores.chaotic_sub_scenarios,
         recomputed=("chaotic_sub_scenarios",),
     ),
+    TableReport("hypotheses", hypotheses.hypotheses, ("hypotheses",), title="Hypotheses of the paper, by dose"),
     TableReport("judge_agreement", judges.agreement, ("agreement",), printed_setup.agreement),
     TableReport("judge_bias", judges.judge_bias, ("judge_bias", "leave_one_out")),
     TableReport("confabulation", judges.confabulation, ("confabulation_prevalence",), printed_setup.confabulation),

@@ -19,7 +19,7 @@ from traps_pipeline.files import write_bytes
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, Cell, Evaluation
+from traps_pipeline.partitions import BESIDE, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.report.terms import ARM_TITLES, TITLES
 from traps_pipeline.report.writing import TEMPLATES, Behind, environment
 from traps_pipeline.storage.workspace import Workspace
@@ -27,7 +27,7 @@ from traps_pipeline.storage.workspace import Workspace
 FOLDER = "items"
 MADE = "made.json"  # digest of what each page was made from
 _PER_CELL = (RESPONSES, VOTES, VERDICTS)
-_DATASETS, _TITLES = (*DATASETS, *ARMS), TITLES | ARM_TITLES  # the items of arms have pages, too
+_DATASETS, _TITLES = (*DATASETS, *BESIDE), TITLES | ARM_TITLES  # the items of arms have pages, too
 
 
 def cells_with_items(workspace: Workspace) -> list[Cell]:

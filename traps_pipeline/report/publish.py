@@ -38,9 +38,11 @@ SHEETS = {
     "contact_sheet.png": "Pairs: control above, void below",
     "arms_occlusion.png": "Arms of a scenario with a panel",
     "arms_chaotic.png": "Arms of a scenario with a cut",
+    "panels_occlusion.png": "Looks of the panel of a scenario, from its pair to panels that let the outcome through",
 }
 FROM_PAPER = "recomputed from the published tables"  # the heading of what the paper does not print
-FULL = ("contact_sheet.png", "arms_occlusion.png", "arms_chaotic.png")  # shown as wide as the screen allows
+# Shown as wide as the screen allows.
+FULL = ("contact_sheet.png", "arms_occlusion.png", "arms_chaotic.png", "panels_occlusion.png")
 Pictures = Mapping[str, bytes]  # PNG by path below the reports folder
 
 

@@ -27,6 +27,7 @@ from traps_pipeline.scoring.people_tables import CORRECTED, HUMAN_ROW, PANEL_ERR
 from traps_pipeline.scoring.tables import (
     CONFABULATION_PREVALENCE,
     CONTRASTS,
+    HYPOTHESES,
     LEADERBOARD,
     LEAVE_ONE_OUT,
     REGIME_TESTS,
@@ -107,6 +108,7 @@ class Results:
     bias = Made(table=JUDGE_BIAS)
     leave_one_out = Made(table=LEAVE_ONE_OUT)
     robust = Made(table=ROBUST)
+    hypotheses = Made(table=HYPOTHESES)
     contrasts = Made(table=CONTRASTS)
     regime_tests = Made(table=REGIME_TESTS)
     confabulation = Made(table=CONFABULATION_PREVALENCE)
@@ -138,8 +140,7 @@ class Results:
         derive=lambda results: effects.family_asymmetry(results.effects),
     )
     steering_domains = Made(
-        "Rows of `mechanism.effects.domains`, and `mark` for those judged in another way.",
-        derive=lambda results: effects.domains(results.effects).assign(mark=""),
+        "Rows of `mechanism.effects.domains`.", derive=lambda results: effects.domains(results.effects)
     )
     steering_layers = Made("Rows of `mechanism.effects.sweep`.", derive=lambda results: effects.sweep(results.effects))
 

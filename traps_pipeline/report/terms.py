@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from traps_pipeline.partitions import ARMS
+from traps_pipeline.partitions import ARMS, VARIATIONS
 from traps_pipeline.scoring.tables import BROKEN_ABOVE, INCOMPLETE_BELOW
 
 TITLES = {
@@ -12,7 +12,9 @@ TITLES = {
     "chaotic": "Chaotic",
     "chaotic_ill_posed": "Chaotic, ill-posed",
 }
-ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}  # arms enter no figure of the pairs
+# Neither arms nor variations enter a figure of the pairs.
+ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}
+ARM_TITLES |= {name: f"Variation: {name.replace('_', ' ')}" for name in VARIATIONS}
 # What the columns of a leaderboard with arms mean (docs/scoring.md, "PECS-R and the gap").
 ROBUST_TERMS = {
     "PECS-R": "PECS over the pairs and the arms, which take shortcuts away; kinds of items have equal weight. Entries "

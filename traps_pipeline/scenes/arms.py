@@ -102,11 +102,17 @@ class Take:
 
 @dataclass(frozen=True)
 class Question:
-    """What an arm asks. side: `control` if it must be answered, `void` if it must be abstained on."""
+    """What an arm asks. side: `control` if it must be answered, `void` if it must be abstained on.
+
+    clip: that of the pair (`control`, `void` or `twin`) which is shown; None where it is the arm's own. labels: the
+    answers to choose from; None where they are the record's.
+    """
 
     side: str
     text: str
     answer: str | None
+    clip: str | None = None
+    labels: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -115,7 +121,7 @@ class Arm:
 
     takes_away: the shortcut that it turns against its user. promises: its certificate in words.
 
-    film(scenario): the clip; None where it is the pair's own, `clip`. ask(spec): its questions. Both raise Rejected.
+    film(scenario): the clip; without frames where it is the pair's own. ask(spec): its questions. Both raise Rejected.
     """
 
     name: str
@@ -123,14 +129,15 @@ class Arm:
     promises: str
     ask: Callable[[SceneSpec], list[Question]]
     film: Callable[[Scenario], Take]
-    clip: str | None = None
 
 
-def _must_answer(spec: SceneSpec) -> list[Question]:
+def must_answer(spec: SceneSpec) -> list[Question]:
+    """The record's question of the arm's own clip, to be answered."""
     return [Question("control", spec.question, spec.ground_truth)]
 
 
-def _must_abstain(spec: SceneSpec) -> list[Question]:
+def must_abstain(spec: SceneSpec) -> list[Question]:
+    """The record's question of the arm's own clip, to be abstained on."""
     return [Question("void", spec.question, None)]
 
 
@@ -229,7 +236,7 @@ def _looking_past(camera: Camera, corners: np.ndarray) -> Iterator[Camera]:
         yield replace(camera, lookat=(a, b, c))
 
 
-def _moving_geoms(model: mujoco.MjModel) -> list[str]:
+def moving_geoms(model: mujoco.MjModel) -> list[str]:
     """Names of the geoms of bodies that move."""
     moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
     return [model.geom(int(i)).name for i in moving if model.geom(int(i)).name]
@@ -242,7 +249,7 @@ def _frame_out(scenario: Scenario) -> Take:
     model, scene = compile_scene(control.family, control.params, control.physics)
     other, _ = compile_scene(twin.family, twin.params, twin.physics)
     decisive, hidden = decisive_geoms(model, scene.decisive), scene.hidden
-    moving = _moving_geoms(model)
+    moving = moving_geoms(model)
     reason = "no camera was tried"
     for camera in _looking_past(control.camera, cover.corners()):
         with Renderer(model, camera) as renderer:
@@ -335,7 +342,7 @@ def _agreeing(scenario: Scenario, frame: int) -> int | None:
 
 
 def _twin_answers(spec: SceneSpec) -> list[Question]:
-    return [Question("control", spec.question, spec.twin.ground_truth)]
+    return [Question("control", spec.question, spec.twin.ground_truth, clip="twin")]
 
 
 def _twin(scenario: Scenario) -> Take:
@@ -350,7 +357,10 @@ def _choices_swapped(spec: SceneSpec) -> list[Question]:
     if plain is None or offering is None:
         which = spec.question if plain is None else spec.ill_posed_question
         raise Rejected(f"the choices of {which!r} cannot be taken from it, or none are known for it")
-    return [Question("control", plain, spec.ground_truth), Question("void", offering, None)]
+    return [
+        Question("control", plain, spec.ground_truth, clip="control"),
+        Question("void", offering, None, clip="control"),
+    ]
 
 
 def _words_alone(scenario: Scenario) -> Take:
@@ -372,7 +382,7 @@ ARMS: Mapping[str, Arm] = {
             "a panel means: abstain",
             f"the void's own panel stands behind or beside the scene with at least {PANEL_PX:.0f} pixels, takes no "
             "pixel of a decisive body or the hidden element in any sampled frame, and the outcome stays legible",
-            _must_answer,
+            must_answer,
             _decoy,
         ),
         Arm(
@@ -380,7 +390,7 @@ ARMS: Mapping[str, Arm] = {
             "a panel in the first frames means: abstain",
             f"the panel stands as in the void until {REMOVED_S:.0f} s; the last three sampled frames are the "
             "control's, with the outcome settled",
-            _must_answer,
+            must_answer,
             _removed,
         ),
         Arm(
@@ -388,14 +398,14 @@ ARMS: Mapping[str, Arm] = {
             "a panel at the end means: abstain",
             "up to the last frame before the outcome is settled the control is seen, and some sampled frame of it "
             f"differs from the other world's in at least {SEEN_PX:.0f} pixels, so that what follows can be inferred",
-            _must_answer,
+            must_answer,
             _late_panel,
         ),
         Arm(
             "length_matched",
             "a short clip means: abstain",
             "the control's last frames, as many as the void has, from which the observer answers rightly",
-            _must_answer,
+            must_answer,
             _length_matched,
         ),
         Arm(
@@ -403,7 +413,7 @@ ARMS: Mapping[str, Arm] = {
             "a cut means: abstain",
             f"the control is cut up to {LEADS[0]} frames before its outcome is settled, where at least "
             f"{AGREE_SHARE:.0%} of {FUTURES} futures of the last frame, perturbed as for `open`, end in the answer",
-            _must_answer,
+            must_answer,
             _predictable_cut,
         ),
         Arm(
@@ -412,7 +422,6 @@ ARMS: Mapping[str, Arm] = {
             "the other world behind the same void, uncovered: its outcome is settled, and is another",
             _twin_answers,
             _twin,
-            clip="twin",
         ),
         Arm(
             "frame_out",
@@ -420,7 +429,7 @@ ARMS: Mapping[str, Arm] = {
             "the camera looks past the outcome: what moves is seen at first with at least "
             f"{SEEN_PX:.0f} pixels, then no decisive body, the hidden element never, no shadow of either, and the twin "
             "has the same frames byte for byte",
-            _must_abstain,
+            must_abstain,
             _frame_out,
         ),
         Arm(
@@ -428,7 +437,7 @@ ARMS: Mapping[str, Arm] = {
             "a long clip means: answer",
             "the void's frames, the last one held until the control's length: nothing is shown that the void does not "
             "show",
-            _must_abstain,
+            must_abstain,
             _held_void,
         ),
         Arm(
@@ -438,7 +447,6 @@ ARMS: Mapping[str, Arm] = {
             "offers some: the vocabulary still refutes it",
             _choices_swapped,
             _words_alone,
-            clip="control",
         ),
     )
 }

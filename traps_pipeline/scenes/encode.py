@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from traps_pipeline.files import replacing
+from traps_pipeline.scenes.policies import SAMPLED, FramePolicy
 
 # veryfast: 3 % larger than medium at the same quality, in half the time. mbtree is off since it is not deterministic in
 # this x264: in one of about 20 runs the same frames gave other bytes.
@@ -97,9 +98,8 @@ def decode_first(path: Path) -> np.ndarray:
         ) from error
 
 
-def decode_sampled(path: Path, fps: float = 5.0, most: int = 25) -> np.ndarray:
-    """The frames (N, H, W, 3) uint8 RGB shown at the times 0, 1/fps, 2/fps, ..., at most `most`
-    (docs/spec.md 3.1). Raises DamagedClip."""
+def decode_sampled(path: Path, shown: FramePolicy = SAMPLED) -> np.ndarray:
+    """The frames (N, H, W, 3) uint8 RGB that a policy shows, by default 5 a second and at most 25 (docs/spec.md 3.1).
+    Raises DamagedClip."""
     frames, times = decode(path)
-    wanted = np.arange(0.0, float(times[-1]) + 1e-6, 1 / fps)[:most]
-    return frames[np.abs(times[:, None] - wanted).argmin(axis=0)]
+    return frames[shown.pick(times)]

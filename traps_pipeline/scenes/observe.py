@@ -11,6 +11,7 @@ from pathlib import Path
 
 from traps_pipeline.scenes.encode import decode_sampled
 from traps_pipeline.scenes.kit import Family
+from traps_pipeline.scenes.policies import SAMPLED, FramePolicy
 from traps_pipeline.scenes.registry import families
 from traps_pipeline.scenes.wording import asked
 
@@ -21,9 +22,10 @@ def family_asking(question: str) -> Family | None:
     return next((family for family in families() if asked(family.questions, question) is not None), None)
 
 
-def observe(clip: Path, question: str) -> str | None:
-    """The answer that is seen in a clip (5 FPS, at most 25 frames); None where the decisive thing is not to be seen."""
+def observe(clip: Path, question: str, shown: FramePolicy = SAMPLED) -> str | None:
+    """The answer that is seen in a clip, of which these frames are shown; None where the decisive thing is not to be
+    seen. What follows something from frame to frame was made for 5 frames a second."""
     family = family_asking(question)
     if family is None or family.observe is None:
         return None
-    return family.observe(decode_sampled(clip), question)
+    return family.observe(decode_sampled(clip, shown), question)

@@ -9,11 +9,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class FramePolicy:
-    """A grid of `fps` frames a second of which the first `most` are shown, or `uniform` evenly spaced frames."""
+    """A grid of `fps` frames a second of which the first `most` are shown, or `uniform` evenly spaced frames. later: in
+    the place of each, the frame so many frames after it, and the clip's last one where there is none."""
 
     fps: float | None = None
     uniform: int | None = None
     most: int = 25
+    later: int = 0
 
     def __str__(self) -> str:
         return f"{self.uniform} evenly spaced" if self.fps is None else f"{self.fps:g} a second"
@@ -26,7 +28,8 @@ class FramePolicy:
         if self.uniform is not None and len(times) <= self.uniform:
             return np.arange(len(times))
         away = np.abs(times[:, None] - self._wanted(times)).round(9)  # s; rounded, or noise would decide between equals
-        return np.unique(away.argmin(axis=0))[: self.uniform or self.most]
+        chosen = np.unique(away.argmin(axis=0))[: self.uniform or self.most]
+        return np.unique(np.minimum(chosen + self.later, len(times) - 1))
 
     def _wanted(self, times: np.ndarray) -> np.ndarray:
         if self.fps is None:
@@ -34,8 +37,10 @@ class FramePolicy:
         return np.arange(int(times[-1] * self.fps + 1e-6) + 1) / self.fps
 
 
+SAMPLED = FramePolicy(fps=5)  # what most models, and the observer, are shown
+
 # Those of the registered models (docs/spec.md 3.1): what is certified to be seen must be seen under each of them.
-POLICIES = (FramePolicy(fps=5), FramePolicy(uniform=16), FramePolicy(fps=2, most=32))
+POLICIES = (SAMPLED, FramePolicy(uniform=16), FramePolicy(fps=2, most=32))
 
 
 def shown_at_end(n_frames: int, fps: int, last_s: float) -> list[int]:

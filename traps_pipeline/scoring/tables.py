@@ -230,6 +230,51 @@ ROBUST = Table("robust", RobustRow, partition_by=(), key=("model", "regime"))
 
 
 @dataclass(frozen=True, kw_only=True)
+class HypothesisRow:
+    """A model under a regime at one dose of a hypothesis (docs/hypotheses.md). No part of PECS or PECS-R."""
+
+    model: shared.Model
+    regime: shared.Regime
+    hypothesis: Annotated[str, "answer space, panel, schema, frames or cut"]
+    dose: Annotated[str, "what is changed, in words; the first dose of a hypothesis is the reference"]
+    counts_as: Annotated[str, "control and void, control, void, or why it is neither"]
+    n_runs: Annotated[int, "runs averaged"]
+    n_scenarios: Annotated[int, "scenarios"]
+    n_items: Annotated[int, "items per run"]
+    n_missing: Annotated[int, "items without an answer or a majority, over runs"]
+    acc: Annotated[float | None, "share of the controls' answers that are right"]
+    acc_ci_low: Bootstrap
+    acc_ci_high: Bootstrap
+    false_abs: Annotated[float | None, "share of controls abstained on; of what is neither, the share abstained on"]
+    false_abs_ci_low: Bootstrap
+    false_abs_ci_high: Bootstrap
+    abs_rec: Annotated[float | None, "share of voids abstained on"]
+    abs_rec_ci_low: Bootstrap
+    abs_rec_ci_high: Bootstrap
+    j: Annotated[float | None, "abs_rec - false_abs"]
+    j_ci_low: Bootstrap
+    j_ci_high: Bootstrap
+    compared: Annotated[str, "the figure that doses are compared by: j, or abstains, of all items of the dose"]
+    value: Annotated[float | None, "that figure"]
+    at_reference: Annotated[float | None, "that figure at the reference, on the scenarios that both have"]
+    change: Annotated[float | None, "by how much the dose is above it; null where refused"]
+    change_ci_low: Bootstrap
+    change_ci_high: Bootstrap
+    chance: Annotated[float | None, "Acc of a guess among the answers that the questions offer"]
+    rule: Annotated[str | None, "of the rules with one cue that with the highest value here; null if none was run"]
+    rule_value: Annotated[float | None, "its value"]
+    rule_changing: Annotated[str | None, "of these rules that with the largest change, either way"]
+    rule_change: Annotated[float | None, "its change"]
+    panel: shared.Panels
+    epoch: shared.AnswerEpochs
+    benchmark_version: shared.BenchmarkVersion
+    refused: Annotated[str | None, "why the dose is not compared with its reference"]
+
+
+HYPOTHESES = Table("hypotheses", HypothesisRow, partition_by=(), key=("model", "regime", "hypothesis", "dose"))
+
+
+@dataclass(frozen=True, kw_only=True)
 class LeaveOneOutRow:
     """A model under a regime on one dataset, or overall, scored by the other two judges; 1-1 is undecided."""
 

@@ -48,7 +48,8 @@ class MediaSpec(BaseModel):
 
     profile: an mp4, separate JPEGs, or raw frames for a local model. Frames are a grid of fps a second, at most `most`,
     or `uniform` evenly spaced ones. size: (width, height) in pixels to resize to. fit: a clip of another shape is
-    stretched to that size, or keeps its shape and is cropped on both sides.
+    stretched to that size, or keeps its shape and is cropped on both sides. later: so many frames of the clip after
+    those frames are shown in their place.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -58,6 +59,7 @@ class MediaSpec(BaseModel):
     uniform: int | None = Field(default=None, ge=1)
     size: tuple[int, int] | None = None
     fit: Literal["stretch", "crop"] = "stretch"
+    later: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")
     def _one_frame_policy(self) -> MediaSpec:
@@ -115,7 +117,7 @@ class Media:
 
 def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
     """Indices of the frames that a model is shown, of a clip whose frames have these times (F,), s."""
-    return FramePolicy(spec.fps, spec.uniform, spec.most).pick(times)
+    return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later).pick(times)
 
 
 def sample(clip: Path, spec: MediaSpec) -> Frames:
@@ -198,8 +200,9 @@ def read_note(note: Path) -> Media:
 
 def profile_digest(spec: MediaSpec) -> str:
     """Digest of all that decides the bytes of a profile, the clip aside."""
-    # A spec without `fit` has the digest that it had before there was one, so that nothing is prepared anew.
-    plain = {"fit"} if spec.fit == "stretch" else None
+    # A spec without `fit` or `later` has the digest that it had before there were these, so that nothing is prepared
+    # anew.
+    plain = ({"fit"} if spec.fit == "stretch" else set()) | ({"later"} if not spec.later else set())
     made: dict[str, Any] = {"revision": _REVISION, "spec": spec.model_dump(mode="json", exclude=plain)}
     if spec.profile == "video":
         made["encoder"] = ENCODER

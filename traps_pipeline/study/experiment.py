@@ -11,7 +11,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.judges import require_panel
 from traps_pipeline.models.own import Own, use
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
-from traps_pipeline.partitions import ARMS, DATASETS, REGIMES, Cell, Evaluation
+from traps_pipeline.partitions import BESIDE, DATASETS, REGIMES, SCHEMAS, Cell, Evaluation
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.study import Asked, MechanismSettings, Study
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml, within
@@ -69,7 +69,7 @@ class Experiment(BaseModel):
     @field_validator("datasets")
     @classmethod
     def _datasets(cls, values: list[str]) -> list[str]:
-        return _known(values, (*DATASETS, *ARMS))
+        return _known(values, (*DATASETS, *BESIDE))
 
     @field_validator("regimes")
     @classmethod
@@ -82,6 +82,16 @@ class Experiment(BaseModel):
         if len(set(values)) != len(values):
             raise ValueError(f"{values} names something twice")
         return values
+
+    @model_validator(mode="after")
+    def _one_object_is_asked_for(self) -> Experiment:
+        schemas = [dataset for dataset in self.datasets if dataset in SCHEMAS]
+        if schemas and "json" in self.regimes:
+            raise ValueError(
+                f"datasets {', '.join(schemas)} ask for an object of their own, and so does the regime json: leave one "
+                "of them out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _study_holds_together(self) -> Experiment:

@@ -20,12 +20,12 @@ from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.partitions import (
-    ARMS,
+    BESIDE,
     DATASETS,
     Cell,
     Evaluation,
     SteeredEvaluation,
-    datasets_and_arms_of,
+    all_datasets_of,
     datasets_of_category,
     sides_of,
 )
@@ -160,7 +160,7 @@ def _count_calls(
     known, lineage, uncertain = _KnownKeys(), Lineage(workspace) if workspace else None, set[str]()
     for cell in experiment.cells():
         answers, votes = plan[cell.evaluation.model]
-        scenes = sum(cell.dataset in datasets_and_arms_of(s.category) for s in scenarios)
+        scenes = sum(cell.dataset in all_datasets_of(s.category) for s in scenarios)
         sides = sides_of(cell.dataset)
         items, votes_asked = len(sides) * scenes, len(panel) * sum(len(tasks_for(side)) for side in sides) * scenes
         if workspace is None or lineage is None or not _items_current(lineage, cell.dataset):
@@ -174,7 +174,7 @@ def _count_calls(
             answers.add(answered, answered)
         else:
             keys = _answer_keys(workspace, cell)
-            wanted = len(keys) if cell.dataset in ARMS else items  # not every scenario admits every arm
+            wanted = len(keys) if cell.dataset in BESIDE else items  # not every scenario admits all
             answers.add(wanted, len(keys & known.of(workspace.answers, cell.evaluation)))
         if answered is None:
             votes.add(votes_asked, 0)

@@ -14,9 +14,11 @@ from dataclasses import dataclass, field
 from threading import Event
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.framing import framed
 from traps_pipeline.models.local.checkpoint import find_checkpoint
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.partitions import dataset_of
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.media import Frames, MediaSpec, sample
 
@@ -99,7 +101,7 @@ class LocalBackend:
 def _frames(request: Request, spec: MediaSpec) -> Frames:
     assert request.media is not None, "local models are asked about clips"
     try:
-        return sample(request.media, spec)
+        return sample(request.media, framed(spec, dataset_of(str(request.about.get("item_id", "")))))
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
 

@@ -280,11 +280,15 @@ def _domains(results: Results) -> PrintedTable:
     rows = rows.assign(path=_short(rows["source"]))
     columns = [
         MODEL, DIRECTIONS, INFERENCE, Column("path", "Direction"), Column("alpha", "α", "count"),
-        Column("same", "Same domain, controls %", "percent", mark="mark"),
+        Column("same", "Same domain, controls %", "percent"),
         Column("cross", "Cross domain, controls %", "percent"),
     ]  # fmt: skip
     notes = ["abstention on the well-posed dataset of the source’s own taxonomy (same) and of the other (cross)"]
-    notes += ["* by a keyword judge"] if "*" in set(rows["mark"]) else []
+    if results.is_study:
+        notes.append(
+            "judged by the panel; the paper judged its two same-domain figures by keywords, which it does not print: "
+            "no keyword judge here would be its own"
+        )
     return PrintedTable("steering_domains", "Same against cross domain", rows, columns, notes, _why(results, rows))
 
 

@@ -1,0 +1,115 @@
+"""Variations: each changes one thing, is certified on a scenario that admits it, and refused where it does not hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.scenes.released import load
+from tests.scenes.variation_table import written
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.partitions import FRAMINGS, LABEL_DOSES, PANEL_DOSES, SCHEMAS, VARIATIONS, beside_of, sides_of
+from traps_pipeline.scenes import variations
+from traps_pipeline.scenes.arms import SEEN_PX, Scenario
+from traps_pipeline.scenes.observe import family_asking
+from traps_pipeline.scenes.outcome import Rejected
+from traps_pipeline.scenes.variations import NOTICED, with_labels
+from traps_pipeline.scenes.vision import largest
+
+
+def scenario(scenario_id: str) -> Scenario:
+    case = load(scenario_id)
+    return Scenario.of_record(case.spec, case.qpos, case.twin)
+
+
+# --- what there is ----------------------------------------------------------------------------------------------------
+
+
+def test_every_variation_that_can_be_asked_is_defined_and_asks_its_sides():
+    assert {*variations.VARIATIONS} == {*VARIATIONS}
+    race = load_released()["hidden_race-0001"]
+    for name in VARIATIONS:
+        assert tuple(question.side for question in variations.VARIATIONS[name].ask(race)) == sides_of(name)
+    of_chaotic = {name for name in beside_of("chaotic") if name in VARIATIONS}
+    assert of_chaotic == {*LABEL_DOSES, *SCHEMAS, *FRAMINGS}  # what has no panel has no look of it
+
+
+def test_the_page_has_the_table_of_variations():
+    assert written() == variations.table() + "\n"
+
+
+# --- the asking -------------------------------------------------------------------------------------------------------
+
+
+def test_what_varies_the_asking_shows_the_pairs_own_clips_and_asks_its_own_question():
+    plinko = load_released()["plinko-0001"]
+    for name in (*SCHEMAS, *FRAMINGS):
+        control, void = variations.VARIATIONS[name].ask(plinko)
+        assert (control.clip, control.text, control.answer) == ("control", plinko.question, plinko.ground_truth)
+        assert (void.clip, void.text, void.answer) == ("void", plinko.question, None)
+
+
+def test_a_question_offers_as_many_answers_as_asked_for_and_always_those_of_both_worlds():
+    admitted = 0
+    for spec in load_released().values():
+        try:
+            asked = {count: with_labels(spec, count) for count in (2, 3, 6)}
+        except Rejected:
+            continue
+        admitted += 1
+        for count, (question, labels) in asked.items():
+            assert len(set(labels)) == count and {spec.ground_truth, spec.twin.ground_truth} <= set(labels)
+            offered = " or ".join([", ".join(labels[:-1]), labels[-1]])
+            assert question.count(offered) == 1 and spec.question.split(":")[0].split(",")[0] in question
+            family = family_asking(question)
+            assert family is not None and family.name == spec.family  # the observer still understands it
+        assert set(asked[2][1]) <= set(asked[3][1]) <= set(asked[6][1])
+    assert admitted > 200
+
+
+@pytest.mark.parametrize("scenario_id", ["bounce-0001", "plinko-0001", "domino_count-0001"])
+def test_a_question_whose_answers_are_no_colours_keeps_its_answers(scenario_id: str):
+    with pytest.raises(Rejected, match="are no colours, so that no others can be offered"):
+        variations.VARIATIONS["labels_two"].ask(load_released()[scenario_id])
+
+
+def test_the_right_answer_is_not_always_offered_in_the_same_place():
+    places = set()
+    for number in range(1, 30):
+        spec = load_released()[f"tumbling_dice-{number:04d}"]
+        places.add(with_labels(spec, 6)[1].index(spec.ground_truth))
+    assert len(places) == 6
+
+
+# --- the panel --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_panel_of_another_look_hides_as_much_and_one_that_lets_light_through_does_not():
+    bounce = scenario("bounce-0001")
+    grey = variations.VARIATIONS["panel_grey"].film(bounce)
+    assert grey.evidence["twin_px"] == 0 and len(grey.frames) == len(bounce.control_frames)
+    assert largest(grey.frames[0], "navy", 1000) is None  # the cue of the panel rule is gone
+    assert grey.evidence["contrast"] < 30  # against 65 of the pair's own panel, which is larger here
+    small = variations.VARIATIONS["panel_small"].film(bounce)
+    assert small.evidence["wide"] in variations.SMALLER
+    assert small.evidence["panel_px"] < grey.evidence["panel_px"]
+    sheer = variations.VARIATIONS["panel_alpha_50"].film(bounce)
+    assert sheer.evidence["seen_through_px"] >= SEEN_PX and sheer.evidence["levels"] >= NOTICED
+    assert sides_of("panel_alpha_50") == ("control",) and "panel_alpha_50" in PANEL_DOSES
+
+
+@pytest.mark.slow
+def test_a_panel_through_which_the_worlds_can_be_told_apart_is_no_void():
+    bounce = scenario("bounce-0001")
+    with pytest.raises(Rejected, match=r"behind this panel the two worlds differ in \d+ pixels, by \d+ levels at most"):
+        variations._void_with(bounce, variations.Look(alpha=0.5))
+    with pytest.raises(Rejected, match=r"through a panel of alpha 1 the two worlds differ .* in 0 pixels"):
+        variations._sheer(1.0)(bounce)
+
+
+@pytest.mark.slow
+def test_frames_that_are_shown_later_show_the_outcome():
+    take = variations.VARIATIONS["frames_later"].film(scenario("plinko-0001"))
+    assert take.frames == [] and min(take.evidence["late_frames"]) >= 45
+    assert np.isfinite(take.evidence["least_visible_px"])
