@@ -69,9 +69,7 @@ class Recipe(BaseModel):
         made before it keeps its digest."""
         unused = {"abstain_shares", "jitter", "decoys"} - self.model_fields_set
         made = self.model_dump(mode="json", include={*only} or None, exclude=unused)
-        if "media" in made and self.media.fit == "stretch":
-            del made["media"]["fit"]
-        return made
+        return made | ({"media": self.media.content()} if "media" in made else {})
 
     @field_validator("scenes")
     @classmethod

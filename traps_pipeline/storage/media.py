@@ -61,6 +61,12 @@ class MediaSpec(BaseModel):
     fit: Literal["stretch", "crop"] = "stretch"
     later: int = Field(default=0, ge=0)
 
+    def content(self) -> dict[str, Any]:
+        """The fields for a digest. One that came later counts only where it is used, so that what was made before it
+        keeps its digest."""
+        unused = {name for name in ("fit", "later") if getattr(self, name) == type(self).model_fields[name].default}
+        return self.model_dump(mode="json", exclude=unused)
+
     @model_validator(mode="after")
     def _one_frame_policy(self) -> MediaSpec:
         if (self.fps is None) == (self.uniform is None):
@@ -200,10 +206,7 @@ def read_note(note: Path) -> Media:
 
 def profile_digest(spec: MediaSpec) -> str:
     """Digest of all that decides the bytes of a profile, the clip aside."""
-    # A spec without `fit` or `later` has the digest that it had before there were these, so that nothing is prepared
-    # anew.
-    plain = ({"fit"} if spec.fit == "stretch" else set()) | ({"later"} if not spec.later else set())
-    made: dict[str, Any] = {"revision": _REVISION, "spec": spec.model_dump(mode="json", exclude=plain)}
+    made: dict[str, Any] = {"revision": _REVISION, "spec": spec.content()}
     if spec.profile == "video":
         made["encoder"] = ENCODER
     if spec.profile == "images":
