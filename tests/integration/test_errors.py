@@ -122,9 +122,8 @@ def test_a_workspace_keeps_its_benchmark(study: Checkout, tmp_path: Path) -> Non
 
 
 def test_unknown_names_are_answered_with_the_known_ones(study: Checkout, tmp_path: Path) -> None:
-    assert_refused(
-        study.traps("plan", "nonesuch"), "no experiment 'nonesuch'", "known: arms, benchmark, demo, mechanism, paper"
-    )
+    known = ", ".join(sorted(path.stem for path in (study.root / "assets" / "experiments").glob("*.yaml")))
+    assert_refused(study.traps("plan", "nonesuch"), "no experiment 'nonesuch'", f"known: arms, {known[6:]}, or give")
     experiment = tmp_path / "typo.yaml"
     experiment.write_text("name: typo\nmodels: [orakel]\n")
     assert_refused(study.traps("plan", experiment), "unknown model 'orakel'", "oracle")
