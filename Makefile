@@ -10,7 +10,7 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test test-cluster ui bench explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
+.PHONY: demo demo-mechanism check fast-tests test all-tests test-cluster ui bench explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
 
 demo: setup-core ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -29,7 +29,10 @@ fast-tests: setup
 	$(PYTEST) -n 2 -m "not slow"
 
 # One more worker than the two cores that are needed: tests of servers and of Dagster's daemon wait for much of their time.
-test: test-packages setup lint ## lint, types and all tests, the slow ones too
+test: test-packages setup ## lint, types and all tests, the slow ones too
+	$(MAKE) --no-print-directory -j2 --output-sync=line lint all-tests
+
+all-tests: setup
 	$(PYTEST) -n 3
 
 # Ray is 80 MB and in no other test; not part of `make test` until something but the gate needs it.

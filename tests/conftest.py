@@ -124,6 +124,15 @@ def copy_workspace(source: Path, target: Path) -> None:
 
 # A test with one of these fixtures needs a study, a server, a browser or scenarios drawn for it: it is slow.
 SERVICES = {"demo", "small", "shared_provider", "page", "stored", "whole"}
+LONGEST = (
+    "test_ui",
+    "test_paper_run",
+    "test_stages_run",
+    "test_readme",
+    "test_faults",
+    "test_one_command",
+    "test_batches",
+)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -135,7 +144,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark what needs a service as slow, and let the last worker begin with it: the studies that others wait for are
-    made while these have all the rest to do. What waits most, for Dagster's daemon, comes first of all."""
+    made while these have all the rest to do. What takes longest comes first, lest a worker ends alone with it."""
     rest, services = list[pytest.Item](), list[pytest.Item]()
     for item in items:
         if SERVICES & set(getattr(item, "fixturenames", ())):
@@ -143,7 +152,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             services.append(item)
         else:
             rest.append(item)
-    services.sort(key=lambda item: "test_ui" not in item.nodeid)
+    services.sort(key=lambda item: next((i for i, name in enumerate(LONGEST) if name in item.nodeid), len(LONGEST)))
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     before = len(items) * (workers - 1) // workers  # that many are dealt to the other workers at first
     items[:] = [*rest[:before], *services, *rest[before:]]

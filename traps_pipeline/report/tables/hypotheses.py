@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import MODEL, REGIME, ordered
 from traps_pipeline.report.writing import NONE, NOT_RUN, Column, PrintedTable, percent
-from traps_pipeline.scoring.hypotheses import HYPOTHESES, SHOWN, Hypothesis
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from traps_pipeline.scoring.hypotheses import Hypothesis
 
 WHY = "no variation was run (traps run hypotheses)"
 _TITLES = {
@@ -26,6 +27,8 @@ _HEADINGS = {"acc": "Acc %", "false_abs": "FalseAbs %", "abs_rec": "AbsRec %", "
 
 def hypotheses(results: Results) -> list[PrintedTable]:
     """How answers and abstentions change when one thing of the pairs is changed step by step, beside what rules get."""
+    from traps_pipeline.scoring.hypotheses import HYPOTHESES
+
     return [_of(results.hypotheses, hypothesis) for hypothesis in HYPOTHESES]
 
 
@@ -33,7 +36,7 @@ def _of(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
     own = rows.loc[rows["hypothesis"] == hypothesis.name]
     place = {dose.name: k for k, dose in enumerate(hypothesis.doses)}
     own = own.assign(place=own["dose"].map(place))
-    shown = {f"{name}_shown": [_figure(row, name) for row in own.to_dict("records")] for name in (*SHOWN, "change")}
+    shown = {f"{name}_shown": [_figure(row, name) for row in own.to_dict("records")] for name in (*_HEADINGS, "change")}
     rules = {f"{name}_shown": [_rule(row, name) for row in own.to_dict("records")] for name in ("value", "change")}
     own = own.assign(**shown, **{f"rule_{name}": values for name, values in rules.items()})
     what = "J" if hypothesis.figure == "j" else "abstentions"
