@@ -30,7 +30,7 @@ fast-tests: setup
 
 # One more worker than the two cores that are needed: tests of servers and of Dagster's daemon wait for much of their time.
 test: test-packages setup ## lint, types and all tests, the slow ones too
-	$(MAKE) --no-print-directory -j2 --output-sync=line lint all-tests
+	$(MAKE) --no-print-directory -j2 lint all-tests
 
 all-tests: setup
 	$(PYTEST) -n 3
