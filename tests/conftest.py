@@ -124,15 +124,7 @@ def copy_workspace(source: Path, target: Path) -> None:
 
 # A test with one of these fixtures needs a study, a server, a browser or scenarios drawn for it: it is slow.
 SERVICES = {"demo", "small", "shared_provider", "page", "stored", "whole"}
-LONGEST = (
-    "test_ui",
-    "test_paper_run",
-    "test_stages_run",
-    "test_readme",
-    "test_faults",
-    "test_one_command",
-    "test_batches",
-)
+LONGEST = ("test_readme", "test_paper_run", "test_stages_run", "test_faults", "test_one_command", "test_batches")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -142,20 +134,23 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark what needs a service as slow, and let the last worker begin with it: the studies that others wait for are
-    made while these have all the rest to do. What takes longest comes first, lest a worker ends alone with it."""
-    rest, services = list[pytest.Item](), list[pytest.Item]()
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what needs a service as slow, and let the last two workers begin with it: the one with what waits for
+    Dagster's daemon, the other with what takes longest besides. (At first each worker is dealt an equal part of the
+    items, in their order.) So the studies that all wait for are made early, and none ends alone with something long."""
+    groups: tuple[list[pytest.Item], ...] = ([], [], [])
     for item in items:
         if SERVICES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
-            services.append(item)
+            groups[1 if any(name in item.nodeid for name in LONGEST) else 2].append(item)
         else:
-            rest.append(item)
-    services.sort(key=lambda item: next((i for i, name in enumerate(LONGEST) if name in item.nodeid), len(LONGEST)))
+            groups[0].append(item)
+    rest, longest, services = groups
+    services.sort(key=lambda item: "test_ui" not in item.nodeid)
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    before = len(items) * (workers - 1) // workers  # that many are dealt to the other workers at first
-    items[:] = [*rest[:before], *services, *rest[before:]]
+    first, second = (max(0, len(items) * k // workers) for k in (workers - 2, workers - 1))
+    between = max(0, second - first - len(longest))
+    items[:] = [*rest[:first], *longest, *rest[first : first + between], *services, *rest[first + between :]]
 
 
 def pytest_sessionstart() -> None:
