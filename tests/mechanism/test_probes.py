@@ -296,6 +296,20 @@ def test_catch_rates_are_shares_of_a_sub_scenarios_voids(rows: pd.DataFrame) -> 
     assert np.allclose(wide["all"], (wide["sub_scenario:sub0"] + wide["sub_scenario:sub1"]) / 2)
 
 
+def test_a_sub_scenario_whose_voids_look_like_controls_is_not_caught_and_the_other_one_is() -> None:
+    items, states = study(pairs=6)
+    for dataset in (*DATASETS, ANSWERABLE):
+        of = items[items["dataset"] == dataset]
+        disguised = (dataset == "chaotic") & (of["sub_scenario"] == "sub1").to_numpy(bool)
+        shown = (of["side"] == "void").to_numpy(bool) & ~disguised
+        states[dataset, 1] = np.where(shown[:, None], [[0.0, 1.0]], [[1.0, 0.0]]).astype(np.float32)
+    run = ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, ProbeSettings(folds=2, resamples=100), 7)
+    rows = pd.DataFrame(run.layer_rows(1)).set_index(["analysis", "source", "target", "scope"])["value"].sort_index()
+    caught = rows["centroid_void", "occlusion", "chaotic"]
+    assert caught.to_dict() == {"all": 0.5, "sub_scenario:sub0": 1.0, "sub_scenario:sub1": 0.0}
+    assert set(rows["centroid_control", "occlusion", "chaotic"]) == {0.0}
+
+
 def test_a_layer_out_of_range_and_missing_states_are_told() -> None:
     items, states = study(pairs=4)
     settings = ProbeSettings(resamples=100)

@@ -211,6 +211,31 @@ def test_mcnemar_counts_discordant_items_and_equals_statsmodels(rows):
     assert only(table, decision="correctness")["p"] == 1.0
 
 
+def test_mcnemar_of_control_abstentions_counts_the_controls_that_one_regime_abstains_on(rows):
+    standard = rows([(False, True, False)] + [(True, False, False)] * 5)  # one control abstained on
+    guided = rows([(True, False, False)] + [(False, True, False)] * 5, regime="guided")  # the five others
+    table = regime_tests(pd.concat([standard, guided], ignore_index=True))
+    row = only(table, decision="control_abstention")
+    assert (row["dataset"], row["n"], row["only_left"], row["only_right"]) == ("occlusion", 6, 1, 5)
+    assert row["p"] == pytest.approx(2 * (1 + 6) / 2**6)
+    assert set(table["decision"]) == {"void_abstention", "control_abstention", "correctness"}
+
+
+def test_holm_counts_the_pairs_of_regimes_of_all_models_together_and_models_within_a_regime(rows):
+    sides = [(model, regime) for model in ("m", "n") for regime in ("standard", "guided", "json")]
+    parts = [
+        rows(pairs_with(20, 12 + k, 1, 9 + k), model=model, regime=regime) for k, (model, regime) in enumerate(sides)
+    ]
+    table = scored(*parts)[2].query("dataset == 'occlusion' and figure == 'pecs'")
+    for _, family in [
+        ("", table.query("kind == 'regimes'")),  # three pairs of each of two models: six tests
+        *table.query("kind == 'models'").groupby("left_regime"),
+    ]:
+        assert len(family) in (1, 6)
+        assert family["p_holm"].to_numpy(float) == pytest.approx(holm(family["p"].to_numpy(float)))
+    assert (table.query("kind == 'regimes'")["p"] < 1 / 6).any()  # so that six tests and three differ
+
+
 def test_mcnemar_leaves_out_items_undecided_under_either_regime(rows):
     standard, guided = [(True, False, None), (True, False, True)], [(True, False, True), (True, False, False)]
     table = regime_tests(pd.concat([rows(standard), rows(guided, regime="guided")], ignore_index=True))

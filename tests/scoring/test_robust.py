@@ -101,6 +101,7 @@ def test_twin_accuracy_is_the_share_of_scenarios_with_both_worlds_right(rows: Ro
     twins = [(True, False, None), (False, False, None), (True, False, None), (None, None, None)]
     row = only(robust(study(rows, own, {"twin_control": twins}), 20))
     assert (row.twin_accuracy, row.n_twins, row.n_missing) == (pytest.approx(1 / 3), 3, 1)
+    assert row.twin_accuracy_std == 0  # of one run
     other = only(robust(study(rows, own, {"decoy": own}), 20))
     assert (other.twin_accuracy, other.n_twins) == (None, 0)
 
