@@ -54,6 +54,8 @@ def test_a_dose_is_compared_with_its_reference_on_the_scenarios_that_both_have(r
     assert (grey["rule_changing"], grey["rule_change"]) == ("panel-rule", -1.0)
     assert (navy["rule"], navy["rule_value"], grey["rule_value"]) == ("panel-rule", 1.0, 0.0)
     assert wrong_rows(made.reset_index()) == 0
+    for column, value in (("change", -0.5), ("value", 0.25), ("abs_rec", 1.5)):
+        assert wrong_rows(made.reset_index().assign(**{column: value})) > 0, column
 
 
 def test_what_shows_the_outcome_through_its_panel_counts_as_no_void(rows: Rows):

@@ -171,6 +171,7 @@ def _row(
         "epoch": joined_epochs(items["epoch"]),
         "benchmark_version": " + ".join(sorted(set(items["benchmark_version"]))),
         "refused": None,
+        "n_compared": None,
         "at_reference": None,
         **dict.fromkeys(_ends("change")),
     }
@@ -186,7 +187,8 @@ def _row(
     row["refused"] = _refusal(mine, shared)
     if row["refused"] is None:
         before, after = (_compared(hypothesis, _figures(some, drawn)) for some in (shared, mine))
-        row |= {"at_reference": before[0], **_told("change", after - before)}
+        row |= {"n_compared": mine["scenario_id"].nunique(), "at_reference": before[0]}
+        row |= _told("change", after - before)
     return row
 
 
@@ -247,11 +249,17 @@ def _best(rows: Iterable[Mapping[str, Any]], field: str, named: str) -> dict[str
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """How many rows break their definition: a share outside [0, 1], an interval out of order, a change that is not the
-    value less the reference's where both are of the same scenarios. Null is not wrong."""
+    """How many rows break their definition: a share outside [0, 1], an interval out of order, a J that is not AbsRec
+    less FalseAbs, a change that is not the value less the reference's although all scenarios are compared. Null is not
+    wrong."""
     wrong = np.zeros(len(table), bool)
     for name in (*SHOWN, "change"):
         figure, low, high = (table[column].to_numpy(float) for column in _ends(name))
         least = -1 if name in ("j", "change") else 0
         wrong |= (figure < least) | (figure > 1) | (low > high) | (low < least) | (high > 1)
+    columns = ("j", "abs_rec", "false_abs", "change", "value", "at_reference")
+    j, abs_rec, false_abs, change, value, before = (table[name].to_numpy(float) for name in columns)
+    whole = (table["n_compared"] == table["n_scenarios"]).fillna(False).to_numpy(bool)
+    wrong |= np.abs(j - (abs_rec - false_abs)) > 1e-12
+    wrong |= whole & (np.abs(change - (value - before)) > 1e-12)
     return int(wrong.sum())

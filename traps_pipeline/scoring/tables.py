@@ -256,6 +256,7 @@ class HypothesisRow:
     j_ci_high: Bootstrap
     compared: Annotated[str, "the figure that doses are compared by: j, or abstains, of all items of the dose"]
     value: Annotated[float | None, "that figure"]
+    n_compared: Annotated[int | None, "scenarios that the dose and its reference both have; null where refused"]
     at_reference: Annotated[float | None, "that figure at the reference, on the scenarios that both have"]
     change: Annotated[float | None, "by how much the dose is above it; null where refused"]
     change_ci_low: Bootstrap
