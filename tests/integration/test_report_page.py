@@ -12,7 +12,7 @@ from playwright.sync_api import Page, sync_playwright
 from tests.conftest import Checkout
 from tests.pages import patient
 from tests.report.test_items import CELL, HOSTILE, write_cell
-from traps_pipeline.report.items import item_page
+from traps_pipeline.report.items import item_pages
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -58,7 +58,7 @@ def test_the_report_opens_from_disk_at_both_widths_and_its_links_lead_to_items(d
 
         hostile = Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))
         write_cell(hostile)
-        (tmp_path / "hostile.html").write_text(item_page(hostile, CELL, None))
+        (tmp_path / "hostile.html").write_text("".join(item_pages(hostile, CELL, None)))
         page.goto((tmp_path / "hostile.html").as_uri())
         assert page.locator("td .text").first.inner_text() == HOSTILE
         assert page.locator("script, img").count() == 0

@@ -8,13 +8,16 @@ import shutil
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, Checkout, Finished, forget_answers
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.judging import panel
+from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.partitions import Cell
 from traps_pipeline.scoring.tables import METRICS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -63,6 +66,24 @@ def test_stages_that_share_partitions_are_made_together_from_the_tables_that_are
     finished = materialize(study, ",".join(before["whole"]))
     assert finished.code == 0, finished.err[-3000:]
     assert known(study) == before  # rebuilt from the same inputs: the same content
+
+
+def test_votes_of_a_large_cell_are_collected_in_parts_and_are_the_same_table(
+    study: Checkout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first cell is known to the ledger, the second is asked again; 5 answers a part, and fewer in the last."""
+    workspace, cells = Workspace.open(study.workspace), [Cell.parse(key) for key in RANGE.split("...")]
+    before = [workspace.tables.read(VOTES, cell.partition) for cell in cells]
+    shutil.rmtree(study.workspace / "ledger" / "votes" / cells[1].evaluation.key)
+    monkeypatch.setattr(panel, "PART", 5)
+    made = dict(panel.collect_votes(workspace, cells))
+    for cell, rows in zip(cells, before, strict=True):
+        wanted = len(rows)
+        assert made[cell].shown["wanted"] == wanted > 3 * 5
+        assert (made[cell].tally.asked, made[cell].tally.cached) == ((0, wanted) if cell == cells[0] else (wanted, 0))
+        workspace.tables.write(VOTES, cell.partition, made[cell].content, {})
+        again = workspace.tables.read(VOTES, cell.partition)
+        pd.testing.assert_frame_equal(again.drop(columns="created_at"), rows.drop(columns="created_at"))
 
 
 def test_a_range_of_cells_is_one_run_through_three_stages_and_makes_exactly_its_cells(study: Checkout) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from datetime import datetime
 
+import pandas as pd
 import pytest
 
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.report.items import addresses, index_page, item_page, page_name, write_item_pages
+from traps_pipeline.report import items
+from traps_pipeline.report.items import addresses, index_page, item_pages, page_name, write_item_pages
 from traps_pipeline.report.writing import Behind
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -61,7 +63,7 @@ def workspace(tmp_path):
 
 def test_a_page_shows_question_answer_votes_verdict_and_clip_as_text(workspace):
     write_cell(workspace)
-    page = item_page(workspace, CELL, "../..")
+    page = "".join(item_pages(workspace, CELL, "../.."))
     assert "<script" not in page
     assert "<img" not in page
     assert (
@@ -75,7 +77,7 @@ def test_a_page_shows_question_answer_votes_verdict_and_clip_as_text(workspace):
     assert '<td><span class="none">not judged</span></td>' in page  # the refused void: nobody was asked to judge it
     assert '<a href="../../clips/plinko-0001/void.mp4">clip</a>' in page
     assert "default-src 'none'" in page
-    assert '<a href="../../clips' not in item_page(workspace, CELL, None)
+    assert '<a href="../../clips' not in "".join(item_pages(workspace, CELL, None))
 
 
 def test_a_page_is_made_anew_only_where_its_tables_changed(workspace, tmp_path):
@@ -92,6 +94,32 @@ def test_a_page_is_made_anew_only_where_its_tables_changed(workspace, tmp_path):
     workspace.tables.path(RESPONSES, other.partition).unlink()
     write_item_pages(workspace, tmp_path, None)
     assert sorted(file.name for file in tmp_path.glob("*.html")) == [page_name(CELL), "index.html"]
+
+
+def test_a_large_cell_has_pages_that_lead_to_each_other_with_both_sides_on_each(workspace, tmp_path, monkeypatch):
+    """Five pairs, two a page: the sides' anchors stand on the first page, and no item is lost or shown twice."""
+    monkeypatch.setattr(items, "PER_PAGE", 2)
+    write_cell(workspace)
+    for table, part in ((ITEMS, {"dataset": "chaotic"}), *((t, CELL.partition) for t in (RESPONSES, VOTES, VERDICTS))):
+        rows, copies = workspace.tables.read(table, part), []
+        for n in range(1, 6):
+            copy = rows.assign(item_id=rows["item_id"].str.replace("0001", f"000{n}"))
+            copies.append(copy.assign(scenario_id=f"plinko-000{n}") if "scenario_id" in rows else copy)
+        workspace.tables.write(table, part, pd.concat(copies), {})
+    write_item_pages(workspace, tmp_path, None)
+    names = [page_name(CELL), page_name(CELL, 2), page_name(CELL, 3)]
+    assert sorted(file.name for file in tmp_path.glob("chaotic*.html")) == sorted(names)
+    pages = [(tmp_path / name).read_text() for name in names]
+    for n in range(1, 6):
+        for side in ("control", "void"):
+            shown = [page.count(f'id="plinko-000{n}-{side}"') for page in pages]
+            assert shown == [int(k == (n - 1) // 2) for k in range(3)]
+    assert [f"Page {k} of 3" in page for k, page in enumerate(pages, start=1)] == [True] * 3
+    assert all('id="void"' in page and f'href="{names[2]}"' in page for page in pages[:2])
+    assert "Controls: can be answered (5 to 5 of 5)" in pages[2]
+    write_cell(workspace)  # one pair again: the pages that it does not fill go
+    write_item_pages(workspace, tmp_path, None)
+    assert [file.name for file in tmp_path.glob("chaotic*.html")] == names[:1]
 
 
 def test_cells_of_arms_have_pages_behind_those_of_the_pairs(workspace, tmp_path):

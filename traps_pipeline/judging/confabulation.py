@@ -20,7 +20,7 @@ from traps_pipeline import progress
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import ask_judges, judge_request, parse_judgement, quoted
+from traps_pipeline.judging.panel import about_answer, ask_judges, judge_request, parse_judgement, quoted
 from traps_pipeline.judging.tables import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.models.ask import Call, Settled
 from traps_pipeline.models.judges import JudgeEntry, load_judges
@@ -185,7 +185,7 @@ def render(question: str, kind: str, answer: str, trace: str | None) -> str:
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
     """The call to the judge about one failure; it reveals neither model nor regime nor ground truth."""
     user = render(item["question"], void_kind(cell.dataset), answer, trace)
-    return judge_request(judge, TASK, SCHEMA, cell, item["item_id"], user)
+    return judge_request(judge, SCHEMA, about_answer(TASK, cell, item["item_id"]), user)
 
 
 class Labels(BaseModel):

@@ -10,16 +10,16 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, StrictBool, StrictFloat, StrictInt, StrictStr, ValidationError
 
-from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.answers import is_correct, strip_fence
 from traps_pipeline.judging.tables import VoteRow
-from traps_pipeline.models.answers import answer_request
+from traps_pipeline.models.answers import answer_request, asked_items
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.judges import SCHEMAS, JudgeEntry, Seat, Task, load_panel, panel_id, require_panel
@@ -29,10 +29,13 @@ from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.partitions import Cell
-from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.parquet import Made, joined
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.yamlfile import explain
+
+PART = 20_000  # answers whose votes are collected at a time
+_ANSWERED = ("item_id", "outcome", "text", "request_key")
 
 # --- what a judge is asked --------------------------------------------------------------------------------------------
 
@@ -59,23 +62,38 @@ def render(task: Task, question: str, answer: str, ground_truth: str | None) -> 
     return "\n\n".join([*parts, quoted("response", "RESPONSE", answer)])
 
 
-def judge_request(judge: Seat, task: str, schema: Mapping[str, Any], cell: Cell, item_id: str, user: str) -> Request:
-    """The call to a judge for one task about one answer of a cell; the judge returns the schema's JSON."""
+def about_answer(task: str, cell: Cell, item_id: str) -> dict[str, str | int]:
+    """What a judge's call is about: the same for all judges of a panel, so that one copy is held."""
     e = cell.evaluation
+    return {"task": task, "item_id": item_id, "model": e.model, "regime": e.regime, "run": e.run}
+
+
+def judge_request(judge: Seat, schema: Mapping[str, Any], about: Mapping[str, str | int], user: str) -> Request:
+    """The call to a judge for one task about one answer of a cell; the judge returns the schema's JSON."""
     return Request(
         participant=judge.id,
         endpoint=judge.endpoint,
-        params={**judge.params, **({"response_format": schema} if judge.backend == NETWORK else {})},
-        system=prompt(f"judge_{task}"),
+        params={**judge.params, "response_format": schema} if judge.backend == NETWORK else judge.params,
+        system=prompt(f"judge_{about['task']}"),
         user=user,
-        about={"task": task, "item_id": item_id, "model": e.model, "regime": e.regime, "run": e.run},
+        about=about,
     )
 
 
+def vote_requests(
+    judges: Sequence[Seat], task: Task, cell: Cell, item: Mapping[str, Any], answer: str
+) -> list[Request]:
+    """Each judge's call for its vote on one task about one answer. All are shown the same text."""
+    user, about = (
+        render(task, item["question"], answer, item["ground_truth"]),
+        about_answer(task, cell, item["item_id"]),
+    )
+    return [judge_request(judge, SCHEMAS[task], about, user) for judge in judges]
+
+
 def vote_request(judge: Seat, task: Task, cell: Cell, item: Mapping[str, Any], answer: str) -> Request:
-    """The call for one judge's vote on one task about one answer."""
-    user = render(task, item["question"], answer, item["ground_truth"])
-    return judge_request(judge, task, SCHEMAS[task], cell, item["item_id"], user)
+    """The call for one judge's vote."""
+    return vote_requests([judge], task, cell, item, answer)[0]
 
 
 # --- a judge's vote ---------------------------------------------------------------------------------------------------
@@ -158,6 +176,19 @@ class Ballot(Call):
         return parse_vote(self.task, row, self.item)
 
 
+@dataclass(frozen=True)
+class Part(Cell):
+    """So many answers of a cell from a place on: what the calls for votes on a large cell, and their rows, are held for
+    at a time."""
+
+    start: int
+
+    @property
+    def whole(self) -> Cell:
+        """The cell."""
+        return Cell(self.dataset, self.evaluation)
+
+
 def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple[Cell, Made]]:
     """Ask the study's panel for missing votes; yields the VOTES rows of each cell when it is done."""
     study = workspace.study
@@ -165,8 +196,23 @@ def collect_votes(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tuple
         study.panel, dict.fromkeys(cell.evaluation.model for cell in cells), judged_by_rules=study.judged_by_rules
     )
     panel, row_of = load_panel(study.panel), partial(_vote_row, panel_id(study.panel))
-    calls = partial(wanted_ballots, workspace, panel)
-    yield from ask_judges(workspace, "votes", panel, cells, calls, lambda settled: settled.made(row_of))
+    parts = {cell: _parts(workspace, cell) for cell in cells}
+    done: dict[Cell, list[Made]] = {}
+
+    def calls(part: Part) -> list[Ballot]:
+        return wanted_ballots(workspace, panel, part.whole, part.start, PART)
+
+    every = [part for of in parts.values() for part in of]
+    for part, made in ask_judges(workspace, "votes", panel, every, calls, lambda settled: settled.made(row_of)):
+        done.setdefault(part.whole, []).append(made)
+        if len(done[part.whole]) == len(parts[part.whole]):
+            yield part.whole, joined(done.pop(part.whole))
+
+
+def _parts(workspace: Workspace, cell: Cell) -> list[Part]:
+    state = workspace.tables.state(RESPONSES, cell.partition)
+    starts = range(0, state.rows if state else 0, PART) or range(1)  # without answers, a part that says so
+    return [Part(cell.dataset, cell.evaluation, start) for start in starts]
 
 
 def ask_judges(
@@ -190,27 +236,33 @@ def _make_judge(entry: Entry) -> Backend:
     return make_backend(entry)
 
 
-def wanted_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], cell: Cell) -> list[Ballot]:
-    """The calls for every vote on the answers of a cell."""
+def wanted_ballots(
+    workspace: Workspace, panel: Sequence[JudgeEntry], cell: Cell, start: int = 0, count: int | None = None
+) -> list[Ballot]:
+    """The calls for every vote on the answers of a cell, or on `count` of them from `start` on."""
     entry, ballots = get_model(cell.evaluation.model), list[Ballot]()
-    for response, item in judged_answers(workspace, RESPONSES, cell):
+    for response, item in judged_answers(workspace, RESPONSES, cell, start, count):
         if response["request_key"] != answer_request(workspace, entry, item, cell.evaluation).key:
             raise TrapsError(
                 f"responses {cell.key}: the answer to {item['item_id']} is of an earlier question, clip or setting; "
                 "materialize responses for this cell first"
             )
         for task in tasks_for(item["side"]):
-            text = response["text"]
-            ballots += [Ballot(vote_request(judge, task, cell, item, text), item, task) for judge in panel]
+            requests = vote_requests(panel, task, cell, item, response["text"])
+            ballots += [Ballot(request, item, task) for request in requests]
     return ballots
 
 
-def judged_answers(workspace: Workspace, table: Table, cell: Cell) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """The answers of a cell that have a text, each with its item. table: the table of the answers. Raises TrapsError
-    for an answer whose item is no longer in the benchmark."""
-    items = {item["item_id"]: item for item in _rows(workspace, ITEMS, {"dataset": cell.dataset})}
-    judged = JUDGED if table is RESPONSES else WITH_TEXT  # a steered answer may be cut off
-    for answer in _rows(workspace, table, cell.partition):
+def judged_answers(
+    workspace: Workspace, table: Table, cell: Cell, start: int = 0, count: int | None = None
+) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """The answers of a cell that have a text, each with its item; of all answers or of `count` from `start` on. table:
+    the table of the answers. Raises TrapsError for an answer whose item is no longer in the benchmark."""
+    items = {item["item_id"]: item for item in asked_items(workspace, cell.dataset)}
+    # A steered answer may be cut off.
+    columns, judged = (_ANSWERED, JUDGED) if table is RESPONSES else (None, WITH_TEXT)
+    answers = workspace.tables.records(table, cell.partition, columns)
+    for answer in islice(answers, start, None if count is None else start + count):
         if answer["outcome"] not in judged:
             continue
         if answer["item_id"] not in items:
@@ -219,10 +271,6 @@ def judged_answers(workspace: Workspace, table: Table, cell: Cell) -> Iterator[t
                 f"materialize {table.name} for {cell.key}"
             )
         yield answer, items[answer["item_id"]]
-
-
-def _rows(workspace: Workspace, table: Table, partition: Mapping[str, Any]) -> list[dict[str, Any]]:
-    return workspace.tables.read(table, partition).to_dict("records")
 
 
 def vote_columns(ballot: Ballot, vote: Vote, row: Row) -> dict[str, Any]:

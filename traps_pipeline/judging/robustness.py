@@ -17,7 +17,7 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_request
+from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_requests
 from traps_pipeline.judging.ratings import INVALID, NO, PANEL, YES, majority
 from traps_pipeline.judging.tables import JUDGE_ROBUSTNESS
 from traps_pipeline.models.ask import Settled
@@ -112,10 +112,10 @@ def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], at
     Raises TrapsError where the votes stage would raise it, and when calls failed.
     """
     ballots = [
-        Ballot(vote_request(judge, task, CELL, attacks.item(text), answer), attacks.item(text), task)
+        Ballot(request, attacks.item(text), task)
         for text, answer in attacks.texts().items()
         for task in TASKS
-        for judge in panel
+        for request in vote_requests(panel, task, CELL, attacks.item(text), answer)
     ]
 
     def finish(settled: Settled[Cell, Ballot]) -> Votes:

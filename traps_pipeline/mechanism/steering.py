@@ -22,7 +22,7 @@ import numpy as np
 
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_request
+from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
 from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.paths import sources_of
@@ -354,10 +354,11 @@ def wanted_steering_ballots(workspace: Workspace, panel: Sequence[JudgeEntry], c
     ballots = []
     for answer, item in judged_answers(workspace, STEERING, cell):
         shared = item | {"item_id": shared_item(answer)}
-        for task, judge in product(tasks_for(answer["side"]), panel):
-            request = vote_request(judge, task, cell, shared, answer["text"])
-            about = {**request.about, "steered": answer["request_key"]}
-            ballots.append(Ballot(replace(request, about=about), item | answer, task))
+        both = item | answer
+        for task in tasks_for(answer["side"]):
+            for request in vote_requests(panel, task, cell, shared, answer["text"]):
+                about = {**request.about, "steered": answer["request_key"]}
+                ballots.append(Ballot(replace(request, about=about), both, task))
     return ballots
 
 

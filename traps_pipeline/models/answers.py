@@ -26,9 +26,9 @@ from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
-# The columns of an item that a request or a response is made from.
+# The columns of an item that a request, a response or a vote is made from.
 _ASKED = ("item_id", "pair_id", "side", "labels", "question", "ground_truth", "commonest_answer", "clip")
-_ASKED += ("media_digest", "benchmark_version")
+_ASKED += ("media_digest", "benchmark_version", "aliases", "answer_type")
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
         if own is None:
             continue
         spec = framed(own, dataset)
-        for item in _items(workspace, dataset):
+        for item in asked_items(workspace, dataset):
             jobs[item["media_digest"], repr(spec)] = (workspace.resolve(item["clip"]), item["media_digest"], spec)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         for done, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
@@ -83,15 +83,15 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
 def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
     """Every call that a cell wants, in the order of its items. Raises TrapsError when these are not made."""
     entry = get_model(cell.evaluation.model)
-    items = _items(workspace, cell.dataset)
+    items = asked_items(workspace, cell.dataset)
     if not items:
         raise TrapsError(f"items {cell.dataset}: not made yet; materialize scene_specs, videos and items first")
     return [Question(answer_request(workspace, entry, item, cell.evaluation), item) for item in items]
 
 
-def _items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    """What is asked and told of the items of a dataset, in order. Of equal texts one copy is held: a cell of 100,000
-    items may have a hundred questions."""
+def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
+    """What is asked, told and judged of the items of a dataset, in order. Of equal texts one copy is held: a cell of
+    100,000 items may have a hundred questions."""
     copies: dict[str, str] = {}
     rows = workspace.tables.read_all(ITEMS, _ASKED, dataset=dataset).to_dict("records")
     return [

@@ -14,7 +14,7 @@ from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
@@ -137,7 +137,7 @@ class _Asking:
         self.writer.append(row, beside)
         await self.writer.kept()
         self.work.budget.booked(name, dollars)
-        self.rows[request.key] = _held(row)
+        self.rows[request.key] = _Held(row)
         progress.current().called(self.work.stage, name, not settles(row), row["latency_s"], dollars)
         participant.breaker.watch(attempted[0])
         return True
@@ -175,9 +175,26 @@ class _Asking:
             raise self.problems[0]
 
 
-def _held(row: Row) -> Row:
-    """A row without its components: they are most of it, and the request holds them too."""
-    return {name: value for name, value in row.items() if name != "components"}
+class _Held(Mapping[str, Any]):
+    """A row of the ledger without its components, which are most of it and which the request holds too: half as large
+    as a dictionary, since all rows with the same columns share these."""
+
+    __slots__ = ("_places", "_values")
+    _shared: ClassVar[dict[tuple[str, ...], dict[str, int]]] = {}
+
+    def __init__(self, row: Row) -> None:
+        names = tuple(name for name in row if name != "components")
+        self._places = self._shared.setdefault(names, {name: place for place, name in enumerate(names)})
+        self._values = tuple(row[name] for name in names)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._values[self._places[name]]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._values)
 
 
 @dataclass(frozen=True)
@@ -218,7 +235,7 @@ async def _settle_cell(
     for place in sorted({*known.notes} - its.told):
         report.note(f"{place}: {known.notes[place]}")
     its.told.update(known.notes)
-    rows = {key: _held(row) for key, row in known.settled.items()}
+    rows = {key: _Held(row) for key, row in known.settled.items()}
     missing = [request for key, request in wanted.items() if key not in rows]
     new = Counter(request.participant for request in missing)
     for name, count in Counter(request.participant for request in wanted.values()).items():

@@ -32,7 +32,7 @@ from traps_pipeline.models.traffic import Breaker, Gate, Meter
 from traps_pipeline.storage.ledger import ASIDES
 from traps_pipeline.storage.study import Study
 
-Row = dict[str, Any]
+Row = Mapping[str, Any]
 MAX_BACKOFF_S, MAX_RETRY_AFTER_S = 60.0, 900.0
 MALFORMED_TRIES = 2  # each is paid for, and a provider whose answers are out of order seldom mends itself
 FILES = 256  # open besides connections: segments, tables, Dagster's history, the interpreter's own

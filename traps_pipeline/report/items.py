@@ -1,4 +1,5 @@
-"""The items behind every number: one page per cell, with each answer, vote and verdict, and an index of the cells.
+"""The items behind every number: a page per cell (several where it is large), with each answer, vote and verdict, and
+an index of the cells.
 
 Pages are made one cell at a time, and only if the cell's tables changed, so that a study with hundreds of cells of a
 thousand items each stays feasible. Answers are untrusted text: Jinja2 escapes everything.
@@ -6,8 +7,10 @@ thousand items each stays feasible. Answers are untrusted text: Jinja2 escapes e
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +29,17 @@ from traps_pipeline.storage.workspace import Workspace
 
 FOLDER = "items"
 MADE = "made.json"  # digest of what each page was made from
+PER_PAGE = 500  # pairs
 _PER_CELL = (RESPONSES, VOTES, VERDICTS)
+_SHOWN = {
+    ITEMS: ["item_id", "scenario_id", "sub_scenario", "side", "clip", "question", "ground_truth"],
+    RESPONSES: ["item_id", "outcome", "text", "reasoning", "error"],
+    VERDICTS: ["item_id", "abstained", "correct"],
+    VOTES: [
+        *("item_id", "task", "judge", "valid", "invalid_reason", "abstained", "confidence", "rationale"),
+        *("correct", "extracted_value"),
+    ],
+}
 _DATASETS, _TITLES = (*DATASETS, *BESIDE), TITLES | ARM_TITLES  # the items of arms have pages, too
 
 
@@ -45,9 +58,9 @@ def _place(cell: Cell) -> tuple[Any, ...]:
     return e.model, REGIMES.index(e.regime), _DATASETS.index(cell.dataset), e.run
 
 
-def page_name(cell: Cell) -> str:
-    """The file name of a cell's page."""
-    return f"{cell.dataset}__{cell.evaluation.key}.html"
+def page_name(cell: Cell, number: int = 1) -> str:
+    """The file name of a cell's page, or of a further one."""
+    return f"{cell.dataset}__{cell.evaluation.key}{f'__page{number}' if number > 1 else ''}.html"
 
 
 def addresses(cells: Sequence[Cell]) -> Callable[[Behind], str]:
@@ -90,9 +103,11 @@ def write_item_pages(workspace: Workspace, folder: Path, clips: str | None) -> l
     for cell in cells:
         name = page_name(cell)
         if made.get(name) != wanted[name] or not (folder / name).is_file():
-            write_bytes(folder / name, item_page(workspace, cell, clips).encode())
+            _remove(folder, name)
+            for number, page in enumerate(item_pages(workspace, cell, clips), start=1):
+                write_bytes(folder / page_name(cell, number), page.encode())
     for stray in set(made) - set(wanted):
-        (folder / stray).unlink(missing_ok=True)
+        _remove(folder, stray)
     write_bytes(folder / "index.html", index_page(cells).encode())
     write_bytes(made_file, json.dumps(wanted, indent=0).encode())
     return cells
@@ -106,35 +121,60 @@ def _made_from(workspace: Workspace, cell: Cell, clips: str | None) -> str:
     return hashlib.sha256("\x00".join(parts).encode()).hexdigest()[:16]
 
 
-def item_page(workspace: Workspace, cell: Cell, clips: str | None) -> str:
-    """HTML of one cell: controls, then voids; each with question, answer, votes, verdict and clip."""
-    rows = list(_item_rows(workspace, cell))
-    sides = {side: [row for row in rows if row["side"] == side] for side in ("control", "void")}
-    return (
-        environment()
-        .get_template("items.html.j2")
-        .render(cell=cell, title=_TITLES[cell.dataset], sides=sides, clips=clips, judged=JUDGED)
-    )
+def _remove(folder: Path, first: str) -> None:
+    """Remove a cell's first page and those behind it."""
+    for page in (folder / first, *folder.glob(f"{glob.escape(Path(first).stem)}__page*.html")):
+        page.unlink(missing_ok=True)
 
 
-def _item_rows(workspace: Workspace, cell: Cell) -> Iterator[Mapping[str, Any]]:
-    """One row per answered item of the cell: its ITEMS columns, `answer`, `verdict` and `votes`."""
+def item_pages(workspace: Workspace, cell: Cell, clips: str | None) -> Iterator[str]:
+    """HTML of one cell, `PER_PAGE` pairs a page: controls, then voids; each with question, answer, votes, verdict and
+    clip. Rows become Python values a page at a time."""
+    items, answers, verdicts, votes = _frames(workspace, cell)
+    items = items[items["item_id"].isin(answers.index)].sort_values(["sub_scenario", "scenario_id"])
+    sides = {side: items[items["side"] == side] for side in ("control", "void")}
+    count = max(1, *(math.ceil(len(rows) / PER_PAGE) for rows in sides.values()))
+    template = environment().get_template("items.html.j2")
+    for number in range(1, count + 1):
+        place = (number - 1) * PER_PAGE
+        shown = {side: rows.iloc[place : place + PER_PAGE] for side, rows in sides.items()}
+        yield template.render(
+            cell=cell,
+            title=_TITLES[cell.dataset],
+            sides={side: list(_item_rows(rows, answers, verdicts, votes)) for side, rows in shown.items()},
+            totals={side: len(rows) for side, rows in sides.items()},
+            first=place + 1,
+            pages=[page_name(cell, n) for n in range(1, count + 1)],
+            number=number,
+            clips=clips,
+            judged=JUDGED,
+        )
+
+
+def _frames(workspace: Workspace, cell: Cell) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """What is shown of a cell's items, and of their answers, verdicts and votes, each by item."""
     tables = workspace.tables
-    items = tables.read(ITEMS, {"dataset": cell.dataset}).sort_values(["sub_scenario", "scenario_id"])
-    answers = _by_item(tables.read(RESPONSES, cell.partition))
-    verdicts = _by_item(tables.read_all(VERDICTS, None, **cell.partition))
-    votes: dict[str, list[Mapping[str, Any]]] = {}
-    for vote in _records(tables.read_all(VOTES, None, **cell.partition)):
-        votes.setdefault(vote["item_id"], []).append(vote)
+    items = tables.read(ITEMS, {"dataset": cell.dataset}, _SHOWN[ITEMS])
+    answers, verdicts, votes = (
+        tables.read_all(table, _SHOWN[table], **cell.partition).set_index("item_id", drop=False)
+        for table in (RESPONSES, VERDICTS, VOTES)
+    )
+    return items, answers, verdicts, votes
+
+
+def _item_rows(
+    items: pd.DataFrame, answers: pd.DataFrame, verdicts: pd.DataFrame, votes: pd.DataFrame
+) -> Iterator[Mapping[str, Any]]:
+    """One row per item: its columns, `answer`, `verdict` and `votes`."""
+    ids = items["item_id"]
+    answer = _by_item(answers[answers.index.isin(ids)])
+    verdict = _by_item(verdicts[verdicts.index.isin(ids)])
+    cast: dict[str, list[Mapping[str, Any]]] = {}
+    for vote in _records(votes[votes.index.isin(ids)]):
+        cast.setdefault(vote["item_id"], []).append(vote)
     for item in _records(items):
-        answer = answers.get(item["item_id"])
-        if answer is not None:
-            yield {
-                **item,
-                "answer": answer,
-                "verdict": verdicts.get(item["item_id"]),
-                "votes": votes.get(item["item_id"], []),
-            }
+        name = item["item_id"]
+        yield {**item, "answer": answer[name], "verdict": verdict.get(name), "votes": cast.get(name, [])}
 
 
 def _by_item(rows: pd.DataFrame) -> dict[str, Mapping[str, Any]]:

@@ -6,7 +6,7 @@ import io
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from itertools import product
@@ -65,6 +65,16 @@ class Made:
         return cast("pd.DataFrame", self.content)
 
 
+def joined(parts: Sequence[Made]) -> Made:
+    """What parts of a partition were made of, as one: rows, tallies and numbers shown are added up."""
+    first, *others = parts
+    for other in others:
+        first.tally.add(other.tally)
+    rows = [row for part in parts for row in part.content]
+    shown = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
+    return Made(rows, first.tally, shown, first.beside)
+
+
 class TableStore:
     """The tables under one folder. A partition is one file, replaced atomically."""
 
@@ -105,6 +115,7 @@ class TableStore:
 
     def _checked(self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame) -> pa.Table:
         import pyarrow as pa
+        import pyarrow.compute as pc
 
         schema = table.arrow_schema()
         listed = rows if isinstance(rows, Sequence) else None
@@ -123,17 +134,15 @@ class TableStore:
             if not column.nullable and data[column.name].null_count:
                 raise TrapsError(f"table {table.name} {dict(partition)}: column {column.name} has missing values")
         for column, value in partition.items():
-            strays = set(data[column].to_pylist()) - {value}
+            strays = {*data[column].unique().to_pylist()} - {value}
             if strays:
                 raise TrapsError(
                     f"table {table.name} {dict(partition)}: column {column} also holds {sorted(map(str, strays))}"
                 )
-        keys = list(zip(*(data[name].to_pylist() for name in table.key), strict=True))
-        if len(set(keys)) != len(keys):
-            repeated = next(k for k in keys if keys.count(k) > 1)
-            raise TrapsError(
-                f"table {table.name} {dict(partition)}: key {dict(zip(table.key, repeated, strict=True))} repeats"
-            )
+        counts = data.group_by([*table.key]).aggregate([([], "count_all")])
+        if len(counts) != len(data):
+            (repeated,) = counts.filter(pc.field("count_all") > 1).select([*table.key]).slice(0, 1).to_pylist()
+            raise TrapsError(f"table {table.name} {dict(partition)}: key {repeated} repeats")
         return data.sort_by([(name, "ascending") for name in table.key]) if len(data) else data
 
     def state(self, table: Table, partition: Mapping[str, Any]) -> State | None:
@@ -186,6 +195,13 @@ class TableStore:
     def read(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
         """One partition. Raises TrapsError naming the file and the stage to materialize when it is not there."""
         return self._load(table, self.path(table, partition), columns).to_pandas()
+
+    def records(
+        self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None
+    ) -> Iterator[dict[str, Any]]:
+        """The rows of one partition as mappings, of which few are held at once. Raises as `read` does."""
+        for batch in self._load(table, self.path(table, partition), columns).to_batches(_ROWS_AT_ONCE):
+            yield from batch.to_pylist()
 
     def read_all(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pd.DataFrame:
         """All partitions whose partition columns equal the given values (of several given, any of them); an empty frame
