@@ -81,7 +81,7 @@ def test_votes_of_a_large_cell_are_collected_in_parts_and_are_the_same_table(
         wanted = len(rows)
         assert made[cell].shown["wanted"] == wanted > 3 * 5
         assert (made[cell].tally.asked, made[cell].tally.cached) == ((0, wanted) if cell == cells[0] else (wanted, 0))
-        workspace.tables.write(VOTES, cell.partition, made[cell].content, {})
+        workspace.tables.write(VOTES, cell.partition, made[cell].rows(VOTES), {})
         again = workspace.tables.read(VOTES, cell.partition)
         pd.testing.assert_frame_equal(again.drop(columns="created_at"), rows.drop(columns="created_at"))
 

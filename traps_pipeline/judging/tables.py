@@ -12,7 +12,7 @@ Valid = Annotated[bool, "whether the judge's JSON meets the schema"]
 VoteEpochs = Annotated[str, "campaigns of the votes, joined by +"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)  # a large cell has 450,000
 class VoteRow:
     """One judge's vote on one task about one answer."""
 

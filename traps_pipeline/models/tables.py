@@ -7,7 +7,7 @@ from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)  # a large cell has 100,000
 class ResponseRow:
     """One answer of one model in one run."""
 

@@ -10,6 +10,7 @@ raises with all that is missing.
 import hashlib
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, cast
 
 import dagster as dg
@@ -254,7 +255,7 @@ def _preview(table: Table, made: Made) -> dg.TableMetadataValue | None:
     """The first rows without long texts: what a model wrote is shown on the report's pages, where it is escaped."""
     content = cast(Any, made.content)
     first = content[:PREVIEWED]
-    rows = first.to_dict("records") if hasattr(content, "head") else [vars(row) for row in first]
+    rows = first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
     names = [c.name for c in table.columns if c.name in table.key or c.type in (int, float, bool)]
     records = [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows]
     return dg.MetadataValue.table(records) if records else None

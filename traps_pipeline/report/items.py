@@ -131,8 +131,8 @@ def item_pages(workspace: Workspace, cell: Cell, clips: str | None) -> Iterator[
     """HTML of one cell, `PER_PAGE` pairs a page: controls, then voids; each with question, answer, votes, verdict and
     clip. Rows become Python values a page at a time."""
     items, answers, verdicts, votes = _frames(workspace, cell)
-    items = items[items["item_id"].isin(answers.index)].sort_values(["sub_scenario", "scenario_id"])
-    sides = {side: items[items["side"] == side] for side in ("control", "void")}
+    items = items.loc[items["item_id"].isin(answers["item_id"])].sort_values(by=["sub_scenario", "scenario_id"])
+    sides = {side: items.loc[items["side"] == side] for side in ("control", "void")}
     count = max(1, *(math.ceil(len(rows) / PER_PAGE) for rows in sides.values()))
     template = environment().get_template("items.html.j2")
     for number in range(1, count + 1):
@@ -152,12 +152,10 @@ def item_pages(workspace: Workspace, cell: Cell, clips: str | None) -> Iterator[
 
 
 def _frames(workspace: Workspace, cell: Cell) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
-    """What is shown of a cell's items, and of their answers, verdicts and votes, each by item."""
-    tables = workspace.tables
-    items = tables.read(ITEMS, {"dataset": cell.dataset}, _SHOWN[ITEMS])
+    """What is shown of a cell's items, and of their answers, verdicts and votes."""
+    items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}, _SHOWN[ITEMS])
     answers, verdicts, votes = (
-        tables.read_all(table, _SHOWN[table], **cell.partition).set_index("item_id", drop=False)
-        for table in (RESPONSES, VERDICTS, VOTES)
+        workspace.tables.read_all(table, _SHOWN[table], **cell.partition) for table in (RESPONSES, VERDICTS, VOTES)
     )
     return items, answers, verdicts, votes
 
@@ -167,10 +165,9 @@ def _item_rows(
 ) -> Iterator[Mapping[str, Any]]:
     """One row per item: its columns, `answer`, `verdict` and `votes`."""
     ids = items["item_id"]
-    answer = _by_item(answers[answers.index.isin(ids)])
-    verdict = _by_item(verdicts[verdicts.index.isin(ids)])
+    answer, verdict = (_by_item(rows.loc[rows["item_id"].isin(ids)]) for rows in (answers, verdicts))
     cast: dict[str, list[Mapping[str, Any]]] = {}
-    for vote in _records(votes[votes.index.isin(ids)]):
+    for vote in _records(votes.loc[votes["item_id"].isin(ids)]):
         cast.setdefault(vote["item_id"], []).append(vote)
     for item in _records(items):
         name = item["item_id"]

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -119,7 +119,8 @@ class TableStore:
 
         schema = table.arrow_schema()
         listed = rows if isinstance(rows, Sequence) else None
-        names = {str(name) for name in (rows if listed is None else (name for row in listed for name in vars(row)))}
+        kinds = () if listed is None else {type(row) for row in listed}
+        names = {*map(str, rows)} if listed is None else {each.name for kind in kinds for each in fields(cast("Any", kind))}
         try:
             if names - set(schema.names):
                 raise ValueError(f"unknown columns {sorted(names - set(schema.names))}")
