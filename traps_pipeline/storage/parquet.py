@@ -119,8 +119,8 @@ class TableStore:
 
         schema = table.arrow_schema()
         listed = rows if isinstance(rows, Sequence) else None
-        kinds = () if listed is None else {type(row) for row in listed}
-        names = {*map(str, rows)} if listed is None else {each.name for kind in kinds for each in fields(cast("Any", kind))}
+        kinds = () if listed is None else {cast("Any", type(row)) for row in listed}
+        names = {*map(str, rows)} if listed is None else {each.name for kind in kinds for each in fields(kind)}
         try:
             if names - set(schema.names):
                 raise ValueError(f"unknown columns {sorted(names - set(schema.names))}")
