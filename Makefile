@@ -32,7 +32,9 @@ fast-tests: setup
 test: test-packages setup ## lint, types and all tests, the slow ones too
 	$(MAKE) --no-print-directory -j2 lint all-tests
 
+# What is compiled is copied to the checkouts of the tests, whose hundreds of commands would each compile it again.
 all-tests: setup
+	$(BIN)/python -m compileall -q traps_pipeline
 	$(PYTEST) -n 3
 
 # Ray is 80 MB and in no other test; not part of `make test` until something but the gate needs it.

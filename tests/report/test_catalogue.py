@@ -110,7 +110,7 @@ def test_a_model_whose_every_call_failed_is_a_row_of_dashes_and_breaks_no_page(b
     assert (row["Ratio"], row["PECS, guided"], row["Missing"]) == ("– ‡", "– ‡", "5616")
     assert shown(uplift, model=THINKS)["Ratio"] == "1.00 †"
     assert BROKEN not in set(broken_tables["frontier"].rows["model"])
-    page = publish.report_files(broken, [], {})["report.html"].decode()
+    page = publish.report_files(broken, PAPER, [], {})["report.html"].decode()
     assert '– <span class="mark">‡</span>' in page
     assert not re.search(r"\bnan\b", page)
     for table in broken_tables.values():

@@ -102,10 +102,10 @@ def _shortcuts(workspace: Workspace) -> Files:
 def _page(workspace: Workspace) -> Files:
     from traps_pipeline.report.items import FOLDER, write_item_pages
     from traps_pipeline.report.publish import report_files, study_pictures
-    from traps_pipeline.report.study_results import StudyResults
 
     cells = write_item_pages(workspace, workspace.reports / FOLDER, clips="../..")
-    return report_files(StudyResults(workspace), cells, study_pictures(workspace))
+    study, paper = (_results(workspace, of_paper=of_paper) for of_paper in (False, True))
+    return report_files(study, paper, cells, study_pictures(workspace))
 
 
 contact_sheet = _report(
@@ -171,7 +171,7 @@ def _results(workspace: Workspace, *, of_paper: bool) -> Results:
 
     if of_paper:
         return _kept(("paper", published_digest()), PublishedResults)
-    reads = {name for report in OF_STUDY.values() for name in report.reads}
+    reads = {"items", *(name for report in OF_STUDY.values() for name in report.reads)}
     files = [f for name in sorted(reads) for f in (workspace.tables.root / name).rglob("*.parquet")]
     slot = (workspace.root, *((file, file.stat().st_mtime_ns) for file in files))
     return _kept(("study", slot), lambda: StudyResults(workspace))

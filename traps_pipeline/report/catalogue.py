@@ -79,7 +79,13 @@ class TableReport:
         return self.paper is not None or bool(self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
-        """The tables; of the paper, those recomputed from its numbers, without columns that have no figure."""
+        """The tables; of the paper, those recomputed from its numbers, without columns that have no figure. They are
+        made once for a set of results: for their own files and for the page."""
+        if self.name not in results.kept:
+            results.kept[self.name] = self._tables(results)
+        return results.kept[self.name]
+
+    def _tables(self, results: Results) -> list[PrintedTable]:
         if not results.is_study and not self.recomputed:
             return []
         said = [results.judged_by] if _is_judged(self.reads) else []

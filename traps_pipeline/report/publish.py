@@ -46,14 +46,15 @@ FULL = ("contact_sheet.png", "arms_occlusion.png", "arms_chaotic.png", "panels_o
 Pictures = Mapping[str, bytes]  # PNG by path below the reports folder
 
 
-def report_files(study: StudyResults, cells: Sequence[Cell], pictures: Pictures) -> dict[str, bytes]:
+def report_files(study: Results, paper: Results, cells: Sequence[Cell], pictures: Pictures) -> dict[str, bytes]:
     """The report page and the leaderboard as Markdown, by path. cells: the cells with pages in `items/`; pictures: the
     existing PNG files of the catalogue and of SHEETS."""
     address = addresses(cells)
     landscape = FIGURES[0]
     first = {landscape.title: pictures[landscape.path(study)]} if landscape.path(study) in pictures else {}
     said = said_by_people(study.human_row, study.panel_errors)
-    page = report_html(study.board, first, _chapters(study, address, pictures), address, robust=study.robust, said=said)
+    chapters = _chapters(study, paper, address, pictures)
+    page = report_html(study.board, first, chapters, address, robust=study.robust, said=said)
     markdown = leaderboard_markdown(study.board, study.robust, said)
     return {PAGE: page.encode(), MARKDOWN: markdown.encode(), METRICS: metrics_lines(study.board).encode()}
 
@@ -64,9 +65,8 @@ def metrics_lines(board: pd.DataFrame) -> str:
 
 
 def _chapters(
-    study: StudyResults, address: Callable[[Behind], str], pictures: Pictures
+    study: Results, paper: Results, address: Callable[[Behind], str], pictures: Pictures
 ) -> list[tuple[str, list[Card]]]:
-    paper = PublishedResults()
     figures = []
     # A study that looked inside models leads with what can refute its claims.
     first = INSIDE if study.mechanism else ()
@@ -97,8 +97,8 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
     Each file is written whole or not at all, and last `index.html`, which lists them. say gets one line per table and
     figure.
     """
-    study, written, pictures = StudyResults(workspace), list[str](), dict[str, bytes]()
-    for source in (study, PublishedResults()):
+    study, paper, written, pictures = StudyResults(workspace), PublishedResults(), list[str](), dict[str, bytes]()
+    for source in (study, paper):
         for report in [r for r in (*TABLES, *FIGURES) if source.is_study or r.published]:
             files = report.files(source)
             for path, content in files.items():
@@ -118,7 +118,7 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
         written.append(path)
     cells = write_item_pages(workspace, target / FOLDER, clips=None)
     say(f"items of {len(cells)} cells")
-    pages = report_files(study, cells, pictures)
+    pages = report_files(study, paper, cells, pictures)
     for path, content in pages.items():
         write_bytes(target / path, content)
     written += [*pages, f"{FOLDER}/{INDEX}"]

@@ -33,10 +33,13 @@ from traps_pipeline.scoring.tables import (
     REGIME_TESTS,
     ROBUST,
 )
+from traps_pipeline.storage.study import MechanismSettings
 from traps_pipeline.storage.tables import Table
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from traps_pipeline.report.writing import PrintedTable
 
 CELL_COLUMNS = (
     *("model", "dataset", "regime", "epoch", "n_pairs", "n_runs", "n_missing", "incomplete"),
@@ -93,6 +96,7 @@ class Results:
     is_study = False
     judged_by = ""  # who judged, in words, for the notes of a study's tables and figures
     makers: ClassVar[Makers] = {}
+    mechanism: MechanismSettings | None = None  # of a study that looks inside models
 
     board = Made(table=LEADERBOARD)
     cells = Made("CELL_COLUMNS, one row per (model, dataset, regime), averaged over runs.")
@@ -146,6 +150,7 @@ class Results:
 
     def __init__(self) -> None:
         self.made: dict[str, pd.DataFrame] = {}
+        self.kept: dict[str, list[PrintedTable]] = {}  # the tables of the catalogue that were made of them, by name
         # The reasons, by analysis, why figures were not computed: their sides are of different epochs.
         self.refused: dict[str, list[str]] = {}
 

@@ -115,7 +115,6 @@ class TableStore:
 
     def _checked(self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame) -> pa.Table:
         import pyarrow as pa
-        import pyarrow.compute as pc
 
         schema = table.arrow_schema()
         listed = rows if isinstance(rows, Sequence) else None
@@ -140,11 +139,17 @@ class TableStore:
                 raise TrapsError(
                     f"table {table.name} {dict(partition)}: column {column} also holds {sorted(map(str, strays))}"
                 )
-        counts = data.group_by([*table.key]).aggregate([([], "count_all")])
-        if len(counts) != len(data):
-            (repeated,) = counts.filter(pc.field("count_all") > 1).select([*table.key]).slice(0, 1).to_pylist()
-            raise TrapsError(f"table {table.name} {dict(partition)}: key {repeated} repeats")
-        return data.sort_by([(name, "ascending") for name in table.key]) if len(data) else data
+        if not len(data):
+            return data
+        data = data.sort_by([(name, "ascending") for name in table.key])
+        before = None
+        for batch in data.select([*table.key]).to_batches(_ROWS_AT_ONCE):
+            for key in zip(*(column.to_pylist() for column in batch.columns), strict=True):
+                if key == before:
+                    named = dict(zip(table.key, key, strict=True))
+                    raise TrapsError(f"table {table.name} {dict(partition)}: key {named} repeats")
+                before = key
+        return data
 
     def state(self, table: Table, partition: Mapping[str, Any]) -> State | None:
         """What the footer of a partition says; None if it was never written, or by a version with other columns (it is
