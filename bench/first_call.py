@@ -1,6 +1,6 @@
 """When the first call of a run goes out: `traps run` on a ledger of 100,000 rows, from the command to the request's
-arrival at the server, and how much of that is imports; CPU seconds too, which a loaded machine does not stretch. Then
-`traps plan` on the same ledger. The first of either reads every row once and keeps totals beside the segments.
+arrival at the server; CPU seconds too, which a loaded machine does not stretch. Then `traps plan` on the same ledger. The
+first of either reads every row once and keeps totals beside the segments.
 
 python bench/first_call.py [--rows 100000] [--database]        (1600000: a large lab's year; the ledger in PostgreSQL)
 """
@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,12 +24,6 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 EVALUATION_ROWS = 4000  # four datasets of 500 pairs
 RUNS, DATABASE = 3, "BENCH_DATABASE"
-IMPORTS = """
-import dagster, pandas, pyarrow, traps_pipeline.cli, traps_pipeline.definitions
-from traps_pipeline.models.api import load_litellm
-load_litellm()
-import openai.resources.chat.completions
-"""
 
 
 def fill(root: Path, rows: int) -> None:
@@ -60,14 +52,6 @@ def fill(root: Path, rows: int) -> None:
                     evaluation.model, "openai/m", params, "system", "Which way?", about, None, None, "0" * 64
                 )
                 writer.append(*ledger_row(request, outcome, 1, 2.5, "1"))
-
-
-def _imports(study: Checkout) -> tuple[float, float]:
-    """Seconds and CPU seconds that a process takes to import what a run imports."""
-    began, used = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, "-c", IMPORTS], cwd=study.root, env=study.environment, check=True)
-    now = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.perf_counter() - began, sum(now[:2]) - sum(used[:2])
 
 
 def _cpu_s(pid: int) -> float:
@@ -105,7 +89,6 @@ def main() -> None:
             print(f"moved into PostgreSQL in {time.perf_counter() - began:.1f} s", flush=True)
         path = experiment(study, ["image-model"], regimes=["standard"])
         for run in range(1, RUNS + 1):
-            imports_s, imports_cpu_s = _imports(study)
             provider.reset()
             began = time.perf_counter()
             process = study.start(sys.executable, "-m", "traps_pipeline.cli", "run", path, "--budget-usd", "100000")
@@ -116,8 +99,7 @@ def main() -> None:
             first_s, first_cpu_s = time.perf_counter() - began, _cpu_s(process.pid)
             os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
-            print(f"run {run}: first call {first_s:.1f} s after the command ({first_cpu_s:.1f} s of CPU)", end="")
-            print(f", {first_s - imports_s:.1f} s ({first_cpu_s - imports_cpu_s:.1f} s) without imports", flush=True)
+            print(f"run {run}: first call {first_s:.1f} s after the command ({first_cpu_s:.1f} s of CPU)", flush=True)
         for run in range(1, RUNS + 1):
             began = time.perf_counter()
             planned = study.traps("plan", path)

@@ -1,93 +1,169 @@
 """Kills and failing disks at chosen system calls, all through a study from items to the leaderboard: the tables at the
 end are those of an undisturbed study, and no call is made twice.
 
-`TRAPS_FAULTS=100` tries so many of each kind in place of the few that the test run affords.
+`TRAPS_FAULTS=100` tries so many of each kind in place of the few that the test run affords, and then through every
+stage, from records to the report and into a model.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import re
 import shutil
 import sys
 from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import Checkout, Finished, copied, forget_answers
-from tests.integration.test_crashes import ANSWERS, ONE_REGIME, VOTES, assert_same_tables
+from tests.conftest import Checkout, Finished, copied, copy_workspace, forget_answers
+from tests.integration.test_crashes import ONE_REGIME, assert_same_tables
+from tests.mechanism.test_stages_run import with_mechanism
 
 pytestmark = pytest.mark.slow
-FAULTS = int(os.environ.get("TRAPS_FAULTS", "3"))
+MANY = os.environ.get("TRAPS_FAULTS")
+FAULTS = int(MANY or 10)
 # How a file gets its content, its name and its place on the disk; SQLite writes by pwrite64 and fdatasync.
 CALLS = "fsync,fdatasync,rename,ftruncate,pwrite64"
 ERRORS = ("ENOSPC", "EIO", "EROFS", "EDQUOT")
 
 
-def traced(study: Checkout, log: Path | str, *more: str) -> Finished:
-    """`traps run` under strace. (With --seccomp-bpf, strace would be faster and inject no signal.)"""
+@dataclass(frozen=True)
+class Campaign:
+    """A study to be disturbed: its command, what it is set back to, what it comes to if it is left alone, and how often
+    the busiest thread of a whole run makes each of `CALLS`."""
+
+    study: Checkout
+    command: tuple[str, ...]
+    start: Callable[[Checkout], object]
+    undisturbed: Path
+    calls: dict[str, int]
+
+    def traced(self, *more: str) -> Finished:
+        return traced(self.study, self.command, "/dev/null", *more)
+
+    def drawn(self, draw: random.Random, fault: str) -> str:
+        """A fault at one of the calls of a whole run, each kind of call as likely as the others."""
+        call = draw.choice(sorted(self.calls))
+        return f"inject={call}:{fault}:when={draw.randint(1, self.calls[call])}"
+
+    def assert_whole(self) -> None:
+        finished = self.study.traps(*self.command)
+        assert finished.code == 0, finished.err
+        for kind in ("answers", "votes"):
+            found, wanted = keys(self.study.workspace, kind), keys(self.undisturbed, kind)
+            assert len(found) == len(set(found))
+            assert set(found) == set(wanted)
+        assert_same_tables(self.study.workspace, self.undisturbed)
+
+
+def keys(workspace: Path, kind: str) -> list[str]:
+    """The key of every row of a study's ledger."""
+    segments = sorted((workspace / "ledger" / kind).glob("*/*.jsonl"))
+    return [json.loads(line)["key"] for segment in segments for line in segment.read_text().splitlines()]
+
+
+def traced(study: Checkout, command: Sequence[str], log: Path | str, *more: str) -> Finished:
+    """A command of `traps` under strace. (With --seccomp-bpf, strace would be faster and inject no signal.)"""
     strace = ("strace", "-f", "-qq", "-o", log, "-e", f"trace={CALLS}", *more)
-    traps = (sys.executable, "-m", "traps_pipeline.cli", "run", ONE_REGIME, "--until", "leaderboard")
-    return study.run(*strace, *traps)
+    return study.run(*strace, sys.executable, "-m", "traps_pipeline.cli", *command)
+
+
+def begun(
+    study: Checkout, command: tuple[str, ...], start: Callable[[Checkout], object], undisturbed: Path
+) -> Campaign:
+    """A campaign against a study, which is run once for the number of its calls."""
+    if shutil.which("strace") is None:
+        pytest.skip("strace is not installed (make test installs it)")
+    start(study)
+    log = study.root / "calls"
+    finished = traced(study, command, log)
+    assert finished.code == 0, finished.err
+    found = Counter(re.findall(r"^(\d+) +(\w+)\(", log.read_text(), re.MULTILINE))
+    calls = {call: max(n for (_, name), n in found.items() if name == call) for call in {name for _, name in found}}
+    if not undisturbed.exists():
+        copy_workspace(study.workspace, undisturbed)
+    start(study)
+    return Campaign(study, command, start, undisturbed, calls)
 
 
 @pytest.fixture(scope="module")
-def calls(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> dict[str, int]:
-    """How often the busiest thread of a whole run makes each of `CALLS`: strace counts by thread and call."""
-    if shutil.which("strace") is None:
-        pytest.skip("strace is not installed (make test installs it)")
-    folder = tmp_path_factory.mktemp("counted")
-    finished = traced(forget_answers(copied(small, folder)), folder / "calls")
-    assert finished.code == 0, finished.err
-    found = Counter(re.findall(r"^(\d+) +(\w+)\(", (folder / "calls").read_text(), re.MULTILINE))
-    return {call: max(n for (_, name), n in found.items() if name == call) for call in {name for _, name in found}}
+def answering(small: Checkout, one_regime: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """From items to the leaderboard."""
+    study, command = copied(small, tmp_path_factory.mktemp("answering")), ("run", ONE_REGIME, "--until", "leaderboard")
+    return begun(study, command, forget_answers, one_regime.workspace)
 
 
-def drawn(draw: random.Random, calls: dict[str, int], fault: str) -> str:
-    """A fault at one of the calls of a whole run, each kind of call as likely as the others."""
-    call = draw.choice(sorted(calls))
-    return f"inject={call}:{fault}:when={draw.randint(1, calls[call])}"
+@pytest.fixture(scope="module")
+def everything(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """From records to the report, with a look into a tiny model."""
+    if MANY is None:
+        pytest.skip("faults through every stage take an hour: TRAPS_FAULTS=100 asks for them")
+    folder = tmp_path_factory.mktemp("everything")
+    study = copied(small, folder)
+    return begun(study, ("run", with_mechanism(study)), forget_everything, folder / "undisturbed")
 
 
-def assert_whole(study: Checkout, undisturbed: Checkout) -> None:
-    finished = study.score(ONE_REGIME)
-    assert finished.code == 0, finished.err
-    for kind, wanted in (("answers", ANSWERS), ("votes", VOTES)):
-        keys = [row["key"] for row in study.ledger_rows(kind)]
-        assert len(keys) == len(set(keys)) == wanted
-    assert_same_tables(study.workspace, undisturbed.workspace)
+def forget_everything(study: Checkout) -> None:
+    """Leave the clips of nine scenarios, with nothing else: rendering three takes long enough."""
+    kept = study.workspace / "clips"
+    for path in study.workspace.iterdir():
+        if path.name in ("study.yaml", "dagster", "media", "clips"):
+            continue
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for name in ("media", *(f"clips/domino_chain-000{n}" for n in (1, 2, 3))):
+        shutil.rmtree(study.workspace / name, ignore_errors=True)
+    assert kept.is_dir()
 
 
-def test_kills_at_system_calls_lose_nothing_and_ask_nothing_twice(
-    calls: dict[str, int], unasked: Checkout, one_regime: Checkout
-) -> None:
-    draw, killed = random.Random(20261122), 0
+def killed(campaign: Campaign) -> None:
+    """Kill a study at so many calls, and see that it comes to the same."""
+    draw, count = random.Random(20261122), 0
     for _ in range(FAULTS):
-        finished = traced(unasked, "/dev/null", "-e", drawn(draw, calls, "signal=KILL"))
+        finished = campaign.traced("-e", campaign.drawn(draw, "signal=KILL"))
         assert "Traceback" not in finished.err, finished.err
-        killed += finished.code != 0
+        count += finished.code != 0
         if finished.code == 0:  # so much was there already that it came to its end
-            assert_whole(unasked, one_regime)
-            forget_answers(unasked)
-    assert killed > FAULTS / 3
-    assert_whole(unasked, one_regime)
+            campaign.assert_whole()
+            campaign.start(campaign.study)
+    assert count > FAULTS / 3
+    campaign.assert_whole()
 
 
-def test_a_disk_that_fails_at_a_system_call_is_named_and_nothing_is_lost(
-    calls: dict[str, int], unasked: Checkout, one_regime: Checkout
-) -> None:
-    draw, failed = random.Random(20261123), 0
+def failed(campaign: Campaign) -> None:
+    """Let so many calls fail, and see that each is named and that the study comes to the same."""
+    draw, count = random.Random(20261123), 0
     for _ in range(FAULTS):
         error = draw.choice(ERRORS)
-        finished = traced(unasked, "/dev/null", "-e", drawn(draw, calls, f"error={error}"))
+        finished = campaign.traced("-e", campaign.drawn(draw, f"error={error}"))
         assert "Traceback" not in finished.err + finished.out, finished.err
-        failed += finished.code != 0
+        count += finished.code != 0
         if finished.code == 0:
-            assert_whole(unasked, one_regime)
-            forget_answers(unasked)
+            campaign.assert_whole()
+            campaign.start(campaign.study)
         else:
-            assert str(unasked.workspace) in finished.err + finished.out, (error, finished.err)
-    assert failed > FAULTS / 3
-    assert_whole(unasked, one_regime)
+            assert str(campaign.study.workspace) in finished.err + finished.out, (error, finished.err)
+    assert count > FAULTS / 3
+    campaign.assert_whole()
+
+
+def test_kills_at_system_calls_lose_nothing_and_ask_nothing_twice(answering: Campaign) -> None:
+    killed(answering)
+
+
+def test_a_disk_that_fails_at_a_system_call_is_named_and_nothing_is_lost(answering: Campaign) -> None:
+    answering.start(answering.study)
+    failed(answering)
+
+
+def test_kills_through_every_stage_lose_nothing_and_ask_nothing_twice(everything: Campaign) -> None:
+    killed(everything)
+
+
+def test_a_disk_that_fails_in_any_stage_is_named_and_nothing_is_lost(everything: Campaign) -> None:
+    everything.start(everything.study)
+    failed(everything)
