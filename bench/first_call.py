@@ -1,6 +1,6 @@
 """When the first call of a run goes out: `traps run` on a ledger of 100,000 rows, from the command to the request's
-arrival at the server; CPU seconds too, which a loaded machine does not stretch. Then `traps plan` on the same ledger. The
-first of either reads every row once and keeps totals beside the segments.
+arrival at the server; CPU seconds too, which a loaded machine does not stretch. Then `traps plan` on the same ledger.
+The first of either reads every row once and keeps totals beside the segments.
 
 python bench/first_call.py [--rows 100000] [--database]        (1600000: a large lab's year; the ledger in PostgreSQL)
 """
@@ -15,10 +15,6 @@ import tempfile
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from tests.conftest import Checkout
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
