@@ -167,7 +167,7 @@ def extraction(subject: Subject, runs: int) -> None:
     def plain() -> None:
         kept = []
         for i in range(ITEMS):
-            inputs = model._placed(subject.prompt(i).inputs)
+            inputs = model.placed(subject.prompt(i).inputs)
             with torch.inference_mode():
                 out = model.network(**inputs, output_hidden_states=True)
             kept.append(torch.stack([state[0, -1] for state in out.hidden_states]).cpu())
@@ -191,7 +191,7 @@ def answering(entry: ModelEntry, runs: int) -> None:
 
     def plain() -> None:
         for i in range(ITEMS):
-            inputs = model._placed(subject.prompt(i).inputs)
+            inputs = model.placed(subject.prompt(i).inputs)
             with torch.inference_mode():
                 model.network.generate(**inputs, max_new_tokens=NEW_TOKENS)
 

@@ -170,6 +170,7 @@ def _record(shot: Shot, recipe: Recipe, decoy: bool, rng: np.random.Generator) -
         draw, guessed = rng.random(), guess(question, labels, rng)
         if recipe.abstain_shares is not None:
             return Question(question, guessed, draw)
+        assert recipe.abstain_share is not None, "a recipe has one of the two"
         return Question(question, None if draw < recipe.abstain_share else guessed)
 
     wording, both = shot.wording, shot.wording.answerable_question

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.pocket.words import PROMPTS
@@ -45,12 +45,12 @@ class Jitter(BaseModel):
 
 class Recipe(BaseModel):
     """Number of training scenes by family, held-out scenes per family, how a clip is shown, and the share of voids that
-    are labelled with an abstention.
+    are labelled with an abstention: `abstain_share`, or by prompt `abstain_shares`.
 
     jitter: without it, the length of a chaotic clip tells its side. decoys: share of looks at an occlusion control in
     which a panel stands where it hides nothing; without it, the panel tells the side. abstain_shares: by prompt (one of
-    `words.PROMPTS`), in the place of `abstain_share`; a void that is labelled with an abstention under one prompt is so
-    under every prompt with a larger share.
+    `words.PROMPTS`); a void that is labelled with an abstention under one prompt is so under every prompt with a larger
+    share.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -58,7 +58,7 @@ class Recipe(BaseModel):
     held_out: int = Field(ge=1)
     data_seed: int = Field(ge=0)
     media: MediaSpec
-    abstain_share: float = Field(ge=0, le=1)
+    abstain_share: float | None = Field(default=None, ge=0, le=1)
     abstain_shares: dict[str, Annotated[float, Field(ge=0, le=1)]] | None = None
     jitter: Jitter | None = None
     decoys: float = Field(default=0, ge=0, le=1)
@@ -67,7 +67,7 @@ class Recipe(BaseModel):
     def content(self, *only: str) -> dict[str, Any]:
         """The settings (only: these) for a digest. One that came later counts only where it is used, so that what was
         made before it keeps its digest."""
-        unused = {"abstain_shares", "jitter", "decoys"} - self.model_fields_set
+        unused = {"abstain_share", "abstain_shares", "jitter", "decoys"} - self.model_fields_set
         made = self.model_dump(mode="json", include={*only} or None, exclude=unused)
         return made | ({"media": self.media.content()} if "media" in made else {})
 
@@ -85,6 +85,12 @@ class Recipe(BaseModel):
         if value is not None and set(value) != set(PROMPTS):
             raise ValueError(f"abstain_shares names {sorted(value)}; it needs a share for each of {', '.join(PROMPTS)}")
         return value
+
+    @model_validator(mode="after")
+    def _one_kind_of_share(self) -> Recipe:
+        if (self.abstain_share is None) == (self.abstain_shares is None):
+            raise ValueError("give abstain_share (one for all prompts) or abstain_shares (by prompt), and not both")
+        return self
 
     def count(self, family: str, split: Split) -> int:
         """Scenes of a family in a split."""

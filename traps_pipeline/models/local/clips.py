@@ -47,10 +47,11 @@ class ClipMemory:
 
     @contextmanager
     def remembering(self, network: Any) -> Iterator[None]:
-        """Inside, a network's vision tower sees each clip once. What it returns is what it returned then."""
+        """Inside, a network's vision tower sees each clip once. What it returns is what it returned then. Inside
+        another such context nothing changes."""
         owner = network.base_model
         original = getattr(owner, "get_video_features", None)
-        if original is None or not hasattr(getattr(owner, "visual", None), "deepstack_merger_list"):
+        if original is None or "get_video_features" in vars(owner) or not hasattr(getattr(owner, "visual", None), "deepstack_merger_list"):
             yield
             return
 

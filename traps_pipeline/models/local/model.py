@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,9 +16,11 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.local.capture import Pooling, capturing
 from traps_pipeline.models.local.checkpoint import Checkpoint, free_bytes
 from traps_pipeline.models.local.clips import ClipMemory
+from traps_pipeline.models.local.decoding import Steers, decode, steered
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prompts import Prompt, batches, collate
-from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
+from traps_pipeline.models.local.prefixes import PrefixMemory
+from traps_pipeline.models.local.prompts import Prompt, batches
+from traps_pipeline.models.local.sampling import Sampling
 from traps_pipeline.models.local.settings import LocalParams
 
 if TYPE_CHECKING:
@@ -27,18 +29,6 @@ if TYPE_CHECKING:
 
 CLOCK_FPS = 1000  # of the time stamps given to processors: milliseconds, as exact as a frame number at any rate
 MEMORY_SHARE = 0.7  # of what is free that a batch may take by estimate
-
-
-class Steers(Protocol):
-    """What may change hidden states during a pass: `mechanism.hook.Steering`."""
-
-    def rows(self, chosen: Sequence[int]) -> Steers:
-        """That of some of the prompts."""
-        ...
-
-    def applied(self, model: LocalModel) -> AbstractContextManager[None]:
-        """Steer the passes made inside."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -71,7 +61,7 @@ class LocalModel:
         self.dtype, self.quantisation = params.dtype, params.quantisation
         self.blocks, self.norm = _decoder_parts(network, checkpoint.name)
         self.n_layers, self.d_model = len(self.blocks), int(network.config.get_text_config().hidden_size)
-        self.clips = ClipMemory()
+        self.clips, self.prefixes = ClipMemory(), PrefixMemory()
         self._processing = Lock()  # tokenizers are not for several threads at once
         network.generation_config = self._plain_generation()
 
@@ -177,6 +167,11 @@ class LocalModel:
         """Inside, the vision tower sees each clip once (`clips`)."""
         return self.clips.remembering(self.network)
 
+    def resuming(self) -> AbstractContextManager[None]:
+        """Inside, steered answers are resumed at the steered block, and each prompt passes those below it once
+        (`prefixes`)."""
+        return self.prefixes.remembering()
+
     # --- hidden states ------------------------------------------------------------------------------------------------
 
     def forward(self, prompt: Prompt) -> Any:
@@ -184,7 +179,7 @@ class LocalModel:
         import torch
 
         with torch.inference_mode():
-            return self.network.base_model(**self._placed(prompt.inputs), use_cache=False)
+            return self.network.base_model(**self.placed(prompt.inputs), use_cache=False)
 
     def forward_states(
         self,
@@ -203,7 +198,7 @@ class LocalModel:
         mask = None if chosen is None else torch.from_numpy(chosen)
         if pooling == "answer":
             prompt = self._answered(prompt, steering)
-        with _steered(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as kept:
+        with steered(steering, self), capturing(iter(self.blocks), self.norm, pooling, mask) as kept:
             self.forward(prompt)
         assert kept.normed is not None and len(kept.raw) == self.n_layers + 1
         rows = torch.stack([row.float() for row in (*kept.raw, kept.normed)]).cpu().numpy()
@@ -294,21 +289,8 @@ class LocalModel:
         use_cache: bool,
         stopped: Callable[[], bool],
     ) -> list[Generated]:
-        import torch
-
-        transformers = load_transformers()
-        inputs = self._placed(collate(prompts, self.network.generation_config.pad_token_id))
-        processors = transformers.LogitsProcessorList([SeededNucleus(sampling)] if sampling else [])
-        with _steered(steering, self), torch.inference_mode():
-            out = self.network.generate(
-                **inputs,
-                max_new_tokens=max_new_tokens,
-                use_cache=use_cache,
-                logits_processor=processors,
-                stopping_criteria=transformers.StoppingCriteriaList([_Stopping(stopped)]),
-            )
-        width = inputs["input_ids"].shape[1]
-        return [self._answer(prompt, row[width:].tolist()) for prompt, row in zip(prompts, out, strict=True)]
+        rows = decode(self, prompts, max_new_tokens, sampling, steering, use_cache, stopped)
+        return [self._answer(prompt, row) for prompt, row in zip(prompts, rows, strict=True)]
 
     def _answer(self, prompt: Prompt, tokens: list[int]) -> Generated:
         eos = self.network.generation_config.eos_token_id
@@ -319,8 +301,8 @@ class LocalModel:
             text = self.processor.tokenizer.decode(kept, skip_special_tokens=True)
         return Generated(text, prompt.n_tokens, len(kept), "length" if ended is None else "stop", tuple(kept))
 
-    def _placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """On the model's device, pictures in its precision."""
+    def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Inputs of a prompt or a batch, on the model's device, pictures in its precision."""
         dtype = self.network.dtype
         return {
             name: value.to(self.device, dtype) if value.is_floating_point() else value.to(self.device)
@@ -343,24 +325,8 @@ class LocalModel:
         return sum(widths) or 2 * self.n_layers * self.d_model
 
 
-class _Stopping:
-    """A stopping criterion of transformers that ends every row when told to."""
-
-    def __init__(self, stopped: Callable[[], bool]) -> None:
-        self._stopped = stopped
-
-    def __call__(self, input_ids: Tensor, scores: Any, **_: Any) -> Tensor:
-        import torch
-
-        return torch.full((len(input_ids),), self._stopped(), dtype=torch.bool, device=input_ids.device)
-
-
 def _first(tokens: int | Sequence[int]) -> int:
     return tokens if isinstance(tokens, int) else tokens[0]
-
-
-def _steered(steering: Steers | None, model: LocalModel) -> AbstractContextManager[None]:
-    return nullcontext() if steering is None else steering.applied(model)
 
 
 def _decoder_parts(network: Any, name: str) -> tuple[Any, Any]:

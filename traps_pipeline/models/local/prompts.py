@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -23,6 +25,15 @@ class Prompt:
     def n_tokens(self) -> int:
         """Tokens of the prompt, those of the clip included."""
         return self.inputs["input_ids"].shape[1]
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the inputs: equal for equal prompts about equal clips."""
+        whole = hashlib.sha256()
+        for name, value in sorted(self.inputs.items()):
+            whole.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+            whole.update(value.detach().cpu().contiguous().numpy().tobytes())
+        return whole.hexdigest()
 
     @property
     def sequences(self) -> list[str]:
