@@ -23,6 +23,7 @@ import pandas as pd
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.mechanism.contrast import ccs, contrast_states
 from traps_pipeline.mechanism.probes import Fit, Probe, Scorer, fit_probe, standardiser
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.mechanism.stages import saved_directions
@@ -160,28 +161,60 @@ def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
     return states - np.outer(whitened @ towards, (towards * size[kept]) @ right[kept])
 
 
+# By name: probes that `protocol` takes. CCS takes the states of `contrast`.
+PROBES: dict[str, Fit] = {"logistic": fit_probe, "mean difference": mean_difference, "CCS": ccs}
+
+
+def contrast(
+    workspace: Where, model: str, *, layer: int, prompt: str = "standard", datasets: Sequence[str] | None = None
+) -> Loaded:
+    """States for contrast-consistent search (`ccs`): X has, for each item, the state behind its question with a
+    statement, and then the state behind the question with its negation, (n, 2 d). Two passes of the model an item."""
+    opened = _workspace(workspace)
+    loaded = load(opened, model, layer=0, prompt=prompt, datasets=datasets)
+    chosen = [*dict.fromkeys(loaded.items["dataset"])]
+    made = contrast_states(opened, Extraction(get_model(model).id, prompt), layer, chosen)
+    return Loaded(np.concatenate([made[name] for name in chosen]), loaded.items)
+
+
 def protocol(
     workspace: Where,
     model: str,
     *,
     layer: int,
-    fit: Fit = fit_probe,
+    fit: Fit | str = fit_probe,
     prompt: str = "standard",
     change: Callable[[np.ndarray], np.ndarray] = lambda states: states,
+    features: Loaded | None = None,
 ) -> pd.DataFrame:
     """The study's own protocol for another probe: the rows that the table `probe_baselines` has for its baselines, with
     the same items, folds, splits by scenario and intervals.
 
-    fit: states (n, d) and void (n,) to anything with `scores` (`fit_probe`, `mean_difference`, `from_sklearn`, your
-    own). change: a change of the states of a dataset, (n, d) to (n, k). Columns: analysis, source, target, value
-    (AUROC), low, high, n_voids, n_controls.
+    fit: states (n, d) and void (n,) to anything with `scores` (a key of PROBES, `from_sklearn`, your own). change: a
+    change of the states of a dataset, (n, d) to (n, k). features: what items have in the place of the study's states
+    (`contrast`, or your own); datasets that it lacks are left out. Columns: analysis, source, target, value (AUROC),
+    low, high, n_voids, n_controls.
     """
     opened = _workspace(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
     mechanism = opened.study.mechanism
     settings = mechanism.probes if mechanism else ProbeSettings()
-    read = lambda dataset, _: change(states.read(dataset, layer))  # noqa: E731 - a name would say no more
-    run = ProbeRun(states.items, read, 1, 0, settings, mechanism.seed if mechanism else 0, fit=fit)
+    if isinstance(fit, str) and fit not in PROBES:
+        raise TrapsError(f"no probe {fit!r}; there are {', '.join(PROBES)}")
+    items = states.items
+    if features is not None:
+        items = items.loc[items["dataset"].isin(set(features.items["dataset"]))].reset_index(drop=True)
+
+    def read(dataset: str, _: int) -> np.ndarray:
+        if features is None:
+            return change(states.read(dataset, layer))
+        places = pd.Index(features.items["item_id"]).get_indexer(pd.Index(states.dataset(dataset)["item_id"]))
+        if (places < 0).any():
+            raise TrapsError(f"`features` lacks {int((places < 0).sum())} items of {dataset}; give all items of it")
+        return change(features.X[places])
+
+    chosen = PROBES[fit] if isinstance(fit, str) else fit
+    run = ProbeRun(items, read, 1, 0, settings, mechanism.seed if mechanism else 0, fit=chosen)
     columns = ["analysis", "source", "target", "value", "low", "high", "n_voids", "n_controls"]
     return pd.DataFrame(run.comparable(0), columns=pd.Index(columns))
 

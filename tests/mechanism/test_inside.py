@@ -18,11 +18,13 @@ from traps_pipeline import inside
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.baselines import RAW, output_margins
+from traps_pipeline.mechanism.contrast import _loss
 from traps_pipeline.mechanism.gate import SOURCES
 from traps_pipeline.mechanism.gating import curve_rows, gate_rows
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.probe_items import probe_items
+from traps_pipeline.mechanism.probes import auroc
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.models.local.adapter import load_local_model
@@ -170,3 +172,47 @@ def test_erasure_leaves_nothing_that_a_linear_probe_can_use_and_changes_little_e
     assert np.abs(gone[void].mean(axis=0) - gone[~void].mean(axis=0)).max() < 1e-9
     assert np.linalg.matrix_rank(gone - gone.mean(axis=0)) == 7
     assert np.abs(LogisticRegression().fit(gone, void).coef_).max() < 1e-4
+
+
+def test_contrast_consistent_search_finds_what_a_statement_and_its_negation_disagree_on() -> None:
+    """Pairs whose halves differ by plus or minus one direction, and share everything else: no label is needed but for
+    the sign. The words of the statement shift all of its states alike, which says nothing."""
+    rng = np.random.default_rng(0)
+    void, truth = np.arange(80) % 2 == 1, np.eye(6)[2]
+    shared = rng.normal(size=(80, 6))
+    sign = np.where(void, -1.0, 1.0)[:, None]
+    pairs = np.hstack([shared + sign * truth + 9.0, shared - sign * truth - 9.0])
+    probe = inside.ccs(pairs, void)
+    assert auroc(void, probe.scores(pairs)) == 1.0
+    assert auroc(void, inside.ccs(pairs, ~void).scores(pairs)) == 0.0  # one bit of labels, and no more
+    other = inside.ccs(pairs, rng.permutation(void)).scores(pairs)
+    assert np.abs(other) == pytest.approx(np.abs(probe.scores(pairs)))
+    with pytest.raises(TrapsError, match="are not pairs"):
+        inside.ccs(pairs[:, :11], void)
+
+
+def test_the_gradient_of_the_search_is_that_of_its_loss() -> None:
+    rng = np.random.default_rng(1)
+    yes, no, values = rng.normal(size=(9, 4)), rng.normal(size=(9, 4)), rng.normal(size=5)
+    numeric = [
+        (_loss(values + step, yes, no)[0] - _loss(values - step, yes, no)[0]) / 2e-6 for step in 1e-6 * np.eye(5)
+    ]
+    assert _loss(values, yes, no)[1] == pytest.approx(numeric, abs=1e-7)
+
+
+def test_probes_of_pairs_take_the_protocol_of_the_study(study: Workspace, entry: ModelEntry) -> None:
+    pairs = inside.contrast(study, "tiny", layer=2, datasets=["chaotic", "chaotic_ill_posed"])
+    assert pairs.X.shape == (4 * PAIRS, 2 * load_local_model(entry).d_model)
+    yes, no = np.split(pairs.X, 2, axis=1)
+    assert (yes != no).any(axis=1).all()
+    figures = inside.protocol(study, "tiny", layer=2, fit="CCS", features=pairs)
+    assert set(figures["source"]) == set(figures["target"]) == {"chaotic", "chaotic_ill_posed"}
+    assert figures["value"].between(0, 1).all()
+    states = inside.load(study, "tiny", layer=2)
+    own = inside.protocol(study, "tiny", layer=2, fit="logistic")
+    assert inside.protocol(study, "tiny", layer=2, features=states).equals(own)
+    with pytest.raises(TrapsError, match="no probe 'mine'; there are logistic, mean difference, CCS"):
+        inside.protocol(study, "tiny", layer=2, fit="mine")
+    with pytest.raises(TrapsError, match="lacks 2 items of chaotic"):
+        few = inside.Loaded(pairs.X[2:], pairs.items.iloc[2:])
+        inside.protocol(study, "tiny", layer=2, features=few)

@@ -187,7 +187,8 @@ def _in_range(layer: int, directions: Directions) -> int:
 def wanted_steered(
     workspace: Workspace, entry: ModelEntry, cell: SteeringCell, directions: Mapping[str, Directions]
 ) -> list[SteeredQuestion]:
-    """The calls for every answer of a cell; calls with the same direction are adjacent, so that they share batches."""
+    """The calls for every answer of a cell; calls about one prompt are adjacent, so that they share what the blocks
+    below the steered one make of it."""
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
@@ -197,8 +198,8 @@ def wanted_steered(
     most = settings.steering.max_new_tokens
     return [
         SteeredQuestion(steered_request(workspace, entry, item, cell, strength, most), item, strength)
-        for strength, sides in plan
         for item in rows
+        for strength, sides in plan
         if item["side"] in sides
     ]
 
@@ -251,8 +252,8 @@ class SteeredBackend(LocalBackend):
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
 
     def _answers(self, batch: _Batch) -> list[Outcome]:
-        """Answer a batch, in the worker thread; all rows of one layer are generated together, and unsteered rows
-        apart."""
+        """Answer a batch, in the worker thread; all rows of one layer are generated together, resumed at that layer,
+        and unsteered rows apart."""
         from traps_pipeline.mechanism.hook import Steering
 
         groups: dict[int | None, list[int]] = {}
@@ -270,7 +271,7 @@ class SteeredBackend(LocalBackend):
                 vectors = np.stack([self._vectors[steering["direction"]] for steering in along])
                 hook = Steering(vectors, group, tuple(float(steering["alpha"]) for steering in along))
             most = requests[0].params["max_new_tokens"]
-            with model.remembering_clips():
+            with model.remembering_clips(), model.resuming():
                 made = model.generate(prompts, most, None, hook, stopped=batch.abandoned.is_set)
             for number, one in zip(numbers, made, strict=True):
                 counts = (one.prompt_tokens, one.completion_tokens)

@@ -51,7 +51,11 @@ class ClipMemory:
         another such context nothing changes."""
         owner = network.base_model
         original = getattr(owner, "get_video_features", None)
-        if original is None or "get_video_features" in vars(owner) or not hasattr(getattr(owner, "visual", None), "deepstack_merger_list"):
+        if (
+            original is None
+            or "get_video_features" in vars(owner)
+            or not hasattr(getattr(owner, "visual", None), "deepstack_merger_list")
+        ):
             yield
             return
 

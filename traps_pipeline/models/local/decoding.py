@@ -49,8 +49,8 @@ def decode(
     use_cache: bool,
     stopped: Callable[[], bool],
 ) -> list[list[int]]:
-    """The tokens of an answer to each prompt, up to the one that ends it; greedy unless sampling is given. Where half of
-    the rows have ended, the others go on without them."""
+    """The tokens of an answer to each prompt, up to the one that ends it; greedy unless sampling is given. Where half
+    of the rows have ended, the others go on without them."""
     import torch
 
     transformers, config = load_transformers(), model.network.generation_config

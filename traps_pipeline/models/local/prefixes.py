@@ -3,8 +3,8 @@ give the same for every direction and dose. A steered answer is then resumed at 
 and only the blocks behind l read the prompt again.
 
 The states at block l and the keys and values of blocks 1 to l are kept for each prompt, on the model's device, the
-latest ones up to `MOST_BYTES`. A prompt is known by the digest of its inputs. Models whose later blocks read more of the
-earlier ones than the residual stream and the cache (Gemma 4), or whose cache is no plain one, are run from the start.
+latest ones up to `MOST_BYTES`. A prompt is known by the digest of its inputs. Models whose later blocks read more of
+earlier ones than the residual stream and the cache (Gemma 4), or whose cache is no plain one, run from the start.
 Whoever changes weights in memory must give the model a new `PrefixMemory`.
 """
 
