@@ -99,7 +99,7 @@ def test_frames_for_training_are_those_that_a_clip_gives(
     """The same scenes written as clips and read through the media path of every model: only H.264 lies between."""
     (job,) = shard_jobs(recipe, "train", data)
     rendered = np.load(job.pixels)
-    assert rendered.shape == (FEW, 2, 2, 96, 128, 3)
+    assert rendered.shape == (FEW, 3, 2, 96, 128, 3)  # control, void, decoy
     monkeypatch.setitem(STREAM, "held-out", STREAM["train"])
     as_clips = dataclasses.replace(job, split="held-out", folder=tmp_path, count=1)
     draw_shard(as_clips)
@@ -114,7 +114,10 @@ def test_voids_alone_are_labelled_with_abstentions(recipe: Recipe, data: Path) -
     (job,) = shard_jobs(recipe, "train", data)
     for scene in _records(job):
         assert scene.asked.answer in scene.labels and scene.answerable.answer is not None
-        assert scene.visual.answer is None or scene.visual.answer in scene.labels
+        assert scene.visual.answer in scene.labels and scene.visual.draw is not None
+        shares = recipe.abstain_shares or {}
+        assert scene.asked.label(shares["guided"]) == scene.asked.answer
+        assert (scene.visual.label(shares["guided"]) is None) == (scene.visual.draw < shares["guided"])
 
 
 def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -> None:
@@ -182,7 +185,7 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
             {"role": "user", "content": [{"type": "video"}, {"type": "text", "text": question.question}]},
         ]
         text = processor.apply_chat_template(turns, add_generation_prompt=True)
-        said = say(question.answer, "guided") + processor.tokenizer.eos_token
+        said = say(question.label((recipe.abstain_shares or {})["guided"]), "guided") + processor.tokenizer.eos_token
         clock = {"fps": 1000.0, "frames_indices": [0, 4900], "total_num_frames": 4901}
         inputs = processor(
             text=[text + said], videos=[np.array(frames)], video_metadata=[clock], do_sample_frames=False,
@@ -341,6 +344,7 @@ def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Pa
     found = inside.read_figures(table)
     assert [figure.seed for figure in found] == [1] * 4 + [2] * 4
     lines = inside.markdown(found).splitlines()
+    assert "| AbsRec under guided, % | 30 points above | – |" in lines  # the study has no verdicts
     assert "| Cross-domain | 0.900 (0.800-1.000) | 2 | 0.800 (0.700-0.900) | 1 |" in lines
     assert "| voids, void directions | 75.0 (75.0-75.0) | 37.5 (25.0-50.0) | 15.0-70.0 | 28 | 10 |" in lines
     assert lines[-1] == "Training seeds: 1, 2."

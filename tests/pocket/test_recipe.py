@@ -104,7 +104,8 @@ def test_the_label_of_a_void_depends_on_the_prompt_and_nothing_else_does(
 
 
 def test_settings_that_are_not_used_leave_the_data_as_they_were(tmp_path: Path) -> None:
-    plain = recipe(scenes={"plinko": 1})
+    shares = {"abstain_share": 0.5, "abstain_shares": None}
+    plain = recipe(scenes={"plinko": 1}, jitter=None, decoys=0.0, **shares)
     (job,) = shard_jobs(plain, "train", tmp_path)
     draw_shard(job)
     line = json.loads(job.lines.read_text())
@@ -116,3 +117,15 @@ def test_a_share_for_every_prompt_is_needed() -> None:
     values = load_recipe().model_dump()
     with pytest.raises(ValidationError, match="needs a share for each of"):
         Recipe.model_validate(values | {"abstain_shares": {"standard": 0.1}})
+    for both in ({"abstain_share": 0.5}, {"abstain_shares": None}):
+        with pytest.raises(ValidationError, match=r"give abstain_share .* or abstain_shares"):
+            Recipe.model_validate(values | both)
+
+
+def test_settings_that_a_recipe_does_not_have_are_not_in_its_digest() -> None:
+    """A recipe from before they came is the same recipe after."""
+    values = load_recipe().model_dump(exclude={"abstain_shares", "jitter", "decoys"})
+    assert "abstain_share" in Recipe.model_validate(values | {"abstain_share": 0.5}).content()
+    assert not {"abstain_shares", "jitter", "decoys"} & set(
+        Recipe.model_validate(values | {"abstain_share": 0.5}).content()
+    )

@@ -16,11 +16,11 @@ from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHAR
 from traps_pipeline.models.local.checkpoint import as_folder, folder_digest
 from traps_pipeline.partitions import ANSWERABLE, transfer_type
 from traps_pipeline.pocket.evaluate import MODEL
+from traps_pipeline.pocket.planted import TRUTHS, planted
 from traps_pipeline.pocket.seeds import write_seeds
 from traps_pipeline.storage.workspace import Workspace
 
 FACTS = "training.json"  # beside the folder of the weights
-KINDS = ("void", "shuffled", "random")
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,9 @@ class Figure:
 
     figure: transfer_best and transfer_source (AUROC of a pair at the layer that is best on the target, and at the
     source's own), held_out_best and held_out_source (the same, fitted without the scored scenario), shuffled,
-    answerable_void, answerable_control (at the source's own layer), abstention (over all paths and regimes). low, high:
-    95 % interval from resampled scenarios. answers: number of distinct answers.
+    answerable_void, answerable_control (at the source's own layer), abstention (over all paths and regimes), planted
+    (kind: its name in `planted.TRUTHS`). low, high: 95 % interval from resampled scenarios. answers: number of distinct
+    answers.
     """
 
     seed: int
@@ -78,7 +79,9 @@ def figures_of(workspace: Workspace) -> list[Figure]:
     over_all = (shares[["path_set", "directions", "regime"]] == ALL).all(axis=1) & (shares["model"] == MODEL)
     shares = shares.rename(columns={"abstention": "value", "n_answers": "answers", "n_scenarios": "scenarios"})
     copied = ["kind", "layer", "alpha", "side", "value", "low", "high", "answers", "scenarios"]
-    return found + [Figure(**of, figure="abstention", **row) for row in _records(shares.loc[over_all, copied])]
+    found += [Figure(**of, figure="abstention", **row) for row in _records(shares.loc[over_all, copied])]
+    truths = planted(workspace, MODEL)
+    return found + [Figure(**of, figure="planted", kind=name, value=round(v, 6)) for name, v in truths.items()]
 
 
 def _records(rows: Any) -> list[dict[str, Any]]:
@@ -139,7 +142,17 @@ def read_figures(path: Path) -> list[Figure]:
 def markdown(figures: Sequence[Figure]) -> str:
     """The model card's tables: means over training seeds, with the lowest and the highest if there are several."""
     seeds = sorted({figure.seed for figure in figures})
-    return "\n".join([*_probes(figures), "", *_steering(figures), "", f"Training seeds: {', '.join(map(str, seeds))}."])
+    parts = [*_planted(figures), "", *_probes(figures), "", *_steering(figures)]
+    return "\n".join([*parts, "", f"Training seeds: {', '.join(map(str, seeds))}."])
+
+
+def _planted(figures: Sequence[Figure]) -> list[str]:
+    lines = ["| planted | expected | found |", "|" + " --- |" * 3]
+    for truth in TRUTHS:
+        chosen = [figure for figure in figures if (figure.figure, figure.kind) == ("planted", truth.name)]
+        value = _over_seeds(chosen, 100, 1) if truth.percent else _over_seeds(chosen)
+        lines.append(f"| {truth.label}{', %' * truth.percent} | {truth.wanted} | {value} |")
+    return lines
 
 
 def _probes(figures: Sequence[Figure]) -> list[str]:
@@ -169,16 +182,15 @@ def _steering(figures: Sequence[Figure]) -> list[str]:
     heads = ["abstained, %", *(f"α {alpha:g}" for alpha in alphas), "95 % at the last", "answers", "scenarios"]
     lines = [f"| {' | '.join(heads)} |", "|" + " --- |" * len(heads)]
     for side in ("void", "control"):
-        for kind in KINDS:
-            cells = [[f for f in shares if (f.side, f.kind, f.alpha) == (side, kind, alpha)] for alpha in alphas]
-            if not all(cells):
-                continue
-            top = cells[-1]
-            low, high = (pick(getattr(f, end) for f in top) for pick, end in ((min, "low"), (max, "high")))
-            columns = [f"{side}s, {kind} directions", *(_over_seeds(cell, 100, 1) for cell in cells)]
-            columns += [f"{100 * low:.1f}-{100 * high:.1f}"]
-            columns += [_range(f.answers for f in top), _range(f.scenarios for f in top)]
-            lines.append(f"| {' | '.join(columns)} |")
+        cells = [[f for f in shares if (f.side, f.kind, f.alpha) == (side, "void", alpha)] for alpha in alphas]
+        if not cells or not all(cells):
+            continue
+        top = cells[-1]
+        low, high = (pick(getattr(f, end) for f in top) for pick, end in ((min, "low"), (max, "high")))
+        columns = [f"{side}s, void directions", *(_over_seeds(cell, 100, 1) for cell in cells)]
+        columns += [f"{100 * low:.1f}-{100 * high:.1f}"]
+        columns += [_range(f.answers for f in top), _range(f.scenarios for f in top)]
+        lines.append(f"| {' | '.join(columns)} |")
     return lines
 
 
