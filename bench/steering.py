@@ -28,6 +28,7 @@ from traps_pipeline.models.local.adapter import Generated, load_local_model
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
+from traps_pipeline.paths import ASSETS
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import MediaSpec, pick, resized
 
@@ -55,13 +56,16 @@ def main() -> None:
 
 
 def random_entry(folder: Path) -> ModelEntry:
-    """The entry of a random checkpoint of middle size, in float32 on the CPU."""
-    build_tiny(
-        "qwen3-vl", folder, text=TEXT, vision=VISION, video={"size": {"shortest_edge": 1024, "longest_edge": 2**22}}
-    )
+    """The entry of a random checkpoint of middle size, in float32 on the CPU. With the pocket model's tokenizer, since
+    bytes as tokens would make a prompt mostly text."""
+    from tokenizers import Tokenizer
+
+    words = Tokenizer.from_file(str(ASSETS / "pocket" / "weights" / "tokenizer.json"))
+    video = {"size": {"shortest_edge": 1024, "longest_edge": 2**22}}
+    build_tiny("qwen3-vl", folder, tokenizer=words, text=TEXT, vision=VISION, video=video)
     params = {"checkpoint": str(folder), "dtype": "float32", "quantisation": "none"}
     params |= {"do_sample": False, "max_new_tokens": NEW_TOKENS}
-    spec = MediaSpec(profile="frames", uniform=8, size=(256, 192))
+    spec = MediaSpec(profile="frames", uniform=8, size=(320, 256))
     return ModelEntry(id="random", backend=LOCAL, device="cpu", media=spec, params=params)
 
 

@@ -116,7 +116,7 @@ def test_probes_stand_beside_their_baselines_at_the_sources_own_layer() -> None:
 
 
 def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
-    sources, controls, answerable = inside.gate(Made())
+    sources, controls, answerable, _ = inside.gate(Made())
     assert [row["Target"] for row in cells(sources)] == ["all", "ch"]
     assert [(row["Features"], row["PECS, gated"]) for row in cells(controls)] == [
         ("states", "0.640"),
@@ -124,6 +124,22 @@ def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
     ]
     (row,) = cells(answerable)
     assert (row["Abstained on %"], row["n"]) == ("40.0", "8") and row["Items"].startswith("decoy")
+
+
+def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
+    table = inside.gate(Made())[-1]
+    (row,) = cells(table)  # chaotic alone has answers, under guided; probes were fitted under standard
+    assert (row["Dataset"], row["guided"], row["guided − standard"]) == ("ch", "50.0", "–")
+    assert (row["Probe, standard"], row["Output margin, standard"]) == ("0.980", "0.900")
+    assert row["Probe, guided"] == row["AbsRec %, standard"] == "–"
+
+
+def test_nulls_say_in_how_many_rows_a_direction_is_ahead() -> None:
+    first, _ = inside.steering_nulls(Made())
+    assert any("ahead of 19 of 20 draws in 1 of 1 rows" in note for note in first.notes)
+    assert inside._ahead(nulls().assign(n_at_least=2))[0].startswith(
+        "the void direction is ahead of 19 of 20 draws nowhere"
+    )
 
 
 def test_few_answers_are_marked_and_p_is_printed() -> None:

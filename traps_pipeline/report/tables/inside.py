@@ -173,10 +173,21 @@ def _nulls(results: Results) -> PrintedTable:
         "effect: more abstention on controls (+), less on voids (−), against the unsteered answers of the same items",
         "nulls are orthogonal to the void direction and have its length; p = (1 + draws at least as large) / "
         "(1 + draws), one-sided, not corrected for the number of rows",
+        *_ahead(rows),
         *([FEW_NOTE] if "†" in set(named["mark"]) else []),
     ]
     absent = why(results, rows) if results.is_study else "the paper has no such nulls"
     return PrintedTable("steering_nulls", "Void directions among their nulls", named, columns, notes, absent)
+
+
+def _ahead(rows: pd.DataFrame) -> list[str]:
+    """Where the void direction is ahead of all but a twentieth of its nulls, in words."""
+    own = rows.loc[rows["target"] != "all"]
+    if own.empty:
+        return []
+    count = int((20 * own["n_at_least"] <= own["draws"]).sum())
+    where = f"in {count} of {len(own)} rows" if count else "nowhere"
+    return [f"the void direction is ahead of 19 of 20 draws {where}; one row in ten would be so by chance"]
 
 
 def _pecs(results: Results) -> PrintedTable:
@@ -213,8 +224,8 @@ SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
 
 def gate(results: Results) -> list[PrintedTable]:
     """Probe-gated abstention: PECS before and after the gate, by its sources and thresholds; beside gates on other
-    features; and what it does to items that must be answered."""
-    return [_gate_sources(results), _gate_controls(results), _gate_answerable(results)]
+    features; what it does to items that must be answered; and what the guided prompt does to answers and to states."""
+    return [_gate_sources(results), _gate_controls(results), _gate_answerable(results), _prompts(results)]
 
 
 _GATED = (
@@ -285,6 +296,50 @@ def _gate_answerable(results: Results) -> PrintedTable:
     notes = ["all of these items can be answered, so that every abstention of a gate is a false one"]
     absent = why(results, rows) if results.is_study else "the paper gates nothing"
     return PrintedTable("gate_answerable", "The gate on items that can be answered", rows, columns, notes, absent)
+
+
+def prompts(results: Results) -> pd.DataFrame:
+    """One row per model and dataset: AbsRec under standard and guided, in shares, their difference, and for both
+    prompts the AUROC of the probe (at the dataset's own layer, fitted without the scored scenario) and of the output
+    margin."""
+    import pandas as pd
+
+    keys = ["model", "dataset"]
+    plain = results.gate.loc[results.gate["target"].isin(DATASETS)].rename(columns={"target": "dataset"})
+    plain = plain.astype({"regime": object, "dataset": object})
+    table = plain.pivot_table(index=keys, columns="regime", values="plain_abs_rec", observed=True)
+    table = table.reindex(columns=pd.Index(PROMPTED)).add_prefix("said_")
+    table["change"] = table["said_guided"] - table["said_standard"]
+    own = [results.probes.loc[results.probes["source_best"].eq(True)]]
+    own += [results.baselines.loc[results.baselines["features"] == "output margin"]]
+    for name, rows in zip(("probe", "margin"), own, strict=True):
+        rows = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"])]
+        rows = rows.rename(columns={"target": "dataset"}).astype({"prompt": object, "dataset": object})
+        wide = rows.pivot_table(index=keys, columns="prompt", values="value", observed=True)
+        table = table.join(wide.reindex(columns=pd.Index(PROMPTED)).add_prefix(f"{name}_"))
+    return table.reset_index()
+
+
+PROMPTED = ("standard", "guided")
+
+
+def _prompts(results: Results) -> PrintedTable:
+    rows = prompts(results)
+    rows = rows.assign(name=[SHORT.get(name, name) for name in rows["dataset"]])
+    columns = [
+        MODEL, Column("name", "Dataset"), Column("said_standard", "AbsRec %, standard", "percent"),
+        Column("said_guided", "guided", "percent"), Column("change", "guided − standard", "percent"),
+        *(Column(f"{kind}_{prompt}", f"{label}, {prompt}", "fraction")
+          for kind, label in (("probe", "Probe"), ("margin", "Output margin")) for prompt in PROMPTED),
+    ]  # fmt: skip
+    notes = [
+        "what the prompt changes: the answers (AbsRec), or what is represented (AUROC of voids against controls, "
+        "states under the VQA prompt of that name, fitted without the scored scenario)",
+    ]
+    absent = why(results, rows) if results.is_study else "the paper prints no such figures"
+    return PrintedTable(
+        "prompt_gate", "What the prompt changes, in answers and in states", rows, columns, notes, absent
+    )
 
 
 def patching(results: Results) -> list[PrintedTable]:
