@@ -7,6 +7,9 @@ directions and doses share batches, the vision tower sees each clip once (`model
 below the steered one make of a prompt is kept (`models/local/prefixes.py`). Answers must be equal, token by token.
 Times are CPU seconds of this process, so that a loaded machine hardly matters; on a GPU they are seconds.
 
+Then the states of every clip under four prompts, as a study reads those of a control (two questions, two system
+prompts): each pass with its own vision pass, against passes that remember the clip. States must be equal, bit for bit.
+
 --random: a random checkpoint of the Qwen3-VL class with 145 M parameters, in the proportions of the 2B model: decoder
 and vision tower have about the same share of a pass. --layer: default the one at 5/9 of the depth, as the paper's layer
 20 of 36.
@@ -20,18 +23,21 @@ from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeVar
 
 import numpy as np
 
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.models.local.adapter import Generated, load_local_model
+from traps_pipeline.models.local.adapter import Generated, LocalModel, load_local_model
+from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.tiny import build_tiny
-from traps_pipeline.models.prompts import system_prompt
+from traps_pipeline.models.prompts import system_prompt, vqa_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
 from traps_pipeline.paths import ASSETS
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import MediaSpec, pick, resized
 
+T = TypeVar("T")
 ALPHAS, NEW_TOKENS = (-40.0, 5.0, 40.0), 24
 CLIP_S = np.arange(50) / 10  # a clip of five seconds
 ROWS = 64  # of a shipped batch
@@ -113,9 +119,33 @@ def measure(entry: ModelEntry, chosen: argparse.Namespace) -> None:
     print(f"{entry.id}: {len(sheet)} answers ({what})")
     print(f"plain {len(sheet) / old:.1f} answers/s, shipped {len(sheet) / new:.1f}: {old / new:.2f} times as many")
     print("answers are equal" if equal else "ANSWERS DIFFER")
+    extraction(model, spec, entry.device, chosen.prompts)
 
 
-def _timed(work: Callable[[], list[Generated]], device: str | None) -> tuple[float, list[Generated]]:
+def extraction(model: LocalModel, spec: MediaSpec, device: str | None, clips: int) -> None:
+    """States of made-up clips under four prompts each, without and with remembered clips."""
+    rng, times = np.random.default_rng(1), CLIP_S[pick(CLIP_S, spec)]
+    prompts = []
+    for _ in range(clips):
+        frames = resized(rng.integers(0, 256, (len(times), HEIGHT, WIDTH, 3), dtype=np.uint8), spec.size)
+        asked = ("Does the ball end up left or right?", "What does the ball weigh?")
+        prompts += [model.prompt(vqa_prompt(name), q, frames, times) for name in ("standard", "guided") for q in asked]
+
+    def plain() -> list[np.ndarray]:
+        return [model.forward_states(prompt).raw for prompt in prompts]
+
+    def remembering() -> list[np.ndarray]:
+        model.clips = ClipMemory()
+        with model.remembering_clips():
+            return plain()
+
+    (old, theirs), (new, ours) = _timed(plain, device), _timed(remembering, device)
+    print(f"extraction of {len(prompts)} states: {old:.1f} s, with remembered clips {new:.1f} s: {old / new:.2f} times")
+    equal = all((one == other).all() for one, other in zip(theirs, ours, strict=True))
+    print("states are equal" if equal else "STATES DIFFER")
+
+
+def _timed(work: Callable[[], list[T]], device: str | None) -> tuple[float, list[T]]:
     clock = time.process_time if device in (None, "cpu") else time.perf_counter
     start = clock()
     answers = work()
