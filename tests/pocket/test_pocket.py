@@ -17,6 +17,8 @@ from traps_pipeline.cli import main
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.mechanism.control_tables import GATE, PATCHING, STEERING_NULLS
 from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.models.local.checkpoint import folder_digest
 from traps_pipeline.models.prompts import system_prompt
@@ -32,6 +34,7 @@ from traps_pipeline.pocket.data import (
     shard_jobs,
 )
 from traps_pipeline.pocket.evaluate import MODEL, Asked, entry_of, evaluate, markdown, read_cells, write_cells
+from traps_pipeline.pocket.planted import planted
 from traps_pipeline.pocket.recipe import POCKET, Recipe, load_recipe
 from traps_pipeline.pocket.words import PROMPTS, say
 from traps_pipeline.storage.media import sample
@@ -71,6 +74,12 @@ def data(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def _guided(recipe: Recipe) -> float:
+    """The share of voids labelled with an abstention under the guided prompt that is decided at each look; 0 where the
+    scene's record has it."""
+    return (recipe.abstain_shares or {}).get("guided", 0.0)
+
+
 def _records(job: ShardJob) -> list[SceneRecord]:
     return [SceneRecord.read(line) for line in job.lines.read_text().splitlines()]
 
@@ -99,7 +108,7 @@ def test_frames_for_training_are_those_that_a_clip_gives(
     """The same scenes written as clips and read through the media path of every model: only H.264 lies between."""
     (job,) = shard_jobs(recipe, "train", data)
     rendered = np.load(job.pixels)
-    assert rendered.shape == (FEW, 3, 2, 96, 128, 3)  # control, void, decoy
+    assert rendered.shape == (FEW, 3 if recipe.decoys else 2, 2, 96, 128, 3)  # control, void, and perhaps a decoy
     monkeypatch.setitem(STREAM, "held-out", STREAM["train"])
     as_clips = dataclasses.replace(job, split="held-out", folder=tmp_path, count=1)
     draw_shard(as_clips)
@@ -114,10 +123,8 @@ def test_voids_alone_are_labelled_with_abstentions(recipe: Recipe, data: Path) -
     (job,) = shard_jobs(recipe, "train", data)
     for scene in _records(job):
         assert scene.asked.answer in scene.labels and scene.answerable.answer is not None
-        assert scene.visual.answer in scene.labels and scene.visual.draw is not None
-        shares = recipe.abstain_shares or {}
-        assert scene.asked.label(shares["guided"]) == scene.asked.answer
-        assert (scene.visual.label(shares["guided"]) is None) == (scene.visual.draw < shares["guided"])
+        assert scene.asked.label(_guided(recipe)) == scene.asked.answer
+        assert scene.visual.label(_guided(recipe)) in (None, *scene.labels)
 
 
 def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -> None:
@@ -185,7 +192,7 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
             {"role": "user", "content": [{"type": "video"}, {"type": "text", "text": question.question}]},
         ]
         text = processor.apply_chat_template(turns, add_generation_prompt=True)
-        said = say(question.label((recipe.abstain_shares or {})["guided"]), "guided") + processor.tokenizer.eos_token
+        said = say(question.label(_guided(recipe)), "guided") + processor.tokenizer.eos_token
         clock = {"fps": 1000.0, "frames_indices": [0, 4900], "total_num_frames": 4901}
         inputs = processor(
             text=[text + said], videos=[np.array(frames)], video_metadata=[clock], do_sample_frames=False,
@@ -344,7 +351,7 @@ def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Pa
     found = inside.read_figures(table)
     assert [figure.seed for figure in found] == [1] * 4 + [2] * 4
     lines = inside.markdown(found).splitlines()
-    assert "| AbsRec under guided, % | 30 points above | – |" in lines  # the study has no verdicts
+    assert not any("planted" in line for line in lines)  # the study has none of these figures
     assert "| Cross-domain | 0.900 (0.800-1.000) | 2 | 0.800 (0.700-0.900) | 1 |" in lines
     assert "| voids, void directions | 75.0 (75.0-75.0) | 37.5 (25.0-50.0) | 15.0-70.0 | 28 | 10 |" in lines
     assert lines[-1] == "Training seeds: 1, 2."
@@ -358,3 +365,36 @@ def test_figures_of_weights_that_lie_there_no_more_are_refused(tmp_path: Path) -
     (tmp_path / "seed3" / WEIGHTS / "model.safetensors").write_bytes(b"others")
     with pytest.raises(TrapsError, match="that folder now has other weights or none"):
         inside.figures_of(workspace)
+
+
+def test_what_was_planted_is_read_from_the_tables_of_the_controls(tmp_path: Path) -> None:
+    workspace, at = examined_study(tmp_path, 4, 1.0, 0.5), {"model": MODEL, "prompt": "standard"}
+    effect = {"dataset": "chaotic", "source": "pair", "site": "residual", "group": "stamps"}
+    patched = [
+        filled(PATCHING, **at, **effect, into=into, layer=layer, effect=value)
+        for into, layer, value in (("control", 0, 0.02), ("void", 0, 0.06), ("void", 1, 0.9))
+    ]
+    workspace.tables.write(PATCHING, at, patched, {})
+    for dataset, regime, said in (
+        ("chaotic", "standard", False),
+        ("chaotic", "guided", True),
+        ("decoy", "guided", False),
+    ):
+        part = {"dataset": dataset, "model": MODEL, "regime": regime, "run": 1}
+        side = "control" if dataset == "decoy" else "void"
+        rows = [filled(VERDICTS, **part, item_id=f"{dataset}:{n}", side=side, abstained=said) for n in range(3)]
+        workspace.tables.write(VERDICTS, part, rows, {})
+    gated = {"features": "states", "source": "other datasets", "threshold": "mid", "target": "decoy", "false_abs": 0.25}
+    workspace.tables.write(GATE, at, [filled(GATE, **at, **gated)], {})
+    ranks = (("chaotic", "void", 2 / 21), ("chaotic", "control", 3 / 21), ("all", "void", 1.0))
+    nulls = [
+        filled(STEERING_NULLS, model=MODEL, target=name, null="isotropic", side=side, p=p) for name, side, p in ranks
+    ]
+    workspace.tables.write(STEERING_NULLS, {}, nulls, {})
+    assert planted(workspace, MODEL) == {
+        **{"stamps": pytest.approx(0.04), "standard": 0.0, "guided": 1.0, "decoy_guided": 0.0},
+        **{"decoy_gate": 0.25, "nulls": 0.5},
+    }
+    lines = inside.markdown(inside.figures_of(workspace)).splitlines()
+    assert "| AbsRec under guided, % | 30 points above | 100.0 |" in lines
+    assert "| indirect effect of the time stamps at layer 0, chaotic | at most 0.1 | 0.040 |" in lines

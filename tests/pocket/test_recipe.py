@@ -37,7 +37,7 @@ def drawn(made: Recipe, folder: Path) -> dict[str, list[SceneRecord]]:
 
 @pytest.fixture(scope="module")
 def planted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recipe, Path, dict[str, list[SceneRecord]]]:
-    made = recipe(jitter=Jitter(control=0.5, void=0.5), decoys=0.5, abstain_shares=SHARES)
+    made = recipe(jitter=Jitter(control=0.5, void=0.5), decoys=0.5, abstain_share=None, abstain_shares=SHARES)
     folder = tmp_path_factory.mktemp("planted")
     return made, folder, drawn(made, folder)
 
@@ -117,14 +117,14 @@ def test_a_share_for_every_prompt_is_needed() -> None:
     values = load_recipe().model_dump()
     with pytest.raises(ValidationError, match="needs a share for each of"):
         Recipe.model_validate(values | {"abstain_shares": {"standard": 0.1}})
-    for both in ({"abstain_share": 0.5}, {"abstain_shares": None}):
+    for both in ((0.5, SHARES), (None, None)):
         with pytest.raises(ValidationError, match=r"give abstain_share .* or abstain_shares"):
-            Recipe.model_validate(values | both)
+            Recipe.model_validate(values | dict(zip(("abstain_share", "abstain_shares"), both, strict=True)))
 
 
 def test_settings_that_a_recipe_does_not_have_are_not_in_its_digest() -> None:
     """A recipe from before they came is the same recipe after."""
-    values = load_recipe().model_dump(exclude={"abstain_shares", "jitter", "decoys"})
+    values = load_recipe().model_dump(exclude={"abstain_share", "abstain_shares", "jitter", "decoys"})
     assert "abstain_share" in Recipe.model_validate(values | {"abstain_share": 0.5}).content()
     assert not {"abstain_shares", "jitter", "decoys"} & set(
         Recipe.model_validate(values | {"abstain_share": 0.5}).content()

@@ -21,6 +21,7 @@ from traps_pipeline.pocket.seeds import write_seeds
 from traps_pipeline.storage.workspace import Workspace
 
 FACTS = "training.json"  # beside the folder of the weights
+KINDS = ("void", "shuffled", "random")  # of the first weights; later studies rank directions among nulls instead
 
 
 @dataclass(frozen=True)
@@ -142,17 +143,20 @@ def read_figures(path: Path) -> list[Figure]:
 def markdown(figures: Sequence[Figure]) -> str:
     """The model card's tables: means over training seeds, with the lowest and the highest if there are several."""
     seeds = sorted({figure.seed for figure in figures})
-    parts = [*_planted(figures), "", *_probes(figures), "", *_steering(figures)]
+    parts = [*_planted(figures), *_probes(figures), "", *_steering(figures)]
     return "\n".join([*parts, "", f"Training seeds: {', '.join(map(str, seeds))}."])
 
 
 def _planted(figures: Sequence[Figure]) -> list[str]:
+    """What was planted and is found; nothing for weights in which nothing was."""
     lines = ["| planted | expected | found |", "|" + " --- |" * 3]
     for truth in TRUTHS:
         chosen = [figure for figure in figures if (figure.figure, figure.kind) == ("planted", truth.name)]
+        if not chosen:
+            continue
         value = _over_seeds(chosen, 100, 1) if truth.percent else _over_seeds(chosen)
         lines.append(f"| {truth.label}{', %' * truth.percent} | {truth.wanted} | {value} |")
-    return lines
+    return [*lines, ""] if len(lines) > 2 else []
 
 
 def _probes(figures: Sequence[Figure]) -> list[str]:
@@ -182,15 +186,16 @@ def _steering(figures: Sequence[Figure]) -> list[str]:
     heads = ["abstained, %", *(f"α {alpha:g}" for alpha in alphas), "95 % at the last", "answers", "scenarios"]
     lines = [f"| {' | '.join(heads)} |", "|" + " --- |" * len(heads)]
     for side in ("void", "control"):
-        cells = [[f for f in shares if (f.side, f.kind, f.alpha) == (side, "void", alpha)] for alpha in alphas]
-        if not cells or not all(cells):
-            continue
-        top = cells[-1]
-        low, high = (pick(getattr(f, end) for f in top) for pick, end in ((min, "low"), (max, "high")))
-        columns = [f"{side}s, void directions", *(_over_seeds(cell, 100, 1) for cell in cells)]
-        columns += [f"{100 * low:.1f}-{100 * high:.1f}"]
-        columns += [_range(f.answers for f in top), _range(f.scenarios for f in top)]
-        lines.append(f"| {' | '.join(columns)} |")
+        for kind in KINDS:
+            cells = [[f for f in shares if (f.side, f.kind, f.alpha) == (side, kind, alpha)] for alpha in alphas]
+            if not cells or not all(cells):
+                continue
+            top = cells[-1]
+            low, high = (pick(getattr(f, end) for f in top) for pick, end in ((min, "low"), (max, "high")))
+            columns = [f"{side}s, {kind} directions", *(_over_seeds(cell, 100, 1) for cell in cells)]
+            columns += [f"{100 * low:.1f}-{100 * high:.1f}"]
+            columns += [_range(f.answers for f in top), _range(f.scenarios for f in top)]
+            lines.append(f"| {' | '.join(columns)} |")
     return lines
 
 
