@@ -8,14 +8,12 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import TYPE_CHECKING, Any, Protocol
 
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prefixes import resumed, without_pictures
+from traps_pipeline.models.local.prefixes import Resumable, resumed, without_pictures
 from traps_pipeline.models.local.prompts import Prompt, collate
 from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from traps_pipeline.models.local.model import LocalModel
 
 
 class Steers(Protocol):
@@ -30,18 +28,18 @@ class Steers(Protocol):
         """That of some of the prompts."""
         ...
 
-    def applied(self, model: LocalModel) -> AbstractContextManager[None]:
+    def applied(self, model: Any) -> AbstractContextManager[None]:
         """Steer the passes made inside."""
         ...
 
 
-def steered(steering: Steers | None, model: LocalModel) -> AbstractContextManager[None]:
+def steered(steering: Steers | None, model: Resumable) -> AbstractContextManager[None]:
     """The steering, or nothing."""
     return nullcontext() if steering is None else steering.applied(model)
 
 
 def decode(
-    model: LocalModel,
+    model: Resumable,
     prompts: Sequence[Prompt],
     max_new_tokens: int,
     sampling: Sampling | None,
@@ -94,7 +92,7 @@ def decode(
                 nucleus.keep(going)
 
 
-def _without(model: LocalModel, inputs: dict[str, Any], out: Any, going: Sequence[int]) -> dict[str, Any]:
+def _without(model: Resumable, inputs: dict[str, Any], out: Any, going: Sequence[int]) -> dict[str, Any]:
     """What the rows that go on continue from: their tokens so far, and their part of the cache."""
     import torch
 

@@ -11,10 +11,10 @@ Whoever changes weights in memory must give the model a new `PrefixMemory`.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompts import Prompt
@@ -23,9 +23,27 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.nn import Module
 
-    from traps_pipeline.models.local.model import LocalModel
-
 MOST_BYTES = 4 * 2**30  # of what is kept, on the model's device
+
+
+class Resumable(Protocol):
+    """What is used of a `LocalModel` here and in `decoding`."""
+
+    network: Any
+    blocks: Any
+    prefixes: PrefixMemory
+
+    def block(self, layer: int) -> Module:
+        """The block whose output is hidden_states[layer]."""
+        ...
+
+    def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Inputs on the model's device."""
+        ...
+
+    def remembering_clips(self) -> AbstractContextManager[None]:
+        """Inside, the vision tower sees each clip once."""
+        ...
 
 
 class _EnoughError(Exception):
@@ -68,7 +86,7 @@ class PrefixMemory:
         finally:
             self.active = before
 
-    def of(self, model: LocalModel, prompts: Sequence[Prompt], layer: int) -> list[Prefix] | None:
+    def of(self, model: Resumable, prompts: Sequence[Prompt], layer: int) -> list[Prefix] | None:
         """The prefix of each prompt up to a layer; None for a model that cannot be resumed there."""
         if not resumable(model):
             return None
@@ -97,13 +115,13 @@ class PrefixMemory:
             self._size -= oldest.size
 
 
-def resumable(model: LocalModel) -> bool:
+def resumable(model: Resumable) -> bool:
     """Whether blocks read nothing of earlier ones but the residual stream and their own cache."""
     config = model.network.config.get_text_config()
     return not any(getattr(config, name, 0) for name in ("num_kv_shared_layers", "hidden_size_per_layer_input"))
 
 
-def without_pictures(model: LocalModel, prompts: Sequence[Prompt], layer: int) -> list[Prompt]:
+def without_pictures(model: Resumable, prompts: Sequence[Prompt], layer: int) -> list[Prompt]:
     """The prompts as a resumed pass needs them: without pixels, unless what the vision tower made of them is added
     behind the layer too (deepstack). Their grids stay, since positions follow from them."""
     added = getattr(getattr(model.network.config, "vision_config", None), "deepstack_visual_indexes", None) or ()
@@ -116,7 +134,7 @@ def without_pictures(model: LocalModel, prompts: Sequence[Prompt], layer: int) -
 
 
 @contextmanager
-def resumed(model: LocalModel, prefixes: Sequence[Prefix], layer: int) -> Iterator[None]:
+def resumed(model: Resumable, prefixes: Sequence[Prefix], layer: int) -> Iterator[None]:
     """Inside, the next pass, over these prompts padded on the left, takes blocks 1 to `layer` from the prefixes; hooks
     on block `layer` see and change its output as ever. Later passes are the model's own."""
     width = max(len(prefix.states) for prefix in prefixes)
@@ -152,7 +170,7 @@ def _padded(rows: Sequence[Tensor], width: int) -> Tensor:
     return torch.stack([torch.nn.functional.pad(row, (0, 0, width - row.shape[-2], 0)) for row in rows])
 
 
-def _record(model: LocalModel, prompt: Prompt, layer: int) -> Prefix | None:
+def _record(model: Resumable, prompt: Prompt, layer: int) -> Prefix | None:
     """A plain pass over a prompt up to a layer; None if its cache is no plain one."""
     import torch
 
