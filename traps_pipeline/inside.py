@@ -203,7 +203,7 @@ def protocol(
         raise TrapsError(f"no probe {fit!r}; there are {', '.join(PROBES)}")
     items = states.items
     if features is not None:
-        items = items.loc[items["dataset"].isin(set(features.items["dataset"]))].reset_index(drop=True)
+        items = items.loc[items["dataset"].isin([*dict.fromkeys(features.items["dataset"])])].reset_index(drop=True)
 
     def read(dataset: str, _: int) -> np.ndarray:
         if features is None:
