@@ -36,7 +36,7 @@ class Training(BaseModel):
 
 class Jitter(BaseModel):
     """How the lengths of chaotic clips, and so their time stamps, overlap. control: share of controls that begin late,
-    so that they are as short as a void; void: share of voids whose last frame is held, up to the control's length."""
+    so that they are as short as a void; void: share of voids whose last frame is held until the control's end."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     control: float = Field(ge=0, le=1)

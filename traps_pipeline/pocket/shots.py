@@ -75,7 +75,8 @@ def _jittered(jitter: Jitter, n: int, cut: int, fps: int, rng: np.random.Generat
     """The first frame of a chaotic control, and the length of its void; (0, None) for clips as they are."""
     late, held = rng.random(2) < (jitter.control, jitter.void)
     short = int(rng.integers(round(EARLIEST_CUT_S * fps) + 1, round(LATEST_CUT_S * fps) + 1))
-    return (max(0, n - short) if late else 0), (int(rng.integers(cut + 1, n + 1)) if held else None)
+    # Held to the very end: of lengths in between there are no controls, so that they alone would tell a void.
+    return (max(0, n - short) if late else 0), (n if held else None)
 
 
 def render_shot(shot: Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.ndarray]]:
