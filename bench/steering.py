@@ -10,7 +10,7 @@ Times are CPU seconds of this process, so that a loaded machine hardly matters; 
 Then the states of every clip under four prompts, as a study reads those of a control (two questions, two system
 prompts): each pass with its own vision pass, against passes that remember the clip. States must be equal, bit for bit.
 
---random: a random checkpoint of the Qwen3-VL class with 145 M parameters, in the proportions of the 2B model: decoder
+--random: a random checkpoint of the Qwen3-VL class with 149 M parameters, in the proportions of the 2B model: decoder
 and vision tower have about the same share of a pass. --layer: default the one at 5/9 of the depth, as the paper's layer
 20 of 36.
 """
@@ -52,7 +52,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--model", default="pocket", help="a local model of the registry")
-    parser.add_argument("--random", action="store_true", help="a random checkpoint of 145 M parameters")
+    parser.add_argument("--random", action="store_true", help="a random checkpoint of 149 M parameters")
     parser.add_argument("--layer", type=int, help="the steered block")
     parser.add_argument("--prompts", type=int, default=8)
     parser.add_argument("--directions", type=int, default=8)
