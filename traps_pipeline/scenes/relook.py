@@ -75,7 +75,7 @@ def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.nda
             measured = certificate.measured(pair)
         except Rejected as rejected:
             return f"{certificate.name}: {rejected}"
-        failure = certificate.failure(evidence | measured, pair.claim)
+        failure = certificate.failure({**evidence, **measured}, pair.claim)
         if failure is not None:
             return f"{certificate.name}: {failure}"
         evidence |= certificate.kept(measured)
