@@ -9,7 +9,7 @@ import pytest
 
 from traps_pipeline.scenes import vision
 from traps_pipeline.scenes.kit import COLOURS, Motion, Physics
-from traps_pipeline.scenes.parts import observers, outcome, questions, vary
+from traps_pipeline.scenes.parts import floor, observers, outcome, questions, vary
 from traps_pipeline.scenes.parts.ramp import Ramp, SteppedRamp
 from traps_pipeline.scenes.parts.stage import Stage, Surface, brake
 
@@ -225,3 +225,19 @@ def test_an_observer_sees_no_flag_and_sees_what_is_no_flag() -> None:
     bare = frames.copy()
     bare[:, 100:160, 60:63] = 200  # without its mast it is a thing
     assert np.array_equal(vision.without_flags(bare), bare)
+
+
+# --- floors ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("pattern", "share"), [("plain", 0.0), ("checks", 0.5), ("stripes", 0.5)])
+def test_a_floors_second_tone_covers_its_share(pattern: str, share: float) -> None:
+    assert floor._shares(pattern).mean() == share
+
+
+def test_planks_have_joints_of_the_second_tone_and_an_unknown_floor_is_refused() -> None:
+    planks = floor._shares("planks")
+    assert (planks == 1).mean() == pytest.approx(0.075, abs=0.02)  # 6 % between planks, 1.6 % at their ends
+    assert planks.min() == 0.0
+    with pytest.raises(ValueError, match="no floor pattern 'sea'; there are plain, checks"):
+        floor._shares("sea")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import yaml
@@ -39,6 +39,7 @@ def sample_benchmark(
     seed: int,
     name: str,
     *,
+    look: Collection[str] = (),
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
@@ -49,7 +50,7 @@ def sample_benchmark(
     """
     for family, count in counts.items():
         try:
-            tally = sample_family(family, count, seed, out / "released", workers=workers, report=report)
+            tally = sample_family(family, count, seed, out / "released", look=look, workers=workers, report=report)
         except RuntimeError as error:
             raise TrapsError(str(error)) from error
         reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"

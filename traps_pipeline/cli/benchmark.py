@@ -9,6 +9,8 @@ from pathlib import Path
 from traps_pipeline.cli.command import FAILED, OK, Commands, number, whole
 from traps_pipeline.errors import TrapsError
 
+LOOKS = ("floor", "light", "panel", "bystanders", "camera")  # `scenes.look.PARTS`, which takes long to import
+
 
 def add(commands: Commands) -> None:
     """Add `traps certify` and `traps sample`."""
@@ -34,6 +36,14 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--count", type=whole(1, 1_000_000), help="number of scenarios of each family, instead of --scale"
+    )
+    parser.add_argument(
+        "--look",
+        nargs="+",
+        choices=LOOKS,
+        default=[],
+        metavar="PART",
+        help=f"vary how scenes look, too: {', '.join(LOOKS)} (default: the floor under dice)",
     )
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
 
@@ -82,6 +92,7 @@ def sample(arguments: argparse.Namespace) -> int:
         wanted,
         arguments.seed,
         name,
+        look=arguments.look,
         workers=arguments.workers,
         report=lambda line: print(line, flush=True),
     )

@@ -10,7 +10,7 @@ default camera, z up; the floor is z = 0.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -38,6 +38,7 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
     "navy": (0.07, 0.11, 0.28),
 }
 
+READ = "read"  # key of a parameter's metadata: how its stored value is read, where that is not as it stands
 PANEL_GROUP = 4  # geoms of the cover panel: drawn in the void only, collide with nothing
 REMOVED_GROUP = 5  # geoms taken away by an ablation: never drawn
 
@@ -225,6 +226,7 @@ class Family:
     physics: Physics = Physics()
     min_margin_m: float = 0.005
     twins: Callable[[Any], Sequence[Any]] | None = None
+    looks: tuple[str, ...] = ()  # parts of the look (`look.PARTS`) that are drawn with every scenario
     perturbation: float = 1e-4  # chaotic: standard deviation of an initial-state perturbation (m, rad)
     check: Callable[[Any], None] = lambda params: (
         None
@@ -233,21 +235,24 @@ class Family:
     def params_from(self, values: Mapping[str, Any]) -> Any:
         """Parameters from a stored mapping (lists become tuples). Raises ValueError naming the first that is unknown,
         missing, of another type or not plausible."""
-        known = {f.name for f in fields(self.params)}
-        unknown, missing = sorted(set(values) - known), sorted(known - set(values))
+        known = {f.name: f for f in fields(self.params)}
+        needed = {name for name, f in known.items() if f.default is MISSING}
+        unknown, missing = sorted(set(values) - set(known)), sorted(needed - set(values))
         if unknown or missing:
             raise ValueError(
                 f"family {self.name}: unknown parameters {unknown}, missing parameters {missing}; "
                 f"known: {sorted(known)}"
             )
-        params = self.params(**{name: _as_tuple(value) for name, value in values.items()})
+        read = {name: known[name].metadata.get(READ, _as_tuple) for name in values}
+        params = self.params(**{name: read[name](value) for name, value in values.items()})
         self.check(params)
         return params
 
 
 def params_to_dict(params: Any) -> dict[str, Any]:
-    """Plain JSON-able mapping of a family's parameters."""
-    return asdict(params)
+    """Plain JSON-able mapping of a family's parameters, without a look that is not there."""
+    absent = {each.name for each in fields(params) if each.default is None and getattr(params, each.name) is None}
+    return {name: value for name, value in asdict(params).items() if name not in absent}
 
 
 def _as_tuple(value: Any) -> Any:

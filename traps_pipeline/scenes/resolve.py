@@ -75,21 +75,21 @@ def resolve(
         sub_scenario=family.sub_scenario,
         family=family.name,
         seed=seed,
-        params=_plain(params_to_dict(params)),
+        params=plain(params_to_dict(params)),
         physics=asdict(physics),
-        camera=_plain(asdict(control.camera)),
+        camera=plain(asdict(control.camera)),
         void_kind=kind,
-        void=_plain({"cut_frame": frame} if panel is None else {"panel": panel, "hidden_from_frame": frame}),
+        void=plain({"cut_frame": frame} if panel is None else {"panel": panel, "hidden_from_frame": frame}),
         question=wording.question,
         labels=list(wording.labels),
         aliases=dict(wording.aliases),
         answer_type=family.answer_type,
         ground_truth=control.outcome.answer,
         ill_posed_question=ill_posed_question,
-        answerable_question=_plain(asdict(wording.answerable_question)),
+        answerable_question=plain(asdict(wording.answerable_question)),
         trajectory_sha256=trajectory_digest(control.qpos),
         twin=Twin(
-            params=None if panel is None else _plain(params_to_dict(twin.params)),
+            params=None if panel is None else plain(params_to_dict(twin.params)),
             rollout=pair.rollout,
             ground_truth=twin.outcome.answer,
             trajectory_sha256=trajectory_digest(twin.qpos),
@@ -209,10 +209,10 @@ def _hopeless(scouts: Sequence[Rollout], first: int) -> bool:
     return few or max(counts.values(), default=0) > HOPELESS_SHARE * counts.total()
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Tuples to lists, numpy numbers to Python's, so that a record equals itself after a round trip through JSON."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return value.item() if isinstance(value, np.generic) else value

@@ -10,8 +10,8 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import numpy as np
 from traps_pipeline.files import write_text
 from traps_pipeline.scenes.certificates import settled_outcome
 from traps_pipeline.scenes.kit import Family
+from traps_pipeline.scenes.look import look_of_draw
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, simulated
 from traps_pipeline.scenes.registry import family_digest, fit_to_sample, get_family
 from traps_pipeline.scenes.resolve import Resolved, resolve
@@ -37,14 +38,15 @@ _UNASKED = "?"  # stands for the ill-posed question until the scenario has its p
 
 @dataclass
 class Tally:
-    """How a family was drawn: the seed, scenarios wanted, draws made, why the others were rejected, and the digest of
-    the family's file (empty in notes that were written before it was kept)."""
+    """How a family was drawn: the seed, scenarios wanted, draws made, why the others were rejected, the digest of the
+    family's file (empty in notes that were written before it was kept), and the parts of the look that vary."""
 
     seed: int
     wanted: int
     draws: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     file: str = ""
+    look: list[str] = field(default_factory=list)
 
 
 def load_tallies(released: Path) -> dict[str, Tally]:
@@ -79,6 +81,7 @@ class Draw:
     seed: int
     number: int
     closed: frozenset[str]
+    look: tuple[str, ...] = ()
 
 
 def sample_family(
@@ -87,6 +90,7 @@ def sample_family(
     seed: int,
     released: Path,
     *,
+    look: Collection[str] = (),
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Tally:
@@ -94,16 +98,17 @@ def sample_family(
 
     Goes on where a stopped call with the same seed and count was, and fills the places of records that were taken out
     (`take_out`); anything else of the family is replaced, as are records of another version of the family's file.
+    look: parts of the look (`look.PARTS`) that vary besides those that always do in the family.
     `report` gets a line for each record and for the first rejection of each kind. Raises RuntimeError with the tally of
     rejections when 40 draws a scenario are not enough, TrapsError for an unfit family.
     """
     family, records = fit_to_sample(name), Records(released, name)
-    tally, file = load_tallies(released).get(name), family_digest(name)
+    tally, file, parts = load_tallies(released).get(name), family_digest(name), sorted({*family.looks, *look})
     if tally is not None and (tally.seed, tally.wanted) == (seed, count) and tally.file not in ("", file):
         report(f"{name}: its file was changed since its scenarios were drawn; all are drawn again")
         tally = None
-    if tally is None or (tally.seed, tally.wanted) != (seed, count):
-        tally = Tally(seed, count, file=file)
+    if tally is None or (tally.seed, tally.wanted, tally.look) != (seed, count, parts):
+        tally = Tally(seed, count, file=file, look=parts)
         records.clear()
     specs = records.read(tally)
     answers = Counter(spec.ground_truth for spec in specs)
@@ -115,7 +120,7 @@ def sample_family(
 
     def jobs() -> Iterator[Draw]:
         for number in range(tally.draws, MOST_DRAWS * count):
-            yield Draw(name, seed, number, _closed(answers, count, family))
+            yield Draw(name, seed, number, _closed(answers, count, family), tuple(parts))
 
     said: set[str] = set()  # kinds of rejections that the report has
     results = run_in_order(try_draw, jobs(), workers)
@@ -174,7 +179,7 @@ class Records:
             except ValueError:  # a line that a kill tore
                 break
         kept = [spec for spec in specs if spec.seed < tally.draws]
-        write_text(self._lines, "".join(_line(spec) for spec in kept))
+        write_text(self._lines, "".join(record_line(spec) for spec in kept))
         return kept
 
     def sort(self) -> None:
@@ -187,8 +192,8 @@ class Records:
         """Add a scenario and note how far the drawing is."""
         save_trajectory(self._released / "trajectories", found.spec.scenario_id, found.qpos, found.twin)
         with self._lines.open("a", encoding="utf-8") as lines:
-            lines.write(_line(found.spec))
-        _save_tallies(self._released, load_tallies(self._released) | {self._family: tally})
+            lines.write(record_line(found.spec))
+        save_tallies(self._released, load_tallies(self._released) | {self._family: tally})
 
 
 def take_out(released: Path, reasons: Mapping[str, str]) -> None:
@@ -204,15 +209,17 @@ def take_out(released: Path, reasons: Mapping[str, str]) -> None:
             tallies[family].rejected[reasons[scenario_id]] += 1
             (released / "trajectories" / f"{scenario_id}.npz").unlink()
         write_text(lines, "".join(f"{line}\n" for line in records.values()))
-    _save_tallies(released, tallies)
+    save_tallies(released, tallies)
 
 
-def _save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
+def save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
+    """Write `draws.json`."""
     notes = {name: vars(each) | {"rejected": dict(each.rejected)} for name, each in tallies.items()}
     write_text(released / DRAWS, json.dumps(notes, indent=1, sort_keys=True) + "\n")
 
 
-def _line(spec: SceneSpec) -> str:
+def record_line(spec: SceneSpec) -> str:
+    """A record as its file has it."""
     return json.dumps(spec.model_dump(mode="json"), ensure_ascii=False) + "\n"
 
 
@@ -234,6 +241,7 @@ def try_draw(draw: Draw) -> Resolved | str:
     rng = np.random.default_rng([draw.seed, *draw.family.encode(), draw.number])
     params = family.draw(rng)
     wording = family.word(params, rng)
+    params = replace(params, look=look_of_draw(draw.seed, draw.family, draw.number, draw.look))
     try:
         answer = simulated_answer(family, params)
         if answer in draw.closed:

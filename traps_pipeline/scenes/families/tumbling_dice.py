@@ -292,9 +292,15 @@ def _tray_edge(frames: np.ndarray) -> tuple[int, float, float] | None:
     still = np.median(frames, axis=0).astype(np.uint8)
     shade = still.mean(axis=2)
     grey = (np.ptp(still, axis=2) < 22) & (shade > 125) & (shade < 185)
-    wood = np.nonzero(colour_mask(still, "wood"))[1]
+    wooden = colour_mask(still, "wood").astype(np.uint8)
+    wood = np.nonzero(wooden)[1]
+    solid = cv2.findNonZero(cv2.morphologyEx(wooden, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)))
+    if solid is None:
+        return None
+    around = cv2.convexHull(solid)
+    grey &= cv2.fillConvexPoly(np.zeros(grey.shape, np.uint8), around, 1) > 0  # a floor may be grey as well
     tray = next(iter(blobs(grey, 400)), None)
-    if tray is None or not wood.size:
+    if tray is None:
         return None
     side = 1 if tray.x > wood.mean() else -1
     left, top, width, height = tray.box
@@ -373,4 +379,5 @@ FAMILY = scene_family(
     physics=Physics(timestep_s=0.001, gravity_m_s2=4.4),
     min_margin_m=0.03,
     perturbation=1e-6,
+    looks=("floor",),
 )

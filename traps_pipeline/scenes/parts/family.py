@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from traps_pipeline.scenes.kit import Family, Motion, Physics, Reading, Scene
+from traps_pipeline.scenes.look import dressed, look_of, with_look
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
@@ -32,6 +33,7 @@ def scene_family(
     legible: Callable[[Motion, Any], Sequence[tuple[tuple[str, ...], float]]] | None = None,
     twins: Callable[[Any], Sequence[Any]] | None = None,
     perturbation: float = 1e-4,
+    looks: tuple[str, ...] = (),
 ) -> Family:
     """A family from its parts; `kit.Family` says what the other fields mean.
 
@@ -46,6 +48,7 @@ def scene_family(
         named = question.named_in(text)
         return None if named is None else observe(frames if twins is None else without_flags(frames), named)
 
+    params = with_look(params)
     return Family(
         name=name,
         taxonomy="chaotic" if twins is None else "occlusion",
@@ -54,7 +57,7 @@ def scene_family(
         answer_type=question.answer_type,
         params=params,
         draw=lambda rng: vary.drawn(params, rng),
-        build=build,
+        build=lambda p, physics: dressed(build(p, physics), look_of(p)),
         outcome=outcome,
         word=lambda p, rng: question.word(p, rng, asides),
         questions=question.templates,
@@ -64,5 +67,6 @@ def scene_family(
         min_margin_m=min_margin_m,
         twins=twins,
         perturbation=perturbation,
+        looks=looks,
         check=vary.check,
     )

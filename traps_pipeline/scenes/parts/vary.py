@@ -17,7 +17,7 @@ hidden element that depends on nothing is as likely whatever is seen. `twins(p)`
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cache
 from typing import Any, TypeVar, get_type_hints
 
@@ -213,11 +213,12 @@ def _shown(value: Any) -> str:
 
 
 def drawn(params: type[Params], rng: np.random.Generator) -> Params:
-    """Parameters of one scenario. Raises TypeError naming a field that has no range."""
+    """Parameters of one scenario; a field that has a default keeps it. Raises TypeError naming a field that has neither
+    a range nor a default."""
     so_far: Drawn = {}
     members = fields(params)  # type: ignore[arg-type]
     for each in members:
-        if each.name in so_far:
+        if each.name in so_far or each.default is not MISSING:
             continue
         how = each.metadata.get(_HOW)
         if how is None:
@@ -226,7 +227,7 @@ def drawn(params: type[Params], rng: np.random.Generator) -> Params:
             so_far |= _of_group(how, members, rng, so_far)
         else:
             so_far[each.name] = how(rng, so_far)
-    return params(**{each.name: so_far[each.name] for each in members})
+    return params(**{each.name: so_far[each.name] for each in members if each.name in so_far})
 
 
 def _of_group(group: Group, members: Sequence[Field[Any]], rng: np.random.Generator, so_far: Drawn) -> Drawn:

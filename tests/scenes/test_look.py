@@ -1,0 +1,118 @@
+"""A look is stored with a scene's parameters, changes what is seen and nothing that happens, and is certified."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes.released import load
+from traps_pipeline.cli.benchmark import LOOKS
+from traps_pipeline.scenes.certify import certify
+from traps_pipeline.scenes.kit import params_to_dict
+from traps_pipeline.scenes.look import PANELS, PARTS, Look, look_of_draw
+from traps_pipeline.scenes.outcome import compile_scene, simulated
+from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.relook import with_look
+from traps_pipeline.scenes.render import Renderer
+from traps_pipeline.scenes.resolve import Resolved
+from traps_pipeline.scenes.sample import Draw, load_tallies, sample_family, try_draw
+from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.world import World
+
+EVERYTHING = Look(
+    floor_pattern="checks",
+    floor_tones=("chalk", "coal"),
+    floor_repeat_m=0.8,
+    light_turn_deg=10.0,
+    light=(0.9, 1.0, 1.1),
+    panel="maroon",
+    bystanders=((0.3, 0.3, 0.1, 0.2),),
+    bystander_tones=("moss",),
+    orbit_deg=(5.0, -2.0),
+)
+
+
+def test_a_look_is_read_back_from_a_record_and_one_that_is_not_there_leaves_none() -> None:
+    family, params = get_family("bounce"), load("bounce-0001").params
+    plain = params_to_dict(params)
+    assert "look" not in plain
+    seen = replace(params, look=EVERYTHING)
+    assert family.params_from(params_to_dict(seen)) == seen
+    assert params_to_dict(seen) == plain | {"look": params_to_dict(seen)["look"]}
+
+
+@pytest.mark.parametrize(
+    ("look", "said"),
+    [
+        ({"floor_tones": ["chalk", "gold"]}, "no tone 'gold'; there are chalk"),
+        ({"panel": "pink"}, "no panel 'pink'; there are navy"),
+        ({"fog": 1.0}, "look: .*'fog'"),
+    ],
+)
+def test_a_look_that_does_not_exist_is_refused_by_name(look: dict[str, object], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        get_family("bounce").params_from(load("bounce-0001").spec.params | {"look": look})
+
+
+def test_a_draws_look_follows_from_its_number_and_varies_in_the_parts_that_are_named() -> None:
+    assert LOOKS == PARTS
+    assert look_of_draw(1, "bounce", 4, ()) is None
+    everything = look_of_draw(1, "bounce", 4, PARTS)
+    assert everything == look_of_draw(1, "bounce", 4, PARTS) != look_of_draw(1, "bounce", 5, PARTS)
+    assert look_of_draw(1, "bounce", 4, ("panel",)) in [Look(panel=name) for name in PANELS]
+    floor = look_of_draw(1, "bounce", 4, ("floor",))
+    assert floor is not None and floor.floor_pattern is not None
+    assert replace(floor, **{f: getattr(Look(), f) for f in vars(floor) if f.startswith("floor_")}) == Look()
+
+
+def test_a_look_changes_no_trajectory() -> None:
+    case = load("bounce-0001")
+    model, scene = compile_scene(case.family, replace(case.params, look=EVERYTHING), case.physics)
+    assert np.array_equal(simulated(model, scene, case.physics), case.qpos)
+
+
+def test_the_floor_the_light_and_the_panel_are_seen() -> None:
+    case = load("bounce-0001")
+    world = World.of_record(case.spec, case.qpos)
+    shown = {}
+    for name, look in {"plain": None, "panel": Look(panel="maroon"), "floor": replace(EVERYTHING, panel=None)}.items():
+        seen = replace(world, params=replace(case.params, look=look))
+        with Renderer(seen.model, seen.camera) as renderer:
+            (shown[name],) = renderer.frames(case.qpos[:1], panel=True)
+    red = {name: frame.astype(int) for name, frame in shown.items()}
+    repainted = (red["panel"] != red["plain"]).any(axis=2)
+    navy = (red["plain"][..., 2] - red["plain"][..., 0])[repainted]  # bluer than red before, redder than blue after
+    maroon = (red["panel"][..., 0] - red["panel"][..., 2])[repainted]
+    assert repainted.sum() > 1000
+    assert (navy > 0).mean() > 0.95 and (maroon > 0).mean() > 0.95
+    assert (red["floor"] != red["plain"]).any(axis=2).mean() > 0.3
+
+
+@pytest.mark.slow
+def test_a_record_under_another_floor_has_the_same_worlds_and_is_certified() -> None:
+    case = load("plinko-0001")
+    seen = with_look(
+        case.spec, replace(EVERYTHING, orbit_deg=(0.0, 0.0), bystanders=(), bystander_tones=()), case.qpos, case.twin
+    )
+    assert isinstance(seen, SceneSpec)
+    assert seen.params == case.spec.params | {"look": seen.params["look"]}
+    assert seen.scene_hash != case.spec.scene_hash and seen.trajectory_sha256 == case.spec.trajectory_sha256
+    assert certify(seen, case.qpos, case.twin, frame_step=5).failures == {}
+    red = replace(EVERYTHING, bystanders=((0.0, -1.6, 0.6, 0.7),), bystander_tones=("moss",))  # over the board
+    assert str(with_look(case.spec, red, case.qpos, case.twin)).startswith("legible: too small at the end")
+
+
+@pytest.mark.slow
+def test_a_scene_is_drawn_and_certified_under_a_look(tmp_path: Path) -> None:
+    tally = sample_family("bounce", 1, 3, tmp_path, look=("floor", "panel"), workers=1)
+    assert load_tallies(tmp_path)["bounce"].look == tally.look == ["floor", "panel"]
+    found = try_draw(Draw("bounce", 3, tally.draws - 1, frozenset(), ("floor", "panel")))
+    assert isinstance(found, Resolved)
+    look = look_of_draw(3, "bounce", tally.draws - 1, ("floor", "panel"))
+    params = get_family("bounce").params_from(found.spec.params)
+    twin = get_family("bounce").params_from(found.spec.twin.params or {})
+    assert params.look == twin.look == look
+    assert found.spec.evidence["twin_px"] == 0 and found.spec.evidence["ablation_px"] == 0

@@ -1,0 +1,82 @@
+"""Giving released records the look that their family's draws have by now: the same worlds under another floor.
+
+Where a look moves neither camera nor panel, a record with it is the one that `sample_family` would have drawn: nothing
+is simulated, the trajectory stays, and what pixels say is measured again. Whoever uses it then runs `traps certify`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import write_text
+from traps_pipeline.scenes.certificates import certificates_for, pair_of
+from traps_pipeline.scenes.kit import params_to_dict
+from traps_pipeline.scenes.look import Look, look_of_draw
+from traps_pipeline.scenes.outcome import Rejected
+from traps_pipeline.scenes.registry import family_digest, get_family
+from traps_pipeline.scenes.resolve import plain
+from traps_pipeline.scenes.sample import load_tallies, record_line, save_tallies
+from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.workers import run_in_order
+
+STILL = ("floor", "light", "bystanders")  # parts of a look that move neither camera nor panel
+
+
+def relook_family(
+    released: Path, name: str, workers: int | None = None, report: Callable[[str], None] = lambda _: None
+) -> None:
+    """Give all records of a family the look of their draw, and measure again what pixels say. Raises TrapsError if a
+    part of the look moves the camera, or naming a record that is no longer certified; nothing is written then."""
+    family, tallies = get_family(name), load_tallies(released)
+    if not set(family.looks) <= set(STILL):
+        raise TrapsError(f"{name}: a look in {', '.join(family.looks)} moves the camera; draw the family anew")
+    tally, lines = tallies[name], released / f"{name}.jsonl"
+    specs = [SceneSpec.model_validate_json(line) for line in lines.read_text(encoding="utf-8").splitlines()]
+    jobs = [(spec, released / "trajectories", tally.seed) for spec in specs]
+    found: list[SceneSpec] = []
+    for job, seen in run_in_order(_relooked, jobs, workers):
+        if isinstance(seen, str):
+            raise TrapsError(f"{job[0].scenario_id}: {seen}; take it out (`take_out`) and draw it anew")
+        found.append(seen)
+        report(f"{seen.scenario_id}: {len(found)} of {len(specs)}")
+    write_text(lines, "".join(record_line(spec) for spec in found))
+    tallies[name] = replace(tally, file=family_digest(name), look=sorted(family.looks))
+    save_tallies(released, tallies)
+
+
+def _relooked(job: tuple[SceneSpec, Path, int]) -> SceneSpec | str:
+    """A record with the look of its draw, or which certificate it loses under it."""
+    spec, folder, seed = job
+    family, path = get_family(spec.family), folder / f"{spec.scenario_id}.npz"
+    look = look_of_draw(seed, spec.family, spec.seed, sorted(family.looks))
+    qpos = load_trajectory(path, spec.trajectory_sha256)
+    return with_look(spec, look, qpos, load_trajectory(path, spec.twin.trajectory_sha256, "twin"))
+
+
+def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.ndarray) -> SceneSpec | str:
+    """A record under a look that moves neither camera nor panel, or which of the certificates that another picture may
+    change it loses. qpos, twin: its trajectories, (F, nq) each."""
+    family = get_family(spec.family)
+    dressed = plain(params_to_dict(replace(family.params_from(spec.params), look=look)))
+    other = spec.twin.params
+    if other is not None:
+        other = plain(params_to_dict(replace(family.params_from(other), look=look)))
+    seen = spec.model_copy(update={"params": dressed, "twin": spec.twin.model_copy(update={"params": other})})
+    pair, evidence = pair_of(seen, qpos, twin), dict(spec.evidence)
+    for certificate in certificates_for(spec.void_kind):
+        if not any(number.kept and not number.compared for number in certificate.numbers):
+            continue
+        try:
+            measured = certificate.measured(pair)
+        except Rejected as rejected:
+            return f"{certificate.name}: {rejected}"
+        failure = certificate.failure({**evidence, **measured}, pair.claim)
+        if failure is not None:
+            return f"{certificate.name}: {failure}"
+        evidence |= certificate.kept(measured)
+    return seen.model_copy(update={"evidence": evidence})
