@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     from traps_pipeline.orchestration.run import dagster_history, failed_checks, stages_until, walk
 
     stages = stages_until(arguments.until)
-    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
+    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", flush=True)
     with reporting(TerminalProgress()) as progress, dagster_history(workspace) as instance:
         participants = _still_to_ask(workspace, experiment, stages)
         for entry in (*participants.models, *participants.judges):

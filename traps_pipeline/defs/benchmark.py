@@ -204,7 +204,7 @@ items = stage(
             "clips_present",
             "Every clip exists and has its digest (checked while the table is made; a damaged clip fails the step).",
             lambda workspace, key, made: sorted(
-                {row.clip for row in made.rows(ITEMS) if not workspace.resolve(row.clip).is_file()}
+                (named := {row.clip for row in made.rows(ITEMS)}) - workspace.sizes(named).keys()
             ),
         ),
     ],

@@ -176,7 +176,7 @@ def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
     for stage in the_graph().stages:
         for key in stage.wanted(wanted):
             for check in workspace.failed_checks(stage.name, key):
-                details = workspace.failed_check(stage.name, check, key).read_text(encoding="utf-8")
+                details = workspace.failure(stage.name, check, key)
                 problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {_unquoted(details)}")
     return problems
 

@@ -16,6 +16,7 @@ from traps_pipeline.orchestration.schemes import LEFT_OUT, Scheme, study_here
 from traps_pipeline.orchestration.step import CURRENT, CURRENT_DOC, Event, Step
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -29,7 +30,7 @@ class WorkspaceResource(dg.ConfigurableResource):
 
     def open(self) -> Workspace:
         """The workspace. Raises TrapsError naming the remedy where there is none."""
-        return Workspace.open(Path(self.root))
+        return Workspace.open(place_of(self.root))
 
 
 def key_of(name: str) -> dg.AssetKey:

@@ -17,7 +17,6 @@ import dagster as dg
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes, write_text
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
@@ -142,8 +141,7 @@ class Step:
                 stage.table, stage.columns(key), rows, inputs, failed=made.tally.errors, code=stage.code
             )
         files = cast(Mapping[str, bytes], content)
-        for path, data in files.items():
-            write_bytes(self.workspace.reports / path, data)
+        self.workspace.store.write({self.workspace.reports / path: data for path, data in files.items()})
         version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
         write_report_state(self.workspace, stage, State(version, dict(inputs), 0, 0, stage.code))
         return version
@@ -165,9 +163,9 @@ class Step:
             problems = check.wrong(self.workspace, key, made)
             file = self.workspace.failed_check(stage.name, check.name, key)
             if problems:
-                write_text(file, json.dumps(problems, default=str))
+                self.workspace.store.write({file: json.dumps(problems, default=str).encode()})
             else:
-                file.unlink(missing_ok=True)
+                self.workspace.store.remove([file])
             yield self._evaluation(check.name, key, {"failing": _plain(problems)} if problems else {})
 
     def _still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
@@ -177,8 +175,7 @@ class Step:
         for key in self.graph.keys(name):
             if key not in seen:
                 for check in self.workspace.failed_checks(name, key):
-                    text = self.workspace.failed_check(name, check, key).read_text(encoding="utf-8")
-                    self.failing[check, key] = {STILL: json.loads(text)}
+                    self.failing[check, key] = {STILL: json.loads(self.workspace.failure(name, check, key))}
                 state = lineage.state(name, key)
                 if state is not None and state.failed:
                     self.failing[CURRENT, key] = {STILL: _failed_calls(state.failed)}
