@@ -127,9 +127,9 @@ class Bucket:
         said = " ".join(str(error).split())[:300]
         return TrapsError(
             f"{self.address}: cannot be used from the host {socket.gethostname()} ({said}). See that the bucket "
-            "exists, that its keys and its address are in the environment (for S3: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, "
-            "AWS_REGION, and AWS_ENDPOINT for a server of your own), and that this machine's clock is right; then run "
-            "the same command again: what is finished is kept"
+            "exists, that its keys and its address are in the environment (for S3: AWS_ACCESS_KEY_ID, "
+            "AWS_SECRET_ACCESS_KEY, AWS_REGION, and AWS_ENDPOINT for a server of your own), and that this machine's "
+            "clock is right; then run the same command again: what is finished is kept"
         )
 
 
@@ -292,13 +292,13 @@ class ObjectStore(Store):
         self._change([row for row in _side_by_side(one, {*paths}) if row is not None])
 
     def _put(self, content: bytes, current: bytes | None) -> bytes:
-        """Bring a content to the store, unless it is seen there; its digest."""
+        """Bring a content to the store, unless it is what is current and is seen there; its digest. What is current no
+        more may be gone from the store, whatever this process has seen."""
         digest = sha256(content).digest()
         name = object_name(digest)
-        if digest not in self._there:
-            if digest != current or self.bucket.size(name) != len(content):
-                self.bucket.put(name, content)
-            self._there.add(digest)
+        if digest != current or (digest not in self._there and self.bucket.size(name) != len(content)):
+            self.bucket.put(name, content)
+        self._there.add(digest)
         return digest
 
     def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
@@ -336,6 +336,7 @@ class ObjectStore(Store):
         lost = {digest for digest, size in found.items() if size != unseen[digest].size}
         self._there |= found.keys() - lost
         if lost:
+            self.bucket.get(object_name(next(iter(lost))))  # tells a bucket that is gone from one without this object
             self._withdraw(lost)
         return {path: row.size for path, row in rows.items() if row.digest not in lost}
 
