@@ -293,7 +293,7 @@ os.environ["{VARIABLE}"] = "postgresql://traps@127.0.0.1/postgres"
 session_of("{VARIABLE}", "my-study")
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
-    assert "a ledger that hosts share needs psycopg, which is not installed: `make setup`" in ran.stderr
+    assert "a study that hosts share needs psycopg, which is not installed: `make setup`" in ran.stderr
 
 
 def test_tables_of_another_format_are_refused() -> None:

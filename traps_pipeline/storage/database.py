@@ -283,5 +283,5 @@ def session_of(variable: str, study: str) -> Session:
 
 @cache
 def _session_of(_pid: int, address: str, variable: str, study: str) -> Session:
-    require("cluster")
+    require("cluster", "psycopg")
     return Session(address, variable, study)

@@ -35,7 +35,8 @@ from traps_pipeline.storage.study import Study
 if TYPE_CHECKING:
     from psycopg import Connection
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 
 OBJECTS = ".objects"  # in a scratch folder: contents by digest
 AT_ONCE = 16  # transfers side by side
@@ -76,7 +77,7 @@ class Bucket:
     """A place in an object store. address: as TRAPS_WORKSPACE has it, for example s3://bucket/study."""
 
     def __init__(self, address: str) -> None:
-        require("cluster")
+        require("cluster", "obstore")
         from obstore.exceptions import BaseError
         from obstore.store import from_url
 
@@ -107,6 +108,16 @@ class Bucket:
 
         try:
             obstore.put(self._store, name, content)
+        except (BaseError, FileNotFoundError) as error:
+            raise self.error(error) from None
+
+    def delete(self, digest: bytes) -> None:
+        """Remove an object. Raises TrapsError."""
+        import obstore
+        from obstore.exceptions import BaseError
+
+        try:
+            obstore.delete(self._store, object_name(digest))
         except (BaseError, FileNotFoundError) as error:
             raise self.error(error) from None
 
