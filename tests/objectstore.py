@@ -72,7 +72,7 @@ class S3:
 
         store = S3Store(
             "lab", config={k.lower(): v for k, v in self.environment.items()}, client_options={"allow_http": True}
-        )  # pyright: ignore  # noqa: E501
+        )  # pyright: ignore
         return sorted(one["path"] for page in obstore.list(store) for one in page)
 
     def _request(self, path: str, method: str) -> bytes:

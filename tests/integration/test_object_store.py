@@ -83,15 +83,15 @@ def test_hosts_make_one_study_together_and_it_is_that_of_a_single_machine(
 
     clips = [path for path in store.below(workspace.root / "clips") if "plinko-0001" in path.parent.name]
     assert len(clips) == 6  # control, void and twin, each with its note
-    before = {path: row.digest for path in clips if (row := store._current(path)) is not None}
+    before = {path: row.digest for path in clips for row in [store._current(path)] if row is not None}
     for digest in before.values():
         store.bucket.delete(digest)
     again = three.traps("run", EXPERIMENT, "--until", "leaderboard")
     assert again.code == 0, again.out + again.err
     assert again.counts()["frames"] > 0 and again.counts()["answers"] == 0
     _, store = opened(three, monkeypatch)
-    names = [path.relative_to(workspace.root) for path in before]
-    assert {row.digest for name in names if (row := store._current(three.root / name))} == {*before.values()}
+    made = [store._current(three.root / path.relative_to(workspace.root)) for path in before]
+    assert [row and row.digest for row in made] == [*before.values()]
     nothing = one.traps("run", EXPERIMENT, "--until", "leaderboard")
     assert (nothing.code, nothing.counts()) == (0, {"answers": 0, "votes": 0, "frames": 0}), nothing.err
     strays = [path for host in hosts for path in host.files() if not path.resolve().is_relative_to(host.scratch)]

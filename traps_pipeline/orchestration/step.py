@@ -21,6 +21,7 @@ from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
+from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made, State
 from traps_pipeline.storage.tables import Table
@@ -53,6 +54,7 @@ class Step:
     def run(self) -> Iterator[Event]:
         """See the module."""
         stage, name = self.stage, self.stage.name
+        require_same_code(self.context.run.tags, self.workspace.study.name)
         lineage = Lineage(self.workspace, thorough=True)
         self.history.observe(lineage, [p for p in self.graph.parents_of[name] if self.graph.source(p)])
         provenance = self.history.provenance(stage)
@@ -189,7 +191,7 @@ class Step:
 
     def _metadata(self, made: Made) -> dict[str, Any]:
         """What Dagster shows of a partition."""
-        shown: dict[str, Any] = {**made.shown}
+        shown: dict[str, Any] = {**made.shown, "tally": json.dumps(vars(made.tally))}
         if self.stage.table is None:
             files = cast(Mapping[str, bytes], made.content)
             paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in files}

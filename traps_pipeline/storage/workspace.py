@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from traps_pipeline.storage.media import MediaStore
 
 VARIABLE = "TRAPS_WORKSPACE"
+RAY = "TRAPS_RAY"  # holds the address of Ray's head, http://HEAD:8265, where runs go to a cluster
 DATABASE = "TRAPS_DATABASE"  # the variable with the database's address, where a new study in a store names no other
 
 
@@ -144,9 +145,14 @@ class Workspace:
             write_text(own, (ROOT / "dagster.yaml").read_text(encoding="utf-8"))
 
     @property
+    def is_on_cluster(self) -> bool:
+        """Whether runs of this study may go to other hosts, and its history therefore lies in its database."""
+        return bool(self._address and os.environ.get(RAY))
+
+    @property
     def dagster_home(self) -> Path:
         """Dagster's own history (DAGSTER_HOME)."""
-        return self.root / "dagster"
+        return self.root / ("cluster" if self.is_on_cluster else "dagster")
 
     @property
     def reports(self) -> Path:
