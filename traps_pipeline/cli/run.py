@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, add_panel, experiment_of, number
+from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, add_panel, experiment_of, number, whole
 from traps_pipeline.cli.init import create
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.extras import require
@@ -57,6 +57,12 @@ def add(commands: Commands) -> None:
         choices=("leave", "cancel"),
         default="leave",
         help="what Ctrl-C does to the runs of --cluster (default: they go on)",
+    )
+    parser.add_argument(
+        "--runs",
+        type=whole(1, 500),
+        default=40,
+        help="runs that --cluster cuts each group of stages into (default: 40)",
     )
     parser.add_argument(
         "--gpus", type=number(0, 1000), default=0.0, help="GPUs of a run of --cluster that loads a local model"
@@ -135,7 +141,7 @@ def _runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: W
     from traps_pipeline.orchestration.cluster import RayRuns, require_cluster
 
     require_cluster(workspace, instance)
-    with RayRuns(instance, workspace, arguments.gpus, arguments.on_interrupt) as runs:
+    with RayRuns(instance, workspace, arguments.runs, arguments.gpus, arguments.on_interrupt) as runs:
         yield runs
 
 

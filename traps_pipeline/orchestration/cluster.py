@@ -28,7 +28,7 @@ from traps_pipeline.partitions import Cell
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
 STUDY_TAG = "traps/study"
-RUNS_A_BLOCK = 40  # at most, besides what a rectangle of cells cannot hold; and as many at once on a head
+AT_ONCE = 40  # runs; Ray keeps a process of some 85 MB for each on the head
 POLL_S = 1.0
 MONITOR_S, START_S, RESUMES = 15, 90, 3
 ALIVE_S = 120  # a daemon that has been silent for longer is dead
@@ -67,7 +67,7 @@ def dagster_yaml(variable: str) -> dict[str, Any]:
             "max_resume_run_attempts": RESUMES,
             "start_timeout_seconds": START_S,
         },
-        "concurrency": {"runs": {"max_concurrent_runs": RUNS_A_BLOCK}},
+        "concurrency": {"runs": {"max_concurrent_runs": AT_ONCE}},
     }
 
 
@@ -92,12 +92,14 @@ def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
 
 
 class RayRuns(Runs):
-    """Runs of a study in Dagster's queue. gpus: of each run that loads a local model."""
+    """Runs of a study in Dagster's queue. most: into which a group of stages is cut, besides what cannot stand in one
+    rectangle of cells. gpus: of each run that loads a local model."""
 
     def __init__(
-        self, instance: dg.DagsterInstance, workspace: Workspace, gpus: float, on_interrupt: OnInterrupt
+        self, instance: dg.DagsterInstance, workspace: Workspace, most: int, gpus: float, on_interrupt: OnInterrupt
     ) -> None:
-        self._instance, self._workspace, self._gpus, self._on_interrupt = instance, workspace, gpus, on_interrupt
+        self._instance, self._workspace, self._on_interrupt = instance, workspace, on_interrupt
+        self._most, self._gpus = most, gpus
         self._stack = ExitStack()
         self._cursors: dict[str, str | None] = {}
         self._chunks: dict[Range, Sequence[str | None]] = {}  # what a range is a part of
@@ -127,7 +129,7 @@ class RayRuns(Runs):
         if scheme is None:
             return [(key, key) for key in keys]
         by_model = sorted(keys, key=lambda key: str(key).partition("|")[::-1])
-        size = -(-len(by_model) // RUNS_A_BLOCK) if by_model else 1
+        size = -(-len(by_model) // self._most) if by_model else 1
         chunks = [by_model[first : first + size] for first in range(0, len(by_model), size)]
         found = {one: chunk for chunk in chunks for one in batches(scheme, chunk)}
         self._chunks |= found

@@ -1,4 +1,4 @@
-"""A place in an object store (S3, Google, Azure), through obstore, and what a person is told where it cannot be used."""
+"""A place in an object store (S3, Google, Azure), through obstore, and what is said where it cannot be used."""
 
 from __future__ import annotations
 
