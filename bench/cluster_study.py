@@ -71,7 +71,7 @@ class Study:
         if self.daemon is not None:
             self.daemon.terminate()
             self.daemon.wait()
-        if keep := os.environ.get("TRAPS_GATE_LOG"):
+        if (keep := os.environ.get("TRAPS_GATE_LOG")) and self.daemon is not None:
             shutil.copy(self.folder / "daemon.log", keep)
 
     def require(self, holds: bool, what: str) -> None:
@@ -81,18 +81,17 @@ class Study:
             self.failures.append(what)
 
 
-def watch(run: subprocess.Popen[str], study: Study, kill: object) -> tuple[int, str]:
-    """Print what a run says, and kill a node once it renders; exit code and output."""
-    said, began, killed = list[str](), time.monotonic(), kill is None
+def watch(run: subprocess.Popen[str], study: Study, kill: object) -> int:
+    """Print what a run says, and kill a node once it renders; its exit code."""
+    began, killed = time.monotonic(), kill is None
     assert run.stdout is not None
     for line in run.stdout:
-        said.append(line)
         print(f"  {time.monotonic() - began:6.1f} s  {line.rstrip()}", flush=True)
         if not killed and "scene_specs" in line and "[" in line:
             killed = True
             time.sleep(3)
             kill()  # type: ignore[operator]
-    return run.wait(), "".join(said)
+    return run.wait()
 
 
 def main() -> None:
@@ -132,7 +131,7 @@ def main() -> None:
                 cluster.start_node(busy[0])
 
             began = time.monotonic()
-            code, said = watch(study.start_run(), study, kill if arguments.kill else None)
+            code = watch(study.start_run(), study, kill if arguments.kill else None)
             print(f"  the study took {time.monotonic() - began:.0f} s on two nodes")
             study.require(code == 0, f"the run succeeds (exit code {code})")
             again = study.traps("run", str(experiment), "--cluster", "--runs", "2", "--until", "leaderboard")
@@ -160,7 +159,8 @@ def compare_with_one_process(study: Study, common: dict[str, str], compare: obje
         "w = Workspace.open()\nfor name in ('tables', 'clips'):\n"
         "    w.bring_folder(w.root / name)\n"
         "    for path in w.store.below(w.root / name):\n"
-        "        to = Path(sys.argv[1]) / path.relative_to(w.root)\n        to.parent.mkdir(parents=True, exist_ok=True)\n"
+        "        to = Path(sys.argv[1]) / path.relative_to(w.root)\n"
+        "        to.parent.mkdir(parents=True, exist_ok=True)\n"
         "        to.write_bytes(path.read_bytes())\n"
     )
     subprocess.run([sys.executable, "-c", code, str(fetched)], env=study.environment, cwd=ROOT, check=True)

@@ -21,7 +21,7 @@ from traps_pipeline.storage.workspace import DATABASE, Workspace
 
 pytestmark = pytest.mark.slow
 EXPERIMENT = SMALL.with_name("one_regime.yaml")
-ANSWERS = 4 * 2 * 12  # models, sides, scenarios
+ANSWERS = 4 * 2 * 2 * 12  # models, datasets of a taxonomy, sides, scenarios
 ADDRESS = "s3://lab/one-regime"
 
 

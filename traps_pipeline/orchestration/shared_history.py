@@ -7,21 +7,15 @@ from importlib import import_module
 from typing import Any
 
 from dagster import StringSource
-from dagster._serdes import ConfigurableClass, ConfigurableClassData
+from dagster._core.storage.base_storage import DagsterStorage
+from dagster._serdes import ConfigurableClassData
 
 from traps_pipeline.errors import TrapsError
 
 
-class SharedHistory(ConfigurableClass):
-    """Named in `dagster.yaml`. variable: that holds the address; the address stands in no file and in no run."""
-
-    def __init__(self, variable: str, inst_data: ConfigurableClassData | None = None) -> None:
-        self.variable, self._inst_data = variable, inst_data
-
-    @property
-    def inst_data(self) -> ConfigurableClassData | None:
-        """What `dagster.yaml` says."""
-        return self._inst_data
+class SharedHistory(DagsterStorage):
+    """Named in `dagster.yaml`; what is made of it is dagster-postgres's own storage. variable: that holds the address,
+    which stands in no file and in no run."""
 
     @classmethod
     def config_type(cls) -> dict[str, Any]:
@@ -29,8 +23,8 @@ class SharedHistory(ConfigurableClass):
         return {"variable": StringSource}
 
     @classmethod
-    def from_config_value(cls, inst_data: ConfigurableClassData | None, config_value: Any) -> Any:
-        """Dagster's way to make it: dagster-postgres's own storage. Raises TrapsError where the variable is not set."""
+    def from_config_value(cls, inst_data: ConfigurableClassData | None, config_value: Any) -> DagsterStorage:
+        """Dagster's way to make it. Raises TrapsError where the variable is not set on this host."""
         variable = config_value["variable"]
         address = os.environ.get(variable)
         if not address:
