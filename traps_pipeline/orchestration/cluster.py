@@ -57,9 +57,14 @@ def dagster_yaml(variable: str) -> dict[str, Any]:
             }
         },
         "run_launcher": {
-            "module": "dagster_ray",
-            "class": "RayRunLauncher",
+            "module": "traps_pipeline.orchestration.ray_launcher",
+            "class": "QuotingRayRunLauncher",
             "config": {"ray": {"address": {"env": RAY}, "num_cpus": 1}},
+        },
+        # Ray keeps what a job prints; Dagster would write it below a path of the host that submitted the run.
+        "compute_logs": {
+            "module": "dagster._core.storage.noop_compute_log_manager",
+            "class": "NoOpComputeLogManager",
         },
         "run_monitoring": {
             "enabled": True,
@@ -110,7 +115,9 @@ class RayRuns(Runs):
         from dagster._core.workspace.load_target import ModuleTarget
 
         target = ModuleTarget("traps_pipeline.definitions", None, None, None)
-        context = self._stack.enter_context(WorkspaceProcessContext(self._instance, target, version=dg.__version__))
+        context = self._stack.enter_context(
+            WorkspaceProcessContext(self._instance, target, version=dg.__version__, code_server_log_level="ERROR")
+        )
         self._context = context.create_request_context()
         (self._location,) = self._context.code_locations
         (self._repository,) = self._location.get_repositories().values()
