@@ -59,7 +59,7 @@ def dagster_yaml(variable: str) -> dict[str, Any]:
         "run_launcher": {
             "module": "traps_pipeline.orchestration.ray_launcher",
             "class": "QuotingRayRunLauncher",
-            "config": {"ray": {"address": {"env": RAY}, "num_cpus": 1}},
+            "config": {"ray": {"address": os.environ[RAY], "num_cpus": 1}},
         },
         # Ray keeps what a job prints; Dagster would write it below a path of the host that submitted the run.
         "compute_logs": {
@@ -105,7 +105,7 @@ class RayRuns(Runs):
     ) -> None:
         self._instance, self._workspace, self._on_interrupt = instance, workspace, on_interrupt
         self._most, self._gpus = most, gpus
-        self._stack = ExitStack()
+        self._stack, self._n_keys = ExitStack(), 0
         self._cursors: dict[str, str | None] = {}
         self._chunks: dict[Range, Sequence[str | None]] = {}  # what a range is a part of
 
@@ -133,6 +133,7 @@ class RayRuns(Runs):
     def ranges(self, scheme: Scheme | None, keys: Sequence[str | None]) -> list[Range]:
         """Ranges for several hosts: so many that all have work, and so few that starting them costs little. What one
         model is asked stays together, so that it is loaded once."""
+        self._n_keys = len(keys)
         if scheme is None:
             return [(key, key) for key in keys]
         by_model = sorted(keys, key=lambda key: str(key).partition("|")[::-1])
@@ -145,7 +146,7 @@ class RayRuns(Runs):
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
         """See `Runs`."""
         if ranges:
-            progress.current().stage(", ".join(stage.name for stage in stages), len(ranges) * len(stages))
+            progress.current().stage(", ".join(stage.name for stage in stages), self._n_keys * len(stages))
             yield from self._watch([self._submit(stages, one, tags) for one in ranges])
 
     def _submit(self, stages: Sequence[Stage], of: Range, tags: Mapping[str, str]) -> str:
