@@ -42,6 +42,7 @@ _WAITING = (
     dg.DagsterRunStatus.CANCELING,
 )
 _MADE, _FAILED = dg.DagsterEventType.ASSET_MATERIALIZATION, dg.DagsterEventType.STEP_FAILURE
+_ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED}
 
 
 def dagster_yaml(variable: str) -> dict[str, Any]:
@@ -238,10 +239,9 @@ class RayRuns(Runs):
         if run.status == dg.DagsterRunStatus.SUCCESS:
             return Ran([], over_budget=False)
         if not ran.problems:
-            ran.problems.append(
-                f"{name} ended as {run.status.value.lower()} without a reason of its own: its host died more often "
-                f"than a run is resumed ({RESUMES} times), or it was cancelled; see its log in `traps ui`"
-            )
+            said = [entry.message for entry in self._instance.all_logs(run_id, of_type=_ENDED)]
+            why = " ".join(" ".join(said[-1:]).split())[:300] or "no reason is known"
+            ran.problems.append(f"{name} ended as {run.status.value.lower()} ({why}); see its log in `traps ui`")
         return ran
 
     def _interrupted(self, left: Sequence[str]) -> None:
