@@ -12,6 +12,7 @@ import signal
 import threading
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, ClassVar, Generic, TypeVar
@@ -99,8 +100,11 @@ def collect(
     `run_work`.
     """
     known = {entry.id: entry for entry in entries}
-    participants = Participants(known, make, workspace.study)
-    with spending(workspace, known.values()) as budget:
+    accounts = {entry.account for entry in known.values() if entry.account}
+    session = workspace.session
+    sharing = session.sharing(accounts) if session is not None and accounts else nullcontext(lambda account: 1)
+    with sharing as sharers, spending(workspace, known.values()) as budget:
+        participants = Participants(known, make, workspace.study, sharers=sharers)
         work = Work(stage, ledger, participants, budget, workspace.study.epoch, calls, finish)
         yield from run_work(work, cells)
 
