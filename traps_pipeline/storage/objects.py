@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, LiteralString, TypeVar
 
 import yaml
 
@@ -39,6 +39,9 @@ R = TypeVar("R")
 
 OBJECTS = ".objects"  # in a scratch folder: contents by digest
 AT_ONCE = 16  # transfers side by side
+MANY = ("clips/", "media/")  # of which a process knows only what it has asked for: there may be millions
+_FEW: LiteralString = "number >= 0 and name not like all (%s)"
+_LIKE = ([f"{folder}%" for folder in MANY],)
 FRESH_S = 0.5  # a look at the rows that is younger is not repeated
 TRIES = 2  # to read an object before it counts as altered
 _SCHEMA = """
@@ -75,7 +78,8 @@ class ObjectStore(Store):
         self.bucket, self._session = bucket, session
         self._rows: dict[str, Current] = {}
         self._names: dict[tuple[str, ...], set[str]] = {}  # by the folder that they lie below, at most two deep
-        self._number, self._looked_at = 0, float("-inf")
+        self._asked = set[str]()  # names in MANY that were looked up; of what changes later every host hears anyhow
+        self._number, self._looked_at = -1, float("-inf")
         self._guard = threading.RLock()
         self._there = set[bytes]()  # digests of objects that this process has seen in the store
         self._whole = set[bytes]()  # digests of contents in the scratch folder that it has compared with their digest
@@ -91,27 +95,49 @@ class ObjectStore(Store):
         with self._guard:
             if time.monotonic() - self._looked_at <= age_s:
                 return
-            began = time.monotonic()
-            sql = """select name, digest, size, note, number, (extract(epoch from at) * 1e9)::bigint
-                     from traps.objects where study = %s and number > %s"""
-            values = self._session.study_id, self._number
-            for name, digest, size, note, number, at_ns in self._session.run(
-                lambda c: c.execute(sql, values).fetchall()
-            ):
-                self._number = max(self._number, number)
-                if digest is None:
-                    self._rows.pop(name, None)
-                    self._names.get(_group(name), set()).discard(name)
-                else:
-                    self._names.setdefault(_group(name), set()).add(name)
-                    self._rows[name] = Current(bytes(digest), size, note, at_ns)
+            began, study = time.monotonic(), self._session.study_id
+
+            def work(connection: Connection[Any]) -> tuple[int, list[Any]]:
+                # The number first: what is committed after it is seen, or seen once more the next time.
+                found = connection.execute("select number from traps.changes where study = %s", [study]).fetchone()
+                if self._number < 0:
+                    return found[0] if found else 0, self._read(connection, _FEW, *_LIKE)
+                newer = self._read(connection, "number > %s", self._number)
+                return max([self._number, *(row[-1] for row in newer)]), newer
+
+            self._number, rows = self._session.run(work)
+            self._take(rows)
             self._looked_at = began
+
+    def _read(self, connection: Connection[Any], condition: LiteralString, *values: Any) -> list[Any]:
+        sql: LiteralString = """select name, digest, size, note, (extract(epoch from at) * 1e9)::bigint, number
+                                from traps.objects where study = %s and """
+        return connection.execute(sql + condition, [self._session.study_id, *values]).fetchall()
+
+    def _take(self, rows: Iterable[Any]) -> None:
+        for name, digest, size, note, at_ns, _ in rows:
+            if digest is None:
+                self._rows.pop(name, None)
+                self._names.get(_group(name), set()).discard(name)
+            else:
+                self._names.setdefault(_group(name), set()).add(name)
+                self._rows[name] = Current(bytes(digest), size, note, at_ns)
+
+    def _ask(self, paths: Iterable[Path]) -> None:
+        """Look up those of these names that are in MANY and were not looked up before."""
+        names = {name for name in map(self._name, paths) if name.startswith(MANY)}
+        with self._guard:
+            if new := sorted(names - self._asked):
+                self._refresh()  # from here on, of what changes everybody hears
+                self._take(self._session.run(lambda c: self._read(c, "name = any(%s)", new)))
+                self._asked |= {*new}
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.root).as_posix()
 
     def _current(self, path: Path) -> Current | None:
         self._refresh()
+        self._ask([path])
         return self._rows.get(self._name(path))
 
     def _change(self, rows: Sequence[tuple[str, bytes | None, int | None, str | None]]) -> None:
@@ -144,8 +170,8 @@ class ObjectStore(Store):
         gone = {*lost}
         with self._guard:
             self._there -= gone
-            self._refresh(0.0)
-            self._change([(name, None, None, None) for name, row in self._rows.items() if row.digest in gone])
+            rows = self._session.run(lambda c: self._read(c, "digest = any(%s)", [*gone]))
+            self._change([(row[0], None, None, None) for row in rows])
 
     # --- contents ---------------------------------------------------------------------------------------------------
 
@@ -203,7 +229,9 @@ class ObjectStore(Store):
                 if self._current(path) is not None:
                     raise  # the store cannot be reached; where it has no such object, nobody has
 
-        _side_by_side(one, {path for path in paths if path.is_relative_to(self.root)})
+        mine = {path for path in paths if path.is_relative_to(self.root)}
+        self._ask(mine)
+        _side_by_side(one, mine)
 
     def keep(self, paths: Iterable[Path]) -> None:
         """See `Store`."""
@@ -219,7 +247,9 @@ class ObjectStore(Store):
             is_known = row is not None and row.digest == digest
             return None if is_known else (self._name(path), digest, len(content), None)
 
-        self._change([row for row in _side_by_side(one, {*paths}) if row is not None])
+        kept = {*paths}
+        self._ask(kept)
+        self._change([row for row in _side_by_side(one, kept) if row is not None])
 
     def _put(self, content: bytes, current: bytes | None) -> bytes:
         """Bring a content to the store, unless it is what is current and is seen there; its digest. What is current no
@@ -260,7 +290,9 @@ class ObjectStore(Store):
 
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
         """See `Store`. Each object is looked for in the store, once a process."""
-        rows = {path: row for path in paths if (row := self._current(path)) is not None}
+        wanted = {*paths}
+        self._ask(wanted)
+        rows = {path: row for path in wanted if (row := self._current(path)) is not None}
         unseen = {row.digest: row for row in rows.values() if row.digest not in self._there}
         found = dict(_side_by_side(lambda digest: (digest, self.bucket.size(object_name(digest))), {*unseen}))
         lost = {digest for digest, size in found.items() if size != unseen[digest].size}
@@ -274,7 +306,10 @@ class ObjectStore(Store):
         """See `Store`."""
         self._refresh()
         if "*" not in pattern:
-            return [folder / pattern] if self._name(folder / pattern) in self._rows else []
+            return [folder / pattern] if self.has(folder / pattern) else []
+        if f"{self._name(folder)}/".startswith(MANY):
+            prefix = f"{self._name(folder)}/"
+            self._take(self._session.run(lambda c: self._read(c, "starts_with(name, %s)", prefix)))
         start, group = f"{self._name(folder)}/", self._name(folder).split("/")[:2]
         with self._guard:
             near = [names for key, names in self._names.items() if list(key[: len(group)]) == group[: len(key)]]
