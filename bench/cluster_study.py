@@ -2,9 +2,11 @@
 two nodes, each with a scratch folder of its own; the study lies on s3:// alone. Then what a cluster must not change is
 compared with a run of one process in a folder.
 
-python bench/cluster_study.py [--kill] [--experiment FILE]        (needs the packages of the extra `cluster`, and moto)
+python bench/cluster_study.py [--kill] [--interrupt leave|cancel] [--experiment FILE]
+(needs the packages of the extra `cluster`, and moto)
 
---kill: every process of a node is killed (-9) while it renders, and the node is started again.
+--kill: every process of a node is killed (-9) while it renders, and the node is started again. --interrupt: Ctrl-C after
+the first partition, which leaves or cancels the runs; then the same command once more.
 """
 
 from __future__ import annotations
@@ -48,8 +50,8 @@ class Study:
             command, env=self.environment | own, cwd=ROOT, text=True, capture_output=True, check=False
         )
 
-    def start_run(self) -> subprocess.Popen[str]:
-        command = ["run", str(self.experiment), "--cluster", "--runs", "2", "--until", "leaderboard"]
+    def start_run(self, *more: str) -> subprocess.Popen[str]:
+        command = ["run", str(self.experiment), "--cluster", "--runs", "2", "--until", "leaderboard", *more]
         return subprocess.Popen(
             [sys.executable, "-m", "traps_pipeline.cli", *command], env=self.environment, cwd=ROOT, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -102,6 +104,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kill", action="store_true")
+    parser.add_argument("--interrupt", choices=("leave", "cancel"))
     parser.add_argument("--experiment", type=Path)
     arguments = parser.parse_args()
     foreign = ("TRAPS_", "DAGSTER_", "RAY_", "AWS_")
@@ -131,6 +134,15 @@ def main() -> None:
                 cluster.start_node(busy[0])
 
             began = time.monotonic()
+            if arguments.interrupt:
+                run = study.start_run("--on-interrupt", arguments.interrupt)
+                code = watch(run, study, lambda: run.send_signal(signal.SIGINT))
+                study.require(code == 130, f"Ctrl-C ends the command (exit code {code})")
+                time.sleep(5)
+                states = runs_of(study)
+                print(f"  runs: {states}", flush=True)
+                is_left = not ({"CANCELED", "CANCELING", "FAILURE"} & {*states})
+                study.require(is_left == (arguments.interrupt == "leave"), f"their runs: {arguments.interrupt}")
             code = watch(study.start_run(), study, kill if arguments.kill else None)
             print(f"  the study took {time.monotonic() - began:.0f} s on two nodes")
             study.require(code == 0, f"the run succeeds (exit code {code})")
@@ -149,6 +161,19 @@ def main() -> None:
                 cluster.signal(node, signal.SIGKILL)
     if study.failures:
         sys.exit("\n".join(study.failures))
+
+
+def runs_of(study: Study) -> list[str]:
+    """What became of the study's runs."""
+    code = (
+        "from dagster import DagsterInstance\nfrom traps_pipeline.storage.workspace import Workspace\n"
+        "home = Workspace.open().dagster_home\n"
+        "print(*(run.status.value for run in DagsterInstance.from_config(str(home)).get_runs()))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=study.environment, cwd=ROOT, text=True, capture_output=True, check=True
+    )
+    return done.stdout.split()
 
 
 def compare_with_one_process(study: Study, common: dict[str, str], compare: object) -> None:
