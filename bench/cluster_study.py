@@ -5,8 +5,8 @@ compared with a run of one process in a folder.
 python bench/cluster_study.py [--kill] [--interrupt leave|cancel] [--experiment FILE]
 (needs the packages of the extra `cluster`, and moto)
 
---kill: every process of a node is killed (-9) while it renders, and the node is started again. --interrupt: Ctrl-C after
-the first partition, which leaves or cancels the runs; then the same command once more.
+--kill: every process of a node is killed (-9) while it renders, and the node is started again. --interrupt: Ctrl-C
+after the first partition, which leaves or cancels the runs; then the same command once more.
 """
 
 from __future__ import annotations
