@@ -107,6 +107,7 @@ def main() -> None:
     parser.add_argument("--interrupt", choices=("leave", "cancel"))
     parser.add_argument("--experiment", type=Path)
     arguments = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it, and so its own
     foreign = ("TRAPS_", "DAGSTER_", "RAY_", "AWS_")
     plain = {key: value for key, value in os.environ.items() if not key.startswith(foreign)}
     with tempfile.TemporaryDirectory(prefix="study-") as name, Postgres.running() as database, S3.running() as store:

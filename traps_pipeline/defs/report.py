@@ -106,9 +106,12 @@ def _page(workspace: Workspace) -> Files:
     from traps_pipeline.report.publish import report_files, study_pictures
 
     folder = workspace.reports / FOLDER
+    held = workspace.store.below(folder)
     workspace.bring_folder(folder)
     cells = write_item_pages(workspace, folder, clips="../..")
-    workspace.store.keep(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    made = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    workspace.store.keep(made)
+    workspace.store.remove({*held} - {*made})
     study, paper = (_results(workspace, of_paper=of_paper) for of_paper in (False, True))
     return report_files(study, paper, cells, study_pictures(workspace))
 
