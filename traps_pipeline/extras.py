@@ -26,7 +26,7 @@ EXTRAS: Mapping[ExtraName, Extra] = {
     "local": Extra("a model on this machine", ("torch", "torchvision", "transformers", "safetensors")),
     "nf4": Extra("quantisation nf4", ("bitsandbytes", "accelerate")),
     "sign": Extra("a signature", ("model_signing",)),
-    "cluster": Extra("a study that hosts share", ("psycopg", "obstore", "ray", "dagster_ray", "dagster_postgres")),
+    "cluster": Extra("a study that hosts share", ("psycopg", "obstore")),
     "ui": Extra("Dagster's web server", ("dagster_webserver",)),
     "web": Extra("a page that listens", ("fastapi", "uvicorn")),
 }

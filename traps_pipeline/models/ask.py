@@ -12,7 +12,6 @@ import signal
 import threading
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, ClassVar, Generic, TypeVar
@@ -24,7 +23,7 @@ from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.participants import Allowed, Participant, Participants, Row, attempt, ledger_row
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
-from traps_pipeline.models.spending import spending
+from traps_pipeline.models.spending import sharing, spending
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, Writer, settles
@@ -100,10 +99,7 @@ def collect(
     `run_work`.
     """
     known = {entry.id: entry for entry in entries}
-    accounts = {entry.account for entry in known.values() if entry.account}
-    session = workspace.session
-    sharing = session.sharing(accounts) if session is not None and accounts else nullcontext(lambda account: 1)
-    with sharing as sharers, spending(workspace, known.values()) as budget:
+    with sharing(workspace, known.values()) as sharers, spending(workspace, known.values()) as budget:
         participants = Participants(known, make, workspace.study, sharers=sharers)
         work = Work(stage, ledger, participants, budget, workspace.study.epoch, calls, finish)
         yield from run_work(work, cells)

@@ -47,6 +47,18 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
         yield Budget(*caps, spent, journal, held, _accounts(workspace, spent, opened))
 
 
+@contextmanager
+def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Callable[[str], int]]:
+    """Within the block this process asks these participants; the value tells how many processes ask through an account
+    at this moment, as far as hosts share a database."""
+    accounts = {entry.account for entry in participants if entry.account}
+    if workspace.session is None or not accounts:
+        yield lambda account: 1
+        return
+    with workspace.session.sharing(accounts) as sharers:
+        yield sharers
+
+
 def _accounts(workspace: Workspace, spent: Mapping[str, float], opened: ExitStack) -> dict[str, AccountBudget]:
     """By participant, the budget of its account where that spans several studies; closed with the stack."""
     shared = _shared_budgets(workspace, spent)

@@ -17,7 +17,7 @@ import dagster as dg
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
+from traps_pipeline.extras import missing
 from traps_pipeline.models.registry import LOCAL, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Stage
@@ -80,7 +80,11 @@ def dagster_yaml(variable: str) -> dict[str, Any]:
 def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
     """Raises TrapsError unless runs can be submitted from here: the study is one that other hosts see, Ray's address is
     known, and a daemon takes runs from the queue."""
-    require("cluster", "dagster_ray", "dagster_postgres", "ray")
+    if absent := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
+        raise TrapsError(
+            f"runs on other hosts need {' and '.join(absent)} here and there: install the extra `cluster`, in a "
+            "checkout `python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"
+        )
     if not isinstance(workspace.place, str):
         raise TrapsError(
             f"{workspace.root}: other hosts do not see this folder; a study for --cluster lies in an object store: "
