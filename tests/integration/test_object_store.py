@@ -110,5 +110,13 @@ def test_errors_name_the_host_the_study_and_the_remedy(
     assert refused.code == 1 and f"{DATABASE} is not set" in refused.err
     refused = one.traps("init", EXPERIMENT, "--workspace", "s3://no-such-bucket/study")
     assert refused.code == 1 and "See that the bucket exists" in refused.err
+    made = one.traps("init", EXPERIMENT, "--workspace", "s3://lab/refusals")
+    assert made.code == 1, "the variable is not set"
+    monkeypatch.setenv(DATABASE, postgres.address())
+    made = one.traps("init", EXPERIMENT, "--workspace", "s3://lab/refusals")
+    assert made.code == 0, made.err
+    for command in (("ledger", "move", "--back"), ("annotate", "--who", "jd")):
+        refused = one.traps(*command, "--workspace", "s3://lab/refusals")
+        assert refused.code == 1 and "s3://lab/refusals: " in refused.err, refused.err
     refused = one.traps("status", "--workspace", "ftp://lab/study")
     assert refused.code == 1 and "is no place for a study" in refused.err

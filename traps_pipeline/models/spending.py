@@ -7,6 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
@@ -99,6 +100,11 @@ def _shared_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[st
     entries: list[Entry] = [*load_models().values(), *load_judges().values()]
     for account, folder in study.account_budgets.items():
         through = [entry.id for entry in entries if entry.account == account]
+        if isinstance(workspace.place, str) and not Path(folder).is_absolute():
+            raise TrapsError(
+                f"{workspace.place}/study.yaml: account_budgets names the folder {folder}, which other hosts do not "
+                "see; give the path of a folder that all hosts of this study share"
+            )
         budget = AccountBudget(account, workspace.root / folder, study.name)
         budget.begin(sum(spent.get(name, 0.0) for name in through))
         shared |= dict.fromkeys(through, budget)
