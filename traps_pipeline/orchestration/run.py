@@ -17,7 +17,6 @@ from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import remedy, write_text
 from traps_pipeline.models.traffic import remembering_stops
-from traps_pipeline.orchestration.cluster import dagster_yaml
 from traps_pipeline.orchestration.graph import name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
@@ -73,6 +72,8 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
 
     for again in (False, True):
         if workspace.is_on_cluster and home == workspace.dagster_home:
+            from traps_pipeline.orchestration.cluster import dagster_yaml
+
             said = yaml.safe_dump(dagster_yaml(str(workspace.study.database)), sort_keys=False)
             write_text(home / "dagster.yaml", said)
         workspace.copy_dagster_yaml(home)
