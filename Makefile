@@ -10,7 +10,7 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test all-tests test-cluster ui bench explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
+.PHONY: demo demo-mechanism check fast-tests test all-tests test-cluster test-cluster-gate cluster-setup ui bench explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
 
 demo: setup-core ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -37,10 +37,16 @@ all-tests: setup
 	$(BIN)/python -m compileall -q traps_pipeline
 	$(PYTEST) -n 3
 
-# Ray is 80 MB and in no other test; not part of `make test` until something but the gate needs it.
-test-cluster: test-packages setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-cluster.lock
+# Ray is 80 MB and in no other test, so these are not part of `make test`.
+test-cluster: cluster-setup ## a study on two nodes of Ray, one killed in mid-run, against a run of one process; tests of runs
+	$(BIN)/python bench/cluster_study.py --kill
+	$(BIN)/python -m pytest tests/orchestration/test_cluster.py
+
+test-cluster-gate: cluster-setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
 	$(BIN)/python bench/cluster_gate.py
+
+cluster-setup: test-packages setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-cluster.lock
 
 ui: setup ## Dagster's web server and daemon on 127.0.0.1:$(PORT); open the address that it prints
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo

@@ -18,6 +18,8 @@ from typing import Any
 import pytest
 
 import traps_pipeline.definitions  # noqa: F401 - declares the graph
+from tests import objectstore
+from tests.objectstore import S3
 from tests.postgres import LACKING, Postgres, programs
 from tests.providers.server import Provider
 
@@ -303,4 +305,13 @@ def postgres() -> Iterator[Postgres]:
         pytest.skip(LACKING)
     pytest.importorskip("psycopg", reason="psycopg is not installed; `pip install -e '.[dev]'` brings it")
     with Postgres.running() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def s3() -> Iterator[S3]:
+    """A server for the tests of a process, each of which uses a study of its own; its keys are in the environment."""
+    if not objectstore.is_installed():
+        pytest.skip(objectstore.LACKING)
+    with S3.running() as server, objectstore.exported(server):
         yield server

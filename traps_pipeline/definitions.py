@@ -25,5 +25,5 @@ defs = dg.Definitions(
     jobs=JOBS,
     sensors=SENSORS,
     executor=dg.in_process_executor,
-    resources={"workspace": WorkspaceResource(root=str(Workspace.default_root()))},
+    resources={"workspace": WorkspaceResource(root=str(Workspace.default_place()))},
 )

@@ -26,7 +26,7 @@ EXTRAS: Mapping[ExtraName, Extra] = {
     "local": Extra("a model on this machine", ("torch", "torchvision", "transformers", "safetensors")),
     "nf4": Extra("quantisation nf4", ("bitsandbytes", "accelerate")),
     "sign": Extra("a signature", ("model_signing",)),
-    "cluster": Extra("a ledger that hosts share", ("psycopg",)),
+    "cluster": Extra("a study that hosts share", ("psycopg", "obstore")),
     "ui": Extra("Dagster's web server", ("dagster_webserver",)),
     "web": Extra("a page that listens", ("fastapi", "uvicorn")),
 }
@@ -37,14 +37,15 @@ def install_line(name: ExtraName) -> str:
     return f"python -m pip install 'traps-pipeline[{name}]'" if IS_INSTALLED else "make setup"
 
 
-def missing(name: ExtraName) -> list[str]:
-    """The modules of an extra that are not installed. None of them is imported."""
-    return [module for module in EXTRAS[name].modules if find_spec(module) is None]
+def missing(name: ExtraName, *modules: str) -> list[str]:
+    """The modules of an extra (or only these of it) that are not installed. None of them is imported."""
+    return [module for module in modules or EXTRAS[name].modules if find_spec(module) is None]
 
 
-def require(name: ExtraName) -> None:
-    """Raises TrapsError with the line to type unless an extra is installed. Call it before the first import of it."""
-    if absent := missing(name):
+def require(name: ExtraName, *modules: str) -> None:
+    """Raises TrapsError with the line to type unless an extra (or these modules of it) is installed. Call it before the
+    first import of it."""
+    if absent := missing(name, *modules):
         raise TrapsError(_sentence(name, absent))
 
 

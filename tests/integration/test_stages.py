@@ -203,7 +203,7 @@ def test_a_run_that_lives_elsewhere_is_left_alone(study: Checkout) -> None:
     code = """
 import dagster as dg, os
 from traps_pipeline.definitions import defs
-from traps_pipeline.orchestration.run import HOST_TAG, PID_TAG, this_host
+from traps_pipeline.orchestration.runs import HOST_TAG, PID_TAG, this_host
 job = defs.resolve_job_def("report")
 with dg.DagsterInstance.get() as history:
     for host in ("another machine", this_host()):

@@ -11,7 +11,8 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.models import own
 from traps_pipeline.models.judges import load_panel, panel_id
 from traps_pipeline.models.registry import account_of, get_model, load_models
-from traps_pipeline.storage.workspace import VARIABLE
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import VARIABLE, Workspace
 from traps_pipeline.study.experiment import load_experiment
 
 MINE = """\
@@ -78,7 +79,7 @@ def test_a_panel_of_one_judge_of_ones_own_has_a_version(tmp_path: Path) -> None:
 
 def test_the_workspace_keeps_what_an_experiment_brought(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     load_experiment(written(tmp_path, MINE))
-    own.keep(tmp_path)
+    own.keep(Workspace(tmp_path, Study(name="lab")))
     own.use(own.Own(), Path("none"))
     with pytest.raises(TrapsError, match="unknown model 'my-model'"):
         get_model("my-model")
@@ -87,7 +88,7 @@ def test_the_workspace_keeps_what_an_experiment_brought(tmp_path: Path, monkeypa
     assert get_model("my-model").provider_id == "openai/org/Model-7B"
     newer = MINE.replace("Model-7B", "Model-8B") + JUDGES
     load_experiment(written(tmp_path, newer))
-    own.keep(tmp_path)
+    own.keep(Workspace(tmp_path, Study(name="lab")))
     own.use(own.Own(), Path("none"))
     assert get_model("my-model").provider_id == "openai/org/Model-8B" and len(load_panel("one")) == 1
 

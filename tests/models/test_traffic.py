@@ -79,6 +79,16 @@ def test_an_account_sends_no_more_calls_a_minute_than_it_may() -> None:
     assert 0.45 <= asyncio.run(run()) < 2.0  # 20 at once, 5 more at ten a second
 
 
+def test_processes_that_share_an_account_share_its_pace() -> None:
+    async def run() -> float:
+        meter = Meter(1200, None, lambda: 2)  # ten a second of twenty, a burst of 20
+        began = time.monotonic()
+        await asyncio.gather(*(meter.admit(1000) for _ in range(25)))
+        return time.monotonic() - began
+
+    assert 0.45 <= asyncio.run(run()) < 2.0
+
+
 def test_tokens_a_minute_hold_back_large_calls() -> None:
     async def run() -> float:
         meter = Meter(None, 60_000)  # a thousand a second, a burst of 2,000

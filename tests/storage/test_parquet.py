@@ -127,7 +127,7 @@ def test_a_full_disk_leaves_the_former_file_and_nothing_half_written(
     def full(*_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    for module, name in ((pq, "write_table"), (os, "fsync"), (os, "replace")):
+    for module, name in ((Path, "write_bytes"), (os, "fsync"), (os, "replace")):
         with monkeypatch.context() as patch:
             patch.setattr(module, name, full)
             with pytest.raises(TrapsError, match=r"part-0\.parquet: .*No space left on device.*free some space"):

@@ -23,7 +23,7 @@ from traps_pipeline.partitions import beside_of, sides_of, taxonomy_of_category
 from traps_pipeline.paths import PACKAGE
 from traps_pipeline.scenes.arms import ARMS as OF_SHORTCUTS
 from traps_pipeline.scenes.arms import Arm, Question, Scenario
-from traps_pipeline.scenes.clips import Clip, read_clip, save_clip
+from traps_pipeline.scenes.clips import Clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.scenes.outcome import Rejected
 from traps_pipeline.scenes.spec import SceneSpec
@@ -76,12 +76,15 @@ def build_arms(workspace: Workspace, category: str) -> tuple[list[ArmRow], int]:
         (row["scenario_id"], row["side"]): row
         for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records")
     }
+    films = [workspace.clip(row["scenario_id"], arm, row["scene_hash"]) for row in rows for arm in arms]
+    workspace.store.bring(file for film in films for file in _files(film))
     drawn = 0
     try:
         jobs = [job for row in rows if (job := _job(workspace, row, arms)) is not None]
         for done, (_, frames) in enumerate(run_in_order(film, jobs), start=1):
             drawn += frames
             progress.current().tick("arms", f"{category}, scenarios", done, len(jobs))
+        workspace.store.keep(file for film in films for file in _files(film) if file.is_file())
         version = version_of(
             (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
             (clip_content(row["scenario_id"], row["scene_hash"]) for row in rows),
@@ -103,6 +106,11 @@ def _job(workspace: Workspace, row: dict[str, Any], arms: Sequence[str]) -> Job 
 
 def _finding_of(clip: Path) -> Path:
     return clip.with_suffix(".arm.json")
+
+
+def _files(clip: Path) -> tuple[Path, ...]:
+    """The files of an arm: its clip with the note, which a refused one has not, and what was found."""
+    return clip, note_of(clip), _finding_of(clip)
 
 
 @cache
@@ -209,4 +217,5 @@ def unmade(workspace: Workspace, category: str) -> list[str]:
     there = set(table["arm"])
     reasons = [f"arm {arm} is asked for now" for arm in asked_arms(workspace, category) if arm not in there]
     clips = sorted({str(clip) for clip in table["clip"].dropna()})
-    return reasons + [f"clip {clip} is gone" for clip in clips if not workspace.resolve(clip).is_file()]
+    found = workspace.sizes(clips)
+    return reasons + [f"clip {clip} is gone" for clip in clips if clip not in found]

@@ -57,6 +57,8 @@ def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
     name = (
         f"{scenario.scenario_id}-{digest([scenario.family, scenario.params, _seed(scenario), _physics(scenario)])[:16]}"
     )
+    own = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
+    workspace.store.bring(own)
     for folder in (CORRECTIONS / "trajectories", workspace.trajectories):
         if (folder / f"{name}.json").is_file():
             record = (folder / f"{name}.json").read_text(encoding="utf-8")
@@ -68,6 +70,7 @@ def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
         raise TrapsError(f"{workspace.trajectories / name}.npz: cannot be written ({error.strerror})") from error
     record = json.dumps(spec.model_dump(mode="json"))
     write_text(workspace.trajectories / f"{name}.json", record)  # last, so that it vouches for the trajectory
+    workspace.store.keep(own)
     progress.current().note(
         f"{scenario.scenario_id}: simulated here after {scenario.where}; to freeze it for other machines copy "
         f"trajectories/{name}.* of the workspace to {CORRECTIONS / 'trajectories'}"

@@ -11,7 +11,7 @@ from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
-from traps_pipeline.scenes.clips import Job, read_clip, render_pairs, rendered
+from traps_pipeline.scenes.clips import Job, note_of, read_clip, render_pairs
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
 
@@ -22,11 +22,14 @@ def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], i
     """Rows of the category's clips (three a scenario), frames drawn for them, leaked pixels of each occluded void."""
     specs: list[dict[str, Any]] = workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
     jobs = [_job(workspace, row) for row in specs]
+    files = [file for job in jobs for clip in job.clips for file in (clip, note_of(clip))]
+    workspace.store.bring(files)
     drawn = 0
     try:
         for done, (_, frames) in enumerate(render_pairs(jobs), start=1):
             drawn += frames
             progress.current().tick("videos", f"{category}, scenarios", done, len(jobs))
+        workspace.store.keep(files)
         version = version_of(
             (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
             (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
@@ -73,5 +76,8 @@ def _rows(workspace: Workspace, spec: dict[str, Any], job: Job, version: str) ->
 
 def missing_clips(workspace: Workspace, category: str) -> Sequence[str]:
     """Clips of the category's table that are gone or have another size: reasons for `traps status`."""
-    table = workspace.tables.read_arrow(VIDEOS, ["path"], category=category)
-    return [path for path in table["path"].to_pylist() if not rendered(workspace.resolve(path))]
+    table = workspace.tables.read_arrow(VIDEOS, ["path", "size_bytes"], category=category)
+    wanted = dict(zip(table["path"].to_pylist(), table["size_bytes"].to_pylist(), strict=True))
+    notes = {path: workspace.relative(note_of(workspace.root / path)) for path in wanted}
+    found = workspace.sizes([*wanted, *notes.values()])
+    return [path for path, size in wanted.items() if found.get(path) != size or notes[path] not in found]

@@ -41,5 +41,11 @@ def annotate(arguments: argparse.Namespace) -> int:
     listening = listening_of(
         arguments, "annotate", TOKEN_VARIABLE, danger="label in other people's names", people=people
     )
-    serve(annotation_app(Annotation(open_workspace(arguments))), listening)
+    workspace = open_workspace(arguments)
+    if isinstance(workspace.place, str):
+        raise TrapsError(
+            f"{workspace.place}: labels are kept in a folder, and this study lies in an object store, where no other "
+            "host would see them; label a study in a folder (docs/people.md)"
+        )
+    serve(annotation_app(Annotation(workspace)), listening)
     return OK

@@ -10,11 +10,11 @@ import argparse
 import os
 import re
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from traps_pipeline.explorer.server import Listening
+    from traps_pipeline.storage.place import Place
     from traps_pipeline.storage.workspace import Workspace
     from traps_pipeline.study.experiment import Experiment
 
@@ -61,7 +61,8 @@ class Commands:
         parser.set_defaults(command=run)
         if workspace:
             parser.add_argument(
-                "--workspace", type=Path, help="study folder (default: $TRAPS_WORKSPACE, else .workspaces/default)"
+                "--workspace",
+                help="folder or s3:// address of the study (default: $TRAPS_WORKSPACE, else .workspaces/default)",
             )
         return parser
 
@@ -96,18 +97,19 @@ def listening_of(
     return Listening(arguments.host, arguments.port, tokens, f"traps {command}", arguments.behind)
 
 
-def root_of(arguments: argparse.Namespace) -> Path:
-    """The folder of the study that a command works in; it may not exist yet."""
+def place_of(arguments: argparse.Namespace) -> Place:
+    """Where the study lies that a command works in; it may not exist yet. Raises TrapsError for a wrong address."""
+    from traps_pipeline.storage import place
     from traps_pipeline.storage.workspace import Workspace
 
-    return arguments.workspace.absolute() if arguments.workspace else Workspace.default_root()
+    return place.place_of(arguments.workspace) if arguments.workspace else Workspace.default_place()
 
 
 def open_workspace(arguments: argparse.Namespace) -> Workspace:
     """The study that a command works in. Raises TrapsError naming the remedy if there is none."""
     from traps_pipeline.storage.workspace import Workspace
 
-    return entered(Workspace.open(root_of(arguments)))
+    return entered(Workspace.open(place_of(arguments)))
 
 
 def entered(workspace: Workspace) -> Workspace:
@@ -116,7 +118,7 @@ def entered(workspace: Workspace) -> Workspace:
     from traps_pipeline.models.own import forget
     from traps_pipeline.storage.workspace import VARIABLE
 
-    os.environ[VARIABLE] = str(workspace.root)
+    os.environ[VARIABLE] = str(workspace.place)
     forget()  # the workspace may have models of its own
     os.environ.setdefault("DAGSTER_HOME", str(workspace.dagster_home))
     return workspace

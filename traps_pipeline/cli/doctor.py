@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from traps_pipeline.cli.command import FAILED, OK, Commands, root_of
+from traps_pipeline.cli.command import FAILED, OK, Commands, place_of
 from traps_pipeline.extras import require
 from traps_pipeline.terminal import plain
 
@@ -25,7 +25,7 @@ def doctor(arguments: argparse.Namespace) -> int:
     from traps_pipeline.study.doctor import examine, examine_files, examine_local
 
     if arguments.verify:
-        findings = [*examine_files(root_of(arguments))]
+        findings = [*examine_files(place_of(arguments))]
         for finding in findings:
             print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}", flush=True)
         return OK if all(finding.ok for finding in findings) else FAILED
@@ -33,7 +33,7 @@ def doctor(arguments: argparse.Namespace) -> int:
         require("local")
     who, needs = ("local models", "need") if arguments.local else ("the demo", "needs")
     problems = 0
-    for finding in examine_local() if arguments.local else examine(root_of(arguments)):
+    for finding in examine_local() if arguments.local else examine(place_of(arguments)):
         print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.detail}", flush=True)
         problems += not finding.ok
     print(

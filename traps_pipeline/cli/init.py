@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from traps_pipeline.cli.command import OK, Commands, add_panel, entered, experiment_of, root_of
+from traps_pipeline.cli.command import OK, Commands, add_panel, entered, experiment_of, place_of
 
 if TYPE_CHECKING:
     from traps_pipeline.storage.workspace import Workspace
@@ -22,8 +22,8 @@ def add(commands: Commands) -> None:
 def init(arguments: argparse.Namespace) -> int:
     """See `traps init --help`."""
     workspace = create(arguments, experiment_of(arguments))
-    print(f"workspace {workspace.root} (study.yaml names its benchmark, panel and budget)")
-    print(f"next: export TRAPS_WORKSPACE={workspace.root} DAGSTER_HOME={workspace.dagster_home}")
+    print(f"workspace {workspace.place} (study.yaml names its benchmark, panel and budget)")
+    print(f"next: export TRAPS_WORKSPACE={workspace.place} DAGSTER_HOME={workspace.dagster_home}")
     return OK
 
 
@@ -35,11 +35,10 @@ def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
     from traps_pipeline.models.own import keep
     from traps_pipeline.storage.workspace import Workspace
 
-    root, by_rules = root_of(arguments), arguments.judged_by_rules
-    is_new = not (root / "study.yaml").exists()
-    if is_new:  # refused before a folder is made
+    place, by_rules = place_of(arguments), arguments.judged_by_rules
+    if not Workspace.is_there(place):  # refused before a folder is made
         experiment.judged(None, arguments.panel, judged_by_rules=by_rules)
-    workspace = Workspace.create(root, experiment.study)
+    workspace = Workspace.create(place, experiment.study)
     judged = experiment.judged(workspace.study, arguments.panel, judged_by_rules=by_rules)
     experiment.check_study(judged, workspace.root / "study.yaml")
     if judged != workspace.study:
@@ -52,7 +51,7 @@ def create(arguments: argparse.Namespace, experiment: Experiment) -> Workspace:
     if asked != workspace.study.experiments:
         workspace = workspace.allow(experiments=asked)
     entered(workspace)
-    keep(workspace.root)
+    keep(workspace)
     from traps_pipeline.orchestration.run import dagster_history
 
     if not (workspace.dagster_home / "dagster.yaml").exists():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from traps_pipeline.cli.command import FAILED, OK, Commands, entered, root_of
+from traps_pipeline.cli.command import FAILED, OK, Commands, entered, place_of
 from traps_pipeline.errors import TrapsError
 
 
@@ -44,9 +44,9 @@ def _named(arguments: argparse.Namespace) -> list[str]:
     from traps_pipeline.storage.workspace import Workspace
     from traps_pipeline.study.experiment import load_experiment
 
-    root = root_of(arguments)
-    if (root / "study.yaml").exists():
-        entered(Workspace.open(root))
+    place = place_of(arguments)
+    if Workspace.is_there(place):
+        entered(Workspace.open(place))
     names = list[str]()
     for name in arguments.names:
         if not name.endswith((".yaml", ".yml")):

@@ -13,7 +13,7 @@ from traps_pipeline.cli.command import (
     experiment_of,
     load_definitions,
     open_workspace,
-    root_of,
+    place_of,
 )
 from traps_pipeline.terminal import text_table
 
@@ -31,17 +31,18 @@ def add(commands: Commands) -> None:
 
 def plan(arguments: argparse.Namespace) -> int:
     """See `traps plan --help`."""
+    from traps_pipeline.storage.workspace import Workspace
     from traps_pipeline.study.plan import Count, make_plan
 
-    experiment, root = experiment_of(arguments), root_of(arguments)
-    workspace = open_workspace(arguments) if (root / "study.yaml").exists() else None
+    experiment, place = experiment_of(arguments), place_of(arguments)
+    workspace = open_workspace(arguments) if Workspace.is_there(place) else None
     load_definitions()
     study = experiment.judged(
         workspace.study if workspace else None, arguments.panel, judged_by_rules=arguments.judged_by_rules
     )
     planned = make_plan(workspace, experiment, study)
     total = (Count(), Count())
-    print(f"{experiment.name} in {root if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
+    print(f"{experiment.name} in {place if workspace else 'a new workspace'}: calls wanted, known (in the ledger), new")
     rows = {**planned.calls, **{f"{model}, steered": counts for model, counts in planned.steered.items()}}
     if planned.labels is not None:
         rows["confabulation labels"] = (Count(), planned.labels)

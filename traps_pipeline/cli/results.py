@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from traps_pipeline.cli.command import OK, Commands, open_workspace, root_of
+from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of
 from traps_pipeline.terminal import text_table
 
 
@@ -56,7 +56,7 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     from traps_pipeline.scoring.contrasts import version_contrasts
     from traps_pipeline.storage.workspace import Workspace
 
-    studies = Workspace.open(arguments.other), Workspace.open(root_of(arguments))
+    studies = Workspace.open(arguments.other), Workspace.open(place_of(arguments))
     then, now = (current(study, VERDICTS) for study in studies)
     table = version_contrasts(then, now)
     if arguments.csv:

@@ -6,17 +6,21 @@ import argparse
 import re
 import sys
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, add_panel, experiment_of
+from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, add_panel, experiment_of, number, whole
 from traps_pipeline.cli.init import create
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.extras import require
 from traps_pipeline.terminal import plain
 
 if TYPE_CHECKING:
+    from dagster import DagsterInstance
+
     from traps_pipeline.models.registry import Entry
+    from traps_pipeline.orchestration.runs import Runs
     from traps_pipeline.storage.workspace import Workspace
     from traps_pipeline.study.experiment import Experiment
 
@@ -45,6 +49,25 @@ def add(commands: Commands) -> None:
         "--until", metavar="STAGES", help="make only these stages (separated by commas) and the stages they need"
     )
 
+    parser.add_argument(
+        "--cluster", action="store_true", help="make it on the hosts of a Ray cluster (docs/cluster.md)"
+    )
+    parser.add_argument(
+        "--on-interrupt",
+        choices=("leave", "cancel"),
+        default="leave",
+        help="what Ctrl-C does to the runs of --cluster (default: they go on)",
+    )
+    parser.add_argument(
+        "--runs",
+        type=whole(1, 500),
+        default=40,
+        help="runs that --cluster cuts each group of stages into (default: 40)",
+    )
+    parser.add_argument(
+        "--gpus", type=number(0, 1000), default=0.0, help="GPUs of a run of --cluster that loads a local model"
+    )
+
 
 def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
@@ -53,12 +76,12 @@ def run(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
-    from traps_pipeline.definitions import defs
+    import traps_pipeline.definitions  # noqa: F401 - declares the graph
     from traps_pipeline.models.backends import require_libraries
     from traps_pipeline.orchestration.run import dagster_history, failed_checks, stages_until, walk
 
     stages = stages_until(arguments.until)
-    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.root}", flush=True)
+    print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", flush=True)
     with reporting(TerminalProgress()) as progress, dagster_history(workspace) as instance:
         participants = _still_to_ask(workspace, experiment, stages)
         for entry in (*participants.models, *participants.judges):
@@ -67,8 +90,8 @@ def run(arguments: argparse.Namespace) -> int:
             require("local")
         if not arguments.no_preflight:
             _preflight(workspace, participants)
-        every_asset = defs.resolve_implicit_global_asset_job_def()
-        outcome = walk(instance, every_asset, workspace, stages, experiment=experiment.name)
+        with _runs(arguments, instance, workspace) as runs:
+            outcome = walk(instance, runs, workspace, stages, experiment=experiment.name)
     problems = [*dict.fromkeys([*outcome.problems, *failed_checks(workspace, experiment.name)])]
     total = progress.totals
     asked, voted = (total.get(stage, Tally()) for stage in ("responses", "votes"))
@@ -104,6 +127,22 @@ def run(arguments: argparse.Namespace) -> int:
     _print_results(workspace)
     print(f"next: open {workspace.reports / 'report.html'}, or run traps why ITEM to examine an item's answers")
     return OK
+
+
+@contextmanager
+def _runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: Workspace) -> Iterator[Runs]:
+    """Who makes the runs: this process, or the hosts of a cluster. Raises TrapsError where there is none."""
+    from traps_pipeline.definitions import defs
+    from traps_pipeline.orchestration.runs import RunsHere
+
+    if not arguments.cluster:
+        yield RunsHere(instance, defs.resolve_implicit_global_asset_job_def())
+        return
+    from traps_pipeline.orchestration.cluster import RayRuns, require_cluster
+
+    require_cluster(workspace, instance)
+    with RayRuns(instance, workspace, arguments.runs, arguments.gpus, arguments.on_interrupt) as runs:
+        yield runs
 
 
 @dataclass(frozen=True)

@@ -37,16 +37,17 @@ def status(arguments: argparse.Namespace) -> int:
     rows = list(stage_statuses(workspace, lineage, experiment))
     counts = [(row.stage, row.fresh, len(row.stale), row.missing) for row in rows]
     lines = text_table(("stage", "fresh", "stale", "missing"), counts).splitlines()
-    print("\n".join([f"workspace {workspace.root}", *lines[: -len(rows)]]))
+    print("\n".join([f"workspace {workspace.place}", *lines[: -len(rows)]]))
     for line, row in zip(lines[-len(rows) :], rows, strict=True):
         print(line)
         for key, reasons in list(row.stale.items())[:SHOWN]:
             print(f"    {key}: {'; '.join(reasons[:3])}{' ...' if len(reasons) > 3 else ''}")
         if len(row.stale) > SHOWN:
             print(f"    ... and {len(row.stale) - SHOWN} more")
-    for file in sorted((workspace.root / "checks").glob("*/*/*.json")):
+    for file in workspace.store.below(workspace.root / "checks", "*/*/*.json"):
         stage, check = file.parts[-3:-1]
-        print(f"check {check} of {stage} {file.stem} does not pass: {file.read_text(encoding='utf-8')[:200]}")
+        said = workspace.store.here(file).read_text(encoding="utf-8")[:200]
+        print(f"check {check} of {stage} {file.stem} does not pass: {said}")
     print("stale: made from something that has changed since; `traps run EXPERIMENT` makes it again")
     return OK
 

@@ -9,7 +9,7 @@ from traps_pipeline.benchmark.composition import problems
 from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, unsettled
 from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.videos import missing_clips
-from traps_pipeline.orchestration.graph import Check
+from traps_pipeline.orchestration.graph import Check, Takes
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.orchestration.stage import key_of, shown, source, stage
 from traps_pipeline.partitions import all_datasets_of, beside_of, sides_of, taxonomy_of_category
@@ -121,6 +121,7 @@ videos = stage(
     deps=[scene_specs],
     scheme=CATEGORY,
     kinds=["parquet", "mp4"],
+    takes=Takes(memory_gb=1.5),
     lost=lambda workspace, key: [f"clip {path} is gone or damaged" for path in missing_clips(workspace, str(key))],
     columns={name: [f"scene_specs.{name}"] for name in ("scenario_id", "scene_hash")},
     checks=[
@@ -204,7 +205,7 @@ items = stage(
             "clips_present",
             "Every clip exists and has its digest (checked while the table is made; a damaged clip fails the step).",
             lambda workspace, key, made: sorted(
-                {row.clip for row in made.rows(ITEMS) if not workspace.resolve(row.clip).is_file()}
+                (named := {row.clip for row in made.rows(ITEMS)}) - workspace.sizes(named).keys()
             ),
         ),
     ],

@@ -65,9 +65,11 @@ def _sheet(workspace: Workspace) -> Files:
     rows = workspace.tables.read_all(ITEMS, dataset=DATASETS)
     if rows.empty:
         raise TrapsError("contact_sheet: no items yet; materialize items first")
-    six = pairs_figure(six_pairs(rows), workspace.root, None, 3, PAGE)
-    sheets = {"contact_sheet.png": contact_sheet(rows, workspace.root), "six_pairs.png": figure_bytes(six)}
-    return sheets | arms_sheets(rows, workspace.tables.read_all(ARMS), workspace.root)
+    arms = workspace.tables.read_all(ARMS)
+    root = workspace.bring([*rows["clip"], *arms["clip"].dropna()])
+    six = pairs_figure(six_pairs(rows), root, None, 3, PAGE)
+    sheets = {"contact_sheet.png": contact_sheet(rows, root), "six_pairs.png": figure_bytes(six)}
+    return sheets | arms_sheets(rows, arms, root)
 
 
 def _gallery(workspace: Workspace) -> Files:
@@ -78,7 +80,7 @@ def _gallery(workspace: Workspace) -> Files:
     if clips.empty:
         raise TrapsError("gallery: no clips yet; materialize videos first")
     release = load_release()
-    return gallery_files(specs, clips, workspace.root, f"{release.name} {release.version}: all pairs")
+    return gallery_files(specs, clips, workspace.bring(clips["path"]), f"{release.name} {release.version}: all pairs")
 
 
 def _shortcuts(workspace: Workspace) -> Files:
@@ -91,7 +93,7 @@ def _shortcuts(workspace: Workspace) -> Files:
     if rows.empty:
         raise TrapsError("shortcuts: no items yet; materialize items first")
     try:
-        table = shortcuts(rows, workspace.tables.read_all(VIDEOS), workspace.root)
+        table = shortcuts(rows, workspace.tables.read_all(VIDEOS), workspace.bring(rows["clip"]))
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
     figure = shortcut_figure(table)
@@ -103,7 +105,13 @@ def _page(workspace: Workspace) -> Files:
     from traps_pipeline.report.items import FOLDER, write_item_pages
     from traps_pipeline.report.publish import report_files, study_pictures
 
-    cells = write_item_pages(workspace, workspace.reports / FOLDER, clips="../..")
+    folder = workspace.reports / FOLDER
+    held = workspace.store.below(folder)
+    workspace.bring_folder(folder)
+    cells = write_item_pages(workspace, folder, clips="../..")
+    made = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    workspace.store.keep(made)
+    workspace.store.remove({*held} - {*made})
     study, paper = (_results(workspace, of_paper=of_paper) for of_paper in (False, True))
     return report_files(study, paper, cells, study_pictures(workspace))
 
@@ -172,8 +180,8 @@ def _results(workspace: Workspace, *, of_paper: bool) -> Results:
     if of_paper:
         return _kept(("paper", published_digest()), PublishedResults)
     reads = {"items", *(name for report in OF_STUDY.values() for name in report.reads)}
-    files = [f for name in sorted(reads) for f in (workspace.tables.root / name).rglob("*.parquet")]
-    slot = (workspace.root, *((file, file.stat().st_mtime_ns) for file in files))
+    files = [f for name in sorted(reads) for f in workspace.store.below(workspace.tables.root / name)]
+    slot = (workspace.root, *((file, workspace.store.changed_ns(file)) for file in files))
     return _kept(("study", slot), lambda: StudyResults(workspace))
 
 

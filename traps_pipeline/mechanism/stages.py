@@ -88,7 +88,12 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
         )
         for item in items
     ]
+    held = workspace.store.below(folder)
+    workspace.store.bring(held)
     done = extract(model, wanted, folder, pooling=settings.pooling, what=f"items of {cell.key}")
+    made = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    workspace.store.keep(made)
+    workspace.store.remove({*held} - {*made})
     record, (ids, _) = read_record(folder), read_layer(folder, 0)
     keys, devices = (dict(zip(ids["item_id"], ids[name], strict=True)) for name in ("key", "device"))
     source = {name: record[name] for name in ("checkpoint", "checkpoint_digest", "dtype", "quantisation", "pooling")}
@@ -115,7 +120,7 @@ def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> lis
     """Those of the first and last layers that hold a number that is not finite."""
     from traps_pipeline.mechanism.hidden_states import read_layer
 
-    folder = states_folder(workspace, cell)
+    folder = workspace.bring_folder(states_folder(workspace, cell))
     return [layer for layer in (0, n_layers) if not np.isfinite(read_layer(folder, layer)[1]).all()]
 
 
@@ -241,6 +246,7 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
         states_digest=digest(sorted(used["states_key"])),
     )
     save_directions(path, directions, origin)
+    workspace.store.keep([path, path.with_suffix(".json")])
     return [
         DirectionRow(
             model=states.extraction.model,
@@ -270,7 +276,8 @@ def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, 
     table = workspace.tables.read(DIRECTIONS, extraction.partition)
     found = {}
     for path in sorted(set(table["path"])):
-        directions, description = load_directions(workspace.resolve(path))
+        workspace.bring([path, str(Path(path).with_suffix(".json"))])
+        directions, description = load_directions(workspace.root / path)
         rows = table.loc[(table["path"] == path) & (table["kind"] == "void")].sort_values("layer")
         if [vector_digest(vector) for vector in directions.void] != list(rows["direction_digest"]):
             raise TrapsError(

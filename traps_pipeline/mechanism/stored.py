@@ -52,7 +52,7 @@ class StoredStates:
         from traps_pipeline.mechanism.hidden_states import read_layer
 
         cell = StatesCell(dataset, self.extraction)
-        ids, states = read_layer(states_folder(self.workspace, cell), layer)
+        ids, states = read_layer(self.workspace.bring_folder(states_folder(self.workspace, cell)), layer)
         wanted = self.dataset(dataset)
         # By item, not by key: two items with the same clip and question share one.
         places = pd.Index(ids["item_id"]).get_indexer(pd.Index(wanted["item_id"]))

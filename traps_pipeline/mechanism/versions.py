@@ -38,16 +38,18 @@ def states_are_there(workspace: Workspace, cell: StatesCell) -> bool:
 
     folder = states_folder(workspace, cell)
     try:
-        shards = set(read_sealed(folder / "ids.parquet")["shard"].to_pylist())
+        shards = set(read_sealed(workspace.store.here(folder / "ids.parquet"))["shard"].to_pylist())
     except (OSError, ValueError, KeyError, TrapsError):
         return False
-    return all((folder / f"{shard}{ending}").is_file() for shard in shards for ending in (".safetensors", ".parquet"))
+    files = {folder / f"{shard}{ending}" for shard in shards for ending in (".safetensors", ".parquet")}
+    return workspace.store.sizes(files).keys() == files
 
 
 def directions_are_there(workspace: Workspace, extraction: Extraction) -> bool:
     """Whether all files in the directions table of an extraction exist."""
-    paths = {workspace.resolve(path) for path in workspace.tables.read(DIRECTIONS, extraction.partition)["path"]}
-    return all(path.is_file() and path.with_suffix(".json").is_file() for path in paths)
+    paths = {workspace.root / path for path in workspace.tables.read(DIRECTIONS, extraction.partition)["path"]}
+    files = paths | {path.with_suffix(".json") for path in paths}
+    return workspace.store.sizes(files).keys() == files
 
 
 def extraction_version(workspace: Workspace, extraction: Extraction) -> str:

@@ -73,8 +73,10 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
         if own is None:
             continue
         spec = framed(own, dataset)
-        for item in asked_items(workspace, dataset):
-            jobs[item["media_digest"], repr(spec)] = (workspace.resolve(item["clip"]), item["media_digest"], spec)
+        items = [*asked_items(workspace, dataset)]
+        workspace.bring(item["clip"] for item in items)
+        for item in items:
+            jobs[item["media_digest"], repr(spec)] = (workspace.root / item["clip"], item["media_digest"], spec)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         for done, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
             progress.current().tick("responses", "media to send", done, len(jobs))

@@ -23,7 +23,7 @@ from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.participants import Allowed, Participant, Participants, Row, attempt, ledger_row
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
-from traps_pipeline.models.spending import spending
+from traps_pipeline.models.spending import sharing, spending
 from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, Writer, settles
@@ -99,8 +99,8 @@ def collect(
     `run_work`.
     """
     known = {entry.id: entry for entry in entries}
-    participants = Participants(known, make, workspace.study)
-    with spending(workspace, known.values()) as budget:
+    with sharing(workspace, known.values()) as sharers, spending(workspace, known.values()) as budget:
+        participants = Participants(known, make, workspace.study, sharers=sharers)
         work = Work(stage, ledger, participants, budget, workspace.study.epoch, calls, finish)
         yield from run_work(work, cells)
 

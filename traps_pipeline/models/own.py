@@ -17,8 +17,7 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
-from traps_pipeline.storage.workspace import VARIABLE
+from traps_pipeline.storage.workspace import VARIABLE, Workspace
 from traps_pipeline.yamlfile import explain, read_yaml
 
 FILE = "own.yaml"
@@ -91,20 +90,20 @@ def use(own: Own, path: Path) -> None:
     forget()
 
 
-def keep(root: Path) -> None:
+def keep(workspace: Workspace) -> None:
     """Write what the experiment brought into the workspace, where every run reads it, whoever starts it."""
     brought = [own for _, own in _overlay if own != Own()]
     if brought:
-        together = _read(root / FILE) | brought[-1]
-        write_text(root / FILE, _yaml(together))
+        path = Workspace.file_of(workspace.place, FILE)
+        together = (_read(path) if path else Own()) | brought[-1]
+        workspace.store.write({workspace.root / FILE: _yaml(together).encode()})
         forget()
 
 
 def sources() -> list[tuple[Path, Own]]:
     """What is added to the registries, each with the file that brings it: the workspace's, then the experiment's."""
-    root = os.environ.get(VARIABLE)
-    of_workspace = [(path, _read(path))] if root and (path := Path(root) / FILE).exists() else []
-    return [*of_workspace, *_overlay]
+    path = Workspace.file_of(Workspace.default_place(), FILE) if os.environ.get(VARIABLE) else None
+    return [*([(path, _read(path))] if path else []), *_overlay]
 
 
 def together() -> Own:
@@ -127,8 +126,6 @@ def entries(kind: Kind) -> Iterable[tuple[Path, dict[str, Any]]]:
 
 
 def _read(path: Path) -> Own:
-    if not path.exists():
-        return Own()
     try:
         return Own.model_validate(read_yaml(path) or {})
     except ValidationError as error:

@@ -14,6 +14,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 from traps_pipeline.errors import TrapsError
@@ -67,7 +68,8 @@ def allow_connections(wanted: int) -> None:
 
 class Participants:
     """Participants by id, made when first asked: one that is not asked needs neither key nor budget. Connections are
-    shared by all evaluations of a run, the pace by all participants of an account."""
+    shared by all evaluations of a run, the pace by all participants of an account. sharers: how many processes ask
+    through an account, where hosts share it."""
 
     def __init__(
         self,
@@ -75,7 +77,9 @@ class Participants:
         make: Callable[[Entry], Backend],
         study: Study,
         accounts: Mapping[str, Account] | None = None,
+        sharers: Callable[[str], int] = lambda account: 1,
     ) -> None:
+        self._sharers = sharers
         self._entries, self._make, self._study = entries, make, study
         self._accounts = load_accounts() if accounts is None else accounts
         self._made: dict[str, Participant] = {}
@@ -99,7 +103,8 @@ class Participants:
     def _meter(self, account: str | None) -> Meter:
         if account not in self._meters:
             limits = Account() if account is None else self._accounts[account]
-            self._meters[account] = Meter(limits.requests_per_minute, limits.tokens_per_minute)
+            sharers = partial(self._sharers, account or "")
+            self._meters[account] = Meter(limits.requests_per_minute, limits.tokens_per_minute, sharers)
         return self._meters[account]
 
 

@@ -7,6 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
@@ -45,6 +46,18 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
         opened.callback(journal.close)
         spent = spent_usd(workspace, journal)
         yield Budget(*caps, spent, journal, held, _accounts(workspace, spent, opened))
+
+
+@contextmanager
+def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Callable[[str], int]]:
+    """Within the block this process asks these participants; the value tells how many processes ask through an account
+    at this moment, as far as hosts share a database."""
+    accounts = {entry.account for entry in participants if entry.account}
+    if workspace.session is None or not accounts:
+        yield lambda account: 1
+        return
+    with workspace.session.sharing(accounts) as sharers:
+        yield sharers
 
 
 def _accounts(workspace: Workspace, spent: Mapping[str, float], opened: ExitStack) -> dict[str, AccountBudget]:
@@ -87,6 +100,11 @@ def _shared_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[st
     entries: list[Entry] = [*load_models().values(), *load_judges().values()]
     for account, folder in study.account_budgets.items():
         through = [entry.id for entry in entries if entry.account == account]
+        if isinstance(workspace.place, str) and not Path(folder).is_absolute():
+            raise TrapsError(
+                f"{workspace.place}/study.yaml: account_budgets names the folder {folder}, which other hosts do not "
+                "see; give the path of a folder that all hosts of this study share"
+            )
         budget = AccountBudget(account, workspace.root / folder, study.name)
         budget.begin(sum(spent.get(name, 0.0) for name in through))
         shared |= dict.fromkeys(through, budget)

@@ -70,12 +70,24 @@ class Gate:
 
 
 class Meter:
-    """Calls and tokens a minute of one account, whoever asks through it: two buckets that fill evenly."""
+    """Calls and tokens a minute of one account, whoever asks through it: two buckets that fill evenly. sharers: how
+    many processes ask through the account at this moment, each of which fills its buckets at an equal part of the
+    rate."""
 
-    def __init__(self, requests_per_minute: int | None, tokens_per_minute: int | None) -> None:
+    def __init__(
+        self,
+        requests_per_minute: int | None,
+        tokens_per_minute: int | None,
+        sharers: Callable[[], int] = lambda: 1,
+    ) -> None:
+        self._sharers = sharers
         self._rates = [None if rate is None else rate / 60 for rate in (requests_per_minute, tokens_per_minute)]
-        self._levels = [self._capacity(rate, 1.0) for rate in self._rates]
+        self._levels = [self._capacity(rate, 1.0) for rate in self._shared()]
         self._at = time.monotonic()
+
+    def _shared(self) -> list[float | None]:
+        """The rates of this process, a second."""
+        return [None if rate is None else rate / self._sharers() for rate in self._rates]
 
     @staticmethod
     def _capacity(rate: float | None, least: float) -> float:
@@ -91,7 +103,7 @@ class Meter:
     def _take(self, amounts: tuple[float, float]) -> float:
         """Take from the buckets; the seconds until they are at zero again."""
         now, wait = time.monotonic(), 0.0
-        for k, (rate, amount) in enumerate(zip(self._rates, amounts, strict=True)):
+        for k, (rate, amount) in enumerate(zip(self._shared(), amounts, strict=True)):
             if rate is None:
                 continue
             self._levels[k] = min(self._capacity(rate, 1.0), self._levels[k] + (now - self._at) * rate) - amount

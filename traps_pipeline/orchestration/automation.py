@@ -21,6 +21,7 @@ from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.run import failed_checks, walk
+from traps_pipeline.orchestration.runs import RunsHere
 from traps_pipeline.orchestration.stage import WorkspaceResource
 from traps_pipeline.orchestration.step import CURRENT
 from traps_pipeline.orchestration.wanted import Wanted
@@ -68,7 +69,7 @@ def _job(
         stages = [stage.name for stage in _stages(costs) if groups is None or stage.spec.group_name in groups]
         opened = workspace.open()
         every_asset = context.repository_def.get_implicit_global_asset_job_def()
-        outcome = walk(context.instance, every_asset, opened, stages, existing=existing)
+        outcome = walk(context.instance, RunsHere(context.instance, every_asset), opened, stages, existing=existing)
         checks = [] if existing else failed_checks(opened, None)
         if problems := [*dict.fromkeys([*outcome.problems, *checks])]:
             raise TrapsError("\n".join(problems))

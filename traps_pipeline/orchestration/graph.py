@@ -62,13 +62,22 @@ class Source:
 
 
 @dataclass(frozen=True)
+class Takes:
+    """What a run of a stage takes of a host, for a cluster to set aside. memory_gb: 0 where it does not matter. A stage
+    whose cost is `machine` takes a GPU besides, where `traps run --gpus` says so."""
+
+    cpus: float = 1.0
+    memory_gb: float = 0.0
+
+
+@dataclass(frozen=True)
 class Stage:
     """Something that is made: a table, or files for people (table: None).
 
     make makes one partition, collect several side by side and hands each on when it is done. needs: how much of each
     parent must be there, by name (default: every partition that the study wants). code: raise it when the formula
     changes, and what was made before is stale. cost: what making it takes besides seconds. wants: whether a study wants
-    a key at all. lost: what is missing of the files that a partition names.
+    a key at all. lost: what is missing of the files that a partition names. takes: what a run of it takes of a host.
     """
 
     spec: dg.AssetSpec
@@ -82,6 +91,7 @@ class Stage:
     cost: Cost
     wants: Callable[[Wanted, Any], bool]
     lost: Callable[[Workspace, Any], list[str]]
+    takes: Takes = Takes()
 
     @property
     def name(self) -> str:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Literal
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
 from traps_pipeline.orchestration.graph import Graph, Stage, name_of, the_graph
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import State
@@ -44,6 +43,7 @@ class Lineage:
 
     def __init__(self, workspace: Workspace, graph: Graph | None = None, *, thorough: bool = False) -> None:
         self._workspace, self.graph, self._thorough = workspace, graph or the_graph(), thorough
+        workspace.store.look()
         self.version, self.state, self.damage = cache(self._version), cache(self._state), cache(self._damage)
         self._wanted = cache(lambda name: {*self.graph[name].wanted(Wanted(workspace))})
 
@@ -72,7 +72,7 @@ class Lineage:
         path = _report_state(self._workspace, stage)
         if stage.table is not None:
             path = self._workspace.tables.path(stage.table, stage.columns(key))
-        return path.stat().st_mtime_ns if path.exists() else 0
+        return self._workspace.store.changed_ns(path)
 
     def blocked(self, name: str, key: str | None, *, current: bool) -> str:
         """Why a partition cannot be made, in words; empty where it can.
@@ -153,16 +153,16 @@ def _differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[st
 
 def write_report_state(workspace: Workspace, stage: Stage, state: State) -> None:
     """What files for people (which are no table) were made from, in a folder beside them."""
-    write_text(_report_state(workspace, stage), json.dumps(asdict(state)))
+    workspace.store.write({_report_state(workspace, stage): json.dumps(asdict(state)).encode()})
 
 
 def read_report_state(workspace: Workspace, stage: Stage) -> State | None:
     """The state that `write_report_state` wrote; None if the files were never made."""
     path = _report_state(workspace, stage)
-    if not path.is_file():
+    if not workspace.store.has(path):
         return None
     try:
-        return State(**json.loads(path.read_text(encoding="utf-8")))
+        return State(**json.loads(workspace.store.here(path).read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
         raise TrapsError(f"{path}: is not what was written ({error}); delete it and run again") from error
 

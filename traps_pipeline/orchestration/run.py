@@ -4,36 +4,26 @@ from __future__ import annotations
 
 import fcntl
 import os
-import re
-import socket
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import dagster as dg
+import yaml
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy
-from traps_pipeline.models.budget import BudgetReached
+from traps_pipeline.files import remedy, write_text
 from traps_pipeline.models.traffic import remembering_stops
 from traps_pipeline.orchestration.graph import name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
-from traps_pipeline.orchestration.schemes import Scheme
+from traps_pipeline.orchestration.runs import HOST_TAG, PID_TAG, Runs, this_host
 from traps_pipeline.orchestration.step import EXPERIMENT_TAG, MAKE_TAG, OUTDATED, STALE, to_make
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.workspace import Workspace
-
-PID_TAG, HOST_TAG = "traps/pid", "traps/host"
-_RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"
-_SENTENCES = (TrapsError.__name__, BudgetReached.__name__)  # errors whose message is for people
-_INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
-_QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
 
 
 @dataclass
@@ -81,6 +71,11 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
     from sqlalchemy.exc import DatabaseError, OperationalError
 
     for again in (False, True):
+        if workspace.is_on_cluster and home == workspace.dagster_home:
+            from traps_pipeline.orchestration.cluster import dagster_yaml
+
+            said = yaml.safe_dump(dagster_yaml(str(workspace.study.database)), sort_keys=False)
+            write_text(home / "dagster.yaml", said)
         workspace.copy_dagster_yaml(home)
         try:
             instance = dg.DagsterInstance.from_config(str(home))
@@ -102,12 +97,6 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
     raise AssertionError("unreachable: the second try returns or raises")
 
 
-def this_host() -> str:
-    """Where process numbers mean what they mean here: the machine and its namespace of processes."""
-    namespace = Path("/proc/self/ns/pid")
-    return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
-
-
 def _alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
@@ -120,14 +109,14 @@ def _alive(pid: int) -> bool:
 
 def walk(
     instance: dg.DagsterInstance,
-    job: dg.JobDefinition,
+    runs: Runs,
     workspace: Workspace,
     stages: Collection[str],
     *,
     experiment: str | None = None,
     existing: bool = False,
 ) -> WalkResult:
-    """Make what is missing or stale of these stages, block by block, in runs of the job of all assets.
+    """Make what is missing or stale of these stages, block by block.
 
     experiment: only what that one of the study's wants; existing: only what is there already and outdated.
     KeyboardInterrupt passes through.
@@ -147,13 +136,9 @@ def walk(
                 if keys or graph.parents_of[stage.name].keys() & todo.keys():
                     todo[stage.name] = keys
             keys = [key for key in graph.keys(block[0].name) if any(key in of for of in todo.values())]
-            for first, last in batches(block[0].scheme, keys):
-                ranged = {_RANGE[0]: str(first), _RANGE[1]: str(last)} if first != last else {}
-                problems, over_budget = _execute(
-                    instance, job, [*todo], first if first == last else None, tags | ranged
-                )
-                outcome.problems += problems
-                outcome.over_budget |= over_budget
+            for ran in runs.make([graph[name] for name in todo], runs.ranges(block[0].scheme, keys), tags):
+                outcome.problems += ran.problems
+                outcome.over_budget |= ran.over_budget
     outcome.problems = [*dict.fromkeys(outcome.problems)]
     outcome.seconds = time.monotonic() - began
     return outcome
@@ -176,86 +161,10 @@ def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
     for stage in the_graph().stages:
         for key in stage.wanted(wanted):
             for check in workspace.failed_checks(stage.name, key):
-                details = workspace.failed_check(stage.name, check, key).read_text(encoding="utf-8")
+                details = workspace.failure(stage.name, check, key)
                 problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {_unquoted(details)}")
     return problems
 
 
 def _unquoted(details: str) -> str:
     return details[1:-1] if details[:1] == details[-1:] == '"' else details
-
-
-def batches(scheme: Scheme | None, keys: Sequence[str | None]) -> Iterator[tuple[str | None, str | None]]:
-    """Ranges (first key, last key) that together are exactly the keys: one run each. Of two dimensions a range is a
-    rectangle of neighbours."""
-    if scheme is None or not keys:
-        yield from ((key, key) for key in keys)
-        return
-    if not isinstance(scheme.definition, dg.MultiPartitionsDefinition):
-        every = [str(key) for key in scheme.definition.get_partition_keys()]
-        yield from ((every[first], every[last]) for first, last in _spans([every.index(str(key)) for key in keys]))
-        return
-    rows, columns = ([str(k) for k in d.partitions_def.get_partition_keys()] for d in scheme.definition.partitions_defs)
-    places = {key: number for number, key in enumerate(columns)}
-    by_row: dict[int, list[int]] = {}
-    for key in keys:
-        row, _, column = str(key).partition("|")
-        by_row.setdefault(rows.index(row), []).append(places[column])
-    spans = sorted((span, row) for row, numbers in by_row.items() for span in _spans(numbers))
-    for span, group in groupby(spans, key=lambda pair: pair[0]):
-        for first, last in _spans([row for _, row in group]):
-            yield f"{rows[first]}|{columns[span[0]]}", f"{rows[last]}|{columns[span[1]]}"
-
-
-def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """Maximal runs of neighbouring numbers, as (first, last)."""
-    spans: list[tuple[int, int]] = []
-    for number in sorted(numbers):
-        if spans and spans[-1][1] == number - 1:
-            spans[-1] = spans[-1][0], number
-        else:
-            spans.append((number, number))
-    return spans
-
-
-def _execute(
-    instance: dg.DagsterInstance, job: dg.JobDefinition, stages: Sequence[str], key: str | None, tags: Mapping[str, str]
-) -> tuple[list[str], bool]:
-    """One Dagster run of some assets; what went wrong in it, a sentence each, and whether a budget was reached."""
-    graph = the_graph()
-    try:
-        result = job.execute_in_process(
-            instance=instance,
-            asset_selection=[graph[name].spec.key for name in stages],
-            partition_key=key,
-            tags={PID_TAG: str(os.getpid()), HOST_TAG: this_host(), **tags},
-            raise_on_error=False,
-            run_config=_QUIET,
-        )
-    except dg.DagsterExecutionInterruptedError:
-        raise KeyboardInterrupt from None
-    failures = [event for event in result.all_events if event.is_step_failure]
-    if any(error.cls_name in _INTERRUPTS for event in failures for error in _chain(event)):
-        raise KeyboardInterrupt
-    problems = [line for event in failures for line in _reason(event).splitlines()]
-    if not result.success and not problems:
-        problems.append(f"{', '.join(stages)} {key or ''}: the run failed; see its log in Dagster")
-    return problems, any(error.cls_name == BudgetReached.__name__ for event in failures for error in _chain(event))
-
-
-def _chain(event: dg.DagsterEvent) -> list[Any]:
-    """The error of a failed step and its causes, outermost first."""
-    chain, error = [], event.step_failure_data.error
-    while error is not None:
-        chain.append(error)
-        error = error.cause
-    return chain
-
-
-def _reason(event: dg.DagsterEvent) -> str:
-    """The error of a failed step: our own sentences where there are some, else the innermost exception."""
-    chain = _chain(event)
-    readable = [error for error in chain if error.cls_name in _SENTENCES]
-    if not readable:
-        return chain[-1].message.strip() if chain else "the step failed"
-    return re.sub(rf"^\S*\b{readable[0].cls_name}: ", "", readable[0].message.strip())

@@ -30,8 +30,8 @@ class Scheme:
 
 def study_here() -> Workspace | None:
     """The workspace that the environment names; None where there is none yet."""
-    root = Workspace.default_root()
-    return Workspace.open(root) if (root / "study.yaml").is_file() else None
+    place = Workspace.default_place()
+    return Workspace.open(place) if Workspace.is_there(place) else None
 
 
 _HERE = Wanted(study_here())

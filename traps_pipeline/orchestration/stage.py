@@ -11,11 +11,12 @@ from typing import Any, cast
 
 import dagster as dg
 
-from traps_pipeline.orchestration.graph import DECLARED, Check, Cost, Need, Source, Stage
+from traps_pipeline.orchestration.graph import DECLARED, Check, Cost, Need, Source, Stage, Takes
 from traps_pipeline.orchestration.schemes import LEFT_OUT, Scheme, study_here
 from traps_pipeline.orchestration.step import CURRENT, CURRENT_DOC, Event, Step
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -29,7 +30,7 @@ class WorkspaceResource(dg.ConfigurableResource):
 
     def open(self) -> Workspace:
         """The workspace. Raises TrapsError naming the remedy where there is none."""
-        return Workspace.open(Path(self.root))
+        return Workspace.open(place_of(self.root))
 
 
 def key_of(name: str) -> dg.AssetKey:
@@ -39,6 +40,8 @@ def key_of(name: str) -> dg.AssetKey:
 
 def _shared_history() -> list[str]:
     home, workspace = os.environ.get("DAGSTER_HOME"), study_here()
+    if workspace is not None and isinstance(workspace.place, str):
+        return [workspace.study.name]  # several studies share its database, and so may share its history
     if workspace is None or not home or Path(home).resolve() == workspace.dagster_home.resolve():
         return []
     return [workspace.study.name] if workspace.study.name else []
@@ -105,6 +108,7 @@ def stage(
     wants: Callable[[Wanted, Any], bool] = lambda wanted, key: True,
     lost: Callable[[Workspace, Any], list[str]] = lambda workspace, key: [],
     columns: Mapping[str, Collection[str]] | None = None,
+    takes: Takes | None = None,
 ) -> dg.AssetsDefinition:
     """The asset of a table, or of files for people where only a name is given (see `graph.Stage` for the parameters).
 
@@ -126,7 +130,9 @@ def stage(
         tags={"cost": cost} if cost else {},
     )
     content = None if isinstance(table, str) else table
-    declared = Stage(spec, content, make, collect, scheme, needs or {}, checks, code, cost, wants, lost)
+    declared = Stage(
+        spec, content, make, collect, scheme, needs or {}, checks, code, cost, wants, lost, takes or Takes()
+    )
     _declare(name, declared)
     specs = [(CURRENT, CURRENT_DOC, False), *((check.name, check.doc, check.blocks) for check in checks)]
 

@@ -17,11 +17,11 @@ import dagster as dg
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes, write_text
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
+from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import Made, State
 from traps_pipeline.storage.tables import Table
@@ -54,6 +54,7 @@ class Step:
     def run(self) -> Iterator[Event]:
         """See the module."""
         stage, name = self.stage, self.stage.name
+        require_same_code(self.context.run.tags, self.workspace.study.name)
         lineage = Lineage(self.workspace, thorough=True)
         self.history.observe(lineage, [p for p in self.graph.parents_of[name] if self.graph.source(p)])
         provenance = self.history.provenance(stage)
@@ -142,8 +143,7 @@ class Step:
                 stage.table, stage.columns(key), rows, inputs, failed=made.tally.errors, code=stage.code
             )
         files = cast(Mapping[str, bytes], content)
-        for path, data in files.items():
-            write_bytes(self.workspace.reports / path, data)
+        self.workspace.store.write({self.workspace.reports / path: data for path, data in files.items()})
         version = hashlib.sha256(b"".join(files.values())).hexdigest()[:16]
         write_report_state(self.workspace, stage, State(version, dict(inputs), 0, 0, stage.code))
         return version
@@ -165,9 +165,9 @@ class Step:
             problems = check.wrong(self.workspace, key, made)
             file = self.workspace.failed_check(stage.name, check.name, key)
             if problems:
-                write_text(file, json.dumps(problems, default=str))
+                self.workspace.store.write({file: json.dumps(problems, default=str).encode()})
             else:
-                file.unlink(missing_ok=True)
+                self.workspace.store.remove([file])
             yield self._evaluation(check.name, key, {"failing": _plain(problems)} if problems else {})
 
     def _still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
@@ -177,8 +177,7 @@ class Step:
         for key in self.graph.keys(name):
             if key not in seen:
                 for check in self.workspace.failed_checks(name, key):
-                    text = self.workspace.failed_check(name, check, key).read_text(encoding="utf-8")
-                    self.failing[check, key] = {STILL: json.loads(text)}
+                    self.failing[check, key] = {STILL: json.loads(self.workspace.failure(name, check, key))}
                 state = lineage.state(name, key)
                 if state is not None and state.failed:
                     self.failing[CURRENT, key] = {STILL: _failed_calls(state.failed)}
@@ -192,7 +191,7 @@ class Step:
 
     def _metadata(self, made: Made) -> dict[str, Any]:
         """What Dagster shows of a partition."""
-        shown: dict[str, Any] = {**made.shown}
+        shown: dict[str, Any] = {**made.shown, "tally": json.dumps(vars(made.tally))}
         if self.stage.table is None:
             files = cast(Mapping[str, bytes], made.content)
             paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in files}

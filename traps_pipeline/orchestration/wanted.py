@@ -58,7 +58,7 @@ class Wanted:
         """Categories with scenarios, and those whose scenarios were all discarded since their table was made."""
         if self._workspace is None:
             return [*CATEGORIES]
-        made = {c for c in CATEGORIES if self._workspace.tables.path(SCENE_SPECS, {"category": c}).exists()}
+        made = {part["category"] for part in self._workspace.tables.partitions(SCENE_SPECS)}
         return [c for c in CATEGORIES if c in made or c in self._present]
 
     @cached_property

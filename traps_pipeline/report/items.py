@@ -45,11 +45,10 @@ _DATASETS, _TITLES = (*DATASETS, *BESIDE), TITLES | ARM_TITLES  # the items of a
 
 def cells_with_items(workspace: Workspace) -> list[Cell]:
     """The cells that have answers, in the benchmark's order."""
-    root = workspace.tables.root / RESPONSES.name
-    found = []
-    for file in root.glob("dataset=*/model=*/regime=*/run=*/part-0.parquet"):
-        part = dict(folder.split("=", 1) for folder in file.relative_to(root).parts[:-1])
-        found.append(Cell(part["dataset"], Evaluation(part["model"], part["regime"], int(part["run"]))))
+    found = [
+        Cell(part["dataset"], Evaluation(part["model"], part["regime"], int(part["run"])))
+        for part in workspace.tables.partitions(RESPONSES)
+    ]
     return sorted(found, key=_place)
 
 

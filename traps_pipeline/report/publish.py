@@ -129,12 +129,12 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
 def _sheets(workspace: Workspace) -> Iterator[tuple[str, bytes]]:
     """The pictures made from clips: the figure of six pairs, if their clips exist; others as the workspace has them."""
     shown = {Path(name).stem for name in SHEETS}
-    for path in sorted(workspace.reports.glob("*.*")):
+    for path in workspace.store.below(workspace.reports, "*.*"):
         if path.stem in shown and not path.name.endswith(".state.json"):
-            yield path.name, path.read_bytes()
+            yield path.name, workspace.store.here(path).read_bytes()
     pairs = six_pairs(workspace.tables.read_all(ITEMS, dataset=DATASETS))
-    if len(pairs) and all(workspace.resolve(clip).is_file() for clip in pairs["clip"]):
-        files = figure_files("six_pairs", pairs_figure(pairs, workspace.root, None, 3, SIX_PAIRS))
+    if len(pairs) and workspace.sizes(pairs["clip"]).keys() == {*pairs["clip"]}:
+        files = figure_files("six_pairs", pairs_figure(pairs, workspace.bring(pairs["clip"]), None, 3, SIX_PAIRS))
         yield from ((f"figures/{name}", content) for name, content in files.items())
 
 
@@ -153,4 +153,5 @@ def study_pictures(workspace: Workspace) -> dict[str, bytes]:
     """The PNG files below the workspace's reports that the page shows."""
     results: tuple[Results, ...] = (StudyResults(workspace), PublishedResults())
     paths = [report.path(r) for report in FIGURES for r in results] + [*SHEETS]
-    return {path: (workspace.reports / path).read_bytes() for path in paths if (workspace.reports / path).is_file()}
+    store, root = workspace.store, workspace.reports
+    return {path: store.here(root / path).read_bytes() for path in paths if store.has(root / path)}

@@ -44,7 +44,7 @@ def worked_example(workspace: Workspace) -> Figure:
         item = str(pair.at[side, "item_id"])
         on_item = [vote for vote in votes if vote["item_id"] == item]
         words[side] = reading(str(answers[item]["text"] or ""), on_item, rows[item])
-    return example_figure(pair, words, workspace.root, str(chosen["model"]))
+    return example_figure(pair, words, workspace.bring(pair["clip"]), str(chosen["model"]))
 
 
 def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:

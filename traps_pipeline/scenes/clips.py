@@ -101,14 +101,6 @@ def check_clip(path: Path, sha256: str, size_bytes: int) -> None:
         )
 
 
-def rendered(path: Path) -> bool:
-    """Whether a clip is there with the size its note says: a quick look, digests aside."""
-    try:
-        return path.stat().st_size == json.loads(note_of(path).read_text(encoding="utf-8"))["size_bytes"]
-    except (OSError, ValueError, KeyError):
-        return False
-
-
 def render_pair(job: Job) -> int:
     """Render and encode what is missing of a pair and its twin; returns the number of frames drawn into clips.
 

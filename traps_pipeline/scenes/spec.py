@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from traps_pipeline.digests import digest
+from traps_pipeline.files import replacing
 
 Slug = r"^[a-z0-9_]+-[a-z0-9]+$"
 
@@ -181,10 +182,10 @@ def trajectory_digest(qpos: np.ndarray) -> str:
 
 def save_trajectory(folder: Path, scenario_id: str, qpos: np.ndarray, twin: np.ndarray) -> None:
     """Write `<folder>/<scenario_id>.npz` (no pickle): the trajectory of a scenario and of its twin."""
-    folder.mkdir(parents=True, exist_ok=True)
     arrays = {"qpos": qpos, "twin": twin}
     plain = {name: np.ascontiguousarray(values, dtype="<f4") for name, values in arrays.items()}
-    np.savez_compressed(folder / f"{scenario_id}.npz", allow_pickle=False, **plain)
+    with replacing(folder / f"{scenario_id}.npz") as part, part.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **plain)
 
 
 def load_trajectory(path: Path, sha256: str, world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:

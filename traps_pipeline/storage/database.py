@@ -13,8 +13,8 @@ import os
 import secrets
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from hashlib import blake2b
@@ -104,6 +104,7 @@ class Session:
         self.claims: dict[int, Claim] = {}
         self.guard, self.closed, self.patience_s = threading.RLock(), False, PATIENCE_S
         self.has_blocks, self.purse = False, threading.Lock()  # of the study's budget; one purse at a time
+        self._sharers: dict[str, int] = {}  # by account that is asked through: how many processes ask through it
         self._connection: Connection[Any] | None = None
         self._looked_at = float("-inf")  # when it was last seen that no claim was lost
         self._lock = lock_number(f"session {self.id}")
@@ -171,6 +172,8 @@ class Session:
                 time.sleep(0.05)
             if claim and not taken:
                 claim.lost = True
+        for account in self._sharers:
+            connection.execute("select pg_advisory_lock_shared(%s)", [lock_number(f"account {account}")])
         if self.claims:
             self._look(connection)
 
@@ -223,7 +226,47 @@ class Session:
         for evaluation, claim in list(self.claims.items()):
             if evaluation in ids and numbers.get(evaluation) != claim.number:
                 claim.lost = True
+        for account in self._sharers:
+            self._sharers[account] = self._count(connection, account)
         self._looked_at = began
+
+    # --- the pace of an account -------------------------------------------------------------------------------------
+
+    @contextmanager
+    def sharing(self, accounts: Collection[str]) -> Iterator[Callable[[str], int]]:
+        """Within the block this process asks through these accounts. The value tells how many processes of all studies
+        in this database do, itself among them, as it was when the claims were last looked at: never waits. A process
+        that dies is not counted any more. Raises TrapsError when the server stays away."""
+
+        def begin(connection: Connection[Any]) -> None:
+            for account in accounts:
+                if account not in self._sharers:
+                    connection.execute("select pg_advisory_lock_shared(%s)", [lock_number(f"account {account}")])
+                    self._sharers[account] = 1
+                self._sharers[account] = self._count(connection, account)
+
+        mine = [account for account in accounts if account not in self._sharers]
+        self.run(begin)
+        try:
+            yield lambda account: max(1, self._sharers.get(account, 1))
+        finally:
+            for account in mine:
+                del self._sharers[account]
+            with suppress(TrapsError):  # a connection that is gone holds no locks
+                self.run(
+                    lambda connection: [
+                        connection.execute("select pg_advisory_unlock_shared(%s)", [lock_number(f"account {account}")])
+                        for account in mine
+                    ],
+                    patience_s=0.0,
+                )
+
+    @staticmethod
+    def _count(connection: Connection[Any], account: str) -> int:
+        sql = """select count(*) from pg_locks where locktype = 'advisory' and granted and objsubid = 1
+                 and database = (select oid from pg_database where datname = current_database())
+                 and classid::bigint = %s and objid::bigint = %s"""
+        return _value(connection, sql, *divmod(lock_number(f"account {account}") % 2**64, 2**32))
 
     def _age_s(self) -> float:
         return awake_s() - self._looked_at
@@ -283,5 +326,5 @@ def session_of(variable: str, study: str) -> Session:
 
 @cache
 def _session_of(_pid: int, address: str, variable: str, study: str) -> Session:
-    require("cluster")
+    require("cluster", "psycopg")
     return Session(address, variable, study)

@@ -31,6 +31,7 @@ from traps_pipeline.files import remedy, write_bytes
 from traps_pipeline.scenes.encode import ENCODER, DamagedClip, decode, encode
 from traps_pipeline.scenes.policies import FramePolicy
 from traps_pipeline.storage.lines import NOT_WHOLE, checked_line, read_checked
+from traps_pipeline.storage.store import FolderStore, Store
 
 Profile = Literal["video", "images", "frames"]
 MOST = 25  # frames an API model sees, docs/spec.md 3.1
@@ -159,8 +160,8 @@ def resized(
 class MediaStore:
     """Prepared media under one folder, by clip and profile. Threads and processes may share it."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, store: Store | None = None) -> None:
+        self.folder, self._store = folder, store or FolderStore(folder)
         self._sound: dict[Path, Media] = {}  # by note: what this process has prepared, or has checked byte by byte
 
     def prepare(self, clip: Path, clip_digest: str, spec: MediaSpec) -> Media:
@@ -172,9 +173,11 @@ class MediaStore:
         note = self._note(clip_digest, spec)
         if note not in self._sound:
             with _alone(note.parent):
-                media = self.known(clip_digest, spec)
+                self._bring(note, spec)
+                media = self._here(clip_digest, spec)
                 if media is None or not _whole(media):
                     media = _make(clip, clip_digest, spec, note)
+                self._store.keep([note] if media.path is None else [media.path, note])
                 self._sound[note] = media
         return self._sound[note]
 
@@ -183,8 +186,17 @@ class MediaStore:
         note = self._note(clip_digest, spec)
         if note in self._sound:
             return self._sound[note]
+        self._bring(note, spec)
+        return self._here(clip_digest, spec)
+
+    def _bring(self, note: Path, spec: MediaSpec) -> None:
+        path = _file(note, spec.profile)
+        self._store.bring([note] if path is None else [note, path])
+
+    def _here(self, clip_digest: str, spec: MediaSpec) -> Media | None:
+        """What lies on this machine."""
         try:
-            media = read_note(note)
+            media = read_note(self._note(clip_digest, spec))
             return media if media.path is None or media.path.stat().st_size == media.size_bytes else None
         except (OSError, ValueError):
             return None

@@ -16,8 +16,9 @@ from zlib import crc32
 
 from traps_pipeline.digests import digest_of_list
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import replacing
+from traps_pipeline.files import write_bytes
 from traps_pipeline.progress import Tally
+from traps_pipeline.storage.store import FolderStore, Store
 from traps_pipeline.storage.tables import VOLATILE, Row, Table
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-_FOOTER = b"traps"
+_FOOTER, _PART = b"traps", "part-0.parquet"
 # A file holds the digest of its own bytes, in its footer, behind this mark: taken while zeros stood in its place.
 _SUM, _MARK, _ZEROS = b"traps-sum", b"traps-sum:", b"0" * 8
 _ROWS_AT_ONCE = 1000  # of a table as Python values
@@ -76,10 +77,10 @@ def joined(parts: Sequence[Made]) -> Made:
 
 
 class TableStore:
-    """The tables under one folder. A partition is one file, replaced atomically."""
+    """The tables under one folder of a study's files. A partition is one file, replaced atomically."""
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    def __init__(self, root: Path, store: Store | None = None) -> None:
+        self.root, self._store = root, store or FolderStore(root)
 
     def path(self, table: Table, partition: Mapping[str, Any]) -> Path:
         """File of one partition (hive layout)."""
@@ -88,7 +89,7 @@ class TableStore:
         folder = self.root / table.name
         for column, value in partition.items():
             folder /= f"{column}={value}"
-        return folder / "part-0.parquet"
+        return folder / _PART
 
     def write(
         self,
@@ -110,7 +111,9 @@ class TableStore:
         data = self._checked(table, partition, rows)
         version = content_version(data)
         state = State(version, dict(inputs), len(data), failed, code)
-        write_sealed(self.path(table, partition), data, {_FOOTER: json.dumps(asdict(state)).encode()})
+        footer, path = json.dumps(asdict(state)), self.path(table, partition)
+        note = json.dumps({"state": footer, "columns": data.schema.names})
+        self._store.write({path: sealed(data, {_FOOTER: footer.encode()})}, note=note, durable=True)
         return version
 
     def _checked(self, table: Table[Row], partition: Mapping[str, Any], rows: Sequence[Row] | pd.DataFrame) -> pa.Table:
@@ -158,12 +161,16 @@ class TableStore:
         import pyarrow.parquet as pq
 
         path = self.path(table, partition)
-        if not path.is_file():
+        if not self._store.has(path):
             return None
         try:
-            schema = pq.ParquetFile(_sound_bytes(path)).schema_arrow
-            state = State(**json.loads((schema.metadata or {})[_FOOTER]))
-            return state if schema.names == table.arrow_schema().names else None
+            if (note := self._store.note(path)) is not None:
+                noted = json.loads(note)
+                footer, names = noted["state"], noted["columns"]
+            else:
+                schema = pq.ParquetFile(_sound_bytes(self._store.here(path))).schema_arrow
+                footer, names = (schema.metadata or {})[_FOOTER], schema.names
+            return State(**json.loads(footer)) if names == table.arrow_schema().names else None
         except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
             raise _unreadable(path, table, error) from error
 
@@ -176,7 +183,10 @@ class TableStore:
         of other processes are not believed.
         """
         path = self.path(table, partition)
+        if not thorough and self._store.note(path) is not None:
+            return ""  # the row vouches for it, and whoever reads it holds it against the row's digest
         try:
+            path = self._store.here(path)
             found = path.stat()
             if _MARK in _sound_bytes(path).getvalue():
                 return ""
@@ -189,7 +199,8 @@ class TableStore:
             return ""
         try:
             state = self.state(table, partition)
-            if state is not None and content_version(self._load(table, path, None)) != state.version:
+            data = None if state is None else self._load(table, self.path(table, partition), None)
+            if state is not None and data is not None and content_version(data) != state.version:
                 return f"{path}: is not what was written (it was altered)"
         except TrapsError as error:
             return str(error)
@@ -223,11 +234,19 @@ class TableStore:
             raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not by {strangers}")
         values = {c: v if isinstance(v, tuple | list) else [v] for c, v in equal.items()}
         parts = product(*([f"{c}={value}" for value in values.get(c, "*")] for c in table.partition_by))
-        patterns = ["/".join([*part, "part-0.parquet"]) for part in parts]
-        paths = {path for pattern in patterns for path in (self.root / table.name).glob(pattern)}
+        patterns = ["/".join([*part, _PART]) for part in parts]
+        paths = {path for pattern in patterns for path in self._store.below(self.root / table.name, pattern)}
         pieces = [self._load(table, path, columns) for path in sorted(paths)]
         pieces = [piece.replace_schema_metadata(None) for piece in pieces]
         return pa.concat_tables(pieces) if pieces else _wanted(table, columns).empty_table()
+
+    def partitions(self, table: Table) -> list[dict[str, str]]:
+        """The partitions of a table that are there, in the order of their paths; values as the paths have them."""
+        root, found = self.root / table.name, list[dict[str, str]]()
+        for path in self._store.below(root, "/".join([*(f"{column}=*" for column in table.partition_by), _PART])):
+            pairs = [folder.partition("=") for folder in path.relative_to(root).parts[:-1]]
+            found.append({column: value for column, _, value in pairs})
+        return found
 
     def _load(self, table: Table, path: Path, columns: Sequence[str] | None) -> pa.Table:
         import pyarrow as pa
@@ -235,7 +254,7 @@ class TableStore:
 
         try:
             wanted = _wanted(table, columns)
-            data = pq.ParquetFile(_sound_bytes(path)).read(columns=wanted.names)
+            data = pq.ParquetFile(_sound_bytes(self._store.here(path))).read(columns=wanted.names)
             if not data.schema.equals(wanted):
                 raise pa.ArrowInvalid("its columns are not those of this version")
             return data
@@ -247,14 +266,19 @@ class TableStore:
 
 def write_sealed(path: Path, data: pa.Table, metadata: Mapping[bytes, bytes]) -> None:
     """Write a Parquet file, whole or not at all, with metadata and the digest of its own bytes in its footer."""
+    write_bytes(path, sealed(data, metadata), durable=True)
+
+
+def sealed(data: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
+    """The bytes of a Parquet file with metadata and the digest of its own bytes in its footer."""
     import pyarrow.parquet as pq
 
-    with replacing(path, durable=True) as part:
-        pq.write_table(data.replace_schema_metadata({**metadata, _SUM: _MARK + _ZEROS}), part, compression="zstd")
-        content = part.read_bytes()
-        with part.open("r+b") as stream:
-            stream.seek(content.rfind(_MARK) + len(_MARK))
-            stream.write(_sum_of(content))
+    made = io.BytesIO()
+    pq.write_table(data.replace_schema_metadata({**metadata, _SUM: _MARK + _ZEROS}), made, compression="zstd")
+    content = made.getvalue()
+    made.seek(content.rfind(_MARK) + len(_MARK))
+    made.write(_sum_of(content))
+    return made.getvalue()
 
 
 def read_sealed(path: Path) -> pa.Table:

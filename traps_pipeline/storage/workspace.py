@@ -1,24 +1,30 @@
-"""A workspace: one folder that holds one study. Every path in it is made here, so that storage may move later."""
+"""A workspace: one folder, or one place in an object store, that holds one study. Every path in it is made here.
+
+Code works with paths below `root`, a folder of this machine: the workspace itself, or a scratch folder, where files of
+an object store are while they are used (`storage/store.py`).
+"""
 
 from __future__ import annotations
 
 import os
-import re
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
 from traps_pipeline.paths import ROOT, WORKSPACES, require_root
+from traps_pipeline.storage.anchor import anchor_of, file_at, store_of, write_anchor
 from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.storage.place import STUDY, Place, name_of, place_of, scratch_of
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.shared_ledger import SharedLedger
+from traps_pipeline.storage.store import FolderStore, Store
 from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
 from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
@@ -26,50 +32,75 @@ if TYPE_CHECKING:
     from traps_pipeline.storage.media import MediaStore
 
 VARIABLE = "TRAPS_WORKSPACE"
-
-
-def _name_of(root: Path) -> str:
-    """A name that no study elsewhere has: the folder's, and a digest of where it was made."""
-    plain = re.sub(r"[^a-z0-9]+", "-", root.name.lower()).strip("-")
-    return f"{plain}-{digest(str(root))[:8]}".lstrip("-")
+RAY = "TRAPS_RAY"  # holds the address of Ray's head, http://HEAD:8265, where runs go to a cluster
+DATABASE = "TRAPS_DATABASE"  # the variable with the database's address, where a new study in a store names no other
 
 
 class Workspace:
     """Paths and stores of one study. Open with `Workspace.open`, make with `Workspace.create`."""
 
-    def __init__(self, root: Path, study: Study) -> None:
-        self.root, self.study = root, study
+    def __init__(self, root: Path, study: Study, address: str = "") -> None:
+        self.root, self.study, self._address = root, study, address
+
+    @property
+    def place(self) -> Place:
+        """What a person names to get it: its folder, or its address in an object store."""
+        return self._address or self.root
 
     @staticmethod
-    def default_root() -> Path:
+    def default_place() -> Place:
         """`$TRAPS_WORKSPACE`, else `.workspaces/default` in the checkout, or, without one, in the current folder."""
-        return Path(os.environ.get(VARIABLE) or WORKSPACES / "default").absolute()
+        return place_of(os.environ.get(VARIABLE) or str(WORKSPACES / "default"))
+
+    @staticmethod
+    def is_there(place: Place) -> bool:
+        """Whether a study lies there. Raises TrapsError where an object store cannot be used."""
+        return anchor_of(place) is not None if isinstance(place, str) else (place / STUDY).is_file()
+
+    @staticmethod
+    def file_of(place: Place, name: str) -> Path | None:
+        """A file at the top of a study, whether or not it can be opened; None where there is none. Raises TrapsError
+        where an object store cannot be used."""
+        if isinstance(place, str):
+            return file_at(scratch_of(place), place, name)
+        return place.absolute() / name if (place / name).is_file() else None
 
     @classmethod
-    def create(cls, root: Path, study: Study) -> Workspace:
+    def create(cls, place: Place, study: Study) -> Workspace:
         """Make a workspace, or open it when it is there with the same benchmark. Raises TrapsError when it differs."""
         require_root()
-        root = root.absolute()
-        if (root / "study.yaml").exists():
-            workspace = cls.open(root)
+        if cls.is_there(place):
+            workspace = cls.open(place)
             for field in ("benchmark", "scenarios", "per_family"):
                 old, new = getattr(workspace.study, field), getattr(study, field)
                 if old != new:
                     raise TrapsError(
-                        f"{root}/study.yaml: {field} is {old!r}, this study wants {new!r}; a workspace keeps its "
+                        f"{place}/study.yaml: {field} is {old!r}, this study wants {new!r}; a workspace keeps its "
                         f"benchmark: choose another folder with {VARIABLE} or --workspace"
                     )
             return workspace
-        for folder in ("tables", "clips", "trajectories", "ledger", "reports", "dagster"):
-            (root / folder).mkdir(parents=True, exist_ok=True)
-        workspace = cls(root, study.model_copy(update={"name": study.name or _name_of(root)}))
+        study = study.model_copy(update={"name": study.name or name_of(place)})
+        if isinstance(place, str):
+            study = study.model_copy(update={"database": study.database or DATABASE})
+            workspace = cls(scratch_of(place), study, place)
+            session_of(study.database or DATABASE, study.name)  # refused before anything is written
+            workspace._make_folders()
+            workspace.save_study()
+            write_anchor(place, study)  # last, so that it vouches for the study
+            return workspace
+        workspace = cls(place.absolute(), study)
+        workspace._make_folders()
         workspace.save_study()
         return workspace
+
+    def _make_folders(self) -> None:
+        for folder in ("tables", "clips", "trajectories", "ledger", "reports", "dagster"):
+            (self.root / folder).mkdir(parents=True, exist_ok=True)
 
     def save_study(self) -> None:
         """Write `study.yaml`, which every run in this workspace reads, whoever starts it."""
         study = self.study.model_dump(mode="json", exclude_none=True)
-        write_text(self.root / "study.yaml", yaml.safe_dump(study, sort_keys=False))
+        self.store.write({self.root / STUDY: yaml.safe_dump(study, sort_keys=False).encode()})
 
     @property
     def mechanism(self) -> MechanismSettings:
@@ -83,18 +114,18 @@ class Workspace:
 
     def allow(self, **changes: Any) -> Workspace:
         """The workspace with other values of fields that may change: budgets, prices, mechanism, experiments."""
-        changed = Workspace(self.root, self.study.model_copy(update=changes))
+        changed = Workspace(self.root, self.study.model_copy(update=changes), self._address)
         changed.save_study()
         return changed
 
     @classmethod
-    def open(cls, root: Path | None = None) -> Workspace:
-        """The workspace at `root` (default: `default_root()`). Raises TrapsError naming the file and the remedy."""
-        root = (root or cls.default_root()).absolute()
-        path = root / "study.yaml"
-        if not path.is_file():
+    def open(cls, place: Place | None = None) -> Workspace:
+        """The workspace at a place (default: `default_place()`). Raises TrapsError naming the file and the remedy."""
+        place = place or cls.default_place()
+        path = cls.file_of(place, STUDY)
+        if path is None:
             raise TrapsError(
-                f"{path}: no such workspace; make one with `traps init` or `traps run demo`, or set {VARIABLE}"
+                f"{place}/{STUDY}: no such workspace; make one with `traps init` or `traps run demo`, or set {VARIABLE}"
             )
         data = read_yaml(path)
         if not isinstance(data, dict) or data.get("format") != FORMAT:
@@ -103,7 +134,8 @@ class Workspace:
                 f"{path}: workspace format {found!r}, this version reads {FORMAT}; use the version that made it, "
                 "or start a new workspace (its ledger folder can be copied over: answers keep their keys)"
             )
-        return cls(root, parse_yaml_model(Study, data, path))
+        study = parse_yaml_model(Study, data, path)
+        return cls(scratch_of(place), study, place) if isinstance(place, str) else cls(place.absolute(), study)
 
     def copy_dagster_yaml(self, home: Path | None = None) -> None:
         """Give Dagster's folder (default: the workspace's) the checkout's `dagster.yaml`, unless it has one of its own
@@ -113,9 +145,14 @@ class Workspace:
             write_text(own, (ROOT / "dagster.yaml").read_text(encoding="utf-8"))
 
     @property
+    def is_on_cluster(self) -> bool:
+        """Whether runs of this study may go to other hosts, and its history therefore lies in its database."""
+        return bool(self._address and os.environ.get(RAY))
+
+    @property
     def dagster_home(self) -> Path:
         """Dagster's own history (DAGSTER_HOME)."""
-        return self.root / "dagster"
+        return self.root / ("cluster" if self.is_on_cluster else "dagster")
 
     @property
     def reports(self) -> Path:
@@ -143,16 +180,25 @@ class Workspace:
         return self.ledger_folder / "locks"
 
     @cached_property
+    def store(self) -> Store:
+        """The study's files."""
+        if not self._address:
+            return FolderStore(self.root)
+        session = self.session
+        assert session is not None, "a study in an object store names a database"
+        return store_of(self.root, self._address, session)
+
+    @cached_property
     def tables(self) -> TableStore:
         """The Parquet tables."""
-        return TableStore(self.root / "tables")
+        return TableStore(self.root / "tables", self.store)
 
     @cached_property
     def media(self) -> MediaStore:
         """Clips as they are sent to models."""
         from traps_pipeline.storage.media import MediaStore
 
-        return MediaStore(self.root / "media")
+        return MediaStore(self.root / "media", self.store)
 
     @cached_property
     def answers(self) -> Ledger:
@@ -180,7 +226,12 @@ class Workspace:
 
     def failed_checks(self, stage: str, key: str | None) -> list[str]:
         """Names of the checks of a partition that do not pass."""
-        return sorted(path.parent.name for path in (self.root / "checks" / stage).glob(f"*/{key or stage}.json"))
+        found = self.store.below(self.root / "checks" / stage, f"*/{key or stage}.json")
+        return sorted(path.parent.name for path in found)
+
+    def failure(self, stage: str, check: str, key: str | None) -> str:
+        """What is wrong where a check does not pass, as JSON."""
+        return self.store.here(self.failed_check(stage, check, key)).read_text(encoding="utf-8")
 
     def clip(self, scenario_id: str, side: str, scene_hash: str) -> Path:
         """Path of a clip; its name holds the scene hash, so a corrected scene never overwrites what was judged."""
@@ -191,5 +242,21 @@ class Workspace:
         return path.relative_to(self.root).as_posix()
 
     def resolve(self, relative: str) -> Path:
-        """Inverse of `relative`."""
+        """Inverse of `relative`: the file as it lies on this machine, if there is one."""
+        self.store.bring([self.root / relative])
         return self.root / relative
+
+    def bring(self, relatives: Iterable[str]) -> Path:
+        """The folder below which these files lie on this machine, as far as they exist. Raises TrapsError."""
+        self.store.bring(self.root / relative for relative in relatives)
+        return self.root
+
+    def bring_folder(self, folder: Path) -> Path:
+        """A folder of the study, after its files were brought to this machine. Raises TrapsError."""
+        self.store.bring(self.store.below(folder))
+        return folder
+
+    def sizes(self, relatives: Iterable[str]) -> dict[str, int]:
+        """The sizes, in bytes, of those files that are there, wherever they lie."""
+        found = self.store.sizes(self.root / relative for relative in relatives)
+        return {self.relative(path): size for path, size in found.items()}

@@ -13,10 +13,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import PART
+from traps_pipeline.storage.place import Place, scratch_of
 
 MIN_FREE_GB = 1.0
 STATES = ("*.safetensors", "*.parquet")  # files of an extraction
+FOLDERS = ("tables", "clips", "media", "trajectories", "states", "directions", "reports")
 SHOWN = 5  # damaged files of a kind that are named
 UNFINISHED_AFTER_S = 24 * 3600.0  # no file takes so long to write
 
@@ -30,15 +33,15 @@ class Finding:
     detail: str
 
 
-def examine(workspace_root: Path) -> Iterator[Finding]:
+def examine(place: Place) -> Iterator[Finding]:
     """One finding for each requirement of the demo."""
     for what, look in (
         ("python", _python),
         ("checkout", _checkout),
         ("rendering", _rendering),
         ("encoding", _encoding),
-        ("disk", lambda: _disk(workspace_root)),
-        ("workspace", lambda: _workspace(workspace_root)),
+        ("disk", lambda: _disk(scratch_of(place) if isinstance(place, str) else place)),
+        ("workspace", lambda: _workspace(place)),
         ("keys", _keys),
     ):
         yield _finding(what, look)
@@ -58,11 +61,22 @@ def examine_local() -> Iterator[Finding]:
         yield _finding("checkpoints", selfcheck.describe_checkpoints)
 
 
-def examine_files(workspace_root: Path) -> Iterator[Finding]:
+def examine_files(place: Place) -> Iterator[Finding]:
     """Every file of a study that says what it must hold, read whole: one finding for each kind."""
     from traps_pipeline.storage.workspace import Workspace
 
-    workspace = Workspace.open(workspace_root)
+    workspace = Workspace.open(place)
+    store, lost = workspace.store, list[str]()
+    remote = [store.below(workspace.root / folder) for folder in FOLDERS] if isinstance(workspace.place, str) else []
+    for path in (path for below in remote for path in below):  # fetched, and held against their digests
+        try:
+            store.here(path)
+        except TrapsError as error:
+            lost.append(str(error))
+    for folder in FOLDERS:
+        workspace.bring_folder(workspace.root / folder)
+    if isinstance(workspace.place, str):
+        yield Finding(not lost, "store", "; ".join(lost[:SHOWN]) or "every object is what was written")
     for what, files, damage_of in (
         ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), _damaged_table),
         ("clips", sorted((workspace.root / "clips").rglob("*.mp4")), _damaged_clip),
@@ -211,13 +225,13 @@ def _disk(root: Path) -> str:
     return f"{free:.1f} GB free at {existing}"
 
 
-def _workspace(root: Path) -> str:
+def _workspace(place: Place) -> str:
     from traps_pipeline.storage.workspace import Workspace
 
-    if not (root / "study.yaml").exists():
-        return f"{root} not made yet (`traps init` or `traps run demo` makes it)"
-    study = Workspace.open(root).study
-    return f"{root}: benchmark {study.benchmark}, panel {study.panel}, budget {study.budget_usd} dollars"
+    if not Workspace.is_there(place):
+        return f"{place} not made yet (`traps init` or `traps run demo` makes it)"
+    study = Workspace.open(place).study
+    return f"{place}: benchmark {study.benchmark}, panel {study.panel}, budget {study.budget_usd} dollars"
 
 
 def _keys() -> str:

@@ -129,6 +129,11 @@ def move_back(workspace: Workspace) -> Moved:
     session = workspace.session
     if session is None:
         raise TrapsError(f"{workspace.root}/study.yaml: the ledger lies in {workspace.ledger_folder} already")
+    if isinstance(workspace.place, str):
+        raise TrapsError(
+            f"{workspace.place}: a study in an object store keeps its ledger in its database, where the names of its "
+            "files lie, too"
+        )
     return asyncio.run(_move_out(workspace, session))
 
 

@@ -1,0 +1,206 @@
+"""A study of reference models on a cluster of this machine: PostgreSQL, moto's S3 server, a Ray head without CPUs and
+two nodes, each with a scratch folder of its own; the study lies on s3:// alone. Then what a cluster must not change is
+compared with a run of one process in a folder.
+
+python bench/cluster_study.py [--kill] [--interrupt leave|cancel] [--experiment FILE]
+(needs the packages of the extra `cluster`, and moto)
+
+--kill: every process of a node is killed (-9) while it renders, and the node is started again. --interrupt: Ctrl-C
+after the first partition, which leaves or cancels the runs; then the same command once more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+EXPERIMENT = """
+name: cluster
+description: Reference models, one behind a bad provider, on one scenario of four families.
+models: [oracle, flaky, prior]
+regimes: [standard]
+panel: rules
+epoch: cluster
+scenarios: [plinko-0001, tumbling_dice-0001, domino_chain-0001, hidden_race-0001]
+"""
+ADDRESS = "s3://lab/cluster-study"
+SUMMARY = " answers asked"
+
+
+class Study:
+    """The study as this host sees it, and the daemon of the head."""
+
+    def __init__(self, folder: Path, environment: dict[str, str], experiment: Path) -> None:
+        self.folder, self.environment, self.experiment = folder, environment, experiment
+        self.daemon: subprocess.Popen[bytes] | None = None
+        self.failures: list[str] = []
+
+    def traps(self, *arguments: str, **own: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "traps_pipeline.cli", *arguments]
+        return subprocess.run(
+            command, env=self.environment | own, cwd=ROOT, text=True, capture_output=True, check=False
+        )
+
+    def start_run(self, *more: str) -> subprocess.Popen[str]:
+        command = ["run", str(self.experiment), "--cluster", "--runs", "2", "--until", "leaderboard", *more]
+        return subprocess.Popen(
+            [sys.executable, "-m", "traps_pipeline.cli", *command], env=self.environment, cwd=ROOT, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+
+    def start_daemon(self) -> None:
+        """What `traps ui` starts beside its pages."""
+        said = self.traps("init", str(self.experiment))
+        if said.returncode:
+            raise SystemExit(said.stderr)
+        home = next(line for line in said.stdout.splitlines() if "DAGSTER_HOME=" in line).partition("DAGSTER_HOME=")[2]
+        with (self.folder / "daemon.log").open("ab") as log:
+            command = [sys.executable, "-m", "dagster._daemon", "run", "-m", "traps_pipeline.definitions"]
+            environment = self.environment | {"DAGSTER_HOME": home}
+            self.daemon = subprocess.Popen(command, stdout=log, stderr=log, cwd=ROOT, env=environment)
+        time.sleep(20)
+
+    def stop(self) -> None:
+        if self.daemon is not None:
+            self.daemon.terminate()
+            self.daemon.wait()
+        if (keep := os.environ.get("TRAPS_GATE_LOG")) and self.daemon is not None:
+            shutil.copy(self.folder / "daemon.log", keep)
+
+    def require(self, holds: bool, what: str) -> None:
+        """Print what was looked at, and remember it where it does not hold."""
+        print(f"  {'holds' if holds else 'DOES NOT HOLD'}: {what}", flush=True)
+        if not holds:
+            self.failures.append(what)
+
+
+def watch(run: subprocess.Popen[str], study: Study, kill: object) -> int:
+    """Print what a run says, and kill a node once it renders; its exit code."""
+    began, killed = time.monotonic(), kill is None
+    assert run.stdout is not None
+    for line in run.stdout:
+        print(f"  {time.monotonic() - began:6.1f} s  {line.rstrip()}", flush=True)
+        if not killed and "scene_specs" in line and "[" in line:
+            killed = True
+            time.sleep(3)
+            kill()  # type: ignore[operator]
+    return run.wait()
+
+
+def main() -> None:
+    from bench.cluster_gate import Cluster
+    from bench.equality import main as compare
+    from tests.objectstore import S3
+    from tests.postgres import Postgres
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kill", action="store_true")
+    parser.add_argument("--interrupt", choices=("leave", "cancel"))
+    parser.add_argument("--experiment", type=Path)
+    arguments = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it, and so its own
+    foreign = ("TRAPS_", "DAGSTER_", "RAY_", "AWS_")
+    plain = {key: value for key, value in os.environ.items() if not key.startswith(foreign)}
+    with tempfile.TemporaryDirectory(prefix="study-") as name, Postgres.running() as database, S3.running() as store:
+        folder = Path(name)
+        experiment = arguments.experiment or folder / "cluster.yaml"
+        if not arguments.experiment:
+            experiment.write_text(EXPERIMENT)
+        common = plain | {"PYTHONPATH": str(ROOT), "TMPDIR": name}
+        shared = common | store.environment | {
+            "TRAPS_DATABASE": database.address(),
+            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",  # the launcher calls `dagster`
+        }  # fmt: skip
+        cluster = Cluster(folder, shared)
+        own = {"TRAPS_RAY": f"http://127.0.0.1:{cluster.dashboard}", "TRAPS_WORKSPACE": ADDRESS}
+        study = Study(folder, shared | own | {"TRAPS_SCRATCH": str(folder / "here")}, experiment)
+        try:
+            cluster.start_head()
+            for node in ("one", "two"):
+                cluster.start_node(node)
+            study.start_daemon()
+
+            def kill() -> None:
+                busy = [node for node in ("one", "two") if list((folder / node).glob("*/clips/*"))] or ["one"]
+                print(f"  {cluster.signal(busy[0], signal.SIGKILL)} processes of {busy[0]} killed", flush=True)
+                cluster.start_node(busy[0])
+
+            began = time.monotonic()
+            if arguments.interrupt:
+                run = study.start_run("--on-interrupt", arguments.interrupt)
+                code = watch(run, study, lambda: run.send_signal(signal.SIGINT))
+                study.require(code == 130, f"Ctrl-C ends the command (exit code {code})")
+                time.sleep(5)
+                states = runs_of(study)
+                print(f"  runs: {states}", flush=True)
+                is_left = not ({"CANCELED", "CANCELING", "FAILURE"} & {*states})
+                study.require(is_left == (arguments.interrupt == "leave"), f"their runs: {arguments.interrupt}")
+            code = watch(study.start_run(), study, kill if arguments.kill else None)
+            print(f"  the study took {time.monotonic() - began:.0f} s on two nodes")
+            study.require(code == 0, f"the run succeeds (exit code {code})")
+            again = study.traps("run", str(experiment), "--cluster", "--runs", "2", "--until", "leaderboard")
+            study.require("0 answers asked (0 from" in again.stdout, "a second run asks nothing")
+            strays = [
+                path for node in ("one", "two") for path in (folder / node).rglob("*")
+                if path.is_symlink() or not path.resolve().is_relative_to(folder / node)
+            ]  # fmt: skip
+            made = {node: len(list((folder / node).rglob("*.parquet"))) for node in ("one", "two")}
+            study.require(not strays and all(made.values()), f"each node has made tables in its own folder: {made}")
+            compare_with_one_process(study, common, compare)
+        finally:
+            study.stop()
+            for node in ("one", "two", "head"):
+                cluster.signal(node, signal.SIGKILL)
+    if study.failures:
+        sys.exit("\n".join(study.failures))
+
+
+def runs_of(study: Study) -> list[str]:
+    """What became of the study's runs."""
+    code = (
+        "from dagster import DagsterInstance\nfrom traps_pipeline.storage.workspace import Workspace\n"
+        "home = Workspace.open().dagster_home\n"
+        "print(*(run.status.value for run in DagsterInstance.from_config(str(home)).get_runs()))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=study.environment, cwd=ROOT, text=True, capture_output=True, check=True
+    )
+    return done.stdout.split()
+
+
+def compare_with_one_process(study: Study, common: dict[str, str], compare: object) -> None:
+    """Make the study once more in a folder, in one process, from the clips that the cluster rendered, and compare."""
+    alone, fetched = study.folder / "alone", study.folder / "fetched"
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom traps_pipeline.storage.workspace import Workspace\n"
+        "w = Workspace.open()\nfor name in ('tables', 'clips'):\n"
+        "    w.bring_folder(w.root / name)\n"
+        "    for path in w.store.below(w.root / name):\n"
+        "        to = Path(sys.argv[1]) / path.relative_to(w.root)\n"
+        "        to.parent.mkdir(parents=True, exist_ok=True)\n"
+        "        to.write_bytes(path.read_bytes())\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(fetched)], env=study.environment, cwd=ROOT, check=True)
+    began = time.monotonic()
+    local = subprocess.run(
+        [sys.executable, "-m", "traps_pipeline.cli", "run", str(study.experiment), "--until", "leaderboard"],
+        env=common | {"TRAPS_WORKSPACE": str(alone)}, cwd=ROOT, text=True, capture_output=True, check=False,
+    )  # fmt: skip
+    print(f"  one process took {time.monotonic() - began:.0f} s: {local.stdout.strip().splitlines()[-2]}", flush=True)
+    study.require(compare(alone, fetched) == 0, "tables are equal, byte for byte but for times")  # type: ignore[operator]
+    clips = {path.relative_to(alone): path.read_bytes() for path in (alone / "clips").rglob("*.mp4")}
+    same = all((fetched / name).read_bytes() == content for name, content in clips.items())
+    study.require(bool(clips) and same, f"{len(clips)} clips have the same bytes")
+
+
+if __name__ == "__main__":
+    main()

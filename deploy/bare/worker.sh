@@ -1,0 +1,6 @@
+#!/bin/sh
+# A worker. Run it in the environment of the package, with the variables of deploy/README.md.
+set -eu
+: "${TRAPS_DATABASE:?}" "${TRAPS_SCRATCH:?}"
+HEAD="${1:?the address of the head}"
+exec ray start --address="$HEAD:6379" --disable-usage-stats --block

@@ -1,0 +1,122 @@
+"""A study in an object store: hosts with scratch folders of their own make it together, and it is the study that one
+machine makes in a folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from bench.equality import main as compare
+from tests.conftest import ROOT, SMALL, Checkout, Finished
+from tests.objectstore import S3
+from tests.postgres import Postgres
+from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.storage.workspace import DATABASE, Workspace
+
+pytestmark = pytest.mark.slow
+EXPERIMENT = SMALL.with_name("one_regime.yaml")
+ANSWERS = 4 * 2 * 2 * 12  # models, datasets of a taxonomy, sides, scenarios
+ADDRESS = "s3://lab/one-regime"
+
+
+@dataclass(frozen=True)
+class Host:
+    """A host of the study, with a scratch folder of its own."""
+
+    scratch: Path
+
+    def traps(self, *arguments: str | Path) -> Finished:
+        own = {"TRAPS_WORKSPACE": ADDRESS, "TRAPS_SCRATCH": str(self.scratch), "PYTHONPATH": str(ROOT)}
+        environment = {name: value for name, value in os.environ.items() if name != "DAGSTER_HOME"} | own
+        command = [sys.executable, "-m", "traps_pipeline.cli", *map(str, arguments)]
+        done = subprocess.run(command, cwd=ROOT, env=environment, text=True, capture_output=True, check=False)
+        return Finished(done.returncode, done.stdout, done.stderr)
+
+    @property
+    def root(self) -> Path:
+        """Its folder for this study."""
+        (folder,) = self.scratch.iterdir()
+        return folder
+
+    def files(self) -> list[Path]:
+        """What it has of tables, clips and media."""
+        return [path for kind in ("tables", "clips", "media") for path in (self.root / kind).rglob("*.*")]
+
+
+@pytest.fixture
+def hosts(s3: S3, postgres: Postgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Host]:
+    monkeypatch.setenv(DATABASE, postgres.address())
+    return [Host(tmp_path / name) for name in ("one", "two", "three")]
+
+
+def opened(host: Host, monkeypatch: pytest.MonkeyPatch) -> tuple[Workspace, ObjectStore]:
+    monkeypatch.setenv("TRAPS_SCRATCH", str(host.scratch))
+    workspace = Workspace.open(ADDRESS)
+    assert isinstance(workspace.store, ObjectStore)
+    return workspace, workspace.store
+
+
+def test_hosts_make_one_study_together_and_it_is_that_of_a_single_machine(
+    hosts: list[Host], one_regime: Checkout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two, three = hosts
+    made = one.traps("init", EXPERIMENT)
+    assert made.code == 0 and ADDRESS in made.out, made.out + made.err
+    shutil.copytree(one_regime.workspace / "clips", one.root / "clips", dirs_exist_ok=True)  # not rendered again
+    first = one.traps("run", EXPERIMENT, "--until", "items")
+    assert (first.code, first.counts()["frames"]) == (0, 0), first.out + first.err
+
+    rest = two.traps("run", EXPERIMENT, "--until", "leaderboard")
+    assert rest.code == 0, rest.out + rest.err
+    assert rest.counts() == {"answers": ANSWERS, "votes": rest.counts()["votes"], "frames": 0}
+    assert "leaderboard 1 0 0" in " ".join(three.traps("status").out.split())
+
+    workspace, store = opened(two, monkeypatch)
+    store.bring(store.below(workspace.tables.root))
+    assert compare(one_regime.workspace, workspace.root) == 0
+
+    clips = [path for path in store.below(workspace.root / "clips") if "plinko-0001" in path.parent.name]
+    assert len(clips) == 6  # control, void and twin, each with its note
+    before = {path: row.digest for path in clips for row in [store._current(path)] if row is not None}
+    for digest in before.values():
+        store.bucket.delete(digest)
+    again = three.traps("run", EXPERIMENT, "--until", "leaderboard")
+    assert again.code == 0, again.out + again.err
+    assert again.counts()["frames"] > 0 and again.counts()["answers"] == 0
+    _, store = opened(three, monkeypatch)
+    made = [store._current(three.root / path.relative_to(workspace.root)) for path in before]
+    assert [row and row.digest for row in made] == [*before.values()]
+    nothing = one.traps("run", EXPERIMENT, "--until", "leaderboard")
+    assert (nothing.code, nothing.counts()) == (0, {"answers": 0, "votes": 0, "frames": 0}), nothing.err
+    strays = [path for host in hosts for path in host.files() if not path.resolve().is_relative_to(host.scratch)]
+    assert strays == []
+
+
+def test_errors_name_the_host_the_study_and_the_remedy(
+    hosts: list[Host], postgres: Postgres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = hosts[0]
+    monkeypatch.setenv(DATABASE, postgres.address(password="wrong"))
+    refused = one.traps("init", EXPERIMENT)
+    assert refused.code == 1 and "password authentication failed" in refused.err and DATABASE in refused.err
+    monkeypatch.delenv(DATABASE)
+    refused = one.traps("init", EXPERIMENT)
+    assert refused.code == 1 and f"{DATABASE} is not set" in refused.err
+    refused = one.traps("init", EXPERIMENT, "--workspace", "s3://no-such-bucket/study")
+    assert refused.code == 1 and "See that the bucket exists" in refused.err
+    made = one.traps("init", EXPERIMENT, "--workspace", "s3://lab/refusals")
+    assert made.code == 1, "the variable is not set"
+    monkeypatch.setenv(DATABASE, postgres.address())
+    made = one.traps("init", EXPERIMENT, "--workspace", "s3://lab/refusals")
+    assert made.code == 0, made.err
+    for command in (("ledger", "move", "--back"), ("annotate", "--who", "jd")):
+        refused = one.traps(*command, "--workspace", "s3://lab/refusals")
+        assert refused.code == 1 and "s3://lab/refusals: " in refused.err, refused.err
+    refused = one.traps("status", "--workspace", "ftp://lab/study")
+    assert refused.code == 1 and "is no place for a study" in refused.err

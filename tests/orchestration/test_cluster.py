@@ -1,0 +1,99 @@
+"""Runs on a cluster, as far as they need none: how work is cut, what a host refuses, what a person is told."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import dagster as dg
+import pytest
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.orchestration.cluster import RayRuns, dagster_yaml, require_cluster
+from traps_pipeline.orchestration.runs import batches
+from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, require_same_code
+from traps_pipeline.orchestration.schemes import CELL, DATASET, Scheme
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import RAY, Workspace
+
+
+def runs(most: int, workspace: Workspace) -> RayRuns:
+    return RayRuns(dg.DagsterInstance.ephemeral(), workspace, most, 0.0, "leave")
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    return Workspace(tmp_path, Study(name="lab"))
+
+
+def keys_of(scheme: Scheme, ranges: list[Any]) -> list[str]:
+    """Every key of every range, as Dagster reads it."""
+    return [key for first, last in ranges for key in scheme.definition.get_partition_keys_in_range(
+        dg.PartitionKeyRange(str(first), str(last)))]  # fmt: skip
+
+
+@pytest.mark.parametrize("most", [1, 3, 40])
+def test_ranges_hold_each_key_once(workspace: Workspace, most: int) -> None:
+    keys = [str(key) for key in CELL.definition.get_partition_keys()][::2][:60]
+    ranges = runs(most, workspace).ranges(CELL, keys)
+    assert sorted(keys_of(CELL, ranges)) == sorted(keys)
+    assert len(ranges) >= min(most, len(keys))
+
+
+def test_cells_of_one_model_stay_together(workspace: Workspace) -> None:
+    datasets = [str(key) for key in DATASET.definition.get_partition_keys()][:4]
+    every = [str(key) for key in CELL.definition.get_partition_keys()]
+    evaluations = [*dict.fromkeys(key.partition("|")[2] for key in every)][:4]
+    keys = [f"{dataset}|{evaluation}" for dataset in datasets for evaluation in evaluations]
+    ranges = runs(4, workspace).ranges(CELL, keys)  # 16 cells in 4 runs: one of each model, all its datasets
+    assert len(ranges) == 4
+    for one in ranges:
+        assert len({key.partition("|")[2] for key in keys_of(CELL, [one])}) == 1
+    assert len([*batches(CELL, keys)]) == 1  # which one process makes in one
+
+
+def test_a_host_with_other_code_refuses_a_run_and_names_both(workspace: Workspace) -> None:
+    require_same_code({CODE_TAG: code_here()}, "lab")
+    require_same_code({}, "lab")  # a run of this host's own
+    with pytest.raises(
+        TrapsError, match=r"the host .* has other code .* study lab \(.* here, 0\.1\.9, files x, packages y there"
+    ):
+        require_same_code({CODE_TAG: "0.1.9, files x, packages y"}, "lab")
+
+
+def test_a_study_in_a_folder_and_a_missing_head_are_refused_with_the_remedy(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("ray", "dagster_ray", "dagster_postgres"):
+        pytest.importorskip(name, reason="the extra `cluster` is not installed")
+    instance = dg.DagsterInstance.ephemeral()
+    with pytest.raises(TrapsError, match=r"other hosts do not see this folder.*s3://BUCKET/STUDY"):
+        require_cluster(workspace, instance)
+    remote = Workspace(workspace.root, workspace.study, "s3://lab/study")
+    monkeypatch.delenv(RAY, raising=False)
+    with pytest.raises(TrapsError, match=r"TRAPS_RAY is not set"):
+        require_cluster(remote, instance)
+    monkeypatch.setenv(RAY, "http://127.0.0.1:1")
+    with pytest.raises(TrapsError, match=r"nobody takes runs of the study lab.*`traps ui` on the head"):
+        require_cluster(remote, instance)
+
+
+def test_what_dagster_is_told_holds_no_address_of_the_database(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(RAY, "http://head:8265")
+    monkeypatch.setenv("TRAPS_DATABASE", "postgresql://user:secret@host/db")
+    said = dagster_yaml("TRAPS_DATABASE")
+    assert "secret" not in str(said) and said["concurrency"]["runs"]["max_concurrent_runs"] == 40
+    assert said["run_launcher"]["config"]["ray"] == {"address": "http://head:8265", "num_cpus": 1}
+
+
+def test_the_command_line_of_a_run_survives_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
+    launcher = pytest.importorskip(
+        "traps_pipeline.orchestration.ray_launcher", reason="the extra `cluster` is not installed"
+    )
+    sent = list[str]()
+    base = launcher.QuotingRayRunLauncher.__mro__[1]
+    monkeypatch.setattr(base, "_launch_ray_job", lambda self, id_, entrypoint, run: sent.append(entrypoint))
+    told = """{"config_yaml": "'variable: X'", "a": 1}"""
+    launcher.QuotingRayRunLauncher("http://head:8265")._launch_ray_job("1", f"dagster api execute_run '{told}'", None)
+    assert shlex.split(sent[0]) == ["dagster", "api", "execute_run", told]

@@ -1,0 +1,234 @@
+"""A study's files: the same tests for a folder and for an object store, and what several hosts of one store see."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.objectstore import S3
+from tests.postgres import Postgres
+from tests.storage.test_parquet import clip
+from traps_pipeline.benchmark.tables import VIDEOS
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.database import Session
+from traps_pipeline.storage.objects import OBJECTS, Bucket, ObjectStore
+from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.storage.store import FolderStore, Store
+
+PLINKO = {"category": "plinko"}
+
+
+@dataclass(frozen=True)
+class Hosts:
+    """Hosts of one study. open: its files, as the host of that name sees them."""
+
+    open: Callable[[str], Store]
+
+
+@pytest.fixture(params=["folder", "objects"])
+def hosts(request: pytest.FixtureRequest, tmp_path: Path) -> Hosts:
+    """Hosts that share a folder, or a bucket."""
+    if request.param == "folder":
+        return Hosts(lambda name: FolderStore(tmp_path / "study"))
+    return Hosts(_hosts_of_bucket(request, tmp_path))
+
+
+@pytest.fixture
+def bucket_hosts(request: pytest.FixtureRequest, tmp_path: Path) -> Hosts:
+    return Hosts(_hosts_of_bucket(request, tmp_path))
+
+
+def _hosts_of_bucket(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[str], ObjectStore]:
+    request.getfixturevalue("s3")
+    postgres: Postgres = request.getfixturevalue("postgres")
+    study = f"study-{secrets.token_hex(4)}"
+
+    def opened(name: str) -> ObjectStore:
+        session = Session(postgres.address(), "TRAPS_TEST_DATABASE", study)
+        return ObjectStore(tmp_path / name, Bucket(f"s3://lab/{study}"), session)
+
+    return opened
+
+
+def put(store: Store, name: str, content: bytes) -> Path:
+    """Make a file and hand it over."""
+    path = store.root / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    path.write_bytes(content)
+    store.keep([path])
+    return path
+
+
+def test_what_is_kept_on_one_host_is_brought_to_another(hosts: Hosts) -> None:
+    one, other = hosts.open("one"), hosts.open("other")
+    put(one, "clips/a/void.mp4", b"frames")
+    there = other.root / "clips/a/void.mp4"
+    other.look()
+    assert other.has(there) and other.sizes([there]) == {there: 6}
+    other.bring([there, other.root / "clips/a/none.mp4"])
+    assert there.read_bytes() == other.here(there).read_bytes() == b"frames"
+
+
+def test_the_newest_content_is_current_everywhere(hosts: Hosts) -> None:
+    one, other = hosts.open("one"), hosts.open("other")
+    path = other.root / "study.yaml"
+    for content in (b"first", b"second", b"first"):
+        one.write({one.root / "study.yaml": content})
+        other.look()
+        other.bring([path])
+        assert other.here(path).read_bytes() == path.read_bytes() == content
+
+
+def test_what_is_removed_is_nowhere(hosts: Hosts) -> None:
+    one, other = hosts.open("one"), hosts.open("other")
+    path = put(one, "checks/items/labels/plinko.json", b"1")
+    one.remove([path, one.root / "checks/none.json"])
+    other.look()
+    for store in (one, other):
+        path = store.root / "checks/items/labels/plinko.json"
+        assert not store.has(path) and store.below(store.root / "checks") == [] and store.changed_ns(path) == 0
+        with pytest.raises(FileNotFoundError):
+            store.here(path).read_bytes()
+
+
+def test_files_below_a_folder_are_found_by_pattern(hosts: Hosts) -> None:
+    store = hosts.open("one")
+    for name in ("tables/a/x=1/part.parquet", "tables/a/x=2/part.parquet", "tables/a/.hidden", "tables/ab/x=1/p", "b"):
+        put(store, name, b"1")
+
+    def found(folder: str, pattern: str = "**/*") -> list[str]:
+        return [path.relative_to(store.root).as_posix() for path in store.below(store.root / folder, pattern)]
+
+    assert found("tables/a") == ["tables/a/x=1/part.parquet", "tables/a/x=2/part.parquet"]
+    assert found("tables") == [*found("tables/a"), "tables/ab/x=1/p"]
+    assert found("tables/a", "x=*/part.parquet") == found("tables/a")
+    assert found("tables/a", "x=2/part.parquet") == ["tables/a/x=2/part.parquet"]
+    assert found("tables", "*") == found("none") == []
+
+
+def test_a_table_of_one_host_is_read_on_another(hosts: Hosts) -> None:
+    one, other = (TableStore(store.root / "tables", store) for store in (hosts.open("one"), hosts.open("other")))
+    version = one.write(VIDEOS, PLINKO, [clip("plinko-0001")], {"scene_specs/plinko": "abc"}, failed=2, code="7")
+    state = other.state(VIDEOS, PLINKO)
+    assert state is not None and (state.version, state.failed, state.code, state.rows) == (version, 2, "7", 1)
+    assert state.inputs == {"scene_specs/plinko": "abc"} and other.damage(VIDEOS, PLINKO, thorough=True) == ""
+    assert (
+        list(other.read(VIDEOS, PLINKO)["scenario_id"])
+        == list(other.read_all(VIDEOS)["scenario_id"])
+        == ["plinko-0001"]
+    )
+    assert other.partitions(VIDEOS) == [PLINKO]
+    assert list(other.read_all(VIDEOS, category=("plinko", "dice"))["scenario_id"]) == ["plinko-0001"]
+
+
+def test_the_bytes_of_a_table_are_the_same_wherever_it_lies(hosts: Hosts, tmp_path: Path) -> None:
+    store, alone = hosts.open("one"), TableStore(tmp_path / "alone")
+    tables = TableStore(store.root / "tables", store)
+    for each in (tables, alone):
+        each.write(VIDEOS, PLINKO, [clip("plinko-0001")], {})
+    path = tables.path(VIDEOS, PLINKO)
+    assert store.here(path).read_bytes() == alone.path(VIDEOS, PLINKO).read_bytes()
+
+
+# --- of an object store alone -----------------------------------------------------------------------------------------
+
+
+def test_a_reader_keeps_the_content_that_it_began_to_read(bucket_hosts: Hosts) -> None:
+    store = bucket_hosts.open("one")
+    path = put(store, "tables/t/part.parquet", b"old")
+    began = store.here(path)
+    store.write({path: b"new"})
+    assert began.read_bytes() == b"old" and store.here(path).read_bytes() == b"new"
+
+
+def test_equal_contents_are_one_object_named_by_its_digest(bucket_hosts: Hosts, s3: S3) -> None:
+    store = bucket_hosts.open("one")
+    assert isinstance(store, ObjectStore)
+    for name in ("clips/a.mp4", "clips/b.mp4"):
+        put(store, name, b"frames")
+    digest = "594cfd2607d4f09e1ce6241203e418cacfed545063792bc5eab7afaadbf0c4e0"  # printf frames | sha256sum
+    folder = store.bucket.address.removeprefix("s3://lab/")
+    assert [name for name in s3.names() if name.startswith(folder)] == [f"{folder}/{digest[:2]}/{digest}"]
+
+
+def test_what_is_gone_from_the_store_is_current_no_more_and_can_be_made_again(bucket_hosts: Hosts, s3: S3) -> None:
+    one, other = bucket_hosts.open("one"), bucket_hosts.open("other")
+    put(one, "clips/a.mp4", b"frames")
+    s3.empty()
+    s3.make_bucket()
+    other.look()
+    path = other.root / "clips/a.mp4"
+    assert other.sizes([path]) == {} and not other.has(path)
+    one.look()
+    put(one, "clips/a.mp4", b"frames")  # the same digest, uploaded again though this host had seen it there
+    other.look()
+    assert other.sizes([path]) == {path: 6}
+
+
+def test_an_object_that_was_altered_is_named_and_nothing_is_read_from_it(bucket_hosts: Hosts) -> None:
+    one, other = bucket_hosts.open("one"), bucket_hosts.open("other")
+    assert isinstance(one, ObjectStore)
+    path = put(one, "tables/t/part.parquet", b"whole")
+    row = one._current(path)
+    assert row is not None
+    for altered in (b"whale", b"who"):
+        one.bucket.put(row.name, altered)
+        other.look()
+        there = other.root / "tables/t/part.parquet"
+        with pytest.raises(TrapsError, match=r"tables/t/part\.parquet: is not what was written.*run again"):
+            other.here(there)
+        assert not other.has(there)
+        one.look()
+        one._there.clear()
+        put(one, "tables/t/part.parquet", b"whole")
+    other.look()
+    assert other.here(there).read_bytes() == b"whole"
+
+
+def test_a_scratch_folder_may_be_lost_or_altered_at_any_time(bucket_hosts: Hosts) -> None:
+    one, other = bucket_hosts.open("one"), bucket_hosts.open("other")
+    put(one, "clips/a.mp4", b"frames")
+    there = other.root / "clips/a.mp4"
+    other.look()
+    other.bring([there])
+    for cached in (path for path in (other.root / OBJECTS).rglob("*") if path.is_file()):
+        cached.unlink()
+        cached.write_bytes(b"rotten")
+    later = bucket_hosts.open("other")
+    later.bring([there])
+    assert later.here(there).read_bytes() == there.read_bytes() == b"frames"
+
+
+def test_a_bucket_that_is_gone_is_no_reason_to_forget_its_files(bucket_hosts: Hosts, s3: S3) -> None:
+    one, other = bucket_hosts.open("one"), bucket_hosts.open("other")
+    path = put(one, "clips/a.mp4", b"frames")
+    s3.empty()
+    try:
+        other.look()
+        for look in (lambda: other.here(other.root / "clips/a.mp4"), lambda: other.sizes([other.root / "clips/a.mp4"])):
+            with pytest.raises(TrapsError, match=r"s3://lab/study-\w+: cannot be used from the host .*bucket exists"):
+                look()
+        assert other.has(other.root / "clips/a.mp4") and one.has(path)
+    finally:
+        s3.make_bucket()
+
+
+def test_changes_of_hosts_at_once_are_all_seen(bucket_hosts: Hosts) -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    stores = [bucket_hosts.open(f"host{number}") for number in range(4)]
+
+    def write(number: int) -> None:
+        for turn in range(10):
+            stores[number].write({stores[number].root / f"tables/{number}/{turn}": f"{number} {turn}".encode()})
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, range(4)))
+    for store in stores:
+        store.look()
+        assert len(store.below(store.root / "tables")) == 40

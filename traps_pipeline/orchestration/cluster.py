@@ -1,0 +1,264 @@
+"""Runs on other hosts: `traps run EXPERIMENT --cluster` puts them in Dagster's queue, from where they start on Ray.
+
+The head of the cluster runs Dagster's daemon (`traps ui`), which starts queued runs as Ray jobs and resumes those whose
+host died. This module cuts what is to be made into ranges, submits them, and tells what they have done.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Any, Literal
+
+import dagster as dg
+
+from traps_pipeline import progress
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import missing
+from traps_pipeline.models.registry import LOCAL, get_model
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.orchestration.graph import Stage
+from traps_pipeline.orchestration.runs import Ran, Range, Runs, batches, problems_of, range_tags
+from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
+from traps_pipeline.orchestration.schemes import Scheme
+from traps_pipeline.partitions import Cell
+from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
+
+STUDY_TAG = "traps/study"
+AT_ONCE = 40  # runs; Ray keeps a process of some 85 MB for each on the head
+POLL_S = 1.0
+MONITOR_S, START_S, RESUMES = 15, 90, 3
+ALIVE_S = 120  # a daemon that has been silent for longer is dead
+QUEUE = "QUEUED_RUN_COORDINATOR"
+OnInterrupt = Literal["leave", "cancel"]
+_WAITING = (
+    dg.DagsterRunStatus.QUEUED,
+    dg.DagsterRunStatus.NOT_STARTED,
+    dg.DagsterRunStatus.STARTING,
+    dg.DagsterRunStatus.STARTED,
+    dg.DagsterRunStatus.CANCELING,
+)
+_MADE, _FAILED = dg.DagsterEventType.ASSET_MATERIALIZATION, dg.DagsterEventType.STEP_FAILURE
+_ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED}
+
+
+def dagster_yaml(variable: str) -> dict[str, Any]:
+    """The `dagster.yaml` of a study whose runs go to a cluster. variable: with the database's address."""
+    return {
+        "telemetry": {"enabled": False},
+        "nux": {"enabled": False},
+        "storage": {
+            "custom": {
+                "module": "traps_pipeline.orchestration.shared_history",
+                "class": "SharedHistory",
+                "config": {"variable": variable},
+            }
+        },
+        "run_launcher": {
+            "module": "traps_pipeline.orchestration.ray_launcher",
+            "class": "QuotingRayRunLauncher",
+            "config": {"ray": {"address": os.environ[RAY], "num_cpus": 1}},
+        },
+        # Ray keeps what a job prints; Dagster would write it below a path of the host that submitted the run.
+        "compute_logs": {
+            "module": "dagster._core.storage.noop_compute_log_manager",
+            "class": "NoOpComputeLogManager",
+        },
+        "run_monitoring": {
+            "enabled": True,
+            "poll_interval_seconds": MONITOR_S,
+            "max_resume_run_attempts": RESUMES,
+            "start_timeout_seconds": START_S,
+        },
+        "concurrency": {"runs": {"max_concurrent_runs": AT_ONCE}},
+    }
+
+
+def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
+    """Raises TrapsError unless runs can be submitted from here: the study is one that other hosts see, Ray's address is
+    known, and a daemon takes runs from the queue."""
+    if absent := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
+        raise TrapsError(
+            f"runs on other hosts need {' and '.join(absent)} here and there: install the extra `cluster`, in a "
+            "checkout `python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"
+        )
+    if not isinstance(workspace.place, str):
+        raise TrapsError(
+            f"{workspace.root}: other hosts do not see this folder; a study for --cluster lies in an object store: "
+            f"{VARIABLE}=s3://BUCKET/STUDY (docs/cluster.md)"
+        )
+    if not os.environ.get(RAY):
+        raise TrapsError(f"{RAY} is not set: export {RAY}=http://HEAD:8265, the address of Ray's head for the study")
+    beats = instance.get_daemon_heartbeats()
+    last = beats[QUEUE].timestamp if QUEUE in beats else 0.0
+    if time.time() - last > ALIVE_S:
+        raise TrapsError(
+            f"nobody takes runs of the study {workspace.study.name} from the queue; run `traps ui` on the head, with "
+            "the same variables, and then the same command again"
+        )
+
+
+class RayRuns(Runs):
+    """Runs of a study in Dagster's queue. most: into which a group of stages is cut, besides what cannot stand in one
+    rectangle of cells. gpus: of each run that loads a local model."""
+
+    def __init__(
+        self, instance: dg.DagsterInstance, workspace: Workspace, most: int, gpus: float, on_interrupt: OnInterrupt
+    ) -> None:
+        self._instance, self._workspace, self._on_interrupt = instance, workspace, on_interrupt
+        self._most, self._gpus = most, gpus
+        self._stack, self._n_keys = ExitStack(), 0
+        self._cursors: dict[str, str | None] = {}
+        self._chunks: dict[Range, Sequence[str | None]] = {}  # what a range is a part of
+
+    def __enter__(self) -> RayRuns:
+        """Load the code location in which runs are submitted; then wait for runs that were left."""
+        from dagster._core.workspace.context import WorkspaceProcessContext
+        from dagster._core.workspace.load_target import ModuleTarget
+
+        target = ModuleTarget("traps_pipeline.definitions", None, None, None)
+        context = self._stack.enter_context(
+            WorkspaceProcessContext(self._instance, target, version=dg.__version__, code_server_log_level="ERROR")
+        )
+        self._context = context.create_request_context()
+        (self._location,) = self._context.code_locations
+        (self._repository,) = self._location.get_repositories().values()
+        ours = dg.RunsFilter(statuses=[*_WAITING], tags={STUDY_TAG: self._workspace.study.name})
+        if left := [run.run_id for run in self._instance.get_runs(ours)]:
+            progress.current().note(f"{len(left)} runs of this study go on that were left; waiting for them first")
+            self._watch(left)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def ranges(self, scheme: Scheme | None, keys: Sequence[str | None]) -> list[Range]:
+        """Ranges for several hosts: so many that all have work, and so few that starting them costs little. What one
+        model is asked stays together, so that it is loaded once."""
+        self._n_keys = len(keys)
+        if scheme is None:
+            return [(key, key) for key in keys]
+        by_model = sorted(keys, key=lambda key: str(key).partition("|")[::-1])
+        size = -(-len(by_model) // self._most) if by_model else 1
+        chunks = [by_model[first : first + size] for first in range(0, len(by_model), size)]
+        found = {one: chunk for chunk in chunks for one in batches(scheme, chunk)}
+        self._chunks |= found
+        return [*found]
+
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
+        """See `Runs`."""
+        if ranges:
+            progress.current().stage(", ".join(stage.name for stage in stages), self._n_keys * len(stages))
+            yield from self._watch([self._submit(stages, one, tags) for one in ranges])
+
+    def _submit(self, stages: Sequence[Stage], of: Range, tags: Mapping[str, str]) -> str:
+        from dagster._core.definitions.selector import JobSubsetSelector
+
+        selected = frozenset(stage.spec.key for stage in stages)
+        selector = JobSubsetSelector(self._location.name, self._repository.name, "__ASSET_JOB", None, selected)
+        job = self._location.get_job(selector)
+        plan = self._location.get_execution_plan(job, {}, None, None, instance=self._instance)
+        own = {
+            STUDY_TAG: self._workspace.study.name,
+            CODE_TAG: code_here(),
+            "dagster-ray/config": self._resources(stages, of),
+        }
+        run = self._instance.create_run(
+            job_name=job.name,
+            run_id=None,
+            run_config={},
+            status=None,
+            tags={**tags, **own, **range_tags(of, always=True)},
+            root_run_id=None,
+            parent_run_id=None,
+            step_keys_to_execute=plan.execution_plan_snapshot.step_keys_to_execute,
+            execution_plan_snapshot=plan.execution_plan_snapshot,
+            job_snapshot=job.job_snapshot,
+            parent_job_snapshot=job.parent_job_snapshot,
+            asset_selection=selected,
+            asset_check_selection=None,
+            resolved_op_selection=None,
+            op_selection=None,
+            remote_job_origin=job.get_remote_origin(),
+            job_code_origin=job.get_python_origin(),
+            asset_graph=self._repository.asset_graph,
+        )
+        return self._instance.submit_run(run.run_id, self._context).run_id
+
+    def _resources(self, stages: Sequence[Stage], of: Range) -> str:
+        """What Ray sets aside for a run, and which study it works in. No secrets: tags can be read by everybody."""
+        takes = {"num_cpus": max(stage.takes.cpus for stage in stages), "num_gpus": 0.0, "memory": None}
+        memory = max(stage.takes.memory_gb for stage in stages)
+        asks = RESPONSES.name in {stage.name for stage in stages} and any(map(_is_local, self._chunks.get(of, ())))
+        if asks or any(stage.cost == "machine" for stage in stages):
+            takes["num_gpus"] = self._gpus
+        if memory:
+            takes["memory"] = int(memory * 2**30)
+        given = {name: value for name, value in takes.items() if value}
+        return json.dumps(given | {"runtime_env": {"env_vars": {VARIABLE: str(self._workspace.place)}}})
+
+    def _watch(self, run_ids: Sequence[str]) -> list[Ran]:
+        """Tell what runs do until all have ended."""
+        left, done = [*run_ids], list[Ran]()
+        try:
+            while left:
+                runs = {run.run_id: run for run in self._instance.get_runs(dg.RunsFilter(run_ids=left))}
+                for run_id in [*left]:
+                    run = runs.get(run_id)
+                    failures = self._tell(run_id)
+                    if run is None or run.is_finished:
+                        left.remove(run_id)
+                        done.append(self._ended(run_id, run, [*failures, *self._tell(run_id)]))
+                if left:
+                    time.sleep(POLL_S)
+        except KeyboardInterrupt:
+            self._interrupted(left)
+            raise
+        return done
+
+    def _tell(self, run_id: str) -> list[dg.DagsterEvent]:
+        """Tell of partitions that a run has made since the last time; returns steps that failed."""
+        failures = list[dg.DagsterEvent]()
+        while True:
+            found = self._instance.get_records_for_run(run_id, self._cursors.get(run_id), {_MADE, _FAILED}, limit=1000)
+            self._cursors[run_id] = found.cursor
+            for record in found.records:
+                event = record.event_log_entry.get_dagster_event()
+                if event.is_step_failure:
+                    failures.append(event)
+                elif (made := event.step_materialization_data.materialization).metadata.get("tally") is not None:
+                    tally = progress.Tally(**json.loads(str(made.metadata["tally"].value)))
+                    progress.current().partition(made.asset_key.path[-1], made.partition or "", tally)
+            if not found.has_more:
+                return failures
+
+    def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> Ran:
+        name = f"run {run_id[:8]} of the study {self._workspace.study.name}"
+        if run is None:
+            return Ran([f"{name} is in Dagster's history no more"], over_budget=False)
+        ran = problems_of(failures)
+        if run.status == dg.DagsterRunStatus.SUCCESS:
+            return Ran([], over_budget=False)
+        if not ran.problems:
+            said = [entry.message for entry in self._instance.all_logs(run_id, of_type=_ENDED)]
+            why = " ".join(" ".join(said[-1:]).split())[:300] or "no reason is known"
+            ran.problems.append(f"{name} ended as {run.status.value.lower()} ({why}); see its log in `traps ui`")
+        return ran
+
+    def _interrupted(self, left: Sequence[str]) -> None:
+        if self._on_interrupt == "leave":
+            progress.current().note(
+                f"{len(left)} runs go on without this command; the same command shows them again, and "
+                "`--on-interrupt cancel` would have ended them"
+            )
+            return
+        for run_id in left:
+            self._instance.run_coordinator.cancel_run(run_id)
+        progress.current().note(f"{len(left)} runs were told to end; what they asked and made is kept")
+
+
+def _is_local(cell: str | None) -> bool:
+    return get_model(Cell.parse(str(cell)).evaluation.model).backend == LOCAL

@@ -1,0 +1,165 @@
+"""How Dagster runs are made: here and now, one after another, or on other hosts (`orchestration/cluster.py`)."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import dagster as dg
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.models.budget import BudgetReached
+from traps_pipeline.orchestration.graph import Stage
+from traps_pipeline.orchestration.schemes import Scheme
+
+PID_TAG, HOST_TAG = "traps/pid", "traps/host"
+Range = tuple[str | None, str | None]  # first and last key
+_RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"
+_SENTENCES = (TrapsError.__name__, BudgetReached.__name__)  # errors whose message is for people
+_INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
+_QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
+
+
+@dataclass
+class Ran:
+    """What went wrong in a run, a sentence each, and whether a budget was reached."""
+
+    problems: list[str]
+    over_budget: bool
+
+
+class Runs(ABC):
+    """Who makes runs of stages that share their partitions."""
+
+    @abstractmethod
+    def ranges(self, scheme: Scheme | None, keys: Sequence[str | None]) -> Sequence[Range]:
+        """The keys, cut into ranges that are made in one run each."""
+
+    @abstractmethod
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[Ran]:
+        """Make the stages in these ranges; KeyboardInterrupt passes through."""
+
+
+class RunsHere(Runs):
+    """Runs in this process, of the job of all assets."""
+
+    def __init__(self, instance: dg.DagsterInstance, job: dg.JobDefinition) -> None:
+        self._instance, self._job = instance, job
+
+    def ranges(self, scheme: Scheme | None, keys: Sequence[str | None]) -> Sequence[Range]:
+        """See `Runs`: as few as there can be."""
+        return [*batches(scheme, keys)]
+
+    def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
+        """See `Runs`."""
+        for one in ranges:
+            key = one[0] if one[0] == one[1] else None
+            yield _execute(self._instance, self._job, stages, key, {**tags, **range_tags(one)})
+
+
+def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
+    """The tags of a run of a range. A single key needs none, unless Dagster is told of it in no other way (always)."""
+    first, last = one
+    if first is None or (first == last and not always):
+        return {}
+    return {_RANGE[0]: str(first), _RANGE[1]: str(last)}
+
+
+def this_host() -> str:
+    """Where process numbers mean what they mean here: the machine and its namespace of processes."""
+    namespace = Path("/proc/self/ns/pid")
+    return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
+
+
+def batches(scheme: Scheme | None, keys: Sequence[str | None]) -> Iterator[tuple[str | None, str | None]]:
+    """Ranges (first key, last key) that together are exactly the keys: one run each. Of two dimensions a range is a
+    rectangle of neighbours."""
+    if scheme is None or not keys:
+        yield from ((key, key) for key in keys)
+        return
+    if not isinstance(scheme.definition, dg.MultiPartitionsDefinition):
+        every = [str(key) for key in scheme.definition.get_partition_keys()]
+        yield from ((every[first], every[last]) for first, last in _spans([every.index(str(key)) for key in keys]))
+        return
+    rows, columns = ([str(k) for k in d.partitions_def.get_partition_keys()] for d in scheme.definition.partitions_defs)
+    places = {key: number for number, key in enumerate(columns)}
+    by_row: dict[int, list[int]] = {}
+    for key in keys:
+        row, _, column = str(key).partition("|")
+        by_row.setdefault(rows.index(row), []).append(places[column])
+    spans = sorted((span, row) for row, numbers in by_row.items() for span in _spans(numbers))
+    for span, group in groupby(spans, key=lambda pair: pair[0]):
+        for first, last in _spans([row for _, row in group]):
+            yield f"{rows[first]}|{columns[span[0]]}", f"{rows[last]}|{columns[span[1]]}"
+
+
+def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """Maximal runs of neighbouring numbers, as (first, last)."""
+    spans: list[tuple[int, int]] = []
+    for number in sorted(numbers):
+        if spans and spans[-1][1] == number - 1:
+            spans[-1] = spans[-1][0], number
+        else:
+            spans.append((number, number))
+    return spans
+
+
+def _execute(
+    instance: dg.DagsterInstance,
+    job: dg.JobDefinition,
+    stages: Sequence[Stage],
+    key: str | None,
+    tags: Mapping[str, str],
+) -> Ran:
+    try:
+        result = job.execute_in_process(
+            instance=instance,
+            asset_selection=[stage.spec.key for stage in stages],
+            partition_key=key,
+            tags={PID_TAG: str(os.getpid()), HOST_TAG: this_host(), **tags},
+            raise_on_error=False,
+            run_config=_QUIET,
+        )
+    except dg.DagsterExecutionInterruptedError:
+        raise KeyboardInterrupt from None
+    failures = [event for event in result.all_events if event.is_step_failure]
+    if any(error.cls_name in _INTERRUPTS for event in failures for error in _chain(event)):
+        raise KeyboardInterrupt
+    ran = problems_of(failures)
+    if not result.success and not ran.problems:
+        ran.problems.append(
+            f"{', '.join(stage.name for stage in stages)} {key or ''}: the run failed; see its log in Dagster"
+        )
+    return ran
+
+
+def problems_of(failures: Sequence[dg.DagsterEvent]) -> Ran:
+    """What failed steps say."""
+    problems = [line for event in failures for line in _reason(event).splitlines()]
+    over = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _chain(event))
+    return Ran(problems, over)
+
+
+def _chain(event: dg.DagsterEvent) -> list[Any]:
+    """The error of a failed step and its causes, outermost first."""
+    chain, error = [], event.step_failure_data.error
+    while error is not None:
+        chain.append(error)
+        error = error.cause
+    return chain
+
+
+def _reason(event: dg.DagsterEvent) -> str:
+    """The error of a failed step: our own sentences where there are some, else the innermost exception."""
+    chain = _chain(event)
+    readable = [error for error in chain if error.cls_name in _SENTENCES]
+    if not readable:
+        return chain[-1].message.strip() if chain else "the step failed"
+    return re.sub(rf"^\S*\b{readable[0].cls_name}: ", "", readable[0].message.strip())

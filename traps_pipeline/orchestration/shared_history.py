@@ -1,0 +1,35 @@
+"""Dagster's history in the PostgreSQL database that holds the study's ledger: the same runs, seen from every host."""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from typing import Any
+
+from dagster import StringSource
+from dagster._core.storage.base_storage import DagsterStorage
+from dagster._serdes import ConfigurableClassData
+
+from traps_pipeline.errors import TrapsError
+
+
+class SharedHistory(DagsterStorage):
+    """Named in `dagster.yaml`; what is made of it is dagster-postgres's own storage. variable: that holds the address,
+    which stands in no file and in no run."""
+
+    @classmethod
+    def config_type(cls) -> dict[str, Any]:
+        """Fields in `dagster.yaml`."""
+        return {"variable": StringSource}
+
+    @classmethod
+    def from_config_value(cls, inst_data: ConfigurableClassData | None, config_value: Any) -> DagsterStorage:
+        """Dagster's way to make it. Raises TrapsError where the variable is not set on this host."""
+        variable = config_value["variable"]
+        address = os.environ.get(variable)
+        if not address:
+            raise TrapsError(f"{variable} is not set on this host; export the address of the study's database")
+        # SQLAlchemy 2.1 takes psycopg 3 for a plain postgresql://, and dagster-postgres's NOTIFY fails with it.
+        url = "postgresql+psycopg2://" + address.partition("://")[2]
+        storage = import_module("dagster_postgres").DagsterPostgresStorage
+        return storage(url, should_autocreate_tables=True, inst_data=inst_data)

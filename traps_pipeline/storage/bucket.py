@@ -1,0 +1,88 @@
+"""A place in an object store (S3, Google, Azure), through obstore, and what is said where it cannot be used."""
+
+from __future__ import annotations
+
+import socket
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.extras import require
+
+
+def object_name(digest: bytes) -> str:
+    """Where the content with that SHA-256 lies, in the store and in a scratch folder."""
+    return f"{digest.hex()[:2]}/{digest.hex()}"
+
+
+class Bucket:
+    """A place in an object store. address: as TRAPS_WORKSPACE has it, for example s3://bucket/study."""
+
+    def __init__(self, address: str) -> None:
+        require("cluster", "obstore")
+        from obstore.exceptions import BaseError
+        from obstore.store import from_url
+
+        self.address = address
+        try:
+            self._store = from_url(address, retry_config={"max_retries": 5})
+        except (BaseError, ValueError, TypeError) as error:
+            raise self.error(error) from None
+
+    def get(self, name: str) -> bytes | None:
+        """The content of an object; None where there is none. Raises TrapsError."""
+        import obstore
+        from obstore.exceptions import BaseError, NotFoundError
+
+        try:
+            return bytes(obstore.get(self._store, name).bytes())
+        except (NotFoundError, FileNotFoundError) as error:
+            if _is_no_bucket(error):
+                raise self.error(error) from None
+            return None
+        except BaseError as error:
+            raise self.error(error) from None
+
+    def put(self, name: str, content: bytes) -> None:
+        """Write an object. Raises TrapsError."""
+        import obstore
+        from obstore.exceptions import BaseError
+
+        try:
+            obstore.put(self._store, name, content)
+        except (BaseError, FileNotFoundError) as error:
+            raise self.error(error) from None
+
+    def delete(self, digest: bytes) -> None:
+        """Remove an object. Raises TrapsError."""
+        import obstore
+        from obstore.exceptions import BaseError
+
+        try:
+            obstore.delete(self._store, object_name(digest))
+        except (BaseError, FileNotFoundError) as error:
+            raise self.error(error) from None
+
+    def size(self, name: str) -> int | None:
+        """The size of an object in bytes; None where there is none. Raises TrapsError."""
+        import obstore
+        from obstore.exceptions import BaseError, NotFoundError
+
+        try:
+            return int(obstore.head(self._store, name)["size"])
+        except (NotFoundError, FileNotFoundError):
+            return None
+        except BaseError as error:
+            raise self.error(error) from None
+
+    def error(self, error: Exception) -> TrapsError:
+        """What a person is told of a store that cannot be used."""
+        said = " ".join(str(error).split())[:300]
+        return TrapsError(
+            f"{self.address}: cannot be used from the host {socket.gethostname()} ({said}). See that the bucket "
+            "exists, that its keys and its address are in the environment (for S3: AWS_ACCESS_KEY_ID, "
+            "AWS_SECRET_ACCESS_KEY, AWS_REGION, and AWS_ENDPOINT for a server of your own), and that this machine's "
+            "clock is right; then run the same command again: what is finished is kept"
+        )
+
+
+def _is_no_bucket(error: Exception) -> bool:
+    return "NoSuchBucket" in str(error)

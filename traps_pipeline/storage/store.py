@@ -1,0 +1,129 @@
+"""Where a study's files lie: one interface with two implementations, which nothing above this room tells apart.
+
+In a folder of one machine (`FolderStore`), or in an object store that several hosts share (`storage/objects.py`). Code
+names a file by its path below the workspace's folder on this machine, makes it there, and hands it over with `keep`;
+before it reads files that another host may have made, it asks for them with `bring`. In a folder both do nothing.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from traps_pipeline.files import write_bytes
+
+
+class Store(ABC):
+    """The files of one study. root: the folder on this machine below which every path lies."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    @abstractmethod
+    def here(self, path: Path) -> Path:
+        """A file on this machine that holds what is current under that path; nobody changes it while it is read.
+
+        Raises FileNotFoundError where there is none, TrapsError where it is not what was written or cannot be had.
+        """
+
+    @abstractmethod
+    def bring(self, paths: Iterable[Path]) -> None:
+        """See to it that these files lie at their paths on this machine, as far as they exist. Raises TrapsError."""
+
+    @abstractmethod
+    def keep(self, paths: Iterable[Path]) -> None:
+        """Make what lies at these paths on this machine current for every host: all of them or none. Raises TrapsError
+        and OSError."""
+
+    @abstractmethod
+    def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
+        """Make these contents current: all of them or none, where several hosts see them. note: what `note` will say
+        of them. durable: not even a power cut leaves a torn file. Raises TrapsError."""
+
+    @abstractmethod
+    def remove(self, paths: Iterable[Path]) -> None:
+        """Let nothing be current under these paths."""
+
+    @abstractmethod
+    def has(self, path: Path) -> bool:
+        """Whether something is current under that path."""
+
+    @abstractmethod
+    def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
+        """The sizes, in bytes, of those files that are really there."""
+
+    @abstractmethod
+    def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
+        """The files below a folder whose paths from there match a pattern, hidden ones left out, in order."""
+
+    @abstractmethod
+    def note(self, path: Path) -> str | None:
+        """What was noted of a file when it was written; None where nothing was, and only the file itself tells."""
+
+    @abstractmethod
+    def changed_ns(self, path: Path) -> int:
+        """When the file was written, in ns since 1970; 0 where there is none."""
+
+    @abstractmethod
+    def look(self) -> None:
+        """See what other hosts have made until now. Without it, what is seen may be half a second old."""
+
+
+class FolderStore(Store):
+    """Files in a folder of this machine."""
+
+    def here(self, path: Path) -> Path:
+        """See `Store`."""
+        return path
+
+    def bring(self, paths: Iterable[Path]) -> None:
+        """See `Store`."""
+
+    def keep(self, paths: Iterable[Path]) -> None:
+        """See `Store`."""
+
+    def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
+        """See `Store`."""
+        for path, content in files.items():
+            write_bytes(path, content, durable=durable)
+
+    def remove(self, paths: Iterable[Path]) -> None:
+        """See `Store`."""
+        for path in paths:
+            path.unlink(missing_ok=True)
+
+    def has(self, path: Path) -> bool:
+        """See `Store`."""
+        return path.is_file()
+
+    def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
+        """See `Store`."""
+        found: dict[Path, int] = {}
+        for path in paths:
+            try:
+                found[path] = path.stat().st_size
+            except OSError:
+                continue
+        return found
+
+    def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
+        """See `Store`."""
+        found = (path for path in folder.glob(pattern) if path.is_file())
+        return sorted(path for path in found if not is_hidden(path.relative_to(folder)))
+
+    def note(self, path: Path) -> str | None:
+        """See `Store`."""
+        return None
+
+    def changed_ns(self, path: Path) -> int:
+        """See `Store`."""
+        return path.stat().st_mtime_ns if path.exists() else 0
+
+    def look(self) -> None:
+        """See `Store`."""
+
+
+def is_hidden(relative: Path) -> bool:
+    """Whether a file, or a folder on the way to it, has a name with a dot before it: locks, unfinished files."""
+    return any(part.startswith(".") for part in relative.parts)
