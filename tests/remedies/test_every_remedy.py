@@ -1,0 +1,57 @@
+"""Each error of the package that names a remedy has a test that carries it out, or is listed here with the reason."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.conftest import ROOT
+from tests.remedies.remedied import says
+from tests.remedies.sentences import by_sentence, carried_out, remedies
+
+# Sentences that tell nothing to do against an error, though they have words like it.
+NO_REMEDIES: dict[str, str] = {}
+# Remedies that a test cannot carry out, and why.
+BEYOND_A_TEST: dict[str, str] = {}
+# Remedies that no test carries out yet, one a line: `FILE.py | sentence`. The list only becomes shorter.
+NOT_YET = (ROOT / "tests" / "remedies" / "not_yet.txt").read_text().splitlines()
+LISTED = {**NO_REMEDIES, **BEYOND_A_TEST, **dict.fromkeys(NOT_YET, "not yet")}
+
+
+def test_many_errors_name_a_remedy() -> None:
+    assert len(remedies()) > 200
+
+
+def test_each_remedy_is_carried_out_by_a_test() -> None:
+    listed = set(LISTED)
+    nobody = [one.where for one in remedies() if one not in by_sentence() and f"{one.file} | {one.text}" not in listed]
+    assert not nobody, "no test carries out what these errors say (tests/remedies/remedied.py):\n" + "\n".join(nobody)
+
+
+def test_what_is_listed_as_not_carried_out_is_a_remedy_and_is_not() -> None:
+    there = {f"{one.file} | {one.text}": one for one in remedies()}
+    gone = [line for line in LISTED if line not in there]
+    assert not gone, "the package no longer says these; take them off the list:\n" + "\n".join(gone)
+    done = [line for line in LISTED if there[line] in by_sentence()]
+    assert not done, "a test carries these out; take them off the list:\n" + "\n".join(done)
+    assert NOT_YET == sorted(set(NOT_YET))
+
+
+def test_what_a_test_carries_out_is_a_sentence_of_the_package() -> None:
+    wrong = {one.where: one.text for one in carried_out() if not one.finds()}
+    assert not wrong, "the package says nothing like it"
+    several = {
+        one.where: [found.where for found in one.finds()] for one in carried_out() if len(one.finds()) > 1
+    }
+    assert not several, "more than one sentence has these words: say more of it, or `FILE.py | words`"
+
+
+@pytest.mark.parametrize(
+    ("sentence", "told", "said"),
+    [
+        ("{}: is empty; restore it", "a.txt: is empty; restore it from git", True),
+        ("is empty ({}); restore it", "a.txt: is empty (0\nbytes); restore it from git", True),
+        ("is empty; restore it", "a.txt: is empty; delete it", False),
+    ],
+)
+def test_a_sentence_is_found_in_what_an_error_says(sentence: str, told: str, said: bool) -> None:
+    assert says(sentence, told) is said
