@@ -24,7 +24,7 @@ ELSEWHERE = re.compile(rf"(?:[;:] {_VERB}|\. {_VERB.replace('(?:', '(?i:', 1)}|,
 KEYWORDS = {"help", "description", "title", "doc", "dash", "question", "promises"}
 CALLS = {"add", "noun", "print", "note", "report", "execute", "query", "Column", "Arm", "stage", "Annotated", "Field"}
 # What stands there is the remedy itself, for an error that is made of it.
-WHOLE = {"_REMEDIES", "require_own", "_require_whole"}
+WHOLE = {"_REMEDIES", "_REMEDIES.get", "require_own", "_require_whole"}
 
 
 @dataclass(frozen=True, order=True)
@@ -54,9 +54,9 @@ def text_of(node: ast.AST) -> str | None:
 
 
 def called(node: ast.AST) -> str:
-    """The last name of what is called, or assigned to; empty for anything else."""
+    """What is called, or assigned to; empty for anything else."""
     if isinstance(node, ast.Call):
-        return ast.unparse(node.func).rpartition(".")[2]
+        return ast.unparse(node.func)
     if isinstance(node, ast.Assign | ast.AnnAssign):
         target = node.targets[0] if isinstance(node, ast.Assign) else node.target
         return ast.unparse(target)
@@ -79,7 +79,7 @@ def texts(node: ast.AST, within: tuple[ast.AST, ...] = ()) -> Iterator[tuple[ast
 
 def is_remedy(text: str, within: tuple[ast.AST, ...]) -> bool:
     """Whether a text of the package tells what to do against an error."""
-    names = {called(node) for node in within}
+    names = {name for node in within for name in (called(node), called(node).rpartition(".")[2])}
     if names & WHOLE:
         return IN_AN_ERROR.search(text) is not None
     if any(isinstance(node, ast.Raise) or _to_stderr(node) for node in within):
@@ -115,19 +115,20 @@ class CarriedOut:
         """The sentences that have this part. `FILE.py | part` is about one of that file alone."""
         file, bar, part = self.text.rpartition(" | ")
         part = part if bar else self.text
-        return [one for one in remedies() if part in one.text and (not bar or one.file == file)]
+        found = [one for one in remedies() if part in one.text and (not bar or one.file == file)]
+        return [one for one in found if one.text == part] or found
 
 
 def _given(test: ast.AST, name: str) -> Iterator[ast.expr]:
     """The values that `parametrize` gives to an argument of a test."""
     for mark in getattr(test, "decorator_list", ()):
-        if not (isinstance(mark, ast.Call) and called(mark) == "parametrize"):
+        if not (isinstance(mark, ast.Call) and called(mark).endswith("parametrize")):
             continue
         names, cases = ast.literal_eval(mark.args[0]), mark.args[1]
         several = not isinstance(names, str)
         assert isinstance(cases, ast.List | ast.Tuple), "the cases stand in the decorator"
         for case in cases.elts if name in names else ():
-            values = case.args if isinstance(case, ast.Call) and called(case) == "param" else getattr(case, "elts", [])
+            values = case.args if isinstance(case, ast.Call) and called(case).endswith("param") else getattr(case, "elts", [])
             yield values[list(names).index(name)] if several else case
 
 
