@@ -1,0 +1,430 @@
+"""What errors about entries, experiments and money say to do lets the same file be read, or the same call be made."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import os
+import resource
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from tests.remedies.remedied import carries_out, command, refused, remedied
+from traps_pipeline.models import own, prompts
+from traps_pipeline.models.account_budget import AccountBudget
+from traps_pipeline.models.budget import Budget, BudgetReached, Journal, check_money
+from traps_pipeline.models.local.settings import LocalParams
+from traps_pipeline.models.participants import allow_connections
+from traps_pipeline.models.reading import read_answer
+from traps_pipeline.models.registry import Account, Entry, Prices, get_model
+from traps_pipeline.models.request import Outcome
+from traps_pipeline.models.spending import spending
+from traps_pipeline.models.traffic import Breaker, Stopped
+from traps_pipeline.study.experiment import Experiment, load_experiment
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import VARIABLE, Workspace
+
+MINE = """
+name: mine
+panel: rules
+judged_by_rules: true
+models:
+  - id: my-model
+    base_url: http://127.0.0.1:8000
+    served_name: org/Model-7B
+    media: images
+"""
+LOCAL = {"checkpoint": "x", "dtype": "float32", "quantisation": "none", "do_sample": False, "max_new_tokens": 9}
+
+
+@pytest.fixture(autouse=True)
+def nobodys_own() -> Iterator[None]:
+    """Entries that a test adds are forgotten at its end."""
+    yield
+    own.use(own.Own(), Path("none"))
+    own.forget()
+
+
+PUBLIC = MINE.replace("http://127.0.0.1:8000", "https://example.org")
+WHOLE = """
+name: mine
+panel: rules
+judged_by_rules: true
+models:
+  - {id: my-model, backend: api, account: mine, provider_id: openai/m, media: {profile: images, fps: 5, most: 25},
+     params: {temperature: 0.8, top_p: 0.95, max_tokens: 8000},
+     groups: {family: f, access: none, input: none, group: g}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence", "right"),
+    [
+        (MINE.replace("    media: images\n", ""), "media: say what your server takes of a clip: `images`", MINE),
+        (
+            MINE.replace("    media: images\n", ""),
+            "or `video` (the clip as one mp4 in video_url",
+            MINE.replace("images", "video"),
+        ),
+        (
+            PUBLIC.replace("media: images", "media: images\n    params: {temperature: 0}"),
+            "params.{} {}, the protocol has {}: send that, or say why under waivers",
+            PUBLIC.replace("media: images", "media: images\n    params: {temperature: 0.8}"),
+        ),
+        (
+            PUBLIC.replace("media: images", "media: images\n    params: {temperature: 0}"),
+            "params.{} {}, the protocol has {}: send that, or say why under waivers",
+            PUBLIC.replace("media: images", "media: images\n    params: {temperature: 0}")
+            + "    waivers: {temperature: the server has no other}\n",
+        ),
+        (
+            PUBLIC + "    waivers: {temperature: none}\n",
+            "waivers.{}: is sent as the protocol has it; remove the waiver",
+            PUBLIC,
+        ),
+        (
+            PUBLIC.replace("media: images", "media: {profile: images, fps: 2, most: 10}"),
+            "media: the protocol has fps 5, most 25: send that, or say why under waivers",
+            PUBLIC.replace("media: images", "media: {profile: images, fps: 5, most: 25}"),
+        ),
+        (
+            WHOLE,
+            "; add one under `accounts:` of {} or of the experiment",
+            WHOLE + "accounts: {mine: {base_url: 'https://example.org/v1'}}\n",
+        ),
+        (
+            MINE + "scenarios: [plinko-0001]\nper_family: 2\n",
+            "give scenarios or per_family, not both",
+            MINE + "per_family: 2\n",
+        ),
+        (
+            MINE + "datasets: [schema_answer]\nregimes: [json]\n",
+            "datasets {} ask for an object of their own, and so does the regime json: leave one of them out",
+            MINE + "datasets: [schema_answer]\nregimes: [standard]\n",
+        ),
+        (MINE + "regimes: [polite]\n", "study/experiment.py | {} given; choose from {}", MINE + "regimes: [guided]\n"),
+    ],
+)
+def test_an_experiment_is_read_once_it_is_as_told(tmp_path: Path, wrong: str, sentence: str, right: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(wrong)
+    assert remedied(lambda: load_experiment(str(path)), sentence, lambda: path.write_text(right)).models == ["my-model"]
+
+
+def test_an_experiment_that_is_not_there_is_named_by_its_path_or_a_known_name(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(MINE)
+    for known in ("demo", str(path)):
+        remedied(lambda: load_experiment("mine"), "is not there; known: {}, or give the path of a YAML file", again=lambda known=known: load_experiment(known))
+
+
+def experiment(tmp_path: Path, **fields: Any) -> Experiment:
+    return Experiment.model_validate({"name": "one", "models": ["oracle"], **fields})
+
+
+def test_a_panel_is_named_in_one_place(tmp_path: Path) -> None:
+    one = experiment(tmp_path, panel="paper")
+    remedied(
+        lambda: one.judged(None, "rules"),
+        "--panel {}: experiment {} names the panel {}; edit one of them",
+        again=lambda: experiment(tmp_path, panel="rules").judged(None, "rules"),
+    )
+    judged = Study(panel="rules")
+    remedied(
+        lambda: one.judged(judged, None),
+        "study.yaml: panel is {}, experiment {} has {}; edit one of them",
+        again=lambda: one.judged(Study(panel="paper"), None),
+    )
+    remedied(
+        lambda: one.check_study(judged, tmp_path),
+        "study/experiment.py | {}: {} is {}, experiment {} has {}; edit one of them",
+        again=lambda: one.check_study(Study(panel="paper"), tmp_path),
+    )
+    remedied(
+        lambda: experiment(tmp_path).judged(None, None),
+        "write `panel: NAME` into the experiment, or say --panel NAME",
+        again=lambda: experiment(tmp_path).judged(None, "rules"),
+    )
+
+
+def test_rules_judge_other_models_where_somebody_says_so() -> None:
+    asks = Experiment.model_validate({"name": "one", "models": ["gpt-5-mini"], "panel": "rules"})
+    remedied(
+        lambda: asks.judged(None, None),
+        "name a panel of language models, or say --judged-by-rules (`judged_by_rules: true` in the experiment)",
+        again=lambda: asks.judged(None, None, judged_by_rules=True),
+    )
+    other = asks.model_copy(update={"panel": "paper"})
+    assert other.judged(None, None).panel == "paper"
+
+
+def test_two_mechanism_sections_are_made_one(tmp_path: Path) -> None:
+    paper = load_experiment("paper")
+    assert paper.mechanism is not None
+    other = paper.mechanism.model_copy(update={"steering": None})
+    for right in (paper.mechanism, None):
+        remedied(
+            lambda: paper.check_study(paper.study.model_copy(update={"mechanism": other}), tmp_path),
+            "edit one of them, or remove it from study.yaml to use the experiment's",
+            again=lambda right=right: paper.check_study(
+                paper.study.model_copy(update={"mechanism": right}), tmp_path
+            ),
+        )
+
+
+def test_a_greedy_model_has_no_temperature() -> None:
+    remedied(
+        lambda: LocalParams.model_validate(LOCAL | {"temperature": 0.8}),
+        "do_sample: false is greedy, and {} has no effect; leave it out",
+        again=lambda: LocalParams.model_validate(LOCAL),
+        error=ValidationError,
+    )
+
+
+def test_a_key_that_is_exported_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    account = Account(key="TRAPS_TEST_SOME_KEY")
+    monkeypatch.delenv("TRAPS_TEST_SOME_KEY", raising=False)
+    found = remedied(
+        account.secret,
+        "{} is not set; export the key, or leave the models that need it out",
+        lambda: monkeypatch.setenv("TRAPS_TEST_SOME_KEY", "sk"),
+    )
+    assert found == "sk"
+
+
+@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_text(" \n")])
+def test_a_prompt_is_read_once_it_is_restored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[Path], object]
+) -> None:
+    copy = Path(shutil.copytree(prompts.PROMPTS, tmp_path / "prompts"))
+    monkeypatch.setattr(prompts, "PROMPTS", copy)
+    damage(copy / "json_suffix.txt")
+    read = prompts.prompt.__wrapped__
+
+    def restored() -> None:
+        shutil.copy(prompts.ASSETS / "prompts" / "json_suffix.txt", copy)
+
+    if (copy / "json_suffix.txt").exists():
+        assert remedied(lambda: read("json_suffix"), "is empty; restore it from git", restored)
+    else:
+        assert remedied(
+            lambda: read("json_suffix"), "models/prompts.py | {}: cannot be read ({}); restore it from git", restored
+        )
+
+
+@carries_out("thinks between tags in its text; say `inline_thinking: true` in its entry")
+def test_a_model_that_thinks_in_its_answer_is_read_once_its_entry_says_so() -> None:
+    row = {"outcome": "answer", "text": "<think>red, then blue</think>The blue one."}
+    told = read_answer(row, None, "standard", inline_thinking=False).why
+    assert told == "thinks between tags in its text; say `inline_thinking: true` in its entry"
+    assert read_answer(row, None, "standard", inline_thinking=True).text == "The blue one."
+
+
+# --- money ------------------------------------------------------------------------------------------------------------
+
+
+def priced(prices: Prices | None) -> Entry:
+    return get_model("gpt-5-mini").model_copy(update={"prices": prices})
+
+
+PRICES = Prices(input=2, output=10, as_of=datetime.date(2026, 11, 1))
+
+
+def test_a_paid_model_is_asked_once_there_is_a_budget_or_a_price() -> None:
+    remedied(
+        lambda: check_money(Study(), priced(PRICES)),
+        "costs money and the study has no budget: set one (--budget-usd, or budget_usd in study.yaml)",
+        again=lambda: check_money(Study(budget_usd=1), priced(PRICES)),
+    )
+    for study, entry in ((Study(budget_usd=1), priced(PRICES)), (Study(allow_unknown_prices=True), priced(None))):
+        remedied(
+            lambda: check_money(Study(budget_usd=1), priced(None)),
+            "the price of {} is unknown: give it prices in the registry, or accept that nothing bounds it",
+            again=lambda study=study, entry=entry: check_money(study, entry),
+        )
+
+
+def spend(budget: Budget, dollars: float) -> None:
+    asyncio.run(budget.reserve("m", dollars))
+
+
+def test_a_budget_that_is_raised_leaves_room_for_the_call() -> None:
+    remedied(
+        lambda: spend(Budget(1.0, {}, {}, None), 2.0),
+        "the next call may cost ${}. Raise it (--budget-usd, or study.yaml) and run the same command to go on",
+        again=lambda: spend(Budget(3.0, {}, {}, None), 2.0),
+        error=BudgetReached,
+    )
+
+
+def paid(root: Path) -> Callable[[], None]:
+    """A call of 2 dollars of a model of the account openai, in the study at `root` as its study.yaml now is."""
+
+    def call() -> None:
+        entry = get_model("gpt-5-mini")
+        with spending(Workspace.open(root), [entry]) as budget:
+            asyncio.run(budget.reserve(entry.id, 2.0))
+
+    return call
+
+
+def test_an_account_has_room_once_its_budget_is_raised_its_file_written_or_its_name_corrected(tmp_path: Path) -> None:
+    folder = tmp_path / "openai"
+    study = {"budget_usd": 50, "account_budgets": {"opnai": str(folder)}, "model_budgets_usd": {"gpt-5-mni": 5}}
+    workspace = Workspace.create(tmp_path / "study", Study.model_validate(study))
+    call, file = paid(workspace.root), workspace.root / "study.yaml"
+
+    def corrected(old: str, new: str) -> Callable[[], int]:
+        return lambda: file.write_text(file.read_text().replace(old, new))
+
+    refused(call, "no account of assets/models.yaml; correct the name, or remove its line")
+    corrected("opnai", "openai")()
+    refused(call, "nor a judge of assets/judges.yaml; correct the name, or remove its line")
+    corrected("gpt-5-mni", "gpt-5-mini")()
+    refused(call, "no such file; write `usd: 100` (dollars that all studies together may spend")
+    folder.mkdir()
+    (folder / "budget.yaml").write_text("usd: 1")
+    remedied(
+        call,
+        "the next call may cost ${}. Raise `usd` in {} and run the same command to go on",
+        lambda: (folder / "budget.yaml").write_text("usd: 100"),
+        error=BudgetReached,
+    )
+
+
+def test_an_account_without_its_file_is_left_out_as_told(tmp_path: Path) -> None:
+    folder = tmp_path / "nowhere"
+    workspace = Workspace.create(tmp_path / "study", Study(budget_usd=50, account_budgets={"openai": str(folder)}))
+    remedied(
+        paid(workspace.root),
+        "into it, or remove {} from account_budgets in study.yaml",
+        lambda: workspace.allow(account_budgets={}),
+    )
+
+
+def test_a_file_of_spending_that_is_removed_is_filled_again(tmp_path: Path) -> None:
+    (tmp_path / "budget.yaml").write_text("usd: 10")
+    running = AccountBudget("openai", tmp_path, "a")
+    assert running.reserve(1.0)
+    path = tmp_path / "spent.jsonl"
+    path.write_bytes(path.read_bytes().replace(b"1.0", b"0.1"))
+    remedied(
+        lambda: AccountBudget("openai", tmp_path, "b"),
+        "compare the provider's bill, then remove the file: every study that names it adds its own spending again",
+        path.unlink,
+    )
+    running.begin(known_usd=1.0)
+    assert AccountBudget("openai", tmp_path, "b").spent_usd == {"a": 1.0}
+
+
+def test_an_account_whose_file_cannot_be_read_is_read_once_that_is_mended(tmp_path: Path) -> None:
+    (tmp_path / "budget.yaml").write_text("usd: 10")
+    path = tmp_path / "spent.jsonl"
+    path.mkdir()
+    remedied(
+        lambda: AccountBudget("openai", tmp_path, "b"),
+        "cannot be read or written ({}); {} and run the same command again: nothing is sent through an account",
+        path.rmdir,
+    )
+
+
+def test_a_journal_on_a_full_disk_is_written_once_there_is_space(tiny_disk: Path) -> None:
+    journal = Journal(tiny_disk / "in_flight.jsonl")
+    filler = tiny_disk / "filler"
+    filler.write_bytes(b"0" * os.statvfs(tiny_disk).f_bavail * os.statvfs(tiny_disk).f_bsize)
+
+    def add_many() -> None:
+        for _ in range(100):
+            journal.add("m", 0.5)
+
+    remedied(add_many, "models/budget.py | {}: cannot be written ({}); {} and run the same command again", filler.unlink)
+    journal.close()
+
+
+def test_connections_that_a_shell_does_not_allow_are_lowered() -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        remedied(
+            lambda: allow_connections(hard),
+            "raise that (`ulimit -n {}`), or lower limits.concurrency of the models that are asked; nothing was sent",
+            again=lambda: allow_connections(24),
+        )
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_a_stopped_model_is_asked_by_the_same_command_once_the_cause_is_mended() -> None:
+    def run(kind: str) -> None:
+        breaker = Breaker("m")
+        for _ in range(100):
+            breaker.watch(Outcome(kind, None if kind == "error" else "left", error="timeout" if kind == "error" else None))
+
+    remedied(
+        lambda: run("error"),
+        "its answers so far are kept. Mend the cause and run the same command again: only what is missing is asked",
+        again=lambda: run("answer"),
+        error=Stopped,
+    )
+
+
+# --- a study's file ---------------------------------------------------------------------------------------------------
+
+
+def test_a_workspace_is_there_once_it_is_made_or_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = tmp_path / "study"
+    made = remedied(
+        lambda: Workspace.open(root),
+        "no such workspace; make one with `traps init` or `traps run demo`, or set {}",
+        lambda: command("init", "demo", "--workspace", root),
+    )
+    assert made.study.panel == "rules"
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "other"))
+    remedied(
+        Workspace.open,
+        "make one with `traps init` or `traps run demo`, or set {}",
+        lambda: monkeypatch.setenv(VARIABLE, str(root)),
+    )
+
+
+def test_another_benchmark_gets_another_folder(tmp_path: Path) -> None:
+    Workspace.create(tmp_path / "one", Study())
+    remedied(
+        lambda: Workspace.create(tmp_path / "one", Study(per_family=2)),
+        "a workspace keeps its benchmark: choose another folder with {} or --workspace",
+        again=lambda: Workspace.create(tmp_path / "two", Study(per_family=2)),
+    )
+
+
+def test_a_study_of_another_format_goes_on_in_a_new_workspace_with_its_ledger(tmp_path: Path) -> None:
+    old = Workspace.create(tmp_path / "old", Study())
+    with old.answers.writer("m__standard__run1") as writer:
+        writer.append({"key": "k", "outcome": "answer", "text": "left"})
+    file = old.root / "study.yaml"
+    file.write_text(file.read_text().replace("format: ", "format: 9"))
+
+    def anew() -> Workspace:
+        new = Workspace.create(tmp_path / "new", Study())
+        shutil.copytree(old.root / "ledger", new.root / "ledger", dirs_exist_ok=True)
+        return Workspace.open(new.root)
+
+    new = remedied(
+        lambda: Workspace.open(old.root),
+        "or start a new workspace (its ledger folder can be copied over: answers keep their keys)",
+        again=anew,
+    )
+    assert list(new.answers.read("m__standard__run1").rows) == ["k"]
+
+
+def test_a_study_asks_inside_models_once_an_experiment_does(tmp_path: Path) -> None:
+    root = Workspace.create(tmp_path / "study", Study()).root
+    paper = load_experiment("mechanism")
+    remedied(
+        lambda: Workspace.open(root).mechanism,
+        "asks nothing inside models; run an experiment with a `mechanism:` section",
+        lambda: Workspace.open(root).allow(mechanism=paper.mechanism),
+    )
