@@ -1,0 +1,148 @@
+"""In a study whose tables are not made yet each error names the stage to materialize; once the study was run, the same
+calls succeed. And what its exports, imports and files say to do lets them go on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.conftest import EXPERIMENT, Checkout, copied
+from tests.remedies.remedied import command, refused, remedied
+from traps_pipeline.benchmark.items import build_items
+from traps_pipeline.benchmark.tables import ITEMS, VIDEOS
+from traps_pipeline.defs import judging, report, scoring
+from traps_pipeline.explorer.annotate import Annotation
+from traps_pipeline.explorer.answers import study_items
+from traps_pipeline.explorer.labelstore import DATABASE, LabelStore
+from traps_pipeline.explorer.review import Review
+from traps_pipeline.explorer.site import write_site
+from traps_pipeline.judging.panel import judged_answers, wanted_ballots
+from traps_pipeline.models.answers import wanted_questions
+from traps_pipeline.models.judges import load_panel
+from traps_pipeline.judging.tables import VOTES
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.orchestration.lineage import Lineage, read_report_state
+from traps_pipeline.orchestration.run import stages_until
+from traps_pipeline.partitions import DATASETS, Cell
+from traps_pipeline.release.content import content_of
+from traps_pipeline.report.contact_sheet import chosen_pairs
+from traps_pipeline.scenes.clips import read_clip
+from traps_pipeline.scenes.encode import DamagedClip, decode
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.study import exchange, harness_logs
+from traps_pipeline.study.batch import export_batches
+from traps_pipeline.study.canary import ask_canary, canary_items, changes_text
+from traps_pipeline.study.exchange import Whose, export_requests, import_answers
+from traps_pipeline.study.experiment import load_experiment
+
+pytestmark = pytest.mark.slow
+CELL = Cell.parse("occlusion|oracle__standard__run1")
+
+
+def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkout, tmp_path: Path) -> None:
+    study = copied(small, tmp_path)
+    shutil.rmtree(study.workspace / "tables")
+    (study.workspace / "tables").mkdir()
+    workspace = Workspace.open(study.workspace)
+    experiment = load_experiment(str(study.root / EXPERIMENT))
+    cards = {**{name: partial(make, workspace) for name, make in FILES.items()}}
+    again: list[Callable[[], Any]] = [
+        refused(lambda: build_items(workspace, "occlusion"), "no scene_specs yet; materialize scene_specs and videos first"),
+        refused(lambda: wanted_questions(workspace, CELL), "not made yet; materialize scene_specs, videos and items first"),
+        refused(cards["sheet"], "contact_sheet: no items yet; materialize items first"),
+        refused(cards["gallery"], "gallery: no clips yet; materialize videos first"),
+        refused(cards["shortcuts"], "shortcuts: no items yet; materialize items first"),
+        refused(
+            lambda: scoring._make_metrics(workspace, "occlusion"),
+            "no verdicts yet; materialize verdicts for a cell of this dataset first",
+        ),
+        refused(lambda: scoring._scored(workspace, "contrasts"), "no metrics yet; materialize metrics for a dataset first"),
+        refused(lambda: scoring._make_robust(workspace, None), "robust: no verdicts yet; materialize verdicts for a cell first"),
+        refused(lambda: judging._votes(workspace, "agreement"), "no votes yet; materialize votes for a cell first"),
+        refused(lambda: Annotation(workspace), "has no clips yet; run `traps run EXPERIMENT` in it first"),
+        refused(lambda: study_items(workspace), "has no items yet; run `traps run EXPERIMENT` in it first"),
+        refused(lambda: Review(workspace, "jd").specs, "has no scenes yet; run `traps run EXPERIMENT` in it first"),
+        refused(lambda: canary_items(workspace), "canary: no items yet; materialize items first"),
+        refused(
+            lambda: export_requests(workspace, experiment, tmp_path / "out"),
+            "no items yet; materialize scene_specs, videos and items first",
+        ),
+        refused(lambda: content_of(workspace), "no pairs to release; make items first (traps run ... --until items)"),
+        refused(may_be_made(workspace, "verdicts"), "is not made; materialize {} for this partition first", error=AssertionError),
+    ]
+    finished = study.traps("run", EXPERIMENT, "--until", "items")
+    assert finished.code == 0, finished.err
+    again.append(
+        refused(
+            lambda: list(exchange._wanted_votes(workspace, experiment)),
+            "no answers yet; make responses first (traps run ... --until responses)",
+        )
+    )
+    finished = study.traps("run", EXPERIMENT)
+    assert finished.code == 0, finished.err
+    assert finished.counts() == {"answers": 0, "votes": 0, "frames": 0}
+    for call in again:
+        call()
+
+
+FILES = {"sheet": report._sheet, "gallery": report._gallery, "shortcuts": report._shortcuts}
+
+
+def may_be_made(workspace: Workspace, stage: str) -> Callable[[], None]:
+    """That nothing keeps the stage of the cell from being made."""
+
+    def call() -> None:
+        why = Lineage(workspace).blocked(stage, CELL.key, current=False)
+        assert not why, why
+
+    return call
+
+
+def edited(path: Path, old: str, new: str) -> Path:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+def test_what_is_damaged_in_a_study_is_made_again_as_told(study: Checkout) -> None:
+    workspace = Workspace.open(study.workspace)
+    experiment = load_experiment(str(study.root / EXPERIMENT))
+    votes = workspace.tables.path(VOTES, CELL.partition)
+    votes.write_bytes(votes.read_bytes()[:-200])
+    clip = next((study.workspace / "clips" / "hidden_race-0001").glob("void-*.mp4"))
+    clip.write_bytes(clip.read_bytes()[: clip.stat().st_size // 2])
+    note = next((study.workspace / "clips" / "hidden_race-0001").glob("control-*.json"))
+    edited(note, "1", "2")
+    state = next(study.workspace.joinpath("reports").rglob(".report.json"), None)
+    calls = [
+        refused(
+            may_be_made(workspace, "verdicts"), "is damaged: {}; materialize {} for it again", error=AssertionError
+        ),
+        refused(
+            lambda: build_items(workspace, "occlusion"),
+            "is not the clip that was rendered ({} of {} bytes; truncated or altered); delete it and run again: it is",
+        ),
+        refused(lambda: content_of(workspace), "is missing or not the clip of its item; materialize videos again"),
+        refused(
+            lambda: read_clip(note.with_suffix(".mp4")),
+            "is not what was written ({}); delete it and run again",
+            error=DamagedClip,
+        ),
+    ]
+    assert state is None or state
+    clip.unlink()
+    note.unlink()
+    finished = study.traps("run", EXPERIMENT, "--until", "leaderboard")
+    assert finished.code == 0, finished.err
+    for call in calls:
+        call()
+    assert experiment.models
