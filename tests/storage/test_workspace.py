@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.storage.study import FORMAT, Study
+from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
 from traps_pipeline.storage.workspace import Workspace
 
 
@@ -108,3 +108,11 @@ def test_a_clip_of_another_scene_has_another_path_and_tables_store_it_relative(t
     assert one != two
     assert workspace.relative(one) == f"clips/plinko-0001/void-{'a' * 16}.mp4"
     assert workspace.resolve(workspace.relative(one)) == one
+
+
+def test_a_study_that_steers_nothing_still_does_so_when_it_is_opened(tmp_path: Path) -> None:
+    settings = {"models": {"qwen3-vl-8b": {"steering": 16, "centroid": 3}}, "steering": None}
+    study = Study(mechanism=MechanismSettings.model_validate(settings))
+    Workspace.create(tmp_path, study)
+    assert Workspace.open(tmp_path).mechanism.steering is None
+    assert Workspace.open(tmp_path).mechanism == study.mechanism

@@ -99,7 +99,8 @@ class Workspace:
 
     def save_study(self) -> None:
         """Write `study.yaml`, which every run in this workspace reads, whoever starts it."""
-        study = self.study.model_dump(mode="json", exclude_none=True)
+        study = {name: value for name, value in self.study.model_dump(mode="json").items() if value is not None}
+        # Further down null is said: `mechanism.steering: null` asks for no steering, and left out it asks for all.
         self.store.write({self.root / STUDY: yaml.safe_dump(study, sort_keys=False).encode()})
 
     @property
