@@ -24,7 +24,7 @@ ELSEWHERE = re.compile(rf"(?:[;:] {_VERB}|\. {_VERB.replace('(?:', '(?i:', 1)}|,
 KEYWORDS = {"help", "description", "title", "doc", "dash", "question", "promises"}
 CALLS = {"add", "noun", "print", "note", "report", "execute", "query", "Column", "Arm", "stage", "Annotated", "Field"}
 # What stands there is the remedy itself, for an error that is made of it.
-WHOLE = {"_REMEDIES", "_REMEDIES.get", "require_own", "_require_whole"}
+WHOLE = {"_REMEDIES", "_REMEDIES.get", "require_own", "_require_whole", "refused"}
 
 
 @dataclass(frozen=True, order=True)

@@ -101,6 +101,8 @@ def write_release(content: Content, target: Path, options: Options) -> Released:
         raise TrapsError(
             f"{target}: holds other files, or what a stopped release left; give an empty or a new folder, or delete it"
         )
+    if options.held_out is not None and options.held_out.is_relative_to(target):  # before a former release is removed
+        raise TrapsError(f"{options.held_out}: lies in the folder that is published; keep the key elsewhere")
     _clear(target)
     folder = _Folder(target, anonymous if options.anonymous else str)
     answers = None
@@ -141,8 +143,6 @@ def _open_tables(folder: _Folder, content: Content) -> None:
 
 def _held_out_tables(folder: _Folder, content: Content, key_file: Path) -> Path:
     """Write the items without their answers, and beside the key which item each of them is."""
-    if key_file.is_relative_to(folder.root):
-        raise TrapsError(f"{key_file}: lies in the folder that is published; keep the key elsewhere")
     key = held_out_key(key_file, make=True)
     folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(content, key))
     names = sorted((opaque(key, row["item_id"]), row["item_id"]) for row in content.items)

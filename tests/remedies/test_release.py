@@ -1,0 +1,204 @@
+"""What errors about what is published, submitted and committed to say to do lets the same command succeed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import Checkout
+from tests.release.test_commitment import committed
+from tests.remedies.remedied import carries_out, command, remedied
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.release.checksums import CHECKSUMS, read_checksums
+from traps_pipeline.release.commitment import commit, read_commitment
+from traps_pipeline.release.content import content_of, pair_rows
+from traps_pipeline.release.folder import Options, write_release
+from traps_pipeline.release.harness.write import write_harness
+from traps_pipeline.release.results import Who, write_results
+from traps_pipeline.release.submission import pack, read_submission
+from traps_pipeline.release.verification import verify
+from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.slow
+__all__ = ["committed"]  # the fixture
+
+
+@pytest.fixture(scope="module")
+def workspace(small: Checkout) -> Workspace:
+    return Workspace.open(small.workspace)
+
+
+@pytest.fixture(scope="module")
+def release(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("release") / "small"
+    write_release(content_of(workspace), folder, Options())
+    return folder
+
+
+def test_a_release_is_written_to_an_empty_a_new_or_a_deleted_folder(workspace: Workspace, tmp_path: Path) -> None:
+    content, folder = content_of(workspace), tmp_path / "taken"
+
+    def taken() -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        (folder / "letter.txt").write_text("mine")
+
+    taken()
+    (tmp_path / "empty").mkdir()
+    for other in (tmp_path / "empty", tmp_path / "new"):
+        remedied(
+            lambda: write_release(content, folder, Options()),
+            "holds other files, or what a stopped release left; give an empty or a new folder, or delete it",
+            again=lambda other=other: write_release(content, other, Options()),
+        )
+    remedied(
+        lambda: write_release(content, folder, Options()),
+        "give an empty or a new folder, or delete it",
+        lambda: shutil.rmtree(folder),
+    )
+    assert (folder / CHECKSUMS).is_file()
+    (folder / "letter.txt").write_text("mine")
+    remedied(
+        lambda: write_release(content, folder, Options()),
+        "is no file of the release there; move it away",
+        lambda: (folder / "letter.txt").rename(tmp_path / "letter.txt"),
+    )
+    remedied(
+        lambda: write_release(content, folder, Options(held_out=folder / "key")),
+        "lies in the folder that is published; keep the key elsewhere",  # and the former release is still there
+        again=lambda: write_release(content, folder, Options(held_out=tmp_path / "key")),
+    )
+
+
+def test_a_pair_is_released_once_both_sides_are_there_and_an_arm_that_is_left_out_is_not_missed(
+    workspace: Workspace, small: Checkout, tmp_path: Path
+) -> None:
+    remedied(
+        lambda: content_of(workspace, ["decoy"]),
+        "Name it among the datasets of an experiment and run that, or leave it out",
+        again=lambda: content_of(workspace),
+    )
+    root = tmp_path / "study"
+    shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("ledger", "dagster", "reports"))
+    own, partition = Workspace.open(root), {"dataset": "chaotic"}
+    whole = own.tables.read(ITEMS, partition)
+    own.tables.write(ITEMS, partition, whole.iloc[1:], {})
+    remedied(
+        lambda: pair_rows(content_of(own)),
+        "{}: only its {} is there; make items again",
+        lambda: own.tables.write(ITEMS, partition, whole, {}),
+    )
+
+
+def test_a_harness_is_written_to_an_empty_folder(release: Path, tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("mine")
+    count = remedied(
+        lambda: write_harness(release, tmp_path),
+        "release/harness/write.py | {}: holds other files; give an empty or a new folder",
+        again=lambda: write_harness(release, tmp_path / "new"),
+    )
+    assert count > 0
+
+
+def test_what_traps_release_wrote_is_verified(release: Path, tmp_path: Path) -> None:
+    remedied(
+        lambda: read_checksums(tmp_path),
+        "cannot be read ({}); give the folder that `traps release` wrote",
+        again=lambda: read_checksums(release),
+    )
+    remedied(lambda: command("verify", tmp_path), "give the folder that `traps release` wrote", again=lambda: command("verify", release))
+
+
+def test_a_release_has_a_date_that_is_one(small: Checkout, tmp_path: Path) -> None:
+    said = ["release", tmp_path / "out", "--workspace", small.workspace, "--date"]
+    remedied(
+        lambda: command(*said, "22.11.2026"),
+        "--date {}: is no date; write it as YYYY-MM-DD",
+        again=lambda: command(*said, "2026-11-22"),
+    )
+
+
+def test_results_are_of_a_repository_and_of_models_that_were_run(workspace: Workspace, small: Checkout, tmp_path: Path) -> None:
+    remedied(
+        lambda: write_results(workspace, tmp_path / "out", "traps", Who()),
+        "--dataset {}: is no repository of the hub; write it as OWNER/NAME",
+        again=lambda: write_results(workspace, tmp_path / "out", "me/traps", Who()),
+    )
+    root = tmp_path / "study"
+    shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("clips", "dagster", "reports"))
+    board = root / "tables" / "leaderboard"
+    aside = board.rename(tmp_path / "aside")
+    remedied(
+        lambda: write_results(Workspace.open(root), tmp_path / "out", "me/traps", Who()),
+        "no model has all four datasets yet; run the experiment first",
+        lambda: aside.rename(board),
+    )
+    assert len(workspace.tables.read_all(LEADERBOARD))
+
+
+@carries_out("items and clips against a release: name its folder with --release")
+def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
+    workspace: Workspace, small: Checkout, release: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "small.zip"
+    remedied(
+        lambda: pack(workspace, path, "Small Study"),
+        "--name {}: {}; use lower-case letters, digits, - and .",
+        again=lambda: pack(workspace, path, "small-study-1.0"),
+    )
+    submission = remedied(
+        lambda: read_submission(tmp_path / "none.zip"),
+        "release/submission.py | {}: cannot be read ({}); name a file that `traps submit` wrote",
+        again=lambda: read_submission(path),
+    )
+    told = "items and clips against a release: name its folder with --release"
+    assert told in verify(submission).unchecked
+    assert told not in verify(submission, release).unchecked
+    remedied(
+        lambda: command("verify", path, "--key", tmp_path / "key.pub"),
+        "--key: only folders are signed, and {} is none; leave it out",
+        again=lambda: command("verify", path),
+    )
+    root = tmp_path / "study"
+    shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("clips", "dagster", "reports"))
+    votes = root / "tables" / "votes"
+    aside = votes.rename(tmp_path / "aside")
+    remedied(
+        lambda: pack(Workspace.open(root), path, "small"),
+        "{}: has no {}; run it first: traps run EXPERIMENT",
+        lambda: aside.rename(votes),
+    )
+
+
+def test_a_commitment_is_made_of_one_draw_into_files_that_are_not_there(
+    committed: Path, tmp_path: Path
+) -> None:
+    copy = Path(shutil.copytree(committed, tmp_path / "copy"))
+    remedied(
+        lambda: commit(copy / "private", copy / "commitment.json", tmp_path / "reveal.json"),
+        "is there already, and a commitment is made once; name another file",
+        again=lambda: commit(copy / "private", tmp_path / "commitment.json", tmp_path / "reveal.json"),
+    )
+    remedied(
+        lambda: read_commitment(tmp_path / "none.json"),
+        "release/commitment.py | cannot be read ({}); name a file of `traps commit`",
+        again=lambda: read_commitment(tmp_path / "commitment.json"),
+    )
+    (copy / "private" / "released" / "draws.json").unlink()
+    remedied(
+        lambda: commit(copy / "private", tmp_path / "c.json", tmp_path / "r.json"),
+        "is not one draw of one seed; draw one with `traps sample` into a new folder",
+        again=lambda: commit(committed / "private", tmp_path / "c.json", tmp_path / "r.json"),
+    )
+    files = [copy / "commitment.json", copy / "reveal.json"]
+    remedied(
+        lambda: command("verify-commitment", *files, "--without-drawing"),
+        "--without-drawing: leaves nothing to look at; name the revealed benchmark with --specs",
+        again=lambda: command("verify-commitment", *files, "--without-drawing", "--specs", committed / "private"),
+    )
