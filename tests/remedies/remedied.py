@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import re
 from collections.abc import Callable
 from typing import TypeVar
@@ -14,6 +15,7 @@ import pytest
 
 from traps_pipeline.cli import main
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.workspace import VARIABLE
 
 T = TypeVar("T")
 
@@ -64,8 +66,14 @@ def carries_out(*sentences: str) -> Callable[[T], T]:
 
 def command(*arguments: object) -> None:
     """Run a `traps` command in this process. Raises a TrapsError with what it says on stderr where it does not end in 0."""
-    said = io.StringIO()
-    with contextlib.redirect_stderr(said):
-        code = main([str(argument) for argument in arguments])
+    said, before = io.StringIO(), os.environ.get(VARIABLE)
+    try:
+        with contextlib.redirect_stderr(said):
+            code = main([str(argument) for argument in arguments])
+    finally:  # a command tells the processes that it starts where its workspace is
+        if before is None:
+            os.environ.pop(VARIABLE, None)
+        else:
+            os.environ[VARIABLE] = before
     if code:
         raise TrapsError(said.getvalue())

@@ -7,11 +7,13 @@ import os
 import resource
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.conftest import ROOT
 from tests.remedies.remedied import carries_out, remedied
 from traps_pipeline.files import require_in_place, try_lock, write_text
 from traps_pipeline.yamlfile import read_lines, read_mapping, read_yaml
@@ -99,11 +101,9 @@ def test_a_folder_of_somebody_else_is_written_to_once_this_user_may(tmp_path: Pa
                     stack.callback(os.seteuid, 65534)
                 folder.chmod(0o777)
 
-        call, sentence = written(folder / "a.txt"), "make its folder writable for this user, or choose another folder"
-        if chosen == "writable":
-            remedied(call, sentence, allow)
-        else:
-            remedied(call, sentence, again=written(tmp_path / "open" / "a.txt"))
+        another = written(tmp_path / "open" / "a.txt")
+        done = {"remedy": allow} if chosen == "writable" else {"again": another}
+        remedied(written(folder / "a.txt"), "make its folder writable for this user, or choose another folder", **done)
 
 
 def test_a_name_that_is_too_long_fits_in_a_folder_with_a_shorter_path(tmp_path: Path) -> None:
@@ -151,6 +151,28 @@ def test_whatever_else_is_wrong_with_a_file_is_seen_to(tmp_path: Path) -> None:
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
     remedied(written(loop / "deeper" / "a.txt"), "see to the file or its disk", loop.unlink)
+
+
+WRITE = "import sys, pathlib; from traps_pipeline.files import write_bytes; from traps_pipeline.errors import TrapsError\n"
+WRITE += "try: write_bytes(pathlib.Path(sys.argv[1]), b'x', durable=True)\nexcept TrapsError as error: sys.exit(str(error))"
+
+
+@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed (make test installs it)")
+@pytest.mark.parametrize("fault", ["fsync:error=EDQUOT", "fsync:error=EIO", "rename:error=ENFILE"])
+@carries_out(
+    "free some space, or raise the quota",
+    "the disk fails: look at it, or choose a folder on another one",
+    "end programs that hold many files open",
+)
+def test_what_the_system_refused_is_written_once_it_no_longer_does(tmp_path: Path, fault: str) -> None:
+    said = {"EDQUOT": "or raise the quota", "EIO": "the disk fails: look at it", "ENFILE": "end programs that hold many"}
+    write = [sys.executable, "-c", WRITE, str(tmp_path / "folder" / "a.txt")]
+    strace = ["strace", "-f", "-qq", "-o", "/dev/null", "-e", f"trace={fault.partition(':')[0]}", "-e", f"inject={fault}"]
+    (tmp_path / "folder").mkdir()
+    refused = subprocess.run([*strace, *write], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert refused.returncode == 1 and said[fault.partition("=")[2]] in refused.stderr, refused.stderr
+    assert list((tmp_path / "folder").iterdir()) == []
+    subprocess.run(write, cwd=ROOT, check=True)
 
 
 def test_a_run_whose_lock_file_was_removed_is_run_again(tmp_path: Path) -> None:

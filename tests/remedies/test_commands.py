@@ -1,0 +1,376 @@
+"""What a command says of its arguments, of an export or an import, and of the stages of a study lets it go on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from tests.conftest import EXPERIMENT, KEY, ROOT, Checkout, make_checkout
+from tests.providers.server import Provider
+from tests.remedies.remedied import carries_out, command, refused, remedied
+from tests.study.test_canary import asked
+from traps_pipeline import paths
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.explorer import site
+from traps_pipeline.explorer.site import write_site
+from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.orchestration.lineage import State, read_report_state, write_report_state
+from traps_pipeline.orchestration.run import dagster_history, stages_until
+from traps_pipeline.report.contact_sheet import MOST_PAIRS, chosen_pairs
+from traps_pipeline.scoring.epochs import EpochMismatch, require_one_epoch
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
+from traps_pipeline.study import doctor, harness_logs
+from traps_pipeline.study.batch import FOLDER, export_batches
+from traps_pipeline.study.canary import CANARY, changes_text
+from traps_pipeline.study.exchange import Whose, checked_answers, export_requests, import_answers
+from traps_pipeline.study.experiment import load_experiment
+
+SMALL = ROOT / EXPERIMENT
+
+
+@pytest.fixture
+def unasked_copy(small: Checkout, tmp_path: Path) -> Workspace:
+    """Clips and items of the small study, with nothing asked."""
+    left_out = shutil.ignore_patterns("ledger", "dagster", "reports", "responses", "votes", "verdicts", "metrics")
+    shutil.copytree(small.workspace, tmp_path / "study", ignore=left_out)
+    return Workspace.open(tmp_path / "study")
+
+
+# --- arguments --------------------------------------------------------------------------------------------------------
+
+
+def test_stages_are_chosen_from_those_that_are_named() -> None:
+    remedied(
+        lambda: stages_until("leaderbord"),
+        "--until {}: no such stage; choose from {}",
+        again=lambda: stages_until("leaderboard"),
+    )
+    remedied(
+        lambda: the_graph()["leaderbord"],
+        "no stage {}; choose from {}",
+        again=lambda: the_graph()["leaderboard"],
+    )
+
+
+@carries_out("no stage is declared yet: import traps_pipeline.definitions first")
+def test_the_graph_is_there_once_the_definitions_are_imported(tmp_path: Path) -> None:
+    code = "from traps_pipeline.orchestration.graph import the_graph\ntry: the_graph()\nexcept RuntimeError as e: print(e)\n"
+    code += "import traps_pipeline.definitions\nprint(len(the_graph().stages) > 10)"
+    finished = Checkout(ROOT, tmp_path).run(sys.executable, "-W", "ignore", "-c", code)
+    assert "import traps_pipeline.definitions first" in finished.out and finished.out.endswith("True\n"), finished.err
+
+
+@pytest.mark.slow  # asks a server
+def test_a_live_check_asks_a_model_with_an_address(provider: Provider, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        f"name: mine\npanel: rules\njudged_by_rules: true\nmodels:\n  - id: seer\n    base_url: {provider.url}/v1\n"
+        f"    served_name: seer\n    key: {KEY}\n    media: images\n"
+    )
+    remedied(
+        lambda: command("models", "check", "--live", "oracle"),
+        "--live asks over the network: name a model or judge with an address, or an experiment",
+        again=lambda: command("models", "check", "--live", path),
+    )
+
+
+def test_an_export_refers_to_media_in_batch_files(unasked_copy: Workspace, tmp_path: Path) -> None:
+    said = ["requests", "export", SMALL, "--out", tmp_path / "out", "--workspace", unasked_copy.root, "--media-at", "https://a.b"]
+    remedied(
+        lambda: command(*said),
+        "--media-at: only batch files refer to media by an address; say --batch, too",
+        again=lambda: command(*said, "--batch"),
+    )
+
+
+@pytest.mark.slow  # runs a study
+def test_a_budget_is_given_in_dollars(unasked_copy: Workspace) -> None:
+    def run(*budgets: str) -> None:
+        said = [part for budget in budgets for part in ("--budget-usd", budget)]
+        finished = Checkout(ROOT, unasked_copy.root).traps("run", SMALL, "--until", "scene_specs", *said)
+        if finished.code:
+            raise TrapsError(finished.err)
+
+    remedied(
+        lambda: run("much"),
+        "--budget-usd {}: give dollars (20 or 20.50), or MODEL=dollars for one model or judge",
+        again=lambda: run("20.50", "gpt-5-mini=3"),
+    )
+    study = Workspace.open(unasked_copy.root).study
+    assert (study.budget_usd, study.model_budgets_usd) == (20.5, {"gpt-5-mini": 3.0})
+
+
+def test_a_file_is_written_once_its_folder_is_made(unasked_copy: Workspace, tmp_path: Path) -> None:
+    out = tmp_path / "gone" / "audit.csv"
+    remedied(
+        lambda: command("audit", "--csv", out),
+        "traps: {}{}; {} and run the same command again",
+        lambda: out.parent.mkdir(),
+    )
+
+
+@pytest.mark.slow  # a server listens
+def test_who_reviews_or_labels_is_said_once_each_in_plain_letters(small: Checkout, tmp_path: Path) -> None:
+    from tests.integration.listening import listening
+
+    root = Path(shutil.copytree(small.workspace, tmp_path / "study", ignore=shutil.ignore_patterns("dagster")))
+    study = Checkout(ROOT, root)
+
+    def listens(what: str, *people: str) -> Callable[[], None]:
+        def call() -> None:
+            with listening(study, what, *people) as server:
+                assert server.addresses
+
+        return call
+
+    at = ("--workspace", root, "--token", "token-of-a-reviewer-0123")
+    remedied(
+        lambda: command("review", *at, "--who", " "),
+        "--who: say whose decisions these are, e.g. --who jd",
+        again=listens("review", "jd"),
+    )
+    for wrong in (("jd", "jd"), ("j d",)):
+        refused(lambda wrong=wrong: command("annotate", *at, "--who", *wrong), "in letters, digits, `.`, `-`, `_` and `@`")
+    remedied(
+        lambda: command("annotate", *at, "--who", "jd", "jd"),
+        "--who {}: say who labels, each once, in letters, digits, `.`, `-`, `_` and `@`, e.g. --who jd ab",
+        again=listens("annotate", "jd", "ab"),
+    )
+
+
+def test_a_checkout_without_its_data_is_whole_once_it_is_cloned(tmp_path: Path) -> None:
+    root = make_checkout(tmp_path / "half")
+    shutil.rmtree(root / "scene_specs")
+    checkout = Checkout(root, tmp_path / "study")
+
+    def init() -> None:
+        finished = checkout.traps("init", "demo")
+        if finished.code:
+            raise RuntimeError(finished.err)
+
+    remedied(
+        init,
+        "{} is missing: install the wheel again, or clone the repository and `pip install -e .` in it",
+        lambda: shutil.copytree(ROOT / "scene_specs", root / "scene_specs"),
+        error=RuntimeError,
+    )
+
+
+@pytest.mark.parametrize("instead", ["name a file of your own with --csv", "write the card in a checkout of the repository"])
+@carries_out("name a file of your own with --csv", "write the card in a checkout of the repository")
+def test_what_a_wheel_brought_is_left_and_a_file_of_ones_own_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, instead: str
+) -> None:
+    monkeypatch.setattr(paths, "IS_INSTALLED", True)
+    monkeypatch.setattr(paths, "SHIPPED", tmp_path / "shipped")
+    shipped, own = tmp_path / "shipped" / "a.csv", tmp_path / "a.csv"
+    assert remedied(lambda: paths.require_own(shipped, instead), instead, again=lambda: paths.require_own(own, instead))
+
+
+def test_another_workspace_is_chosen_where_the_disk_is_small(tiny_disk: Path, tmp_path: Path) -> None:
+    remedied(
+        lambda: doctor._disk(tiny_disk),
+        "{} GB free at {}; free at least {} GB or choose another workspace",
+        again=lambda: doctor._disk(tmp_path),
+        error=RuntimeError,
+    )
+
+
+# --- exports and imports ----------------------------------------------------------------------------------------------
+
+
+def test_an_export_goes_to_another_folder_or_to_one_that_was_deleted(unasked_copy: Workspace, tmp_path: Path) -> None:
+    asks = load_experiment(str(SMALL)).model_copy(update={"models": ["prior"], "regimes": ["json"], "datasets": ["chaotic"]})
+    out, other = tmp_path / "out", tmp_path / "other"
+    assert export_requests(unasked_copy, asks, out) > 0
+    remedied(
+        lambda: export_requests(unasked_copy, asks, out),
+        "study/exchange.py | {} exists already; give another folder, or delete it",
+        again=lambda: export_requests(unasked_copy, asks, other),
+    )
+    remedied(
+        lambda: export_requests(unasked_copy, asks, out),
+        "study/exchange.py | exists already; give another folder, or delete it",
+        lambda: shutil.rmtree(out),
+    )
+    (out / FOLDER).mkdir(exist_ok=True)
+    (out / FOLDER / "batch.jsonl").write_text("{}")
+    remedied(
+        lambda: export_batches({}, out),
+        "holds batches already; give another folder, or delete it",
+        again=lambda: export_batches({}, tmp_path / "third"),
+    )
+    remedied(
+        lambda: export_batches({}, out),
+        "holds batches already; give another folder, or delete it",
+        lambda: shutil.rmtree(out / FOLDER),
+    )
+
+
+def test_answers_are_imported_once_it_is_said_whose_they_are_and_no_error_is_among_them(
+    unasked_copy: Workspace, tmp_path: Path
+) -> None:
+    asks, path = load_experiment(str(SMALL)), tmp_path / "answers.jsonl"
+    items = list(unasked_copy.tables.read_all(ITEMS)["item_id"])
+    right = {"item": items[0], "regime": "json", "text": "left"}
+
+    def written(*lines: dict[str, Any]) -> Callable[[], int]:
+        return lambda: path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+    written(right)()
+    found = remedied(
+        lambda: import_answers(unasked_copy, asks, path),
+        "say whose answers these are: --model, one of {}",
+        again=lambda: import_answers(unasked_copy, asks, path, Whose("prior")),
+    )
+    assert found.new == 1
+    wrong = {"item": items[1], "regime": "json", "outcome": "error"}
+    written(right, wrong)()
+    found = remedied(
+        lambda: import_answers(unasked_copy, asks, path, Whose("prior")),
+        "outcome: an error is no answer; remove the line, so that the item stays missing",
+        written(right),
+    )
+    assert (found.new, found.known) == (0, 1)
+    given = tmp_path / "by_key.jsonl"
+    given.write_text(json.dumps({"key": "k", "outcome": "error"}) + "\n")
+    remedied(
+        lambda: checked_answers(given, {}),
+        "an error is no answer; remove the line",
+        lambda: given.write_text(""),
+    )
+
+
+def test_a_log_without_images_or_converted_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = tmp_path / "log.json"
+
+    def logged(pixels: int) -> Callable[[], int]:
+        sample = {"id": "x", "messages": ["i" * pixels]}
+        return lambda: log.write_text(json.dumps({"samples": [], "images": sample}))
+
+    with monkeypatch.context() as small_limits:
+        small_limits.setattr(harness_logs, "MOST_LOG_BYTES", 1000)
+        logged(2000)()
+        remedied(
+            lambda: list(harness_logs._json_log(log)),
+            "is larger than {} bytes; log it without images (--no-log-images)",
+            logged(10),
+        )
+    broken = tmp_path / "log.eval"
+    broken.write_bytes(b"no zip")
+    remedied(
+        lambda: list(harness_logs._eval_log(broken)),
+        "is no log that can be read ({}); convert it: inspect log convert --to json",
+        again=lambda: list(harness_logs._json_log(log)),
+    )
+
+
+# --- a study's stages and pages ---------------------------------------------------------------------------------------
+
+
+def test_a_note_of_what_files_were_made_from_is_deleted_and_written_again(tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path, Study())
+    stage = the_graph()["gallery"]
+    write_report_state(workspace, stage, State("v", {}, 0, 0))
+    note = next(workspace.reports.rglob("gallery.json"))
+    note.write_text("{")
+
+    def run_again() -> None:
+        note.unlink()
+        write_report_state(workspace, stage, State("v", {}, 0, 0))
+
+    found = remedied(
+        lambda: read_report_state(workspace, stage),
+        "orchestration/lineage.py | {}: is not what was written ({}); delete it and run again",
+        run_again,
+    )
+    assert found is not None and found.version == "v"
+
+
+def test_a_history_is_opened_once_what_lies_in_its_way_is_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study())
+    home = tmp_path / "dagster"
+    monkeypatch.setenv("DAGSTER_HOME", str(home))
+    (home / "history" / "runs.db").mkdir(parents=True)
+
+    def opened() -> int:
+        with dagster_history(workspace) as instance:
+            return len(instance.get_runs())
+
+    refused(opened, "orchestration/run.py | free some space, or move that folder away")
+    found = remedied(
+        opened,
+        "Dagster's history cannot be read or written ({}); {} and run the same command again: tables are whole",
+        lambda: home.rename(tmp_path / "away"),
+    )
+    assert found == 0
+
+
+def test_a_site_goes_to_a_folder_that_is_empty_or_does_not_exist(small: Checkout, tmp_path: Path) -> None:
+    workspace = Workspace.open(small.workspace)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "letter.txt").write_text("mine")
+    (tmp_path / "empty").mkdir()
+    for other in ("empty", "new"):
+        remedied(
+            lambda: write_site(workspace, tmp_path / "taken", clips=False),
+            "holds something that is no site; name a folder that is empty, or does not exist yet",
+            again=lambda other=other: write_site(workspace, tmp_path / other, clips=False),
+        )
+
+
+def test_the_sites_libraries_are_used_once_they_are_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copy = Path(shutil.copytree(site.LIBRARY.parent, tmp_path / "vendor")) / site.LIBRARY.name
+    kept = site.LIBRARY
+    monkeypatch.setattr(site, "LIBRARY", copy)
+    copy.write_bytes(copy.read_bytes() + b"//")
+    assert remedied(
+        lambda: site.script.__wrapped__(),
+        "is not what was checked in; restore it from git, or run `make explorer-vendor`",
+        lambda: shutil.copy(kept, copy),
+    )
+
+
+def test_a_contact_sheet_shows_fewer_pairs_of_each_family() -> None:
+    rows = pd.DataFrame(
+        [
+            {"pair_id": f"p{n:03d}", "dataset": "occlusion", "sub_scenario": f"f{n % 4}", "side": side}
+            for n in range(MOST_PAIRS + 4)
+            for side in ("control", "void")
+        ]
+    )
+    for items, per_family in ((rows, 3), (rows[: 2 * MOST_PAIRS], None)):
+        assert remedied(
+            lambda: chosen_pairs(rows, None),
+            "a contact sheet shows 1 to {} pairs, not {}: pass other items or a smaller per_family",
+            again=lambda items=items, per_family=per_family: chosen_pairs(items, per_family),
+            error=ValueError,
+        )
+
+
+def test_a_comparison_within_one_epoch_is_made() -> None:
+    mixed = pd.DataFrame({"standard": ["e1", "e1"], "guided": ["e2", "e1"]}, index=pd.Index(["m", "n"]))
+    for right in (mixed.assign(guided="e1"), mixed.drop(index="m")):
+        remedied(
+            lambda: require_one_epoch(mixed, "uplift"),
+            "ratio, contrast or gap: evaluate both sides in one epoch, or leave this one out",
+            again=lambda right=right: require_one_epoch(right, "uplift"),
+            error=EpochMismatch,
+        )
+
+
+@carries_out("canary: asked in this epoch; name another epoch in study.yaml to ask again, and what changed is shown")
+def test_a_canary_of_another_epoch_shows_what_changed() -> None:
+    one = pd.DataFrame([vars(asked("nov", "a", 1))], columns=pd.Index(CANARY.names))
+    assert changes_text(one).startswith("canary: asked in this epoch; name another epoch in study.yaml to ask again")
+    both = pd.concat([one, pd.DataFrame([vars(asked("dec", "a", 9, value="right", text="right"))])])
+    assert changes_text(both).startswith("canary: items that changed")
