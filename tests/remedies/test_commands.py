@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
+import yaml
 
 from tests.conftest import EXPERIMENT, KEY, ROOT, Checkout, make_checkout
 from tests.providers.server import Provider
 from tests.remedies.remedied import carries_out, command, refused, remedied
+from tests.remedies.test_models import nobodys_own
 from tests.study.test_canary import asked
 from traps_pipeline import paths
 from traps_pipeline.benchmark.tables import ITEMS
@@ -34,6 +37,7 @@ from traps_pipeline.study.canary import CANARY, changes_text
 from traps_pipeline.study.exchange import Whose, checked_answers, export_requests, import_answers
 from traps_pipeline.study.experiment import load_experiment
 
+__all__ = ["nobodys_own"]  # the fixture
 SMALL = ROOT / EXPERIMENT
 
 
@@ -83,13 +87,29 @@ def test_a_live_check_asks_a_model_with_an_address(provider: Provider, tmp_path:
     )
 
 
-def test_an_export_refers_to_media_in_batch_files(unasked_copy: Workspace, tmp_path: Path) -> None:
-    said = ["requests", "export", SMALL, "--out", tmp_path / "out", "--workspace", unasked_copy.root, "--media-at", "https://a.b"]
+def test_an_export_in_batches_is_of_models_with_a_provider(unasked_copy: Workspace, tmp_path: Path) -> None:
+    asks = yaml.safe_load(SMALL.read_text()) | {"datasets": ["chaotic"], "regimes": ["json"], "judged_by_rules": True}
+    server = {"id": "seer", "base_url": "http://127.0.0.1:9/v1", "served_name": "seer", "media": "images"}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(asks | {"models": [server]}))
+    (tmp_path / "here.yaml").write_text(yaml.safe_dump(asks | {"models": ["oracle", "prior"]}))
+
+    def export(experiment: str, out: str, *more: str) -> Callable[[], None]:
+        said = ["requests", "export", tmp_path / experiment, "--out", tmp_path / out, "--workspace", unasked_copy.root]
+        return lambda: command(*said, *more)
+
+    elsewhere = ("--media-at", "https://media.example.org")
     remedied(
-        lambda: command(*said),
+        export("mine.yaml", "out", *elsewhere),
         "--media-at: only batch files refer to media by an address; say --batch, too",
-        again=lambda: command(*said, "--batch"),
+        again=export("mine.yaml", "out", *elsewhere, "--batch"),
     )
+    assert list((tmp_path / "out" / FOLDER).iterdir())
+    for again in (export("here.yaml", "other"), export("mine.yaml", "third", "--batch")):
+        remedied(
+            export("here.yaml", "other", "--batch"),
+            "only a provider takes batches: leave --batch out, or take experiment and panel of others",
+            again=again,
+        )
 
 
 @pytest.mark.slow  # runs a study
@@ -265,6 +285,21 @@ def test_a_log_without_images_or_converted_is_read(tmp_path: Path, monkeypatch: 
             "is larger than {} bytes; log it without images (--no-log-images)",
             logged(10),
         )
+    zipped = tmp_path / "images.eval"
+
+    def packed(pixels: int) -> Callable[[], None]:
+        def write() -> None:
+            sample = {"id": "x", "messages": ["i" * pixels]}
+            with zipfile.ZipFile(zipped, "w") as archive:
+                archive.writestr("samples/x.json", json.dumps(sample))
+
+        return write
+
+    with monkeypatch.context() as small_limits:
+        small_limits.setattr(harness_logs, "MOST_SAMPLE_BYTES", 1000)
+        small_limits.setattr(harness_logs, "_sample", lambda where, sample: sample)
+        packed(2000)()
+        remedied(lambda: list(harness_logs._eval_log(zipped)), "{}: {} has {} bytes; log without images", packed(10))
     broken = tmp_path / "log.eval"
     broken.write_bytes(b"no zip")
     remedied(

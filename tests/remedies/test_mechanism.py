@@ -31,7 +31,7 @@ from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.partitions import Extraction, StatesCell
+from traps_pipeline.partitions import DATASETS, Extraction, StatesCell
 from traps_pipeline.storage.study import MechanismSettings, ProbeSettings
 from traps_pipeline.storage.workspace import Workspace
 
@@ -210,6 +210,16 @@ def test_directions_are_made_once_states_settings_and_files_are_as_told(own: Wor
     )
     shutil.rmtree(own.root / "tables" / "directions")
     remedied(lambda: stages.cosine_rows(own), "cosines: no directions yet; materialize directions first", with_directions(own))
+
+
+def test_directions_are_made_once_a_dataset_of_the_pairs_has_states(own: Workspace) -> None:
+    for dataset in DATASETS:
+        own.tables.path(HIDDEN_STATES, StatesCell(dataset, STANDARD).partition).unlink()
+    remedied(
+        lambda: stages.direction_rows(own, STANDARD),
+        "directions {}: no hidden states of any dataset; materialize hidden_states first",
+        extracted(own),
+    )
 
 
 def test_a_target_is_steered_once_directions_lead_to_it(own: Workspace) -> None:

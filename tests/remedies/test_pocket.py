@@ -16,7 +16,7 @@ from traps_pipeline.mechanism.tables import HIDDEN_STATES
 from traps_pipeline.pocket import commands, inside
 from traps_pipeline.pocket.commands import CARD, EVALUATION, WEIGHTS, write_card
 from traps_pipeline.pocket.data import read_shards, render
-from traps_pipeline.pocket.evaluate import read_cells
+from traps_pipeline.pocket.evaluate import read_cells, write_cells
 from traps_pipeline.pocket.recipe import Recipe
 
 pytestmark = pytest.mark.slow
@@ -109,6 +109,21 @@ def test_a_table_of_figures_is_read_once_it_is_written_again(tmp_path: Path) -> 
         written,
     )
     assert {figure.seed for figure in figures} == {3}
+
+
+def test_a_table_of_counts_is_read_once_it_is_that_of_an_evaluation(tmp_path: Path) -> None:
+    path = tmp_path / "evaluation.csv"
+    path.write_text("seed\nthree\n")
+    whole = read_cells(EVALUATION)
+
+    def evaluated() -> None:
+        path.unlink()
+        write_cells(path, whole)
+
+    cells = remedied(
+        lambda: read_cells(path), "is not a table of `traps pocket evaluate` ({}); run it again", evaluated
+    )
+    assert cells == whole
 
 
 def test_a_card_is_written_once_its_comments_are_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

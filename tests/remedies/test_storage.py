@@ -315,7 +315,9 @@ def test_a_ledger_moves_once_what_stands_in_the_way_is_done_as_told(
     async def while_asking() -> None:
         async with Workspace.open(other.root).answers.writing("m__standard__run1", print):
             await asyncio.to_thread(
-                refused, lambda: move_back(Workspace.open(other.root)), "{}; nothing was moved. Wait, then move the ledger"
+                lambda: refused(
+                    lambda: move_back(Workspace.open(other.root)), "{}; nothing was moved. Wait, then move the ledger"
+                )
             )
 
     asyncio.run(while_asking())

@@ -59,6 +59,11 @@ def export_batches(
     and the number of calls. media_at: the address under which the folder `media` of `out` will be found, to which the
     bodies then refer; without it media are inline. Raises TrapsError where a call cannot be made, or where files are
     there already."""
+    if here := [name for name, (entry, _) in calls.items() if entry.account is None]:
+        raise TrapsError(
+            f"{', '.join(here[:5])}{' and others are' if len(here) > 5 else ' are' if len(here) > 1 else ' is'} asked on "
+            "this machine, and only a provider takes batches: leave --batch out, or take experiment and panel of others"
+        )
     folder = out / FOLDER
     if folder.exists() and any(folder.iterdir()):
         raise TrapsError(f"{folder} holds batches already; give another folder, or delete it")
