@@ -46,7 +46,9 @@ def remedied(
 
     again: the call with what the sentence says to give instead, where the remedy is another argument.
     """
-    assert (remedy is None) != (again is None), "a remedy is either done before the same call, or another argument of it"
+    assert (remedy is None) != (again is None), (
+        "a remedy is either done before the same call, or another argument of it"
+    )
     refused(call, sentence, error=error)
     if remedy is not None:
         remedy()

@@ -8,15 +8,86 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 from tests.conftest import ROOT
 
 PACKAGE = ROOT / "traps_pipeline"
-VERBS = """accept add allow change check choose clone close commit compare convert copy correct create declare delete
-discard download draw edit end evaluate export extract fill film fix free give import install keep leave let list log look
-lower make materialize mend mount move name open pass pick put raise rename remove render repair restore retry run save
-say see send set shorten show start stop take tell try turn unset update use wait write""".split()
+VERBS = [
+    "accept",
+    "add",
+    "allow",
+    "change",
+    "check",
+    "choose",
+    "clone",
+    "close",
+    "commit",
+    "compare",
+    "convert",
+    "copy",
+    "correct",
+    "create",
+    "declare",
+    "delete",
+    "discard",
+    "download",
+    "draw",
+    "edit",
+    "end",
+    "evaluate",
+    "export",
+    "extract",
+    "fill",
+    "film",
+    "fix",
+    "free",
+    "give",
+    "import",
+    "install",
+    "keep",
+    "leave",
+    "let",
+    "list",
+    "log",
+    "look",
+    "lower",
+    "make",
+    "materialize",
+    "mend",
+    "mount",
+    "move",
+    "name",
+    "open",
+    "pass",
+    "pick",
+    "put",
+    "raise",
+    "rename",
+    "remove",
+    "render",
+    "repair",
+    "restore",
+    "retry",
+    "run",
+    "save",
+    "say",
+    "see",
+    "send",
+    "set",
+    "shorten",
+    "show",
+    "start",
+    "stop",
+    "take",
+    "tell",
+    "try",
+    "turn",
+    "unset",
+    "update",
+    "use",
+    "wait",
+    "write",
+]
 _VERB = rf"(?:{'|'.join(VERBS)})\b(?= |$)"
 IN_AN_ERROR = re.compile(rf"(?:[;:.,(] |\bor |\band |\bthen |^){_VERB}(?! (?:is|has)\b)", re.IGNORECASE)
 ELSEWHERE = re.compile(rf"(?:[;:] {_VERB}|\. {_VERB.replace('(?:', '(?i:', 1)}|, or {_VERB})")
@@ -128,7 +199,11 @@ def _given(test: ast.AST, name: str) -> Iterator[ast.expr]:
         several = not isinstance(names, str)
         assert isinstance(cases, ast.List | ast.Tuple), "the cases stand in the decorator"
         for case in cases.elts if name in names else ():
-            values = case.args if isinstance(case, ast.Call) and called(case).endswith("param") else getattr(case, "elts", [])
+            values = (
+                case.args
+                if isinstance(case, ast.Call) and called(case).endswith("param")
+                else getattr(case, "elts", [])
+            )
             yield values[list(names).index(name)] if several else case
 
 

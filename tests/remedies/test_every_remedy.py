@@ -10,9 +10,8 @@ from tests.remedies.sentences import by_sentence, carried_out, remedies
 
 # Sentences that tell nothing to do against an error, though they have words like it.
 NO_REMEDIES: dict[str, str] = {
-    "cli/release.py | fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep": (
-        "the help of a command"
-    ),
+    "cli/release.py | fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to "
+    "keep": "the help of a command",
     "report/leaderboard.py | Acc × max(0, J), from 0 to 1; computed per run, then averaged. J is clipped at 0 here, so "
     "chance alone lifts a random strategy slightly above 0; look at the column J, which is not clipped": (
         "what a column means"
@@ -21,9 +20,8 @@ NO_REMEDIES: dict[str, str] = {
 }
 # Remedies that a test cannot carry out, and why.
 BEYOND_A_TEST: dict[str, str] = {
-    "models/local/selfcheck.py | hooked states differ from the library's own at layers {}; install the pinned versions": (
-        "tests run with the pinned versions, with which they do not differ"
-    ),
+    "models/local/selfcheck.py | hooked states differ from the library's own at layers {}; install the pinned "
+    "versions": "tests run with the pinned versions, with which they do not differ",
 }
 # Remedies that no test carries out yet, one a line: `FILE.py | sentence`. The list only becomes shorter.
 NOT_YET = (ROOT / "tests" / "remedies" / "not_yet.txt").read_text().splitlines()
@@ -46,15 +44,13 @@ def test_what_is_listed_as_not_carried_out_is_a_remedy_and_is_not() -> None:
     assert not gone, "the package no longer says these; take them off the list:\n" + "\n".join(gone)
     done = [line for line in LISTED if there[line] in by_sentence()]
     assert not done, "a test carries these out; take them off the list:\n" + "\n".join(done)
-    assert NOT_YET == sorted(set(NOT_YET))
+    assert sorted(set(NOT_YET)) == NOT_YET
 
 
 def test_what_a_test_carries_out_is_a_sentence_of_the_package() -> None:
     wrong = {one.where: one.text for one in carried_out() if not one.finds()}
     assert not wrong, "the package says nothing like it"
-    several = {
-        one.where: [found.where for found in one.finds()] for one in carried_out() if len(one.finds()) > 1
-    }
+    several = {one.where: [found.where for found in one.finds()] for one in carried_out() if len(one.finds()) > 1}
     assert not several, "more than one sentence has these words: say more of it, or `FILE.py | words`"
 
 

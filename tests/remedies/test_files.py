@@ -153,8 +153,12 @@ def test_whatever_else_is_wrong_with_a_file_is_seen_to(tmp_path: Path) -> None:
     remedied(written(loop / "deeper" / "a.txt"), "see to the file or its disk", loop.unlink)
 
 
-WRITE = "import sys, pathlib; from traps_pipeline.files import write_bytes; from traps_pipeline.errors import TrapsError\n"
-WRITE += "try: write_bytes(pathlib.Path(sys.argv[1]), b'x', durable=True)\nexcept TrapsError as error: sys.exit(str(error))"
+WRITE = (
+    "import sys, pathlib; from traps_pipeline.files import write_bytes; from traps_pipeline.errors import TrapsError\n"
+)
+WRITE += (
+    "try: write_bytes(pathlib.Path(sys.argv[1]), b'x', durable=True)\nexcept TrapsError as error: sys.exit(str(error))"
+)
 
 
 @pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed (make test installs it)")
@@ -165,9 +169,23 @@ WRITE += "try: write_bytes(pathlib.Path(sys.argv[1]), b'x', durable=True)\nexcep
     "end programs that hold many files open",
 )
 def test_what_the_system_refused_is_written_once_it_no_longer_does(tmp_path: Path, fault: str) -> None:
-    said = {"EDQUOT": "or raise the quota", "EIO": "the disk fails: look at it", "ENFILE": "end programs that hold many"}
+    said = {
+        "EDQUOT": "or raise the quota",
+        "EIO": "the disk fails: look at it",
+        "ENFILE": "end programs that hold many",
+    }
     write = [sys.executable, "-c", WRITE, str(tmp_path / "folder" / "a.txt")]
-    strace = ["strace", "-f", "-qq", "-o", "/dev/null", "-e", f"trace={fault.partition(':')[0]}", "-e", f"inject={fault}"]
+    strace = [
+        "strace",
+        "-f",
+        "-qq",
+        "-o",
+        "/dev/null",
+        "-e",
+        f"trace={fault.partition(':')[0]}",
+        "-e",
+        f"inject={fault}",
+    ]
     (tmp_path / "folder").mkdir()
     refused = subprocess.run([*strace, *write], capture_output=True, text=True, cwd=ROOT, check=False)
     assert refused.returncode == 1 and said[fault.partition("=")[2]] in refused.stderr, refused.stderr

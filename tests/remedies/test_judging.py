@@ -74,7 +74,9 @@ def test_verdicts_are_made_once_all_votes_are_there(tmp_path: Path) -> None:
     def verdicts() -> pd.DataFrame:
         own = [name for name in items_of(workspace).columns if name != "benchmark_version"]
         answers = workspace.tables.read(RESPONSES, CELL.partition).drop(columns="benchmark_version")
-        items = items_of(workspace)[[n for n in own if n not in answers.columns or n == "item_id"] + ["benchmark_version"]]
+        items = items_of(workspace)[
+            [n for n in own if n not in answers.columns or n == "item_id"] + ["benchmark_version"]
+        ]
         return decide(items, answers, workspace.tables.read(VOTES, CELL.partition))
 
     assert len(remedied(verdicts, "judging/verdicts.py | {} {}: {}; materialize {} for {}", voted)) == 4
@@ -192,4 +194,6 @@ def test_labels_are_read_once_their_file_is_restored_and_the_database_is_made_fr
 
 def test_a_task_that_is_chosen_from_those_that_are_named_is_known() -> None:
     for task in TASKS:
-        remedied(lambda: require_task("none"), "no task of this name; choose from {}", again=lambda t=task: require_task(t))
+        remedied(
+            lambda: require_task("none"), "no task of this name; choose from {}", again=lambda t=task: require_task(t)
+        )

@@ -1,4 +1,4 @@
-"""What the check of a model says to do makes the same check find nothing; and what a server of pages says lets one in."""
+"""What the check of a model says to do makes the same check find nothing; what a server of pages says lets one in."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ def test_a_right_key_is_accepted(check: Check, provider: Provider, monkeypatch: 
 
 
 @pytest.mark.slow
-@carries_out("it ignores the schema (its answer in the JSON regime is no such object): say `json_schema: false` and why")
+@carries_out(
+    "it ignores the schema (its answer in the JSON regime is no such object): say `json_schema: false` and why"
+)
 def test_a_model_without_a_schema_says_so_in_its_entry(check: Check, provider: Provider) -> None:
     provider.configure(scripts={NAME: {"": "red and then blue"}})
     (problem,) = check().problems

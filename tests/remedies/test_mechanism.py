@@ -15,12 +15,11 @@ from tests.mechanism.study import PAIRS, SETTINGS, make_study, write_verdicts
 from tests.mechanism.test_directions import origin, pair_states
 from tests.mechanism.test_probes import LAYERS, random_states
 from tests.mechanism.test_probes import study as probed
-from tests.mechanism.test_stages import STANDARD, entry, extract_all, own, patch, study
-from tests.remedies.remedied import carries_out, refused, remedied
+from tests.mechanism.test_stages import STANDARD, entry, own, patch, study
+from tests.remedies.remedied import carries_out, remedied
 from traps_pipeline import inside
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.mechanism import stages
-from traps_pipeline.mechanism.baselines import NoMargin
 from traps_pipeline.mechanism.directions import extract_directions, load_directions, save_directions
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.probe_items import probe_items
@@ -28,7 +27,7 @@ from traps_pipeline.mechanism.probes import fit_probe, scenario_folds, solve_gra
 from traps_pipeline.mechanism.probing import NothingConfabulated, ProbeRun, confabulated_scenarios
 from traps_pipeline.mechanism.steering import strengths
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS
+from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.partitions import DATASETS, Extraction, StatesCell
@@ -106,9 +105,7 @@ def test_a_protocol_runs_on_states_that_were_extracted_again() -> None:
 
 
 def test_more_scenarios_have_confabulations() -> None:
-    rows = pd.DataFrame(
-        [("a", "void", False), ("b", "void", True)], columns=["scenario_id", "side", "abstained"]
-    )
+    rows = pd.DataFrame([("a", "void", False), ("b", "void", True)], columns=["scenario_id", "side", "abstained"])
     found = remedied(
         lambda: confabulated_scenarios(rows[1:], "chaotic", "m"),
         "there is no Cf->Cf probe of this dataset; take more scenarios, or read the all-sample curves",
@@ -133,9 +130,7 @@ def test_directions_of_more_scenarios_are_made_and_damaged_files_are_written_aga
 
     save_directions(path, made, origin())
     path.write_bytes(path.read_bytes()[:-1])
-    remedied(
-        lambda: load_directions(path), "{}: damaged ({}); delete it, then `traps run` makes it again", made_again
-    )
+    remedied(lambda: load_directions(path), "{}: damaged ({}); delete it, then `traps run` makes it again", made_again)
     from safetensors.numpy import load_file, save_file
 
     from traps_pipeline.digests import file_digest
@@ -171,16 +166,14 @@ def test_states_that_are_missing_or_damaged_are_extracted_again(own: Workspace) 
     remedied(read, "cannot be read ({}); delete it, then `traps run` extracts its items again", deleted_and_run)
     rows = own.tables.read(HIDDEN_STATES, CHAOTIC.partition)
     own.tables.write(HIDDEN_STATES, CHAOTIC.partition, rows.assign(states_key="another"), {})
-    remedied(
-        read, "the shards hold other items than the table; materialize hidden_states for it again", extracted(own)
-    )
+    remedied(read, "the shards hold other items than the table; materialize hidden_states for it again", extracted(own))
 
 
 def test_states_of_another_prompt_are_read_once_they_are_extracted(own: Workspace) -> None:
     guided = Extraction("tiny", "guided")
     remedied(
         lambda: StoredStates.of(own, guided),
-        "no hidden states of {}; materialize hidden_states for it first",
+        "mechanism/stored.py | no hidden states of {}; materialize hidden_states for it first",
         extracted(own, StatesCell("chaotic", guided)),
     )
 
@@ -209,7 +202,11 @@ def test_directions_are_made_once_states_settings_and_files_are_as_told(own: Wor
         deleted_and_run,
     )
     shutil.rmtree(own.root / "tables" / "directions")
-    remedied(lambda: stages.cosine_rows(own), "cosines: no directions yet; materialize directions first", with_directions(own))
+    remedied(
+        lambda: stages.cosine_rows(own),
+        "cosines: no directions yet; materialize directions first",
+        with_directions(own),
+    )
 
 
 def test_directions_are_made_once_a_dataset_of_the_pairs_has_states(own: Workspace) -> None:
@@ -241,7 +238,7 @@ def test_a_target_is_steered_once_directions_lead_to_it(own: Workspace) -> None:
         "the directions of {} have no {} draw {}; materialize directions again",
         again=lambda: strengths("chaotic", layers, settings, stages.saved_directions(own, STANDARD)),
     )
-    zero = {name: of for name, of in stages.saved_directions(own, STANDARD).items()}
+    zero = stages.saved_directions(own, STANDARD)
     for of in zero.values():
         of.vectors["void"][0][1] = 0.0
     at_one = layers.model_copy(update={"steering": 1, "sweep": ()})
@@ -254,7 +251,9 @@ def test_a_target_is_steered_once_directions_lead_to_it(own: Workspace) -> None:
 
 def test_a_model_and_its_layers_are_read_once_the_study_names_them(own: Workspace) -> None:
     settings = own.mechanism
-    own.allow(mechanism=MechanismSettings.model_validate(SETTINGS | {"models": {"tiny": {"steering": 9, "centroid": 1}}}))
+    own.allow(
+        mechanism=MechanismSettings.model_validate(SETTINGS | {"models": {"tiny": {"steering": 9, "centroid": 1}}})
+    )
     remedied(
         lambda: stages.extract_states(Workspace.open(own.root), CHAOTIC),
         "(layer 0 is the embeddings); name one of these in the experiment and in study.yaml",

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.pocket.test_pocket import FEW, _one_thread, data, examined_study, recipe
-from tests.remedies.remedied import carries_out, remedied
-from traps_pipeline import paths
+from tests.remedies.remedied import remedied
 from traps_pipeline.mechanism.tables import HIDDEN_STATES
 from traps_pipeline.pocket import commands, inside
 from traps_pipeline.pocket.commands import CARD, EVALUATION, WEIGHTS, write_card

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -112,7 +109,11 @@ def test_what_traps_release_wrote_is_verified(release: Path, tmp_path: Path) -> 
         "cannot be read ({}); give the folder that `traps release` wrote",
         again=lambda: read_checksums(release),
     )
-    remedied(lambda: command("verify", tmp_path), "give the folder that `traps release` wrote", again=lambda: command("verify", release))
+    remedied(
+        lambda: command("verify", tmp_path),
+        "give the folder that `traps release` wrote",
+        again=lambda: command("verify", release),
+    )
 
 
 def test_a_release_has_a_date_that_is_one(small: Checkout, tmp_path: Path) -> None:
@@ -124,7 +125,9 @@ def test_a_release_has_a_date_that_is_one(small: Checkout, tmp_path: Path) -> No
     )
 
 
-def test_results_are_of_a_repository_and_of_models_that_were_run(workspace: Workspace, small: Checkout, tmp_path: Path) -> None:
+def test_results_are_of_a_repository_and_of_models_that_were_run(
+    workspace: Workspace, small: Checkout, tmp_path: Path
+) -> None:
     remedied(
         lambda: write_results(workspace, tmp_path / "out", "traps", Who()),
         "--dataset {}: is no repository of the hub; write it as OWNER/NAME",
@@ -176,9 +179,7 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     )
 
 
-def test_a_commitment_is_made_of_one_draw_into_files_that_are_not_there(
-    committed: Path, tmp_path: Path
-) -> None:
+def test_a_commitment_is_made_of_one_draw_into_files_that_are_not_there(committed: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(committed, tmp_path / "copy"))
     remedied(
         lambda: commit(copy / "private", copy / "commitment.json", tmp_path / "reveal.json"),

@@ -29,13 +29,18 @@ def write(add: Add, name: str = "plank_post", **changes: tuple[str, str]) -> Non
     add(name, **changes)
 
 
-FOLLOWS = "drawn_by(lambda rng, so_far: uniform(rng, 0.55, 0.59) + 0.04 * (so_far['post_in_way'] or rng.random() < 0.2))"
+FOLLOWS = (
+    "drawn_by(lambda rng, so_far: uniform(rng, 0.55, 0.59) + 0.04 * (so_far['post_in_way'] or rng.random() < 0.2))"
+)
 
 
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
-        ({"family": ("FAMILY = ", "MINE = ")}, "defines no FAMILY = scene_family(...); write it, or take the file away"),
+        (
+            {"family": ("FAMILY = ", "MINE = ")},
+            "defines no FAMILY = scene_family(...); write it, or take the file away",
+        ),
         (
             {"called": ('"plank_post"', '"plank"')},
             "defines a family named {}; give it the name of its file, {}, or rename the file",

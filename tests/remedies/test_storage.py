@@ -18,8 +18,8 @@ from tests.remedies.remedied import refused, remedied
 from tests.storage.conftest import VARIABLE
 from tests.storage.test_ledger import answer, write
 from tests.storage.test_media import IMAGES, VIDEO, drawn, write_clip
-from tests.storage.test_shared_ledger import _claimed, _lose_connection, two_of
 from tests.storage.test_parquet import PARTITION, clip
+from tests.storage.test_shared_ledger import _claimed, _lose_connection, two_of
 from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip, count_frames, decode, decode_first
@@ -167,7 +167,10 @@ def test_media_are_prepared_once_their_folder_can_be_made(tmp_path: Path) -> Non
     ("damage", "sentence"),
     [
         (lambda path: path.unlink(), "not there yet; materialize {} for this partition first"),
-        (lambda path: path.write_bytes(b"PAR1 no table"), "not a readable {} table ({}); delete it and materialize again"),
+        (
+            lambda path: path.write_bytes(b"PAR1 no table"),
+            "not a readable {} table ({}); delete it and materialize again",
+        ),
         (
             lambda path: path.write_bytes(path.read_bytes().replace(b"plinko-0001", b"plinko-0002")),
             "is not what was written (it was altered); run again, and it is made anew",
@@ -265,7 +268,7 @@ def test_an_address_that_is_exported_and_right_leads_to_the_database(
     export(postgres.address(password="wrong"))()
     session = remedied(
         call,
-        'See that the server runs and that address, user and password are right (`psql "${}"` tries them), then run the',
+        'See that the server runs and that address, user and password are right (`psql "${}"` tries them), then run',
         export(postgres.address()),
     )
     assert session.study == "remedied"
@@ -342,7 +345,9 @@ def test_what_a_silent_writer_had_not_stored_is_stored_by_the_same_command(postg
         assert time.monotonic() < until
         time.sleep(0.2)
     assert taken.number == old.number + 1
-    refused(store_late, "for too long. Nothing more is sent, and what it had not stored is refused. Run the same command")
+    refused(
+        store_late, "for too long. Nothing more is sent, and what it had not stored is refused. Run the same command"
+    )
     _lose_connection(two, one)
     third = SharedLedger(Session(postgres.address(), VARIABLE, two.session.study), "answers")
     write(third, answer("b", "left"))

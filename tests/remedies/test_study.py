@@ -3,7 +3,6 @@ calls succeed. And what its exports, imports and files say to do lets them go on
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -11,35 +10,25 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from tests.conftest import EXPERIMENT, Checkout, copied
-from tests.remedies.remedied import command, refused, remedied
+from tests.remedies.remedied import refused
 from traps_pipeline.benchmark.items import build_items
-from traps_pipeline.benchmark.tables import ITEMS, VIDEOS
+from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs import judging, report, scoring
 from traps_pipeline.explorer.annotate import Annotation
 from traps_pipeline.explorer.answers import study_items
-from traps_pipeline.explorer.labelstore import DATABASE, LabelStore
 from traps_pipeline.explorer.review import Review
-from traps_pipeline.explorer.site import write_site
-from traps_pipeline.judging.panel import judged_answers, wanted_ballots
 from traps_pipeline.models.answers import wanted_questions
-from traps_pipeline.models.judges import load_panel
-from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.orchestration.lineage import Lineage, read_report_state
-from traps_pipeline.orchestration.run import stages_until
-from traps_pipeline.partitions import DATASETS, Cell
+from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.partitions import Cell
 from traps_pipeline.release.content import content_of
-from traps_pipeline.report.contact_sheet import chosen_pairs
 from traps_pipeline.scenes.clips import read_clip
-from traps_pipeline.scenes.encode import DamagedClip, decode
+from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study import exchange, harness_logs
-from traps_pipeline.study.batch import export_batches
-from traps_pipeline.study.canary import ask_canary, canary_items, changes_text
-from traps_pipeline.study.exchange import Whose, export_requests, import_answers
+from traps_pipeline.study import exchange
+from traps_pipeline.study.canary import canary_items
+from traps_pipeline.study.exchange import export_requests
 from traps_pipeline.study.experiment import Experiment, load_experiment
 
 pytestmark = pytest.mark.slow
@@ -54,8 +43,12 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
     experiment = load_experiment(str(study.root / EXPERIMENT))
     cards = {**{name: partial(make, workspace) for name, make in FILES.items()}}
     again: list[Callable[[], Any]] = [
-        refused(lambda: build_items(workspace, "occlusion"), "no scene_specs yet; materialize scene_specs and videos first"),
-        refused(lambda: wanted_questions(workspace, CELL), "not made yet; materialize scene_specs, videos and items first"),
+        refused(
+            lambda: build_items(workspace, "occlusion"), "no scene_specs yet; materialize scene_specs and videos first"
+        ),
+        refused(
+            lambda: wanted_questions(workspace, CELL), "not made yet; materialize scene_specs, videos and items first"
+        ),
         refused(cards["sheet"], "contact_sheet: no items yet; materialize items first"),
         refused(cards["gallery"], "gallery: no clips yet; materialize videos first"),
         refused(cards["shortcuts"], "shortcuts: no items yet; materialize items first"),
@@ -63,8 +56,13 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
             lambda: scoring._make_metrics(workspace, "occlusion"),
             "no verdicts yet; materialize verdicts for a cell of this dataset first",
         ),
-        refused(lambda: scoring._scored(workspace, "contrasts"), "no metrics yet; materialize metrics for a dataset first"),
-        refused(lambda: scoring._make_robust(workspace, None), "robust: no verdicts yet; materialize verdicts for a cell first"),
+        refused(
+            lambda: scoring._scored(workspace, "contrasts"), "no metrics yet; materialize metrics for a dataset first"
+        ),
+        refused(
+            lambda: scoring._make_robust(workspace, None),
+            "robust: no verdicts yet; materialize verdicts for a cell first",
+        ),
         refused(lambda: judging._votes(workspace, "agreement"), "no votes yet; materialize votes for a cell first"),
         refused(lambda: Annotation(workspace), "has no clips yet; run `traps run EXPERIMENT` in it first"),
         refused(lambda: study_items(workspace), "has no items yet; run `traps run EXPERIMENT` in it first"),
@@ -75,7 +73,11 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
             "no items yet; materialize scene_specs, videos and items first",
         ),
         refused(lambda: content_of(workspace), "no pairs to release; make items first (traps run ... --until items)"),
-        refused(may_be_made(workspace, "verdicts"), "is not made; materialize {} for this partition first", error=AssertionError),
+        refused(
+            may_be_made(workspace, "verdicts"),
+            "is not made; materialize {} for this partition first",
+            error=AssertionError,
+        ),
     ]
     finished = study.traps("run", EXPERIMENT, "--until", "items")
     assert finished.code == 0, finished.err
@@ -136,5 +138,3 @@ def edited(path: Path, old: str, new: str) -> Path:
     assert old in text
     path.write_text(text.replace(old, new, 1))
     return path
-
-

@@ -61,8 +61,8 @@ def export_batches(
     there already."""
     if here := [name for name, (entry, _) in calls.items() if entry.account is None]:
         raise TrapsError(
-            f"{', '.join(here[:5])}{' and others are' if len(here) > 5 else ' are' if len(here) > 1 else ' is'} asked on "
-            "this machine, and only a provider takes batches: leave --batch out, or take experiment and panel of others"
+            f"{', '.join(here[:5])}{' and others are' if len(here) > 5 else ' are' if len(here) > 1 else ' is'} asked "
+            "here, and only a provider takes batches: leave --batch out, or take experiment and panel of others"
         )
     folder = out / FOLDER
     if folder.exists() and any(folder.iterdir()):
