@@ -14,6 +14,7 @@ import pytest
 from tests.conftest import EXPERIMENT, Checkout, Finished
 from tests.integration.test_crashes import assert_same_tables
 from tests.integration.test_errors import edit_record
+from tests.remedies.remedied import carries_out
 
 pytestmark = pytest.mark.slow
 CELL = "occlusion|oracle__json__run1"
@@ -110,17 +111,21 @@ def told(finished: Finished, path: Path, remedy: str) -> str:
     return found[0]
 
 
+@carries_out("finished work is kept: run the same command to continue")
 def test_each_remedy_for_a_file_lets_the_same_command_go_on(study: Checkout, small: Checkout, tmp_path: Path) -> None:
     for folder in ("scene_specs", "assets"):
         shutil.copytree(study.root / folder, tmp_path / "kept" / folder)
+    said = ""
     for name, (damaged, remedy) in FAULTS.items():
         path = damaged(study)
-        words = told(study.score(EXPERIMENT), path, remedy)
+        finished = study.score(EXPERIMENT)
+        words, said = told(finished, path, remedy), said + finished.err
         carried_out(words, study, path, tmp_path / "kept")
         again = study.score(EXPERIMENT)
         assert again.code == 0, f"{name}: {again.err}"
         counts = again.counts()
         assert (counts["answers"], counts["votes"]) == (0, 0), f"{name}: {json.dumps(counts)}"
+    assert "problem(s); finished work is kept: run the same command to continue" in said
     assert_same_tables(study.workspace, small.workspace)
 
 

@@ -67,7 +67,7 @@ def carries_out(*sentences: str) -> Callable[[T], T]:
 
 
 def command(*arguments: object) -> None:
-    """Run a `traps` command in this process. Raises a TrapsError with what it says on stderr where it does not end in 0."""
+    """Run a `traps` command in this process. Raises TrapsError with what it says on stderr unless it ends in 0."""
     said, before = io.StringIO(), os.environ.get(VARIABLE)
     try:
         with contextlib.redirect_stderr(said):

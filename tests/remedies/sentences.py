@@ -1,4 +1,4 @@
-"""The remedies that the package's errors name, read from its sources, and those that tests carry out, read from tests."""
+"""The remedies that the package's errors name, read from its sources; those that tests carry out, read from tests."""
 
 from __future__ import annotations
 

@@ -58,7 +58,8 @@ def test_stages_are_chosen_from_those_that_are_named() -> None:
 
 @carries_out("no stage is declared yet: import traps_pipeline.definitions first")
 def test_the_graph_is_there_once_the_definitions_are_imported(tmp_path: Path) -> None:
-    code = "from traps_pipeline.orchestration.graph import the_graph\ntry: the_graph()\nexcept RuntimeError as e: print(e)\n"
+    code = "from traps_pipeline.orchestration.graph import the_graph\n"
+    code += "try: the_graph()\nexcept RuntimeError as error: print(error)\n"
     code += "import traps_pipeline.definitions\nprint(len(the_graph().stages) > 10)"
     finished = Checkout(ROOT, tmp_path).run(sys.executable, "-W", "ignore", "-c", code)
     assert "import traps_pipeline.definitions first" in finished.out and finished.out.endswith("True\n"), finished.err

@@ -16,7 +16,7 @@ NO_REMEDIES: dict[str, str] = {
     "chance alone lifts a random strategy slightly above 0; look at the column J, which is not clipped": (
         "what a column means"
     ),
-    "scoring/contrasts.py | the two studies share no whole pair of the same model, regime and run": "run is a noun here",
+    "scoring/contrasts.py | the two studies share no whole pair of the same model, regime and run": "run is a noun",
 }
 # Remedies that a test cannot carry out, and why.
 BEYOND_A_TEST: dict[str, str] = {
