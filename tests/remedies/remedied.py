@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 def says(sentence: str, told: str) -> bool:
-    """Whether an error has a part of a sentence as it stands in the package; `{}` stands for what is only known then."""
+    """Whether an error has a part of a sentence of the package; `{}` stands for what is only known then."""
     sentence = sentence.rpartition(" | ")[2]
     return re.search(re.escape(sentence).replace(r"\{\}", ".*?"), told, re.DOTALL) is not None
 
