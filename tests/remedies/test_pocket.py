@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from tests.pocket.test_pocket import FEW, _one_thread, data, examined_study, recipe
 from tests.remedies.remedied import remedied
@@ -15,6 +16,7 @@ from traps_pipeline.pocket.commands import CARD, EVALUATION, WEIGHTS, write_card
 from traps_pipeline.pocket.data import read_shards, render
 from traps_pipeline.pocket.evaluate import read_cells, write_cells
 from traps_pipeline.pocket.recipe import Recipe
+from traps_pipeline.pocket.words import PROMPTS
 
 pytestmark = pytest.mark.slow
 __all__ = ["_one_thread", "data", "recipe"]  # fixtures
@@ -40,6 +42,17 @@ def test_scenes_of_another_recipe_are_drawn_in_another_folder_or_once_it_is_dele
             lambda: render(other, "train", folder),
             "holds scenes of another recipe; give another folder, or delete it",
             lambda: (shutil.rmtree(folder), folder.mkdir()),
+        )
+
+
+def test_a_recipe_has_one_kind_of_share(recipe: Recipe) -> None:
+    both = recipe.model_dump() | {"abstain_share": 0.4, "abstain_shares": dict.fromkeys(PROMPTS, 0.4)}
+    for neither in ("abstain_share", "abstain_shares"):
+        remedied(
+            lambda: Recipe.model_validate(both),
+            "give abstain_share (one for all prompts) or abstain_shares (by prompt), and not both",
+            again=lambda neither=neither: Recipe.model_validate(both | {neither: None}),
+            error=ValidationError,
         )
 
 

@@ -27,6 +27,7 @@ from traps_pipeline.storage import media
 from traps_pipeline.storage.database import FORMAT, Session, session_of
 from traps_pipeline.storage.media import MediaSpec, MediaStore, payload
 from traps_pipeline.storage.parquet import TableStore
+from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.stream import Stream, encoded
@@ -207,6 +208,15 @@ def test_a_column_that_says_its_meaning_is_a_column() -> None:
         error=TypeError,
     )
     assert [column.doc for column in columns] == ["in metres"]
+
+
+def test_a_study_lies_in_a_folder_or_an_object_store(tmp_path: Path) -> None:
+    for place in (str(tmp_path), "s3://bucket/study"):
+        remedied(
+            lambda: place_of("http://bucket/study"),
+            "{}: is no place for a study; name a folder, or {}, and give keys in the environment",
+            again=lambda place=place: place_of(place),
+        )
 
 
 # --- ledgers ----------------------------------------------------------------------------------------------------------
