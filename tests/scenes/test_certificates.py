@@ -21,6 +21,7 @@ from traps_pipeline.scenes.certificates import (
     ORDER,
     OUTCOME,
     REFERENTS,
+    TURNS,
     pair_of,
     settled_outcome,
 )
@@ -260,6 +261,7 @@ CLAIM = Claim.of_record(load("hidden_race-0001").spec)
 CHAOTIC = Claim.of_record(load("plinko-0001").spec)
 GOOD: dict[str, Any] = {
     "outcome": {"label": CLAIM.answer, "commit_s": 2.3, "margin_m": 0.17},
+    "turns": {"turns_deg": 10.0},
     "physics": {"same_physics": False, "simulated_answer": CLAIM.answer, "parted_m": 0.005},
     "in_frame": {"in_frame": True},
     "legible": {"too_small": [], "least_visible_px": 150.0},
@@ -292,6 +294,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("outcome", {"commit_s": 4.4}, "is committed only 0.5 s before the end"),
     ("outcome", {"margin_m": 0.0}, "has a margin of 0.0000 m, below"),
     ("outcome", {"margin_m": float("nan")}, "has a margin of nan m, below"),
+    ("turns", {"turns_deg": 9.9}, "turns by 9.9 degrees, 10 wanted"),
     ("physics", {"simulated_answer": "teal"}, "simulated here, the scene ends in 'teal'"),
     ("physics", {"parted_m": 0.0051}, "parts from its trajectory at once"),
     ("in_frame", {"in_frame": False}, "leaves the frame"),
@@ -345,6 +348,18 @@ def test_evidence_beyond_a_threshold_is_not(name: str, worse: dict[str, Any], sa
 def test_a_twin_that_ends_as_its_scenario_does_is_refused_though_its_record_says_so_too() -> None:
     alike, good = replace(CLAIM, twin_answer=CLAIM.answer), GOOD["twin behind panel"] | {"twin_answer": CLAIM.answer}
     assert "the twin ends in" in str(JUDGES["twin behind panel"].failure(good, alike))
+
+
+def test_a_seesaw_that_nothing_strikes_loses_and_what_turns_nothing_is_not_asked() -> None:
+    case = load("seesaw_sorter-0001")
+    pair = pair_of(case.spec, case.qpos, case.twin)
+    assert TURNS.failure(TURNS.measured(pair), pair.claim) is None
+    hinge = int(pair.control.model.joint(pair.control.model.body("seesaw").jntadr[0]).qposadr[0])
+    still = case.qpos.copy()
+    still[:, hinge] = 0
+    measured = TURNS.measured(replace(pair, control=replace(pair.control, qpos=still)))
+    assert TURNS.failure(measured, pair.claim) == "what the scene is about turns by 0.0 degrees, 10 wanted"
+    assert TURNS.failure({"turns_deg": None}, CHAOTIC) is None
 
 
 def test_three_answers_need_less_entropy_than_two() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, make_dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from traps_pipeline.scenes import vision
 from traps_pipeline.scenes.kit import COLOURS, Motion, Physics
 from traps_pipeline.scenes.parts import floor, observers, outcome, questions, vary
+from traps_pipeline.scenes.parts.board import Board
 from traps_pipeline.scenes.parts.ramp import Ramp, SteppedRamp
 from traps_pipeline.scenes.parts.stage import Stage, Surface, brake
 
@@ -227,7 +229,17 @@ def test_an_observer_sees_no_flag_and_sees_what_is_no_flag() -> None:
     assert np.array_equal(vision.without_flags(bare), bare)
 
 
-# --- floors ----------------------------------------------------------------------------------------------------------
+def test_how_far_a_body_turns_is_its_greatest_angle_from_where_it_stands_at_first() -> None:
+    def about_z(degrees: float) -> np.ndarray:
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+    path = np.stack([about_z(20 + turn) for turn in (0, 5, -12, 3)])
+    assert outcome.turns_deg(path) == pytest.approx(12.0, abs=1e-6)
+    assert outcome.turns_deg(path[:1]) == 0.0
+
+
+# --- floors and boards ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("pattern", "share"), [("plain", 0.0), ("checks", 0.5), ("stripes", 0.5)])
@@ -241,3 +253,16 @@ def test_planks_have_joints_of_the_second_tone_and_an_unknown_floor_is_refused()
     assert planks.min() == 0.0
     with pytest.raises(ValueError, match="no floor pattern 'sea'; there are plain, checks"):
         floor._shares("sea")
+
+
+def test_pegs_stand_only_where_they_may() -> None:
+    def names(where: Callable[[float, float], bool]) -> set[str]:
+        board = Board(
+            Physics(), tilt_deg=30, width_m=1.0, ball_radius_m=0.03, light=(0.5, 0.5, 0.5), bounce=(-20000.0, -8.0)
+        )
+        board.pegs([0.5, 0.6], [0.0, 0.05], 0.1, 0.01, "grey", square=False, where=where)
+        return {geom.name for geom in board.spec.geoms if geom.name.startswith("peg_")}
+
+    everywhere, right = names(lambda across, up: True), names(lambda across, up: across > 0 and up < 0.55)
+    assert right == {"peg_0_21", "peg_0_22", "peg_0_23", "peg_0_24"}  # 0.1 to 0.4 m in the lower row
+    assert right < everywhere and "peg_1_20" in everywhere

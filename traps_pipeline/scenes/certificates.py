@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 # --- thresholds: a family has its own `min_margin_m`, and may have its own `legible` ----------------------------------
 
+TURNS_DEG = 10.0  # so far the thing turns that a scene is about
 COMMITTED_BEFORE_END_S = 0.6  # so long the outcome must have stood at the end
 LEGIBLE_PIXELS = 150.0  # of each decisive body at the end of the control
 REFERENT_PIXELS = 80.0  # of whatever a question names, in each frame of the void
@@ -153,6 +154,24 @@ def settled_answer(world: World) -> str | None:
         return settled_outcome(world.family, world.motion, world.params).label
     except Rejected:
         return None
+
+
+def _judge_turns(e: Evidence, claim: Claim) -> Judged:
+    turns = e.get("turns_deg")
+    if turns is not None and turns < TURNS_DEG:
+        yield f"what the scene is about turns by {turns:.1f} degrees, {TURNS_DEG:.0f} wanted"
+
+
+TURNS = Certificate(
+    name="turns",
+    about="control",
+    promises=f"where the scene is about a thing that turns, and nothing but the ball moves it (the seesaw), this is "
+    f"struck and turns by {TURNS_DEG:.0f} degrees or more in some frame",
+    does_not_promise="that the twin's turns as well",
+    numbers=(Number("turns_deg", kept=False),),
+    measure=lambda pair: {"turns_deg": pair.control.outcome.turns_deg},
+    judge=_judge_turns,
+)
 
 
 # --- physics, picture -------------------------------------------------------------------------------------------------
@@ -621,6 +640,7 @@ WORDS = Certificate(
 
 CERTIFICATES = (
     OUTCOME,
+    TURNS,
     PHYSICS,
     IN_FRAME,
     LEGIBLE,

@@ -167,11 +167,13 @@ class Motion:
 class Reading:
     """What a run comes to. labels: for every frame the label that holds then, None while undecided. margin_m: distance
     (m) of the end state from the nearest other outcome. in_order: of a question after the order of two events, the
-    frames from which the first one and the second one have happened: in between, the order is seen."""
+    frames from which the first one and the second one have happened: in between, the order is seen. turns_deg: how far
+    the thing turns that the scene is about, where there is one: a seesaw that nothing strikes sorts nothing."""
 
     labels: Sequence[str | None]
     margin_m: float
     in_order: tuple[int, int] | None = None
+    turns_deg: float | None = None
 
 
 @dataclass(frozen=True)

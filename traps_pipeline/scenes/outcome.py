@@ -26,14 +26,15 @@ class Outcome:
     """What a run comes to, held against nothing yet.
 
     label: None if it is undecided at the end. commit_frame: first frame from which the label holds to the end (the
-    number of frames if it is undecided). margin_m: distance (m) of the end from the nearest other outcome. in_order: as
-    in `kit.Reading`.
+    number of frames if it is undecided). margin_m: distance (m) of the end from the nearest other outcome. in_order,
+    turns_deg: as in `kit.Reading`.
     """
 
     label: str | None
     commit_frame: int
     margin_m: float
     in_order: tuple[int, int] | None = None
+    turns_deg: float | None = None
 
     @property
     def answer(self) -> str:
@@ -49,7 +50,7 @@ def read_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
     commit = last_run(reading.labels)
     label = reading.labels[-1]
     committed = len(reading.labels) if label is None else commit
-    return Outcome(label, committed, float(reading.margin_m), reading.in_order)
+    return Outcome(label, committed, float(reading.margin_m), reading.in_order, reading.turns_deg)
 
 
 def last_run(labels: Sequence[str | None]) -> int:

@@ -1,34 +1,38 @@
 """A ball runs down a tilted board of pegs towards a seesaw above two coloured bins; the question is where it ends up.
 
-The ball is thrown up the bare head of the board, curves back and meets the pegs after about a second. Where it strikes
-the seesaw, this tips and sheds it into the red bin on the left or the blue one on the right; a ball that misses them
-lies in a grey tray at the side. Control: the whole run. Void: the clip ends before that. Each peg magnifies a
-difference in the ball's path about tenfold, so that what no pixel shows at the cut decides the place.
+The ball is thrown up the bare head of the board, curves back over the seesaw and meets the pegs after a second. A
+funnel below them leads it onto the seesaw, which tips under it and sheds it into the red bin on the left or the blue
+one on the right; a ball that flies past them lies in a grey tray at the side. Control: the whole run. Void: the clip
+ends before that. Each peg magnifies a difference in the ball's path about tenfold, so that what no pixel shows at the
+cut decides the place. Boards, what stands beside them and the floor differ, so that no two scenes look alike.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
 import numpy as np
 
-from traps_pipeline.scenes.kit import Inventory, Motion, Physics, Scene, View, add_box, listed, rgba, uniform
-from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place
+from traps_pipeline.scenes.kit import Box, Inventory, Motion, Physics, Scene, View, add_box, listed, rgba, uniform
+from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, turned
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.outcome import Reading
+from traps_pipeline.scenes.parts.outcome import Reading, turns_deg
 from traps_pipeline.scenes.parts.questions import Filled, Question, choice_of, either
 from traps_pipeline.scenes.parts.stage import Surface
-from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of
+from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, one_of, several_between, shuffled
 from traps_pipeline.scenes.vision import Blob, blobs, colour_mask, largest
 
 SILL_M = 0.03  # below the bins
-BIN_M = 0.17  # length of the walls between the bins
+BIN_M = 0.15  # length of the walls between the bins
 BARE_M = 0.02  # strip below their upper end without the bin's colour: what lies in a bin lies well inside
 BEAM_M = 0.010  # half the thickness of the seesaw
+TIP_M = 0.16  # the lower ends of the funnel over the pivot: a ball passes between them and the seesaw, however it tips
+FUNNEL_IN_M = 0.085  # so far they reach in over the bins
+STEEP = 1.3  # slope of the funnel
 SLICK = Surface(2e-4, sliding=0.5, spinning=3e-4)  # little resistance to turning, as a ball on the seesaw does
 # Boards, and the balls and seesaws that stand out against them. Red, blue and grey belong to the bins and trays.
 BALLS = {
@@ -48,13 +52,14 @@ BEAMS = {
 CLASHES = {("yellow", "orange"), ("green", "cyan"), ("purple", "purple")}  # ball and seesaw
 TRIM = {"wood": "grey", "white": "wood", "green": "wood", "purple": "grey", "black": "grey"}  # frame, walls and pegs
 CHOICES = {"left": "in the left bin (red)", "right": "in the right bin (blue)", "elsewhere": "somewhere else"}
-ROWS = peg_rows(4, 6)
+ROWS = peg_rows(5, 6)
+CRATES = ("grey", "wood", "white", "black")
 
 
 def _tilt(rng: np.random.Generator, so_far: Drawn) -> float:
-    """Before it, the side from which the ball crosses the middle: start and push follow from that."""
+    """Before it, the side on which the ball begins: start and push follow from that."""
     so_far["side"] = int(rng.choice([-1, 1]))
-    return uniform(rng, 24, 31)
+    return uniform(rng, 31, 35)
 
 
 def _beam_colour(rng: np.random.Generator, so_far: Drawn) -> str:
@@ -63,9 +68,48 @@ def _beam_colour(rng: np.random.Generator, so_far: Drawn) -> str:
     return str(rng.choice([beam for beam in beams if (ball, beam) not in CLASHES]))
 
 
+def _start(rng: np.random.Generator, so_far: Drawn) -> float:
+    """Well inside the frame, on the side that is drawn."""
+    return so_far["side"] * uniform(rng, 0.05, 0.35)
+
+
+def _push(rng: np.random.Generator, so_far: Drawn) -> float:
+    """So that the ball is over the seesaw after about a second, when it meets the pegs."""
+    return round((so_far["trays_m"][0] - so_far["trays_m"][1]) / 2 + uniform(rng, -0.12, 0.12) - so_far["start_m"], 4)
+
+
+def _rise(rng: np.random.Generator, so_far: Drawn) -> float:
+    """So far that the ball is back where it began after a second: it has not met a peg when the void may end."""
+    slowing = 5 / 7 * 9.81 * math.sin(math.radians(so_far["tilt_deg"]))
+    return round(slowing * uniform(rng, 1.0, 1.05) ** 2 / 8, 4)
+
+
+def _bands(rng: np.random.Generator, so_far: Drawn) -> tuple[float, ...]:
+    """Two bands, or none."""
+    so_far["half_m"] = so_far["bin_m"] + sum(so_far["trays_m"]) / 2
+    if so_far["bands"] == "none":
+        return ()
+    low, high = (-so_far["half_m"], so_far["half_m"]) if so_far["bands"] == "along" else (0.35, 1.5)
+    first, second = uniform(rng, low, (low + high) / 2 - 0.1), uniform(rng, (low + high) / 2, high - 0.1)
+    return tuple(round(at + wide, 3) for at in (first, second) for wide in (0, uniform(rng, 0.1, (high - low) / 3)))
+
+
+def _crates(rng: np.random.Generator, so_far: Drawn) -> tuple[tuple[float, ...], ...]:
+    """Boxes that stand beside the board, at most one on either side: how far across and away, half width and height."""
+    crates: list[tuple[float, ...]] = []
+    for side in (-1, 1):
+        if rng.random() < 0.6:
+            half, tall = uniform(rng, 0.06, 0.16), uniform(rng, 0.05, 0.25)
+            away = uniform(rng, 0.0, 1.0)
+            across = side * (so_far["half_m"] + 0.06 + half + uniform(rng, 0.0, 0.15))
+            crates.append((round(across, 4), away, half, tall))
+    so_far["crates"] = len(crates)
+    return tuple(crates)
+
+
 @dataclass(frozen=True)
 class Params:
-    """Lengths are measured on the board; sideways ones from its middle."""
+    """Lengths are measured on the board; sideways ones from its middle, those of bins and seesaw from the pivot."""
 
     rows: int = ROWS()
     peg_gap_m: float = ROWS()  # from peg to peg in a row
@@ -73,22 +117,38 @@ class Params:
     board_colour: str = one_of(*BALLS)
     tilt_deg: float = drawn_by(_tilt)  # of the board against the floor
     ball_colour: str = drawn_by(lambda rng, so_far: str(rng.choice(BALLS[so_far["board_colour"]])))
-    bin_m: float = between(0.29, 0.33)  # width of a coloured bin, from the middle outwards
-    width_m: float = between(1.15, 1.30)  # inside of the board
+    bin_m: float = between(0.36, 0.42)  # width of a coloured bin, from the middle outwards
+    trays_m: tuple[float, ...] = several_between(2, 0.09, 0.21)  # width of the trays to the left and to the right
     beam_m: float = drawn_by(  # half the length of the seesaw
-        lambda rng, so_far: round(so_far["bin_m"] - uniform(rng, 0.10, 0.12), 4)
+        lambda rng, so_far: round(so_far["bin_m"] - uniform(rng, 0.115, 0.145), 4)
     )
     swing_deg: float = between(14, 20)  # how far it tips
+    drop_m: float = between(0.015, 0.05)  # from its lower end to the bins: the further, the more balls fly past them
     row_gap_m: float = between(0.092, 0.100)  # from row to row, down the board
     square_pegs: bool = chance(0.35)
-    peg_radius_m: float = between(0.012, 0.016)
-    ball_radius_m: float = between(0.0345, 0.037)
-    start_m: float = drawn_by(lambda rng, so_far: so_far["side"] * uniform(rng, 0.05, 0.40))
-    push_m_s: float = drawn_by(lambda rng, so_far: -so_far["side"] * uniform(rng, 0.05, 0.45))  # sideways speed
-    rise_m: float = between(0.26, 0.36)  # how far up the board the throw carries
+    peg_radius_m: float = between(0.011, 0.014)
+    ball_radius_m: float = between(0.0355, 0.0375)
+    start_m: float = drawn_by(_start)
+    push_m_s: float = drawn_by(_push)  # sideways speed
+    rise_m: float = drawn_by(_rise)  # how far up the board the throw carries
     beam_colour: str = drawn_by(_beam_colour)
-    azimuth_deg: float = between(86, 94)
-    elevation_deg: float = looking_on(-6, 6)
+    bands: str = one_of("none", "along", "across")  # in another shade, painted on the board
+    bands_m: tuple[float, ...] = drawn_by(_bands)  # from where to where, in turn, from the left or from the sill
+    crates_m: tuple[tuple[float, ...], ...] = drawn_by(_crates)
+    crate_colours: tuple[str, ...] = shuffled(*CRATES)("crates")
+    beside_m: float = between(-0.45, 0.45)  # so much more of the floor is in view to the right, or to the left
+    azimuth_deg: float = between(82, 98)
+    elevation_deg: float = looking_on(-10, 6)
+
+    @property
+    def width_m(self) -> float:
+        """Inside of the board."""
+        return 2 * self.bin_m + sum(self.trays_m)
+
+    @property
+    def middle_m(self) -> float:
+        """Where the pivot is across the board."""
+        return (self.trays_m[0] - self.trays_m[1]) / 2
 
     @property
     def rim_m(self) -> float:
@@ -97,8 +157,8 @@ class Params:
 
     @property
     def pivot_m(self) -> float:
-        """Where the seesaw turns, measured up the board: its lower end just clears the bins."""
-        return self.rim_m + self.beam_m * math.sin(math.radians(self.swing_deg)) + 0.025
+        """Where the seesaw turns, measured up the board."""
+        return self.rim_m + self.beam_m * math.sin(math.radians(self.swing_deg)) + self.drop_m
 
 
 def build(p: Params, physics: Physics) -> Scene:
@@ -111,29 +171,78 @@ def build(p: Params, physics: Physics) -> Scene:
         light=(0.45, 0.45, 0.44),
         bounce=(-20000.0, -8.0),
     )
-    lowest = p.pivot_m + 0.075 + 2.4 * p.ball_radius_m
+    lowest = p.pivot_m + TIP_M + 0.03
     *rows, start = [lowest + row * p.row_gap_m for row in range(p.rows + 1)]
     top, side, trim = start + p.rise_m + 2.5 * p.ball_radius_m, board.side, TRIM[p.board_colour]
     SLICK.on(board.block("plate", (-board.outer, board.outer), (SILL_M, top), (-0.02, 0), p.board_colour))
     board.frame(SILL_M, top, trim)
-    edges = pairwise((-side, -p.bin_m, 0.0, p.bin_m, side))
+    _paint_bands(board, p, top)
+    left, middle, right = p.middle_m - p.bin_m, p.middle_m, p.middle_m + p.bin_m
+    edges = pairwise((-side, left, middle, right, side))
     for i, (across, colour) in enumerate(zip(edges, ("grey", "red", "blue", "grey"), strict=True)):
         board.block(f"paint_{i}", across, (SILL_M, p.rim_m - BARE_M), (0, 0.001), colour, solid=False)
-    for i, (x, high) in enumerate(((-p.bin_m, p.rim_m), (0.0, p.pivot_m - 0.035), (p.bin_m, p.rim_m))):
+    for i, (x, high) in enumerate(((left, p.rim_m), (middle, p.pivot_m - 0.035), (right, p.rim_m))):
         board.divider(i, x, (SILL_M, high), WALL_M / 2, trim)
     _add_seesaw(board, p)
-    board.pegs(rows, p.row_shifts_m, p.peg_gap_m, p.peg_radius_m, trim, square=p.square_pegs)
+    passed = _add_funnel(board, p, trim)
+    board.pegs(rows, p.row_shifts_m, p.peg_gap_m, p.peg_radius_m, trim, square=p.square_pegs, where=passed)
     ball = board.ball("ball", (p.start_m, start), p.ball_colour)
     ball.contype = ball.conaffinity = 3  # the seesaw's 2 as well as the board's 1
-    colours = sorted({"red", "blue", "grey", p.ball_colour, p.board_colour, p.beam_colour, trim})
+    _stand_crates(board, p)
+    colours = sorted({"red", "blue", "grey", p.ball_colour, p.board_colour, p.beam_colour, trim, *p.crate_colours})
+    nouns = ["ball", "board", "peg", "seesaw", "bin", "tray", "wall"]
+    out, (sill, head) = p.beside_m + math.copysign(board.outer, p.beside_m), board.ends(top)
+    beside = Box((out, sill.low[1], sill.low[2]), (out, sill.low[1], sill.low[2]))
     return Scene(
         spec=board.spec,
         view=View(azimuth_deg=p.azimuth_deg, elevation_deg=p.elevation_deg),
         decisive=("ball",),
-        stage=board.ends(top),
+        stage=(sill, head, beside),
         velocity={"ball": board.throw(p.push_m_s, p.rise_m)},
-        inventory=Inventory(tuple(colours), ("ball", "board", "peg", "seesaw", "bin", "tray", "wall")),
+        inventory=Inventory(tuple(colours), (*nouns, *(["box", "crate"] if p.crates_m else []))),
     )
+
+
+def _add_funnel(board: Board, p: Params, colour: str) -> Callable[[float, float], bool]:
+    """Two slanted bars that lead a ball at a side onto the seesaw. Returns whether a ball passes between them and a peg
+    at a place (across, up)."""
+    tip = p.pivot_m + TIP_M
+    feet = [p.bin_m - FUNNEL_IN_M + side * p.middle_m for side in (-1, 1)]
+    for name, side, foot in zip(("funnel_left", "funnel_right"), (-1, 1), feet, strict=True):
+        a, b = np.array([side * foot, tip]), np.array([side * board.side, tip + STEEP * (board.side - foot)])
+        middle, along = (a + b) / 2, b - a
+        bar = board.block(name, (-1e-3, 1e-3), (-1e-3, 1e-3), (0, board.deep), colour)
+        bar.pos = [float(middle[0]), float(middle[1]), board.deep / 2]
+        bar.size = [float(np.hypot(*along)) / 2, WALL_M / 2, board.deep / 2]
+        bar.quat = turned(math.atan2(along[1], along[0]), 3)
+        SLICK.on(bar)
+
+    def passed(across: float, up: float) -> bool:
+        foot = feet[0] if across < 0 else feet[1]
+        high = tip + STEEP * (board.side - foot) + p.ball_radius_m
+        return up > high or foot + (up - tip) / STEEP - abs(across) - p.peg_radius_m > 2.9 * p.ball_radius_m
+
+    return passed
+
+
+def _paint_bands(board: Board, p: Params, top: float) -> None:
+    """Two bands of another shade on the plate, from frame to frame."""
+    for i, (low, high) in enumerate(zip(p.bands_m[::2], p.bands_m[1::2], strict=True)):
+        across, up = (
+            ((low, min(high, board.side)), (SILL_M, top))
+            if p.bands == "along"
+            else ((-board.side, board.side), (low, min(high, top)))
+        )
+        if up[1] > up[0]:
+            band = board.block(f"band_{i}", across, up, (0, 0.0005), p.board_colour, solid=False)
+            band.rgba = [*(np.array(band.rgba[:3]) * 0.72 + (0.16 if p.board_colour == "black" else 0)), 1]
+
+
+def _stand_crates(board: Board, p: Params) -> None:
+    """Boxes on the floor beside the board, which nothing touches."""
+    for i, (colour, (across, away, half, tall)) in enumerate(zip(p.crate_colours, p.crates_m, strict=True)):
+        at = (across, away, tall)
+        add_box(board.spec.worldbody, f"crate_{i}", at, (half, half, tall), colour, contype=0, conaffinity=0)
 
 
 def _add_seesaw(board: Board, p: Params) -> None:
@@ -141,7 +250,7 @@ def _add_seesaw(board: Board, p: Params) -> None:
     import mujoco
 
     half_deep = board.deep / 2
-    body = board.body.add_body(name="seesaw", pos=[0, p.pivot_m, half_deep])
+    body = board.body.add_body(name="seesaw", pos=[p.middle_m, p.pivot_m, half_deep])
     joint = body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
     joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-p.swing_deg, p.swing_deg]
     joint.damping, joint.stiffness = [0.006, 0, 0], [0.03, 0, 0]
@@ -155,10 +264,12 @@ def outcome(motion: Motion, p: Params) -> Reading:
     """The bin that the ball's centre is in, or elsewhere for a tray at the side; None above the bins. The margin is how
     far that centre ends from where another place begins: a wall or the bins' rim."""
     across, up = place(motion, "ball", p.tilt_deg)
+    across = across - p.middle_m
     names = np.where(np.abs(across) > p.bin_m, "elsewhere", np.where(across < 0, "left", "right"))
     labels = [str(name) if u < p.rim_m - BARE_M else None for name, u in zip(names, up, strict=True)]
     off = abs(float(across[-1]))  # from the middle wall, which only a ball in a bin could have missed
-    return Reading(labels, min(abs(off - p.bin_m), off if off < p.bin_m else math.inf, p.rim_m - float(up[-1])))
+    margin = min(abs(off - p.bin_m), off if off < p.bin_m else math.inf, p.rim_m - float(up[-1]))
+    return Reading(labels, margin, turns_deg=turns_deg(motion.rot("seesaw")))
 
 
 def _places(p: Params, rng: np.random.Generator) -> Filled:
@@ -213,7 +324,7 @@ FAMILY = scene_family(
         _places,
     ),
     asides=[
-        either("How many rows of pegs are above the seesaw, 4, 5 or 6?", ("4", "5", "6"), lambda p: str(p.rows)),
+        either("How many rows of pegs are above the seesaw, 5 or 6?", ("5", "6"), lambda p: str(p.rows)),
         either("Are the pegs round or square?", ("round", "square"), lambda p: "square" if p.square_pegs else "round"),
         either(
             "In which half of the board is the ball when the clip begins, left or right?",
@@ -228,4 +339,6 @@ FAMILY = scene_family(
     ],
     observe=observe,
     min_margin_m=0.01,
+    perturbation=6e-4,
+    looks=("floor",),
 )

@@ -7,7 +7,7 @@ out of it towards the glass. Everything is added in the order of the calls, whic
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -144,18 +144,27 @@ class Board:
         self.post(f"tip_{i}", (x, up[1]), half_m, colour, square=True)
 
     def pegs(
-        self, heights: Sequence[float], shifts: Sequence[float], gap: float, radius: float, colour: str, *, square: bool
+        self,
+        heights: Sequence[float],
+        shifts: Sequence[float],
+        gap: float,
+        radius: float,
+        colour: str,
+        *,
+        square: bool,
+        where: Callable[[float, float], bool] = lambda across, up: True,
     ) -> None:
         """Rows of pegs from side to side, without those that leave a ball just enough room to jam at a side.
 
-        heights: up the board; shifts: sideways; one a row. gap: from peg to peg.
+        heights: up the board; shifts: sideways; one a row. gap: from peg to peg. where: whether a peg may stand at a
+        place (across, up).
         """
         reach = self.side - radius
         for row, (height, shift) in enumerate(zip(heights, shifts, strict=True)):
             for k in range(-20, 21):
                 x = shift + k * gap
                 room = reach - abs(x)
-                if room < 0 or 0.4 * self.ball_radius_m < room < 2.3 * self.ball_radius_m:
+                if room < 0 or 0.4 * self.ball_radius_m < room < 2.3 * self.ball_radius_m or not where(x, height):
                     continue
                 self.post(f"peg_{row}_{k + 20}", (x, height), radius, colour, square=square)
 

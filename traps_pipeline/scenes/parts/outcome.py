@@ -109,3 +109,10 @@ def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead
 def top_m(motion: Motion, body: str, height_m: float, floor_m: float = 0.0) -> np.ndarray:
     """Height over a floor of the middle of a standing or fallen body's top (m), shape (F,)."""
     return motion.pos(body)[:, 2] - floor_m + motion.rot(body)[:, 2, 2] * height_m / 2
+
+
+def turns_deg(rotations: np.ndarray) -> float:
+    """How far (degrees) a body is turned, in the frame where it is most, from how it stands at first. rotations: its
+    matrices, (F, 3, 3)."""
+    traces = np.einsum("fij,ij->f", rotations, rotations[0])
+    return float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)).max()))
