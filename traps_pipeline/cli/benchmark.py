@@ -43,7 +43,7 @@ def add(commands: Commands) -> None:
         choices=LOOKS,
         default=[],
         metavar="PART",
-        help=f"vary how scenes look, too: {', '.join(LOOKS)} (default: the floor under dice)",
+        help=f"vary how scenes look, too: {', '.join(LOOKS)} (default: the floor under dice and seesaws)",
     )
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
 
