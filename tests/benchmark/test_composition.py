@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
+from bench.lite import chosen
 from traps_pipeline.benchmark.composition import load_composition, prior_accuracy, problems
 from traps_pipeline.benchmark.evidence import answerable_ill_posed, answerable_voids, unanswerable_controls
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
-from traps_pipeline.paths import RELEASED
+from traps_pipeline.paths import ASSETS, RELEASED
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.spec import SceneSpec
 
@@ -197,3 +199,7 @@ def test_certify_passes_what_is_released_and_names_what_is_altered(
     assert main(command) == 1
     assert "no such trajectory" in capsys.readouterr().err
     load_released.cache_clear()
+
+
+def test_the_lite_set_is_the_one_that_its_rule_chooses_from_the_released_records() -> None:
+    assert yaml.safe_load((ASSETS / "lite.yaml").read_text())["scenarios"] == chosen()
