@@ -50,6 +50,9 @@ def test_a_text_cut_off_before_a_final_answer_is_truncated_and_one_cut_off_after
     assert read("The ball rolls down and I look at", "truncated").outcome == "truncated"
     assert read("The ball rolls down and I look at", "truncated").text is None
     assert read("The answer is: left. Moreover, the", "truncated").outcome == "answer"
+    assert read("**Answer:** left", "truncated").outcome == "answer"
+    for announced in ("The answer is:", "The answer is", "**Answer:**", "Final answer = "):
+        assert read(announced, "truncated").outcome == "truncated"
 
 
 def test_thoughts_between_tags_are_split_off_where_the_entry_declares_them() -> None:

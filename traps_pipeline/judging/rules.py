@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from traps_pipeline.judging.answers import NUMBER_WORDS, normalise, strip_fence
+from traps_pipeline.models.reading import FINAL
 from traps_pipeline.models.request import Outcome, Request
 
 COLOURS = (
@@ -96,7 +97,6 @@ _COMMITMENT = re.compile(
 )
 _TURN = re.compile(r"\W*(?:but|however|so|therefore|thus|hence|still|yet|nevertheless|nonetheless)\b")
 _REASON = re.compile(r"^\W*(?:because|since|as|given|due to|without|if|whether|which)\b")
-_FINAL = re.compile(r"\banswer\W*?(?:\bis\b\s*:?|[:=])\s*", re.IGNORECASE)
 # A clause ends at punctuation, at a line's end, and at a comma before a conjunction.
 _CLAUSE = re.compile(
     r"(?<=[^\d\s])[.:](?=\s|$|\*)|(?<=\d)[.:](?=\s|$)|[;!?\n]+"
@@ -144,7 +144,7 @@ def final_statement(answer: str) -> str:
     if isinstance(parsed, dict) and "final_answer" in parsed:
         abstains = parsed["final_answer"] is None or parsed.get("abstain") is True
         return "" if abstains else str(parsed["final_answer"])
-    pieces = _FINAL.split(answer)
+    pieces = FINAL.split(answer)
     return pieces[-1] if len(pieces) > 1 and normalise(pieces[-1]) else answer
 
 

@@ -16,8 +16,8 @@ from traps_pipeline.models.prompts import fields_of
 from traps_pipeline.models.request import JUDGED, WITH_TEXT
 
 THINKS = re.compile(r"<(/?)think(?:ing)?>", re.IGNORECASE)
-READING = "1"  # version of this module's rules; the answers' tables are stale when it is raised
-_FINAL = re.compile(r"\banswer\W*?(?:\bis\b\s*:?|[:=])\s*\S", re.IGNORECASE)
+READING = "2"  # version of this module's rules; the answers' tables are stale when it is raised
+FINAL = re.compile(r"\banswer\W*?(?:\bis\b\s*:?|[:=])\s*", re.IGNORECASE)  # what announces the final answer
 _WORD = re.compile(r"\w+")
 _LONGEST_UNIT, _LEAST_REPEATS, _LEAST_SHARE = 40, 6, 0.5  # words, times, of the text's words
 _LEAST_WORDS, _FEW_CHARACTERS = 12, 30
@@ -58,9 +58,14 @@ def read_answer(
             return Reading("truncated" if outcome == "truncated" else "empty", None, reasoning, is_json, "only thinks")
     if why := degenerate(text):
         return Reading("degenerate", None, reasoning, is_json, why)
-    if outcome == "truncated" and not (_FINAL.search(text) or _is_json(text, fields or ())):
+    if outcome == "truncated" and not (_says_its_answer(text) or _is_json(text, fields or ())):
         return Reading("truncated", None, reasoning, is_json, "cut off at the limit of tokens before a final answer")
     return Reading(JUDGED[0], text, reasoning, is_json)
+
+
+def _says_its_answer(text: str) -> bool:
+    """Whether a word follows what announces the final answer."""
+    return any(_WORD.search(piece) for piece in FINAL.split(text)[1:])
 
 
 def split_thinking(text: str) -> tuple[str, str]:

@@ -64,7 +64,8 @@ def decode(
     answers: dict[int, list[int]] = {}
     with torch.inference_mode():
         while True:
-            criteria: list[Any] = [_Stopping(stopped)] + ([_HalfEnded(ends, width)] if use_cache else [])
+            stopping = _Stopping(stopped)
+            criteria: list[Any] = [stopping] + ([_HalfEnded(ends, width)] if use_cache else [])
             with ExitStack() as stack:
                 if prefixes is not None and steering is not None:
                     stack.enter_context(resumed(model, prefixes, steering.layer))
@@ -79,7 +80,7 @@ def decode(
                 )
             made = out.sequences[:, width:]
             ended = _ended(made, ends)
-            full = made.shape[1] >= max_new_tokens or stopped() or not use_cache
+            full = made.shape[1] >= max_new_tokens or stopping.stopped or not use_cache
             for place, row in enumerate(rows):
                 if full or ended[place]:
                     answers[row] = made[place].tolist()
@@ -121,15 +122,16 @@ def _ended(made: Tensor, ends: Tensor) -> Tensor:
 
 
 class _Stopping:
-    """A stopping criterion of transformers that ends every row when told to."""
+    """A stopping criterion of transformers that ends every row when told to. stopped: whether it was told."""
 
-    def __init__(self, stopped: Callable[[], bool]) -> None:
-        self._stopped = stopped
+    def __init__(self, asked: Callable[[], bool]) -> None:
+        self._asked, self.stopped = asked, False
 
     def __call__(self, input_ids: Tensor, scores: Any, **_: Any) -> Tensor:
         import torch
 
-        return torch.full((len(input_ids),), self._stopped(), dtype=torch.bool, device=input_ids.device)
+        self.stopped = self._asked()
+        return torch.full((len(input_ids),), self.stopped, dtype=torch.bool, device=input_ids.device)
 
 
 class _HalfEnded:
