@@ -13,6 +13,7 @@ import yaml
 
 from tests.conftest import Checkout
 from tests.release.environments import run_in
+from tests.remedies.remedied import carries_out
 from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.benchmark.tables import ITEMS
@@ -232,8 +233,14 @@ def test_mlcroissant_validates_its_description_and_reads_every_record(released: 
 SIGN = """
 import sys
 from pathlib import Path
+from traps_pipeline.errors import TrapsError
 from traps_pipeline.release.signing import check_signature, sign
 folder, private, public, other = map(Path, sys.argv[1:])
+for refused in (lambda: sign(folder, public), lambda: check_signature(folder, public)):
+    try:
+        refused()
+    except TrapsError as error:
+        print(error)
 sign(folder, private)
 print(repr(check_signature(folder, public)))
 print(check_signature(folder, other).partition(" (")[0])
@@ -242,6 +249,11 @@ print(check_signature(folder, public).partition(" (")[0])
 """
 
 
+@carries_out(
+    "{}: cannot sign ({}); give a private elliptic key in PEM, e.g. of `openssl ecparam -name prime256v1 -genkey "
+    "-noout -out KEY.pem`",
+    "{}: is missing, so that there is nothing to verify; leave --key out",
+)
 def test_a_signature_is_of_its_key_over_these_files_alone(copy: Path, tmp_path: Path, demo: Checkout) -> None:
     keys = []
     for name in ("one", "two"):
@@ -252,4 +264,7 @@ def test_a_signature_is_of_its_key_over_these_files_alone(copy: Path, tmp_path: 
         keys += [private, public]
     printed = run_in("sign", "-c", SIGN, copy, keys[0], keys[1], keys[3], PYTHONPATH=str(demo.root))
     refused = "signature.sig.json: is not of this key over these files"
-    assert printed.splitlines() == ["''", refused, refused]
+    no_key, unsigned, *checked = printed.splitlines()
+    assert "one.pub: cannot sign (" in no_key and "give a private elliptic key in PEM" in no_key
+    assert "signature.sig.json: is missing, so that there is nothing to verify; leave --key out" in unsigned
+    assert checked == ["''", refused, refused]

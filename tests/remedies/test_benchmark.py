@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,18 @@ from typing import Any
 import pytest
 
 from tests.remedies.remedied import remedied
+from tests.scenes.test_encode import frames
+from traps_pipeline.benchmark import arms, videos
 from traps_pipeline.benchmark.corrections import Correction, check_benchmark, fold, read_corrections
 from traps_pipeline.benchmark.decisions import FILE, DecidedMeanwhile, decide, decisions_on, undo
 from traps_pipeline.benchmark.held_out import held_out_key
+from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.records import RELEASED, load_released
-from traps_pipeline.benchmark.specs import resolve_scenario
+from traps_pipeline.benchmark.specs import build_specs, resolve_scenario
+from traps_pipeline.benchmark.tables import ARMS, SCENE_SPECS, VIDEOS, ArmRow, VideoRow
+from traps_pipeline.scenes.encode import DamagedClip, decode, encode
 from traps_pipeline.scenes.spec import load_trajectory
-from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.study import Asked, Study
 from traps_pipeline.storage.workspace import Workspace
 
 ID, OTHER = "domino_chain-0001", "plinko-0003"
@@ -198,3 +204,67 @@ def test_corrected_parameters_are_simulated_once_the_line_is_as_told(tmp_path: P
         "these parameters make no valid pair ({}); change them or discard it",
         write(path, correction(params={"azimuth_deg": azimuth})),
     )
+
+
+# --- clips and items --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_clips_arms_and_items_are_made_once_what_they_are_of_is(tmp_path: Path) -> None:
+    """One chaotic scenario from its record to the items of an arm, each stage asked too early first."""
+    asked = Asked(datasets=("chaotic", "length_matched"), models=("oracle",), regimes=("standard",), runs=(1,))
+    study = Study(panel="rules", scenarios=[OTHER], experiments={"one": asked})
+    workspace, part = Workspace.create(tmp_path / "study", study), {"category": "plinko"}
+    tables = workspace.tables
+    tables.write(SCENE_SPECS, part, build_specs(workspace, "plinko")[0], {})
+    (row,) = tables.read(SCENE_SPECS, part).to_dict("records")
+    row = {str(name): value for name, value in row.items()}
+    filmed = list[VideoRow]()
+    rendered = remedied(
+        lambda: list(videos._rows(workspace, row, videos._job(workspace, row), "1")),
+        "benchmark/videos.py | {}: was not rendered; run again",
+        lambda: filmed.extend(videos.build_videos(workspace, "plinko")[0]),
+    )
+    assert [each.side for each in rendered] == [each.side for each in filmed] == ["control", "void", "twin"]
+
+    tables.write(VIDEOS, part, [replace(each, scene_hash="another") for each in filmed], {})
+    remedied(
+        lambda: build_items(workspace, "chaotic"),
+        "items {}: the {} clip of {} is not of its current scene; materialize videos for {}",
+        lambda: tables.write(VIDEOS, part, filmed, {}),
+    )
+
+    made = list[ArmRow]()
+    remedied(
+        lambda: list(arms._rows(workspace, row, "length_matched", {}, "1")),
+        "benchmark/arms.py | {}: was not filmed; run again",
+        lambda: made.extend(arms.build_arms(workspace, "plinko")[0]),
+    )
+    tables.write(ARMS, part, [replace(each, refused="its outcome is settled too late") for each in made], {})
+    items = remedied(
+        lambda: build_items(workspace, "length_matched"),
+        "items {}: no scenario of this study admits it; take more scenarios or leave the arm out",
+        lambda: tables.write(ARMS, part, made, {}),
+    )
+    assert [item.scenario_id for item in items] == [OTHER]
+
+
+def test_a_clip_that_holds_fewer_frames_than_it_promises_is_made_again(tmp_path: Path) -> None:
+    clip = tmp_path / "clip.mp4"
+    encode(frames(3), clip, 10)
+    data = clip.read_bytes()
+    sizes = data.index(b"stsz") + 16  # behind it: the sizes of the frames, four bytes each; the last one ends the file
+    last = int.from_bytes(data[sizes + 8 : sizes + 12])
+
+    def made_again() -> None:
+        clip.unlink()
+        encode(frames(3), clip, 10)
+
+    clip.write_bytes(data[:-last])
+    decoded, _ = remedied(
+        lambda: decode(clip),
+        "{}: holds {} of {} frames; delete the file and materialize videos again",
+        made_again,
+        error=DamagedClip,
+    )
+    assert len(decoded) == 3

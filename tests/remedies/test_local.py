@@ -16,6 +16,7 @@ from tests.remedies.remedied import remedied
 from traps_pipeline.models.local.adapter import load_local_model
 
 pytestmark = pytest.mark.slow
+LLAVA = {"processor_class": "LlavaProcessor"}  # of images alone
 
 
 @pytest.fixture
@@ -149,3 +150,48 @@ def test_a_checkpoint_that_says_how_an_answer_ends_answers(folder: Path) -> None
         "names no token that ends an answer; set eos_token_id in its generation_config.json",
         lambda: config.write_text(json.dumps(said)),
     )
+
+
+def test_a_processor_that_takes_videos_is_named(folder: Path) -> None:
+    (folder / "video_preprocessor_config.json").unlink(missing_ok=True)
+    for path in folder.glob("*config.json"):
+        said = json.loads(path.read_text())
+        if "processor_class" in said:
+            path.write_text(json.dumps({k: v for k, v in said.items() if k != "video_processor"} | LLAVA))
+    remedied(
+        lambda: load_local_model(entry("qwen3-vl", folder)),
+        "checkpoint {}: {} takes no videos; name a model that does",
+        again=lambda: load_local_model(entry("qwen3-vl", checkpoint("qwen3-vl"))),
+    )
+
+
+def test_a_download_that_is_completed_is_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The hub's cache as it is laid out on a disk; what a second download would bring is put there by hand."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    repository, commit = tmp_path / "models--nobody--nothing", "0" * 40
+    snapshot = repository / "snapshots" / commit
+    shutil.copytree(checkpoint("qwen3-vl"), snapshot)
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text(commit)
+    (snapshot / "model.safetensors").unlink()
+    remedied(
+        lambda: load_local_model(entry("qwen3-vl", "nobody/nothing")),
+        "models/local/checkpoint.py | run `{}` again to complete it",
+        lambda: shutil.copy(checkpoint("qwen3-vl") / "model.safetensors", snapshot),
+    )
+
+
+def test_a_prompt_that_does_not_fit_is_answered_once_memory_is_freed(monkeypatch: pytest.MonkeyPatch) -> None:
+    of = model("qwen3-vl")
+
+    def full(*_: object) -> None:
+        raise torch.OutOfMemoryError
+
+    with monkeypatch.context() as memory:
+        memory.setattr(of, "_one_batch", full)
+        (answer,) = remedied(
+            lambda: of.generate([ask(of)], 2),
+            "new ones: free memory, show fewer frames or use a larger device",
+            memory.undo,
+        )
+    assert answer.tokens

@@ -11,27 +11,35 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.local_models import QUESTIONS, SYSTEM, ask, model
 from tests.mechanism.study import PAIRS, SETTINGS, make_study, write_verdicts
 from tests.mechanism.test_directions import origin, pair_states
+from tests.mechanism.test_gate import study as gated
 from tests.mechanism.test_probes import LAYERS, random_states
 from tests.mechanism.test_probes import study as probed
 from tests.mechanism.test_stages import STANDARD, entry, own, patch, study
 from tests.remedies.remedied import carries_out, remedied
 from traps_pipeline import inside
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
-from traps_pipeline.mechanism import stages
+from traps_pipeline.mechanism import margin, stages
+from traps_pipeline.mechanism.baselines import output_margins, probed_items
+from traps_pipeline.mechanism.contrast import contrast_states
 from traps_pipeline.mechanism.directions import extract_directions, load_directions, save_directions
+from traps_pipeline.mechanism.gate import OTHER_DATASETS, Items, decide
+from traps_pipeline.mechanism.hidden_states import Item, Pooling, item_states
 from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.patched import WELL_POSED, patching_rows
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.probes import fit_probe, scenario_folds, solve_gram
 from traps_pipeline.mechanism.probing import NothingConfabulated, ProbeRun, confabulated_scenarios
 from traps_pipeline.mechanism.steering import strengths
 from traps_pipeline.mechanism.stored import StoredStates
-from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES
+from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import DATASETS, Extraction, StatesCell
-from traps_pipeline.storage.study import MechanismSettings, ProbeSettings
+from traps_pipeline.storage.study import Asked, MechanismSettings, PatchingSettings, ProbeSettings
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -339,3 +347,116 @@ def test_a_direction_of_this_model_and_a_block_that_it_has_are_steered(study: Wo
             "this direction has no class gap; give amount, or take a direction of `inside.direction`",
             again=apply(of, **dose),
         )
+
+
+def test_items_and_states_are_joined_once_states_are_extracted_again(own: Workspace) -> None:
+    items = own.tables.read(PROBE_ITEMS, {"dataset": "chaotic"})
+    own.tables.write(PROBE_ITEMS, {"dataset": "chaotic"}, items[1:], {})
+    joined = remedied(
+        lambda: probed_items(own, StoredStates.of(own, STANDARD), "chaotic"),
+        "probe_items {}: has no {}, which has states; materialize hidden_states again",
+        extracted(own),
+    )
+    assert list(joined["item_id"]) == list(items["item_id"][1:])
+
+
+def test_a_margin_is_read_and_parts_are_averaged_under_a_pooling_that_there_is(
+    own: Workspace, entry: ModelEntry
+) -> None:
+    settings = own.mechanism
+
+    def pooled(pooling: str) -> Workspace:
+        own.allow(mechanism=settings.model_copy(update={"pooling": pooling}))
+        return Workspace.open(own.root)
+
+    extracted(pooled("mean"))()
+    margins = remedied(
+        lambda: output_margins(entry, StoredStates.of(own, STANDARD), ["chaotic"]),
+        "states are means over tokens; set `pooling: last` to read the output margin",
+        lambda: extracted(pooled("last"))(),
+    )
+    assert np.isfinite(margins["chaotic"]).all() and len(margins["chaotic"]) == 2 * PAIRS
+
+
+def test_parts_that_a_prompt_lacks_are_not_averaged() -> None:
+    of = model("llava-next-video")
+    prompt = ask(of, QUESTIONS[1])
+
+    def states(pooling: Pooling) -> Callable[[], object]:
+        about = {"system": SYSTEM, "question": QUESTIONS[1]}
+        return lambda: item_states(of, Item("one", "control", about, lambda: prompt), prompt, pooling)
+
+    remedied(
+        states("stamps"),
+        "mechanism/hidden_states.py | {}: its prompt for {} has no {}; choose another pooling",
+        again=states("question"),
+    )
+
+
+def test_what_needs_an_abstentions_first_token_is_left_out_for_a_model_without_one(
+    own: Workspace, entry: ModelEntry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = Asked(datasets=("chaotic",), models=("tiny",), regimes=("standard",), runs=(1,), mechanism=True)
+    patching = own.mechanism.model_copy(update={"patching": PatchingSettings(pairs=1)})
+    own.allow(mechanism=patching, experiments={"inside": asked}, scenarios=["plinko-0001"])
+    monkeypatch.setattr(margin, "begins_abstention", lambda token: False)  # as in a vocabulary of another language
+
+    def patched_if_wanted() -> object:
+        workspace = Workspace.open(own.root)
+        return patching_rows(workspace, entry, STANDARD) if Wanted(workspace).patches else None
+
+    nothing = remedied(
+        patched_if_wanted,
+        "so its output margin cannot be read; set `patching: null` in the experiment and in study.yaml",
+        lambda: Workspace.open(own.root).allow(mechanism=patching.model_copy(update={"patching": None})),
+    )
+    assert nothing is None
+
+
+def test_activations_are_patched_once_there_are_probe_items(own: Workspace, entry: ModelEntry) -> None:
+    own.allow(mechanism=own.mechanism.model_copy(update={"patching": PatchingSettings(pairs=1, sites=("residual",))}))
+    items = {dataset: own.tables.read(PROBE_ITEMS, {"dataset": dataset}) for dataset in WELL_POSED}
+    for dataset in WELL_POSED:
+        own.tables.path(PROBE_ITEMS, {"dataset": dataset}).unlink()
+    rows = remedied(
+        lambda: patching_rows(Workspace.open(own.root), entry, STANDARD),
+        "patching: no pairs of a well-posed dataset; materialize probe_items first",
+        lambda: own.tables.write(PROBE_ITEMS, {"dataset": "chaotic"}, items["chaotic"], {}),
+    )
+    assert {row.dataset for row in rows} == {"chaotic"}
+
+
+def test_pairs_of_statements_are_read_once_the_dataset_has_states(own: Workspace) -> None:
+    cell = StatesCell("occlusion", STANDARD)
+    own.tables.path(HIDDEN_STATES, cell.partition).unlink()
+    made = remedied(
+        lambda: contrast_states(own, STANDARD, 2, ["occlusion"]),
+        "mechanism/contrast.py | no hidden states of {}; materialize hidden_states for it first",
+        extracted(own, cell),
+    )
+    assert len(made["occlusion"]) == 2 * PAIRS
+
+
+def test_features_of_all_items_are_put_through_the_protocol(study: Workspace) -> None:
+    whole = inside.load(study, "tiny", layer=2)
+
+    def figures(features: inside.Loaded) -> Callable[[], pd.DataFrame]:
+        return lambda: inside.protocol(study, "tiny", layer=2, features=features)
+
+    remedied(
+        figures(inside.Loaded(whole.X[2:], whole.items.iloc[2:])),
+        "`features` lacks {} items of {}; give all items of it",
+        again=figures(whole),
+    )
+
+
+def test_a_gate_is_fitted_once_a_dataset_of_its_source_has_states() -> None:
+    items, _ = gated()
+    target = (items.table["dataset"] == "chaotic").to_numpy()
+    alone = Items(items.table[target].reset_index(drop=True), items.features[target])
+    settings = {"folds": 3, "seed": 1, "false_abs": 0.05}
+    remedied(
+        lambda: decide(alone, OTHER_DATASETS, "chaotic", **settings),
+        "a gate from {} has no items; extract the hidden states of its datasets first",
+        again=lambda: decide(items, OTHER_DATASETS, "chaotic", **settings),
+    )

@@ -39,7 +39,7 @@ def abstention_tokens(model: LocalModel) -> list[int]:
     if not found:
         raise TrapsError(
             f"{model.checkpoint.name}: no token of its vocabulary begins an abstention ({', '.join(PHRASES)}), so its "
-            "output margin cannot be read; leave out what needs it"
+            "output margin cannot be read; set `patching: null` in the experiment and in study.yaml"
         )
     return found
 
