@@ -13,7 +13,9 @@ from safetensors.torch import load_file, save_file
 
 from tests.local_models import NF4_SKIP, ask, checkpoint, entry, model
 from tests.remedies.remedied import remedied
+from traps_pipeline.mechanism.adapter_checks import CHECKS
 from traps_pipeline.models.local.adapter import load_local_model
+from traps_pipeline.study.doctor import examine_local
 
 pytestmark = pytest.mark.slow
 LLAVA = {"processor_class": "LlavaProcessor"}  # of images alone
@@ -195,3 +197,13 @@ def test_a_prompt_that_does_not_fit_is_answered_once_memory_is_freed(monkeypatch
             memory.undo,
         )
     assert answer.tokens
+
+
+def test_a_model_that_runs_here_is_looked_into() -> None:
+    findings = remedied(
+        lambda: [*examine_local(["gpt-5-mini"])],
+        "{}: runs elsewhere, so nobody looks into it; name one of {}",
+        again=lambda: [*examine_local(["pocket"])],
+    )
+    assert all(finding.ok for finding in findings if finding.what.startswith("pocket, ")), findings
+    assert len([finding for finding in findings if finding.what.startswith("pocket, ")]) == len(CHECKS)

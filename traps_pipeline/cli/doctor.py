@@ -13,7 +13,10 @@ def add(commands: Commands) -> None:
     """Add `traps doctor`."""
     parser = commands.add("doctor", doctor, "check this machine: render and encode a frame, and name what is missing")
     parser.add_argument(
-        "--local", action="store_true", help="check local models instead: tiny checkpoints of each family, devices, NF4"
+        "--local",
+        nargs="*",
+        metavar="MODEL",
+        help="check local models instead: devices, NF4, tiny checkpoints of each family, and the models that are named",
     )
     parser.add_argument(
         "--verify", action="store_true", help="read every table, ledger and clip of the study whole, and name damage"
@@ -29,11 +32,12 @@ def doctor(arguments: argparse.Namespace) -> int:
         for finding in findings:
             print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}", flush=True)
         return OK if all(finding.ok for finding in findings) else FAILED
-    if arguments.local:
+    local = arguments.local is not None
+    if local:
         require("local")
-    who, needs = ("local models", "need") if arguments.local else ("the demo", "needs")
+    who, needs = ("local models", "need") if local else ("the demo", "needs")
     problems = 0
-    for finding in examine_local() if arguments.local else examine(place_of(arguments)):
+    for finding in examine_local(arguments.local) if local else examine(place_of(arguments)):
         print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.detail}", flush=True)
         problems += not finding.ok
     print(

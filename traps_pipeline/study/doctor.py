@@ -7,15 +7,19 @@ import sqlite3
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import PART
 from traps_pipeline.storage.place import Place, scratch_of
+
+if TYPE_CHECKING:
+    from traps_pipeline.mechanism.adapter_checks import Subject
 
 MIN_FREE_GB = 1.0
 STATES = ("*.safetensors", "*.parquet")  # files of an extraction
@@ -47,18 +51,49 @@ def examine(place: Place) -> Iterator[Finding]:
         yield _finding(what, look)
 
 
-def examine_local() -> Iterator[Finding]:
-    """One finding for each requirement of local models: the three families on tiny checkpoints, devices and weights."""
+def examine_local(models: Sequence[str] = ()) -> Iterator[Finding]:
+    """One finding for each requirement of local models: the three families on tiny checkpoints, devices and weights,
+    and what looking into a model takes for granted, of those and of the models of the registry that are named."""
+    from traps_pipeline.mechanism import adapter_checks
     from traps_pipeline.models.local import selfcheck
+    from traps_pipeline.models.local.adapter import load_local_model
     from traps_pipeline.models.local.tiny import FAMILIES
+    from traps_pipeline.models.registry import LOCAL, get_model, local_models
 
+    named = [get_model(model) for model in models]
+    for entry in named:
+        if entry.backend != LOCAL:
+            raise TrapsError(
+                f"{entry.id}: runs elsewhere, so nobody looks into it; name one of {', '.join(local_models())}"
+            )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         yield _finding("devices", selfcheck.describe_devices)
         for family in FAMILIES:
             yield _finding(family, partial(selfcheck.check_family, family, folder))
+            yield from _inside(family, partial(adapter_checks.tiny_subject, family, folder))
         yield _finding("nf4", lambda: selfcheck.check_nf4(folder))
         yield _finding("checkpoints", selfcheck.describe_checkpoints)
+    for entry in named:
+        yield from _inside(
+            entry.id,
+            lambda entry=entry: adapter_checks.Subject(
+                load_local_model(entry, inside=True), *adapter_checks.brightening()
+            ),
+        )
+
+
+def _inside(name: str, load: Callable[[], Subject]) -> Iterator[Finding]:
+    """One finding for each check of a model; one alone where it cannot be loaded."""
+    from traps_pipeline.mechanism.adapter_checks import CHECKS
+
+    try:
+        subject = load()
+    except Exception as error:  # noqa: BLE001 - whatever the library raises becomes a finding
+        yield Finding(False, name, f"{type(error).__name__}: {error}")
+        return
+    for check in CHECKS:
+        yield _finding(f"{name}, {check.name}", partial(check.found, subject))
 
 
 def examine_files(place: Place) -> Iterator[Finding]:

@@ -1,0 +1,98 @@
+"""The checks of an adapter: each holds on the three families as the page says, and each loses where it is broken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.local_models import FAMILIES, model
+from tests.models.local import check_table
+from tests.remedies.remedied import carries_out
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
+from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.models.local import capture, clips, prefixes
+from traps_pipeline.models.local.model import LocalModel
+
+pytestmark = pytest.mark.slow
+BY_NAME = {check.name: check for check in CHECKS}
+
+
+def test_the_page_has_the_table_of_checks(tmp_path: Path) -> None:
+    assert check_table.written() == check_table.table(tmp_path)
+    assert [*check_table.NAMES] == [*FAMILIES]
+
+
+def one_block_late(patch: pytest.MonkeyPatch) -> None:
+    """States are taken before a block in place of behind it."""
+    first = capture.first_tensor
+    patch.setattr(capture, "first_tensor", lambda output: first(output) + 1)
+
+
+def a_hook_that_stays(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Steering, "applied", _adding_always)
+
+
+def _adding_always(self: Steering, model: LocalModel) -> Any:
+    @contextmanager
+    def applied() -> Iterator[None]:
+        handle = model.block(self.layer).register_forward_hook(lambda _, __, out: out)
+        try:
+            yield
+        finally:
+            handle.remove()
+
+    return applied()
+
+
+def rounded_features(patch: pytest.MonkeyPatch) -> None:
+    made = clips._Features
+    patch.setattr(clips, "_Features", lambda tokens, deepstack: made(tokens * 1.01, deepstack))
+
+
+def prefixes_of_other_states(patch: pytest.MonkeyPatch) -> None:
+    record = prefixes._record
+
+    def other(*of: Any) -> prefixes.Prefix | None:
+        made = record(*of)
+        return made and replace(made, states=-made.states)
+
+    patch.setattr(prefixes, "_record", other)
+
+
+@carries_out("{}; install the pinned versions, or do not look into this model")  # what is broken stands for another
+@pytest.mark.parametrize(
+    ("check", "broken", "said"),
+    [
+        ("states", one_block_late, "hooked states differ from the library's own at layers"),
+        ("alpha 0", a_hook_that_stays, "steering with alpha 0 leaves a hook"),
+        ("alpha", a_hook_that_stays, "a steered state at layer 2 is not the plain one and alpha times v"),
+        ("clips", rounded_features, "a remembered clip gives other states"),
+        ("resuming", prefixes_of_other_states, "a resumed answer is another one"),
+    ],
+)
+def test_a_check_loses_where_the_adapter_is_broken(
+    check: str, broken: Callable[[pytest.MonkeyPatch], None], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    subject = Subject(model("qwen3-vl"), *brightening())
+    subject.model.clips, subject.model.prefixes = clips.ClipMemory(), prefixes.PrefixMemory()
+    with monkeypatch.context() as patch:
+        broken(patch)
+        with pytest.raises(TrapsError, match=said):
+            BY_NAME[check].found(subject)
+    subject.model.clips, subject.model.prefixes = clips.ClipMemory(), prefixes.PrefixMemory()
+    BY_NAME[check].found(subject)
+
+
+def test_in_sixteen_bits_what_rounding_changes_is_not_looked_at() -> None:
+    subject = Subject(model("qwen3-vl", dtype="bfloat16"), *brightening())
+    found = {check.name: check.found(subject) for check in CHECKS}
+    assert found["states"] == "5 states, bit for bit"
+    assert found["batches"] == "not looked at: in bfloat16 rounding differs with the shape of a pass"
+    assert np.isfinite(subject.model.forward_states(subject.prompts[0]).raw).all()

@@ -1,0 +1,258 @@
+"""What looking into a local model takes for granted, as checks that any adapter passes or says why not: `traps doctor
+--local` runs them on a tiny checkpoint of each family, and on a model that is named; docs/local.md has the table.
+
+The tests go further (tests/models/local, tests/mechanism); a check is what can be held on any checkpoint in seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.margin import abstention_tokens
+from traps_pipeline.mechanism.patching import SITES, Patch, patched_changes, record, require_patchable
+from traps_pipeline.models.local.clips import ClipMemory
+from traps_pipeline.models.local.model import LocalModel
+from traps_pipeline.models.local.prefixes import PrefixMemory, resumable
+from traps_pipeline.models.local.prompts import Prompt
+from traps_pipeline.models.local.selfcheck import tiny_model
+from traps_pipeline.models.local.spans import spans
+from traps_pipeline.models.local.tiny import Family
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+SYSTEM = "You are asked about a video."
+QUESTIONS = ("Does it grow brighter?", "Does the picture end up bright, dark, or as it was?", "Which?")
+NEW_TOKENS = 8
+CLOSE = 1e-4  # of effects; and of means, relative to the largest state
+EXACT = ("float32",)  # in 16 bits rounding differs with the shape of a batch
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A model and a clip to ask it about: frames (N, H, W, 3) uint8 RGB, two or more, and their times in seconds."""
+
+    model: LocalModel
+    frames: np.ndarray
+    times_s: np.ndarray
+
+    @cached_property
+    def prompts(self) -> list[Prompt]:
+        """Prompts of three lengths about the clip."""
+        return [self.model.prompt(SYSTEM, question, self.frames, self.times_s) for question in QUESTIONS]
+
+    @cached_property
+    def direction(self) -> np.ndarray:
+        """A random unit vector as wide as the states, (d,) float32."""
+        drawn = np.random.default_rng(0).normal(size=self.model.d_model)
+        return (drawn / np.linalg.norm(drawn)).astype(np.float32)
+
+    @property
+    def layer(self) -> int:
+        """A layer in the middle."""
+        return max(1, self.model.n_layers // 2)
+
+    def steered(self, *alphas: float) -> Steering:
+        """Steering by the random direction, at so many times the length of the state there."""
+        length = float(np.linalg.norm(self.model.forward_states(self.prompts[0]).raw[self.layer]))
+        return Steering(self.direction, self.layer, tuple(alpha * length for alpha in alphas))
+
+
+@dataclass(frozen=True)
+class Check:
+    """promise: what holds, in words. run: what was found, in a few words; raises TrapsError where it does not hold.
+    exact: it is held to the bit or nearly, so only in float32."""
+
+    name: str
+    promise: str
+    run: Callable[[Subject], str]
+    exact: bool = True
+
+    def found(self, subject: Subject) -> str:
+        """What was found of a model. Raises TrapsError where the promise does not hold."""
+        dtype = subject.model.params.dtype
+        if self.exact and (dtype not in EXACT or subject.model.params.quantisation != "none"):
+            return f"not looked at: in {dtype} rounding differs with the shape of a pass"
+        return self.run(subject)
+
+
+def _require(holds: bool, said: str) -> None:
+    if not holds:
+        raise TrapsError(f"{said}; install the pinned versions, or do not look into this model")
+
+
+# --- states -----------------------------------------------------------------------------------------------------------
+
+
+def _library_states(subject: Subject, prompt: Prompt) -> list[Tensor]:
+    """The library's own states of a prompt, (T, d) each: embeddings, outputs of blocks, the last one normed."""
+    import torch
+
+    model = subject.model
+    with torch.inference_mode():
+        out = model.network.base_model(**model.placed(prompt.inputs), use_cache=False, output_hidden_states=True)
+    return [states[0].float().cpu() for states in out.hidden_states]
+
+
+def _states(subject: Subject) -> str:
+    prompt = subject.prompts[0]
+    own, hooked = _library_states(subject, prompt), subject.model.forward_states(prompt)
+    ours = [*hooked.raw[:-1], hooked.normed]
+    wrong = [layer for layer, (a, b) in enumerate(zip(ours, own, strict=True)) if (a != b[-1].numpy()).any()]
+    _require(not wrong, f"hooked states differ from the library's own at layers {wrong}")
+    return f"{len(own)} states, bit for bit"
+
+
+def _steered_states(subject: Subject) -> str:
+    prompt, layer = subject.prompts[0], subject.layer
+    push = subject.steered(-0.5)
+    plain, steered = (subject.model.forward_states(prompt, steering=steering) for steering in (None, push))
+    exact = steered.raw[layer] == plain.raw[layer] + np.float32(push.alphas[0]) * push.direction
+    _require(bool(exact.all()), f"a steered state at layer {layer} is not the plain one and alpha times v")
+    _require(bool((steered.raw[:layer] == plain.raw[:layer]).all()), f"steering layer {layer} changes a layer below it")
+    _require(bool((steered.normed != plain.normed).any()), f"steering layer {layer} changes nothing above it")
+    return "exactly"
+
+
+def _zero(subject: Subject) -> str:
+    import torch
+
+    model, none = subject.model, subject.steered(0.0, 0.0, 0.0)
+
+    def hooks() -> int:
+        return sum(len(module._forward_hooks) for module in model.network.modules())
+
+    before, plain = hooks(), model.forward(subject.prompts[0]).last_hidden_state
+    with none.applied(model):
+        _require(hooks() == before, "steering with alpha 0 leaves a hook")
+        _require(torch.equal(model.forward(subject.prompts[0]).last_hidden_state, plain), "alpha 0 changes states")
+    answers = [model.generate(subject.prompts, NEW_TOKENS, steering=steering) for steering in (None, none)]
+    _require(answers[0] == answers[1], "alpha 0 changes answers")
+    return "no bit changes"
+
+
+# --- parts of a prompt ------------------------------------------------------------------------------------------------
+
+
+def _parts(subject: Subject) -> str:
+    prompt, question = subject.prompts[1], QUESTIONS[1]
+    found, decode = spans(subject.model, prompt, SYSTEM, question), subject.model.processor.tokenizer.decode
+    ids = prompt.inputs["input_ids"][0]
+    for name, text in (("system", SYSTEM), ("question", question)):
+        there = "".join(decode(ids[found[name]]).split())
+        _require(there == "".join(text.split()), f"the tokens of the {name} read {there[:80]!r}")
+    _require(bool(found["visual"].any()), "no visual token is found")
+    stamps = int(found["stamps"].sum())
+    times = f"{stamps} of time stamps" if stamps else "it writes no times"
+    return f"{int(found['visual'].sum())} visual tokens, {times}"
+
+
+def _pooled(subject: Subject) -> str:
+    prompt = subject.prompts[1]
+    chosen = spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
+    ours = subject.model.forward_states(prompt, "question", chosen=chosen).raw[subject.layer]
+    own = _library_states(subject, prompt)[subject.layer][chosen].mean(dim=0).numpy()
+    _require(np.abs(ours - own).max() <= CLOSE * np.abs(own).max(), "the mean over the question is another one")
+    return "equal"
+
+
+# --- patching ---------------------------------------------------------------------------------------------------------
+
+
+def _patching(subject: Subject) -> str:
+    model = subject.model
+    try:
+        require_patchable(model)
+    except TrapsError as why:
+        return f"refused: {str(why).partition(': ')[2].partition(' (')[0]}"
+    tokens = abstention_tokens(model)
+    other = model.prompt(SYSTEM, QUESTIONS[0], 255 - subject.frames, subject.times_s)
+    target, source = (record(model, prompt, tokens) for prompt in (subject.prompts[0], other))
+    whole = np.ones(target.length, bool)
+    everywhere = [Patch("residual", layer, whole) for layer in range(model.n_layers + 1)]
+    sites = [Patch(site, layer, whole) for site in SITES for layer in range(1, model.n_layers + 1)]
+    same = patched_changes(model, target, target, [*everywhere, *sites], tokens)
+    _require(bool((same == 0).all()), "a patch with itself changes the outcome")
+    gap = source.margin - target.margin
+    far = np.abs(patched_changes(model, target, source, everywhere, tokens) / gap - 1)
+    _require(bool(gap and far.max() <= CLOSE), f"patching all positions misses the source's outcome by {far.max():.1e}")
+    return "exactly 0, and 1" + ("" if target.visual is None else " with deepstack features")
+
+
+# --- faster ways ------------------------------------------------------------------------------------------------------
+
+
+def _clips(subject: Subject) -> str:
+    model, memory = subject.model, ClipMemory()
+    plain = [model.forward_states(prompt).raw for prompt in subject.prompts]
+    with memory.remembering(model.network):
+        known = [model.forward_states(prompt).raw for prompt in subject.prompts]
+    _require(all((a == b).all() for a, b in zip(plain, known, strict=True)), "a remembered clip gives other states")
+    return "seen once" if memory.passes == 1 else "seen by every pass"
+
+
+def _resumed(subject: Subject) -> str:
+    model, before = subject.model, subject.model.prefixes
+    sheet = subject.steered(0.5, -0.5, 0.25)
+    plain = model.generate(subject.prompts, NEW_TOKENS, steering=sheet)
+    model.prefixes = PrefixMemory()
+    try:
+        with model.resuming(), model.remembering_clips():
+            made = model.generate(subject.prompts, NEW_TOKENS, steering=sheet)
+        passes = model.prefixes.passes
+    finally:
+        model.prefixes = before
+    _require([a.tokens for a in made] == [a.tokens for a in plain], "a resumed answer is another one")
+    return "resumed at the steered block" if passes and resumable(model) else "every pass is whole"
+
+
+def _batches(subject: Subject) -> str:
+    model, prompts = subject.model, subject.prompts
+    with _ending(model, model.generate(prompts[:1], 2)[0].tokens[-1]):
+        together = model.generate(prompts, NEW_TOKENS)
+        alone = [model.generate([prompt], NEW_TOKENS)[0] for prompt in prompts]
+    _require([a.tokens for a in together] == [a.tokens for a in alone], "an answer depends on its batch")
+    return "equal"
+
+
+@contextmanager
+def _ending(model: LocalModel, token: int) -> Iterator[None]:
+    """Inside, a token that an answer has early ends answers, so that rows leave their batch."""
+    config = model.network.generation_config
+    before, config.eos_token_id = config.eos_token_id, [token]
+    try:
+        yield
+    finally:
+        config.eos_token_id = before
+
+
+CHECKS = (
+    Check("states", "hooked states are the library's own", _states, exact=False),
+    Check("alpha 0", "steering with alpha 0 leaves no hook and changes no bit of states or answers", _zero),
+    Check("alpha", "a steered state is the plain one and alpha times v, and none below it changes", _steered_states),
+    Check("parts", "system prompt, question and visual tokens are where their texts are", _parts, exact=False),
+    Check("means", "the mean over the question's tokens is that of the library's states", _pooled),
+    Check("patching", "a patch with itself changes nothing, one of all positions gives the source", _patching),
+    Check("clips", "the vision tower sees a clip once, and states stay as they are", _clips),
+    Check("resuming", "steered answers go on from the steered block, and stay as they are", _resumed),
+    Check("batches", "answers do not depend on their batch, nor on rows that leave it", _batches),
+)
+
+
+def brightening() -> tuple[np.ndarray, np.ndarray]:
+    """A clip for the questions: four frames (4, 64, 96, 3), half a second apart."""
+    return np.stack([np.full((64, 96, 3), shade, np.uint8) for shade in range(40, 200, 40)]), np.arange(4) / 2
+
+
+def tiny_subject(family: Family, folder: Path) -> Subject:
+    """A tiny checkpoint of a family, built, saved and loaded again, and the clip."""
+    return Subject(tiny_model(family, folder / family), *brightening())
