@@ -24,7 +24,10 @@ import pandas as pd
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.mechanism.contrast import ccs, contrast_states
-from traps_pipeline.mechanism.probes import Fit, Probe, Scorer, fit_probe, standardiser
+from traps_pipeline.mechanism.other_probes import NAMED
+from traps_pipeline.mechanism.other_probes import from_sklearn as from_sklearn
+from traps_pipeline.mechanism.other_probes import mean_difference as mean_difference
+from traps_pipeline.mechanism.probes import Fit, Scorer, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.mechanism.stages import saved_directions
 from traps_pipeline.mechanism.stored import StoredStates
@@ -117,36 +120,6 @@ def _verdicts(workspace: Workspace, cell: Cell) -> pd.DataFrame:
 # --- probes -----------------------------------------------------------------------------------------------------------
 
 
-def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
-    """The probe whose weights are the difference of the sides' standardised means; 0 lies half-way between them."""
-    mean, scale = standardiser(np.asarray(states, float))
-    standard = (states - mean) / scale
-    sides = standard[void].mean(axis=0), standard[~void].mean(axis=0)
-    weights = sides[0] - sides[1]
-    return Probe(mean, scale, weights, float(-(sides[0] + sides[1]) @ weights / 2))
-
-
-def from_sklearn(make: Callable[[], Any]) -> Fit:
-    """A probe of any scikit-learn classifier or pipeline; make: returns a new one. Scores are its decision function, or
-    the log-odds of its probabilities."""
-
-    def fit(states: np.ndarray, void: np.ndarray) -> Scorer:
-        return _Estimator(make().fit(states, void))
-
-    return fit
-
-
-@dataclass(frozen=True, eq=False)
-class _Estimator:
-    fitted: Any
-
-    def scores(self, states: np.ndarray) -> np.ndarray:
-        if hasattr(self.fitted, "decision_function"):
-            return np.asarray(self.fitted.decision_function(states), float)
-        chance = np.clip(self.fitted.predict_proba(states)[:, 1], 1e-12, 1 - 1e-12)
-        return np.log(chance / (1 - chance))
-
-
 def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
     """States (n, d) from which no linear classifier can tell the sides: the smallest change, in the metric of the
     states' own covariance, after which both sides have the same mean (least-squares concept erasure, LEACE, of Belrose
@@ -162,7 +135,7 @@ def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
 
 
 # By name: probes that `protocol` takes. CCS takes the states of `contrast`.
-PROBES: dict[str, Fit] = {"logistic": fit_probe, "mean difference": mean_difference, "CCS": ccs}
+PROBES: dict[str, Fit] = {**NAMED, "CCS": ccs}
 
 
 def contrast(

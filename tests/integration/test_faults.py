@@ -12,9 +12,11 @@ import os
 import random
 import re
 import shutil
+import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,7 +28,8 @@ from tests.mechanism.test_stages_run import with_mechanism
 
 pytestmark = pytest.mark.slow
 MANY = os.environ.get("TRAPS_FAULTS")
-FAULTS = int(MANY or 4)
+FAULTS = int(MANY or 10)
+HELD_US = 10**9  # longer than any test
 # How a file gets its content, its name and its place on the disk; SQLite writes by pwrite64 and fdatasync.
 CALLS = "fsync,fdatasync,rename,ftruncate,pwrite64"
 ERRORS = ("ENOSPC", "EIO", "EROFS", "EDQUOT")
@@ -46,10 +49,10 @@ class Campaign:
     def traced(self, *more: str) -> Finished:
         return traced(self.study, self.command, "/dev/null", *more)
 
-    def drawn(self, draw: random.Random, fault: str) -> str:
-        """A fault at one of the calls of a whole run, each kind of call as likely as the others."""
+    def drawn(self, draw: random.Random) -> tuple[str, int]:
+        """One of the calls of a whole run, by name and number, each name as likely as the others."""
         call = draw.choice(sorted(self.calls))
-        return f"inject={call}:{fault}:when={draw.randint(1, self.calls[call])}"
+        return call, draw.randint(1, self.calls[call])
 
     def assert_whole(self) -> None:
         finished = self.study.traps(*self.command)
@@ -68,9 +71,38 @@ def keys(workspace: Path, kind: str) -> list[str]:
 
 
 def traced(study: Checkout, command: Sequence[str], log: Path | str, *more: str) -> Finished:
-    """A command of `traps` under strace. (With --seccomp-bpf, strace would be faster and inject no signal.)"""
-    strace = ("strace", "-f", "-qq", "-o", log, "-e", f"trace={CALLS}", *more)
-    return study.run(*strace, sys.executable, "-m", "traps_pipeline.cli", *command)
+    """A command of `traps` under strace, which stops it at `CALLS` alone."""
+    return study.run(*strace(log, *more), sys.executable, "-m", "traps_pipeline.cli", *command)
+
+
+def strace(log: Path | str, *more: str) -> tuple[str | Path, ...]:
+    return ("strace", "-f", "--seccomp-bpf", "-qq", "-o", log, "-e", f"trace={CALLS}", *more)
+
+
+def killed_at(study: Checkout, command: Sequence[str], call: str, number: int, when: str) -> Finished:
+    """A command of `traps` that is killed before or behind a thread's so manieth call of a name. Under --seccomp-bpf
+    strace injects no signal, so the call is held (`delay_enter`, `delay_exit`) until the process is killed from here,
+    and then strace, which would hold the dead one as long."""
+    log = study.root / "killed"
+    log.unlink(missing_ok=True)
+    held = strace(log, "-e", f"inject={call}:delay_{when}={HELD_US}:when={number}")
+    process = study.start(*held, sys.executable, "-m", "traps_pipeline.cli", *command)
+    with ThreadPoolExecutor(1) as reader:  # what is printed is read, or the command would wait for a reader
+        said = reader.submit(process.communicate)
+        while not said.done() and (thread := reached(log, call, number)) is None:
+            wait([said], timeout=0.02)
+        if not said.done() and thread is not None:
+            os.kill(thread, signal.SIGKILL)
+            process.kill()
+        out, err = said.result()
+    return Finished(process.returncode, out, err)
+
+
+def reached(log: Path, call: str, number: int) -> int | None:
+    """The thread that has begun so many calls of a name, None if none has."""
+    lines = log.read_text() if log.exists() else ""
+    begun = Counter(int(thread) for thread in re.findall(rf"^(\d+) +{call}\(", lines, re.MULTILINE))
+    return next((thread for thread, n in begun.items() if n >= number), None)
 
 
 def begun(
@@ -124,7 +156,7 @@ def killed(campaign: Campaign) -> None:
     """Kill a study at so many calls, and see that it comes to the same."""
     draw, count = random.Random(20261122), 0
     for _ in range(FAULTS):
-        finished = campaign.traced("-e", campaign.drawn(draw, "signal=KILL"))
+        finished = killed_at(campaign.study, campaign.command, *campaign.drawn(draw), draw.choice(("enter", "exit")))
         assert "Traceback" not in finished.err, finished.err
         count += finished.code != 0
         if finished.code == 0:  # so much was there already that it came to its end
@@ -139,7 +171,8 @@ def failed(campaign: Campaign) -> None:
     draw, count = random.Random(20261123), 0
     for _ in range(FAULTS):
         error = draw.choice(ERRORS)
-        finished = campaign.traced("-e", campaign.drawn(draw, f"error={error}"))
+        call, number = campaign.drawn(draw)
+        finished = campaign.traced("-e", f"inject={call}:error={error}:when={number}")
         assert "Traceback" not in finished.err + finished.out, finished.err
         count += finished.code != 0
         if finished.code == 0:

@@ -28,6 +28,7 @@ from traps_pipeline.mechanism.directions import extract_directions, load_directi
 from traps_pipeline.mechanism.gate import OTHER_DATASETS, Items, decide
 from traps_pipeline.mechanism.hidden_states import Item, Pooling, item_states
 from traps_pipeline.mechanism.hook import Steering
+from traps_pipeline.mechanism.other_probes import fit_named
 from traps_pipeline.mechanism.patched import WELL_POSED, patching_rows
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.probes import fit_probe, scenario_folds, solve_gram
@@ -460,3 +461,18 @@ def test_a_gate_is_fitted_once_a_dataset_of_its_source_has_states() -> None:
         "a gate from {} has no items; extract the hidden states of its datasets first",
         again=lambda: decide(items, OTHER_DATASETS, "chaotic", **settings),
     )
+
+
+def test_a_further_probe_is_named_by_a_name_that_there_is() -> None:
+    states, void = random_states(20, 5)
+    remedied(
+        lambda: fit_named("os.system", 1),
+        "or a classifier of scikit-learn by its class, e.g. LinearSVC",
+        again=lambda: fit_named("mean difference", 1),
+    )
+    fit = remedied(
+        lambda: fit_named("StackingClassifier", 1),
+        "mechanism.probes.others: {} cannot be made without settings ({}); name another classifier",
+        again=lambda: fit_named("LinearSVC", 1),
+    )
+    assert fit(states, void).scores(states).shape == (20,)

@@ -83,7 +83,9 @@ class ProbeBaselineRow:
     model: shared.Model
     prompt: Prompt
     features: Annotated[
-        str, "question words, first frame, all frames, length, time stamps, output margin, or noise as wide as states"
+        str,
+        "question words, first frame, all frames, length, time stamps, output margin, noise as wide as states, or "
+        "states with the name of another probe than that of `probes`, at the layer that is steered",
     ]
     analysis: Annotated[str, "as in probes: transfer, held_out, answerable_void, answerable_control, time_swapped"]
     source: Annotated[str, "dataset that was fitted"]

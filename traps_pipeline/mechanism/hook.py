@@ -26,23 +26,28 @@ class Steering:
 
     direction: (d_model,) float32 for all rows, or (rows, d_model) with one of its own for each; used without scaling
     (void directions are unit vectors). layer: counted as in hidden_states, 1 to n_layers. alphas: one per row, signed.
+    removed: one per row, the share of a state's part along the direction that is taken out before alpha times the
+    direction is added; empty where nothing is taken out.
     """
 
     direction: np.ndarray
     layer: int
     alphas: tuple[float, ...]
+    removed: tuple[float, ...] = ()
 
     def rows(self, chosen: Sequence[int]) -> Steering:
         """The steering of some of the rows."""
         direction = self.direction if self.direction.ndim == 1 else self.direction[list(chosen)]
-        return Steering(direction, self.layer, tuple(self.alphas[i] for i in chosen))
+        removed = tuple(self.removed[i] for i in chosen) if self.removed else ()
+        return Steering(direction, self.layer, tuple(self.alphas[i] for i in chosen), removed)
 
     @contextmanager
     def applied(self, model: LocalModel) -> Iterator[None]:
         """Steer the passes that are made inside the context; the hook is always removed at its end.
 
-        Where every alpha is 0 there is no hook, and outputs equal the unsteered model's bit for bit. Raises TrapsError
-        for a layer out of range, and for a direction of another width or with values that are not finite.
+        Where every alpha is 0 and nothing is taken out there is no hook, and outputs equal the unsteered model's bit
+        for bit. Raises TrapsError for a layer out of range, and for a direction of another width or with values that
+        are not finite.
         """
         block = model.block(self.layer)
         shapes = ((model.d_model,), (len(self.alphas), model.d_model))
@@ -51,7 +56,7 @@ class Steering:
                 f"the direction has shape {self.direction.shape} {'and' if self.direction.shape else ''} for "
                 f"{model.checkpoint.name}, whose states are {model.d_model} finite numbers: extract it from this model"
             )
-        if not any(self.alphas):
+        if not any((*self.alphas, *self.removed)):
             yield
             return
         # This hook runs first, so that hooks that record states (ours, and the library's own) record the steered ones.
@@ -72,10 +77,22 @@ class _Adding:
         direction = torch.from_numpy(np.ascontiguousarray(steering.direction, dtype=np.float32))
         added = alphas[:, None] * direction  # (rows, d), for a shared direction too
         self._added = added[:, None, :].to(model.device, model.network.dtype)
+        self._along, self._removed = None, None
+        if any(steering.removed):
+            unit = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+            self._along = unit.expand(len(alphas), -1).to(model.device)
+            self._removed = torch.tensor(steering.removed, dtype=torch.float32, device=model.device)
 
     def __call__(self, _: Any, __: Any, output: Any) -> Any:
+        import torch
+
         states = output[0] if isinstance(output, tuple) else output
         if len(states) != len(self._added):
             raise ValueError(f"the pass has {len(states)} rows, but {len(self._added)} alphas were given")
-        steered = states + self._added
+        if self._along is None or self._removed is None:
+            steered = states + self._added
+        else:  # in float32, as the added vector is made
+            part = torch.einsum("rtd,rd->rt", states.float(), self._along) * self._removed[:, None]
+            taken = (part[..., None] * self._along[:, None, :]).to(states.dtype)
+            steered = states - taken + self._added
         return (steered, *output[1:]) if isinstance(output, tuple) else steered

@@ -3,7 +3,8 @@
 A steered answer is a request like any other, so it goes through the same ledger: its key holds the direction's digest,
 the layer and the signed alpha, beside the prompt, the clip and the checkpoint. At alpha 0 the key holds none of the
 three, so that all directions share one answer. The two datasets of a taxonomy have the same control items, and share
-their answers too; so do two sign policies where they add the same.
+their answers too; so do two sign policies where they add the same. What takes out a state's part along a direction, or
+sets it, is steering too, with the share that is taken out in the key.
 
 Doses are given as alphas, the paper's, and in units of the class gap, since one alpha is a large step in one model and
 none in another. Nulls are steered at the largest dose, along the direction of the dataset that is steered.
@@ -26,7 +27,7 @@ from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tas
 from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.paths import sources_of
-from traps_pipeline.mechanism.tables import STEERING, SteeringRow, SteeringVoteRow
+from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT, STEERING, SteeringRow, SteeringVoteRow
 from traps_pipeline.mechanism.versions import loaded_params
 from traps_pipeline.models.answers import Question
 from traps_pipeline.models.ask import Settled, collect
@@ -54,7 +55,8 @@ PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every di
 @dataclass(frozen=True)
 class Strength:
     """One direction at one strength. alpha has no sign: `signs` says on which side alpha times the direction is added
-    and on which it is subtracted. dose: alpha in its unit, alpha or gap."""
+    and on which it is subtracted. dose: in its unit, one of DoseUnit. removed: the share of a state's part along the
+    direction that is taken out first."""
 
     source: str
     kind: str
@@ -66,6 +68,7 @@ class Strength:
     unit: str = "alpha"
     dose: float = 0.0
     signs: str = BY_LABEL
+    removed: float = 0.0
 
     def signed(self, side: str) -> float:
         """The signed alpha for a row of that side."""
@@ -116,14 +119,20 @@ def strengths(
                 "there; name another layer in the experiment and in study.yaml"
             )
         for unit, dose in row.doses:
-            alpha = float(dose * of.gaps[layer]) if unit == "gap" else float(dose)
+            alpha, removed = _change(unit, dose, float(of.gaps[layer]))
             relative = float(alpha / of.residual_norms[layer]) if of.residual_norms[layer] > 0 else None
             along = (row.source, row.kind, layer, alpha, vector_digest(vector), relative)
-            wanted.append((Strength(*along, row.draw, unit, dose, row.signs), row.sides))
+            wanted.append((Strength(*along, row.draw, unit, dose, row.signs, removed), row.sides))
     return wanted
 
 
-Dose = tuple[str, float]  # unit (alpha or gap) and number
+Dose = tuple[str, float]  # unit and number
+
+
+def _change(unit: str, dose: float, gap: float) -> tuple[float, float]:
+    """What is added along a direction, and the share of a state's part along it that is taken out first."""
+    added = {"alpha": float(dose), "gap": float(dose * gap), PROJECT_OUT: 0.0, CLAMP: float(dose * gap)}[unit]
+    return added, {PROJECT_OUT: float(dose), CLAMP: 1.0}.get(unit, 0.0)
 
 
 class _Planned(NamedTuple):
@@ -140,12 +149,16 @@ class _Planned(NamedTuple):
 
 def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Container[str]) -> list[_Planned]:
     """Every direction along which a target is steered, among these sources: all paths into it; along its own direction
-    also the other sign policies, the nulls at the largest dose, and on controls the sweep over layers."""
+    also the other sign policies, what takes out or sets the part along it, the nulls at the largest dose, and on
+    controls the sweep over layers."""
     alphas: tuple[Dose, ...] = tuple(("alpha", float(alpha)) for alpha in steering.alphas)
     doses: tuple[Dose, ...] = (*alphas, *(("gap", float(gap)) for gap in steering.gaps))
     at = layers.steering
     plan = [_Planned(source, "void", 0, at, BY_LABEL, SIDES, doses) for source in sources_of(target)]
     plan += [_Planned(target, "void", 0, at, signs, SIDES, doses) for signs in steering.signs]
+    changes: tuple[Dose, ...] = tuple((PROJECT_OUT, float(share)) for share in steering.project_out)
+    changes += tuple((CLAMP, float(gaps)) for gaps in steering.clamp)
+    plan += [_Planned(target, "void", 0, at, "plus", SIDES, changes)] if changes else []
     if steering.nulls:
         draws = product(steering.nulls.kinds, range(steering.nulls.draws))
         plan += [_Planned(target, kind, draw, at, BY_LABEL, SIDES, doses[-1:]) for kind, draw in draws]
@@ -217,9 +230,10 @@ def steered_request(
     clip = workspace.resolve(item["clip"])
     sent = workspace.media.prepare(clip, item["media_digest"], entry.media)
     steering = None
-    if strength.alpha:
+    if strength.alpha or strength.removed:
         signed = strength.signed(item["side"])
         steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed}
+        steering |= {"removed": strength.removed} if strength.removed else {}
     return Request(
         participant=entry.id,
         endpoint=entry.backend,
@@ -269,7 +283,9 @@ class SteeredBackend(LocalBackend):
             if group is not None:
                 along = [request.params["steering"] for request in requests]
                 vectors = np.stack([self._vectors[steering["direction"]] for steering in along])
-                hook = Steering(vectors, group, tuple(float(steering["alpha"]) for steering in along))
+                alphas = tuple(float(steering["alpha"]) for steering in along)
+                removed = tuple(float(steering.get("removed", 0.0)) for steering in along)
+                hook = Steering(vectors, group, alphas, removed)
             most = requests[0].params["max_new_tokens"]
             with model.remembering_clips(), model.resuming():
                 made = model.generate(prompts, most, None, hook, stopped=batch.abandoned.is_set)

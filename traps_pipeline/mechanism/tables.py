@@ -15,7 +15,12 @@ AnswerRegime = Annotated[str, "system prompt of the steered answer"]
 SteeredSource = Annotated[str, "dataset of the direction; none where alpha is 0"]
 SteeredKind = Annotated[str, "void, or a null: isotropic, covariance or shuffled; none where alpha is 0"]
 Draw = Annotated[int, "number of a null's draw; 0 for void"]
-DoseUnit = Annotated[str, "of the dose: alpha, or gap (the distance between the sides' means at the layer)"]
+PROJECT_OUT, CLAMP = "project out", "clamp"  # units of doses that do not only add
+DoseUnit = Annotated[
+    str,
+    "of the dose: alpha; gap (the distance between the sides' means at the layer); project out (the share of a "
+    "state's part along the direction that is taken out); clamp (what that part is set to, in gaps)",
+]
 Dose = Annotated[float, "strength in that unit; 0 is the unsteered model"]
 Signs = Annotated[str, "label: added on controls and subtracted on voids; plus or minus: the same on both sides"]
 SteeredLayer = Annotated[int, "steered block, counted as in hidden_states; 0 where alpha is 0"]

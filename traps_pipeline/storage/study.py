@@ -32,6 +32,9 @@ class ProbeSettings(BaseModel):
     folds: int = Field(default=5, ge=2)
     shuffles: int = Field(default=20, ge=20, description="with fewer the mean says little")
     resamples: int = Field(default=1000, ge=100)
+    others: tuple[str, ...] = Field(
+        default=(), description="further probes, at the steered layer: mean difference, or classifiers of scikit-learn"
+    )
 
 
 class NullSettings(BaseModel):
@@ -59,6 +62,12 @@ class SteeringSettings(BaseModel):
     signs: tuple[Literal["plus", "minus"], ...] = Field(
         default=("plus", "minus"), description="policies beside the paper's, which knows each item's side"
     )
+    project_out: tuple[Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)], ...] = Field(
+        default=(), description="shares of a state's part along the direction that are taken out"
+    )
+    clamp: tuple[Annotated[float, Field(allow_inf_nan=False)], ...] = Field(
+        default=(), description="what the part along the direction is set to, in class gaps; for 0 say project_out: [1]"
+    )
     nulls: NullSettings | None = NullSettings()
     max_new_tokens: int = Field(default=512, ge=1)
 
@@ -67,6 +76,13 @@ class SteeringSettings(BaseModel):
     def _ascending(cls, values: tuple[float, ...]) -> tuple[float, ...]:
         if list(values) != sorted(set(values)):
             raise ValueError(f"{values} must ascend; alpha 0, the unsteered model, is always there")
+        return values
+
+    @field_validator("project_out", "clamp")
+    @classmethod
+    def _distinct(cls, values: tuple[float, ...]) -> tuple[float, ...]:
+        if len(set(values)) < len(values) or 0 in values:
+            raise ValueError(f"{values} must be different numbers and not 0 (`project_out: [1]` sets the part to 0)")
         return values
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from traps_pipeline.mechanism.paths import path_name, probed_taxonomy
+from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT
 from traps_pipeline.partitions import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.mechanism import DIRECTIONS, INFERENCE, NO_MECHANISM
@@ -77,11 +78,16 @@ def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
     rows = results.baselines
     probe = (probe if len(rows) else probe.head(0)).astype({"prompt": object})
     wide = rows.pivot_table(index=keys, columns="features", values="value", observed=True)
-    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise"])).reset_index()
+    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise", *other_probes(results)])).reset_index()
     noise = rows.loc[rows["features"] == "noise", [*keys, "spread"]].rename(columns={"spread": "noise_spread"})
     kept = probe[[*keys, "layer", "value", "low", "high", "n_voids", "n_controls"]]
     table = kept.merge(wide, on=keys, how="left").merge(noise, on=keys, how="left")
     return table.assign(mark=few(table, "n_voids", "n_controls"))
+
+
+def other_probes(results: Results) -> list[str]:
+    """The further probes of the states that experiments name, as features of `probe_baselines`."""
+    return [*dict.fromkeys(name for name in results.baselines["features"] if str(name).startswith("states, "))]
 
 
 _PROBE = (
@@ -107,7 +113,8 @@ _NOTES = (
 def _beside(results: Results) -> PrintedTable:
     rows = beside(results)
     rows = rows.assign(path=[path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)])
-    columns = [MODEL, Column("path", "Path"), *_PROBE, *_BASELINES, *_SIDES]
+    others = [Column(name, name.capitalize(), "fraction") for name in other_probes(results)]
+    columns = [MODEL, Column("path", "Path"), *_PROBE, *others, *_BASELINES, *_SIDES]
     notes = [
         *_NOTES,
         "pairs within a taxonomy and a dataset on itself: fitted without the scored scenario, controls included",
@@ -151,10 +158,8 @@ def steering_nulls(results: Results) -> list[PrintedTable]:
 
 
 def _dose(rows: pd.DataFrame) -> list[str]:
-    return [
-        "none" if not dose else f"α {dose:g}" if unit == "alpha" else f"{dose:g} gap"
-        for unit, dose in zip(rows["unit"], rows["dose"], strict=True)
-    ]
+    words = {"alpha": "α {:g}", "gap": "{:g} gap", PROJECT_OUT: "{:.0%} taken out", CLAMP: "set to {:g} gap"}
+    return [words[unit].format(dose) if dose else "none" for unit, dose in zip(rows["unit"], rows["dose"], strict=True)]
 
 
 def _nulls(results: Results) -> PrintedTable:
