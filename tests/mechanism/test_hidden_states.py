@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -160,12 +159,50 @@ def test_states_of_before_devices_were_recorded_are_not_made_again(tmp_path: Pat
     assert set(read_layer(tmp_path, 1)[0]["device"]) == {"not recorded"}
 
 
-def test_of_two_extractions_at_once_one_makes_the_states_and_the_other_finds_them(tmp_path: Path) -> None:
-    of, opened = model("llava-next-video"), []
-    with ThreadPoolExecutor(2) as pool:
-        twice = [pool.submit(extract, of, work(of, opened=opened.append), tmp_path, shard_size=2) for _ in range(2)]
-    assert sorted(one.result().n_new for one in twice) == [0, 5]
-    assert opened == list(range(5))
+SLOW = """
+import sys, time
+from pathlib import Path
+from tests.mechanism.test_hidden_states import work
+from tests.local_models import model
+from traps_pipeline.mechanism.hidden_states import extract
+of = model("qwen3-vl")
+print(extract(of, work(of, 40, opened=lambda i: time.sleep(0.05)), Path(sys.argv[1]), shard_size=2).n_new)
+"""
+
+
+def slowly(folder: Path) -> subprocess.Popen[str]:
+    """A process that extracts forty items, in two seconds or more."""
+    root = Path(__file__).resolve().parents[2]
+    return subprocess.Popen([sys.executable, "-c", SLOW, folder], cwd=root, stdout=subprocess.PIPE, text=True)
+
+
+def test_processes_at_one_folder_share_the_items_and_each_is_made_once(tmp_path: Path) -> None:
+    both = [slowly(tmp_path) for _ in range(2)]
+    made = [int(process.communicate()[0]) for process in both]
+    assert sum(made) == 40 and min(made) > 0
+    of, (ids, states) = model("qwen3-vl"), read_layer(tmp_path, 2)
+    assert list(ids["item_id"]) == [item.item_id for item in work(of, 40)]
+    for i in (0, 1, 20, 39):
+        assert (states[i] == of.forward_states(work(of, 40)[i].prompt()).raw[2]).all()
+    assert not (tmp_path / "leases").exists()
+
+
+def test_the_chunk_of_a_process_that_is_killed_is_made_by_another_one(tmp_path: Path) -> None:
+    process = slowly(tmp_path)
+    deadline = time.monotonic() + 900
+    while not (tmp_path / "shard-00000.parquet").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    of, opened = model("qwen3-vl"), list[int]()
+
+    def kill_once(i: int) -> None:
+        opened.append(i)
+        if len(opened) == 5:
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait()
+
+    done = extract(of, work(of, 40, opened=kill_once), tmp_path, shard_size=2)
+    assert done.n_new == len(opened) and 0 < done.n_new < 40
+    assert len(read_layer(tmp_path, 3)[0]) == 40
 
 
 class _Stop(Exception):
@@ -187,19 +224,8 @@ def test_an_extraction_that_breaks_off_keeps_what_was_made(tmp_path: Path) -> No
     assert opened == [3, 4]
 
 
-KILLED = """
-import sys, time
-from pathlib import Path
-from tests.mechanism.test_hidden_states import work
-from tests.local_models import model
-from traps_pipeline.mechanism.hidden_states import extract
-of = model("qwen3-vl")
-extract(of, work(of, 40, opened=lambda i: time.sleep(0.05)), Path(sys.argv[1]), shard_size=2)
-"""
-
-
 def test_an_extraction_killed_half_way_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    process = subprocess.Popen([sys.executable, "-c", KILLED, tmp_path], cwd=Path(__file__).resolve().parents[2])
+    process = slowly(tmp_path)
     deadline = time.monotonic() + 900
     while not (tmp_path / "shard-00001.parquet").exists() and time.monotonic() < deadline:
         time.sleep(0.02)

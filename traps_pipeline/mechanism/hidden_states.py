@@ -15,14 +15,13 @@ States of one token are stored in the model's own precision, which loses nothing
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -31,7 +30,8 @@ import numpy as np
 from traps_pipeline import progress
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, write_bytes
+from traps_pipeline.files import write_bytes
+from traps_pipeline.mechanism.chunks import alone, end_leases, leased
 from traps_pipeline.models.local.capture import OF_PARTS, ONE_TOKEN, Pooling
 from traps_pipeline.models.local.spans import spans
 from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     from traps_pipeline.models.local.adapter import LocalModel, Prompt, States
 
-SHARD_SIZE = 64  # items: 20 MB at the 8B size; a kill loses one shard at most
+SHARD_SIZE = 64  # items of a chunk and its shard: 20 MB at the 8B size; a kill loses one shard at most
 PREPARED_AHEAD = 2  # prompts that are decoded while the model works
 NORMED = "normed"
 _IDS = "ids.parquet"
@@ -123,23 +123,42 @@ def extract(
 ) -> Extracted:
     """Make the missing states of the items, one prompt per pass, then write the current row of each item.
 
-    If it ends early (Ctrl-C, an error), the states made so far are written, and the same call continues there. what:
-    names the items in the progress line. Raises TrapsError when the disk cannot be written.
+    Several processes may work at one folder: each takes chunks of `shard_size` items that no other one has. If one ends
+    early (Ctrl-C, an error, a kill), the states made so far are written, but for the chunk that a kill interrupts, and
+    the others or the same call continue there. what: names the items in the progress line. Raises TrapsError when the
+    disk cannot be written.
     """
-    with _alone(folder):
-        keys = [states_key(model, item, pooling) for item in items]
-        known = {
-            key: (shard, row, device)
-            for shard, table in _shards(folder)
-            for row, (key, device) in enumerate(zip(table["key"], table["device"], strict=True))
-        }
-        missing = [(item, key) for item, key in zip(items, keys, strict=True) if key not in known]
-        _make(model, missing, folder, pooling, shard_size, what, known)
+    keys = [states_key(model, item, pooling) for item in items]
+    known, made = dict[str, _Place](), 0
+    with alone(folder):
+        _look_for(folder, known)
+    total = sum(key not in known for key in keys)
+    for chunk in leased(folder, len(items), shard_size):
+        if any(keys[n] not in known for n in chunk):
+            _look_for(folder, known)  # another process may have had this chunk
+        missing = [(items[n], keys[n]) for n in chunk if keys[n] not in known]
+        if missing:
+            tick = partial(_tick, what, made, total)
+            made += _make(model, missing, folder, pooling, tick, known)
+    with alone(folder):
         _write_ids(folder, items, keys, known, _record(model, pooling))
         _sweep(folder, {known[key][0] for key in keys})
-        _note_devices(folder, sorted({known[key][2] for key in keys}))
+        end_leases(folder)
+    _note_devices(folder, sorted({known[key][2] for key in keys}))
     version = digest([[item.item_id, item.side, key] for item, key in zip(items, keys, strict=True)])
-    return Extracted(folder, len(items), len(missing), version)
+    return Extracted(folder, len(items), made, version)
+
+
+def _tick(what: str, before: int, total: int, done: int) -> None:
+    progress.current().tick("hidden_states", what, min(before + done, total), total)
+
+
+def _look_for(folder: Path, known: dict[str, _Place]) -> None:
+    """Add what is in shards that were not looked at."""
+    seen = {shard for shard, _, _ in known.values()}
+    for shard, table in _shards(folder, seen):
+        for row, (key, device) in enumerate(zip(table["key"], table["device"], strict=True)):
+            known[key] = (shard, row, device)
 
 
 def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFrame, np.ndarray]:
@@ -172,40 +191,24 @@ def read_record(folder: Path) -> dict[str, Any]:
 # --- inside -----------------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Lock a folder, so that a second extraction waits and then finds the states. A kill releases the lock."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / ".lock").open("w")
-    except OSError as error:
-        raise TrapsError(f"{folder}: cannot be written ({error.strerror or error}); {remedy(error)}") from error
-    with lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-
-
 def _make(
     model: LocalModel,
     missing: Sequence[tuple[Item, str]],
     folder: Path,
     pooling: Pooling,
-    shard_size: int,
-    what: str,
+    tick: Callable[[int], None],
     known: dict[str, _Place],
-) -> None:
-    """Make one pass per item; a shard is written when it is full, and the last one also after an error or Ctrl-C."""
-    number = 1 + max((int(path.stem.split("-")[1]) for path in folder.glob("shard-*.safetensors")), default=-1)
+) -> int:
+    """Make one pass per item, and a shard of them all, of what there is also after an error or Ctrl-C; their number."""
     shard: list[_Made] = []
     try:
         for done, ((item, key), prompt) in enumerate(_prepared(missing), start=1):
             shard.append((item, key, item_states(model, item, prompt, pooling)))
-            progress.current().tick("hidden_states", what, done, len(missing))
-            if len(shard) == shard_size:
-                full, shard = shard, []
-                number = _flush(folder, number, full, model, pooling, known)
+            tick(done)
     finally:
-        _flush(folder, number, shard, model, pooling, known)
+        with alone(folder):
+            _flush(folder, shard, model, pooling, known)
+    return len(missing)
 
 
 def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling) -> States:
@@ -246,21 +249,15 @@ def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item,
                 prompt.cancel()
 
 
-def _flush(
-    folder: Path,
-    number: int,
-    shard: Sequence[_Made],
-    model: LocalModel,
-    pooling: Pooling,
-    known: dict[str, _Place],
-) -> int:
-    """Write a shard, tensors first, and note where its items are; the next shard's number."""
+def _flush(folder: Path, shard: Sequence[_Made], model: LocalModel, pooling: Pooling, known: dict[str, _Place]) -> None:
+    """Write a shard under the next free number, tensors first, and note where its items are."""
     if not shard:
-        return number
+        return
     import pyarrow as pa
     import torch
     from safetensors.torch import save
 
+    number = 1 + max((int(path.stem.split("-")[1]) for path in folder.glob("shard-*.safetensors")), default=-1)
     name = f"shard-{number:05d}"
     dtype = model.network.dtype if pooling in ONE_TOKEN else torch.float32
     raw = torch.from_numpy(np.stack([states.raw for _, _, states in shard], axis=1)).to(dtype)  # (layers, n, d)
@@ -272,12 +269,12 @@ def _flush(
     columns = zip(("item_id", "side", "key", "device"), zip(*rows, strict=True), strict=True)
     write_sealed(folder / f"{name}.parquet", pa.table({column: list(values) for column, values in columns}), {})
     known.update({key: (name, row, device) for row, (_, _, key, device) in enumerate(rows)})
-    return number + 1
 
 
-def _shards(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
-    """The complete shards: name and table. Tensors without a table come from a killed run; `_sweep` removes them."""
-    for path in sorted(folder.glob("shard-*.parquet")):
+def _shards(folder: Path, seen: Container[str]) -> Iterator[tuple[str, pd.DataFrame]]:
+    """The complete shards but those seen: name and table. Tensors without a table come from a killed run; `_sweep`
+    removes them."""
+    for path in sorted(path for path in folder.glob("shard-*.parquet") if path.stem not in seen):
         try:
             table = read_sealed(path).to_pandas()
             rows = _sound_rows(path.with_suffix(".safetensors"))
