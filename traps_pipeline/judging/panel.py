@@ -34,7 +34,7 @@ from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.yamlfile import explain
 
-PART = 10_000  # answers whose votes are collected at a time
+PART = 4_000  # answers whose votes are collected at a time
 _ANSWERED = ("item_id", "outcome", "text", "request_key")
 
 # --- what a judge is asked --------------------------------------------------------------------------------------------
