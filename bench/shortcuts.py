@@ -1,10 +1,11 @@
 """What a benchmark can be passed by, other than by seeing: measured on its records, and on a study of its arms.
 
 From the records (two frames of each are drawn, about a minute and a half on two cores): how many controls the family's
-own observer answers from the last shown frame alone; how many records of a family have a neighbour whose first frame
-looks like theirs; how far each seesaw turns; how well the state at the cut predicts the outcome of a chaotic record,
-beside always saying the commonest outcome. From a study that asked the arms (`traps run arms`): PECS, PECS-R and the
-gap of the shortcut rules and of the observer.
+own observer answers from the last shown frame alone, and how many nobody can, since a panel hides the outcome there
+(certificate `closing`); when outcomes settle, and until when they are in view; how many records of a family have a
+neighbour whose first frame looks like theirs; how far each seesaw turns; how well the state at the cut predicts the
+outcome of a chaotic record, beside always saying the commonest outcome. From a study that asked the arms (`traps run
+arms`): PECS, PECS-R and the gap of the shortcut rules and of the observer.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ import pandas as pd
 
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.paths import RELEASED
-from traps_pipeline.scenes.render import Renderer
+from traps_pipeline.scenes.certificates import CLOSING, stored_evidence
+from traps_pipeline.scenes.evidence import Claim
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
 from traps_pipeline.scenes.world import World
 from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
@@ -38,15 +40,20 @@ STEP = 2  # every second frame is shown: 5 of 10 a second
 NEAR_BITS = 8  # of 64: two pictures whose hashes differ in so few look alike
 FOLDS, SEED = 5, 0
 TURN_DEG = 10.0
+SETTLED = 0.3, 0.8  # wanted: outcomes settle between these shares of the clip
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What is measured of one record."""
+    """What is measured of one record. settled, in_view_until: shares of the clip."""
 
     scenario_id: str
     family: str
+    taxonomy: str
     truth: str
+    settled: float
+    in_view_until: float
+    hidden_at_end: bool
     last_frame_answer: str | None
     looks: int
     turned_deg: float | None
@@ -65,6 +72,8 @@ def main() -> None:
         found = list(pool.map(partial(measure, folder=arguments.specs), chosen, chunksize=4))
     print(f"{len(found)} records of {len({one.family for one in found})} families")
     print_last_frame(found)
+    print_hidden(found)
+    print_times(found)
     print_looks(found)
     print_seesaws(found)
     print_states(found)
@@ -86,19 +95,30 @@ def measure(spec: SceneSpec, folder: Path) -> Measured:
     qpos = load_trajectory(folder / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
     world = World.of_record(spec, qpos)
     shown = range(0, len(qpos), STEP)
-    with Renderer(world.model, world.camera) as renderer:
-        first, last = renderer.frames(qpos[[0, shown[-1]]])
+    with world.closed_renderer() as renderer:
+        (first,) = renderer.frames(qpos[:1])
+        (last,) = renderer.frames(qpos[[shown[-1]]], panel=world.open_frames <= shown[-1])
     observe = world.family.observe
     answer = observe(np.stack([last] * len(shown)), spec.question) if observe is not None else None
     return Measured(
         scenario_id=spec.scenario_id,
         family=spec.family,
+        taxonomy=spec.taxonomy,
         truth=spec.ground_truth,
+        settled=spec.evidence["commit_s"] * world.physics.fps / len(qpos),
+        in_view_until=world.open_frames / len(qpos),
+        hidden_at_end=spec.control is not None
+        and CLOSING.failure(stored_evidence(spec), Claim.of_record(spec)) is None,
         last_frame_answer=answer,
         looks=perceptual_hash(first),
         turned_deg=turned_deg(world.model, qpos) if spec.family == "seesaw_sorter" else None,
         at_cut=state_at_cut(qpos, spec.void["cut_frame"]) if spec.void_kind == "truncation" else None,
     )
+
+
+def hidden_at_end(spec: SceneSpec) -> bool:
+    """Whether the record's own evidence certifies that its last shown frame hides the outcome."""
+    return spec.control is not None and CLOSING.failure(stored_evidence(spec), Claim.of_record(spec)) is None
 
 
 def perceptual_hash(frame: np.ndarray) -> int:
@@ -136,6 +156,28 @@ def print_last_frame(found: Sequence[Measured]) -> None:
         print(f"  {family:20} {right / n:6.3f} {any_answer / n:6.3f} {n:4d}")
     right, any_answer, n = np.sum(list(rows.values()), axis=0)
     print(f"  {'all':20} {right / n:6.3f} {any_answer / n:6.3f} {n:4d}")
+
+
+def print_hidden(found: Sequence[Measured]) -> None:
+    """How clever a reader is does not matter here: two worlds with different answers end in the same frames."""
+    print("\nControls that nobody can answer from the last shown frame: certified hidden there (share, of)")
+    for name, ones in [*by_family(found).items(), *by_taxonomy(found).items(), ("all", found)]:
+        print(f"  {name:20} {np.mean([one.hidden_at_end for one in ones]):6.3f} {len(ones):4d}")
+
+
+def print_times(found: Sequence[Measured]) -> None:
+    low, high = SETTLED
+    print(f"\nTimes as shares of the clip (least, quartiles, most; share from {low:g} to {high:g})")
+    for name, ones in [*by_taxonomy(found).items(), ("all", found)]:
+        for what in ("settled", "in_view_until"):
+            times = np.array([getattr(one, what) for one in ones])
+            spread = " ".join(f"{value:5.2f}" for value in np.quantile(times, (0, 0.25, 0.5, 0.75, 1)))
+            within = np.mean((times >= low - 1e-9) & (times <= high + 1e-9))
+            print(f"  {name:10} {what:14} {spread}  {within:6.3f}")
+
+
+def by_taxonomy(found: Sequence[Measured]) -> dict[str, list[Measured]]:
+    return {name: [one for one in found if one.taxonomy == name] for name in ("occlusion", "chaotic")}
 
 
 def answered(ones: Sequence[Measured]) -> int:

@@ -16,11 +16,13 @@ import numpy as np
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.camera import Camera, Panel
+from traps_pipeline.scenes.checks import control_frames
 from traps_pipeline.scenes.kit import Family, Physics
 from traps_pipeline.scenes.outcome import compile_scene
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.world import World
 
 SAMPLED = slice(None, None, 2)  # the 5 FPS frames that models are shown
 
@@ -56,9 +58,9 @@ class Released:
     @cached_property
     def control_frames(self) -> np.ndarray:
         """The control as it is sampled, (25, 360, 480, 3)."""
-        model, _ = compile_scene(self.family, self.params, self.physics)
-        with Renderer(model, self.camera) as renderer:
-            return np.stack(list(renderer.frames(self.qpos[SAMPLED])))
+        world = World.of_record(self.spec, self.qpos)
+        with world.closed_renderer() as renderer:
+            return np.stack(list(control_frames(renderer, self.qpos[SAMPLED], -(-world.open_frames // SAMPLED.step))))
 
     @cached_property
     def void(self) -> np.ndarray:

@@ -172,10 +172,13 @@ def void_from_s(spec: SceneSpec) -> float:
     return frame / spec.physics["fps"]
 
 
+_AS_JSON = ("params", "physics", "camera", "void", "control", "aliases", "answerable_question", "twin")
+
+
 def _row(workspace: Workspace, item: Resolved, version: str) -> SceneSpecRow:
     spec = item.spec
     record = spec.model_dump(mode="json", exclude={"evidence"})
-    for name in ("params", "physics", "camera", "void", "aliases", "answerable_question", "twin"):
+    for name in _AS_JSON:
         record[name] = json.dumps(record[name], sort_keys=True, ensure_ascii=False)
     return SceneSpecRow(
         **record,
@@ -199,7 +202,7 @@ def _relative(path: Path, *roots: Path) -> str:
 def spec_of(row: dict[str, Any]) -> SceneSpec:
     """A row of scene_specs back to its record."""
     record = {name: row[name] for name in SceneSpec.model_fields}
-    for name in ("params", "physics", "camera", "void", "aliases", "answerable_question", "twin", "evidence"):
+    for name in (*_AS_JSON, "evidence"):
         record[name] = json.loads(record[name])
     record["labels"] = list(record["labels"])
     return SceneSpec.model_validate(record)

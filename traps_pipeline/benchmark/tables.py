@@ -27,6 +27,9 @@ class SceneSpecRow:
     camera: Annotated[str, "JSON: resolved free camera"]
     void_kind: Annotated[str, "occluder or truncation"]
     void: Annotated[str, "JSON: cover panel and first hidden frame, or cut frame"]
+    control: Annotated[
+        str, "JSON: frame from which a panel closes the control, of a chaotic one with the panel; or null"
+    ]
     question: Annotated[str, "well-posed question with its choices"]
     labels: Labels
     aliases: Aliases

@@ -26,7 +26,7 @@ from traps_pipeline.explorer.duplicates import Comparison
 from traps_pipeline.explorer.queue import MEANINGS, QUEUES, QueueName, flags, queue
 from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script, study_file
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.report.gallery import certificate_phrases, intervention
+from traps_pipeline.report.gallery import answer_of_control, certificate_phrases, intervention
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import EXPERIMENTS
 from traps_pipeline.yamlfile import explain
@@ -202,7 +202,7 @@ class Review:
             "words": {word: _as_json(spec[word]) for word in ("question", "ill_posed_question", "labels")}
             | {"answer": spec["ground_truth"]},
             "captions": {
-                "control": f"Control: {spec['ground_truth']}",
+                "control": f"Control: {answer_of_control(spec)}",
                 "void": f"Void: {intervention(spec)}",
                 "twin": f"Twin, same void: {json.loads(spec['twin'])['ground_truth']}",
             },

@@ -28,7 +28,7 @@ from traps_pipeline.yamlfile import explain, read_lines
 
 _HEX = r"^[0-9a-f]{64}$"
 # What a record says of arithmetic: another CPU or another version of the simulator may draw the same scene otherwise.
-_OF_ARITHMETIC = ("evidence", "trajectory_sha256", "twin")
+_OF_ARITHMETIC = ("evidence", "trajectory_sha256", "twin", "control")
 _LIBRARIES = ("mujoco", "numpy")
 
 

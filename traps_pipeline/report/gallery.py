@@ -56,7 +56,8 @@ def gallery_files(specs: pd.DataFrame, videos: pd.DataFrame, root: Path, title: 
     for spec in specs.sort_values("scenario_id").to_dict("records"):
         if all((spec["scenario_id"], side) in clips for side in SIDES):
             for side in SIDES:
-                files[_poster(spec["scenario_id"], side)] = _last_frame(root / clips[spec["scenario_id"], side])
+                shown = closes_frame(spec) if side == "control" else None
+                files[_poster(spec["scenario_id"], side)] = _last_frame(root / clips[spec["scenario_id"], side], shown)
             sections[spec["family"]].append(_entry(spec, clips))
     files["gallery.html"] = _render(title, dict(sorted(sections.items()))).encode()
     return files
@@ -66,11 +67,12 @@ def _poster(scenario_id: str, side: str) -> str:
     return f"{POSTERS}/{scenario_id}-{side}.jpg"
 
 
-def _last_frame(clip: Path) -> bytes:
+def _last_frame(clip: Path, before: int | None) -> bytes:
+    """The last frame, or the last one before a panel closes the clip, as a JPEG."""
     import cv2
 
     frames, _ = decode(clip)
-    small = cv2.resize(frames[-1], (POSTER_WIDTH, POSTER_HEIGHT), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(frames[:before][-1], (POSTER_WIDTH, POSTER_HEIGHT), interpolation=cv2.INTER_AREA)
     _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 82])
     return jpeg.tobytes()
 
@@ -78,7 +80,7 @@ def _last_frame(clip: Path) -> bytes:
 def _entry(spec: Mapping[str, Any], clips: Mapping[tuple[str, str], str]) -> ShownScenario:
     scenario_id, evidence, twin = spec["scenario_id"], json.loads(spec["evidence"]), json.loads(spec["twin"])
     captions = {
-        "control": f"control: {spec['ground_truth']}",
+        "control": f"control: {answer_of_control(spec)}",
         "void": f"void: {intervention(spec)}",
         "twin": f"twin, same void: {twin['ground_truth']}",
     }
@@ -90,6 +92,18 @@ def _entry(spec: Mapping[str, Any], clips: Mapping[tuple[str, str], str]) -> Sho
     return ShownScenario(scenario_id, spec["question"], labels, spec["ill_posed_question"], pictures, certificate)
 
 
+def closes_frame(spec: Mapping[str, Any]) -> int | None:
+    """The frame from which a panel closes the control of a SCENE_SPECS row; None if none does."""
+    control = json.loads(spec["control"])
+    return None if control is None else control["closes_frame"]
+
+
+def answer_of_control(spec: Mapping[str, Any]) -> str:
+    """The control's answer and until when its outcome is in view, from a SCENE_SPECS row."""
+    frame, fps = closes_frame(spec), json.loads(spec["physics"])["fps"]
+    return spec["ground_truth"] if frame is None else f"{spec['ground_truth']}, in view until {frame / fps:.1f} s"
+
+
 def intervention(spec: Mapping[str, Any]) -> str:
     """What was done to the control's clip to make the void, from a SCENE_SPECS row."""
     at = f"{spec['void_from_s']:.1f} s"
@@ -98,6 +112,7 @@ def intervention(spec: Mapping[str, Any]) -> str:
 
 _PHRASES = {
     "commit_s": "outcome settled at {} s",
+    "read_s": "in view for {:.1f} s before a panel comes",
     "margin_m": "margin {} m",
     "least_visible_px": "at least {:.0f} pixels at the end",
     "ablation_px": "{} pixels change without what is hidden",
@@ -114,7 +129,7 @@ _PHRASES = {
 def certificate_phrases(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Name and words of each number that the certificates of a scenario rest on, from its evidence."""
     for name, phrase in _PHRASES.items():
-        if name in evidence:
+        if evidence.get(name) is not None:
             yield name, phrase.format(evidence[name])
 
 

@@ -2,7 +2,8 @@
 
 A shortcut tells control from void without looking at what happens: a panel in the first frame, a short clip, a question
 without choices. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be answered
-can be answered, and what must be abstained on cannot. Not every scenario admits every arm; `Rejected` says why.
+can be answered, and what must be abstained on cannot. Not every scenario admits every arm; `Rejected` says why. What
+an arm shows of a control it shows as if no panel closed it: it differs from the pair in what it takes away.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,15 +26,12 @@ from traps_pipeline.scenes.certificates import (
 )
 from traps_pipeline.scenes.kit import View
 from traps_pipeline.scenes.offers import with_choices, without_choices
-from traps_pipeline.scenes.outcome import Rejected, compile_scene, decisive_geoms
+from traps_pipeline.scenes.outcome import Rejected, compile_scene, decisive_geoms, moving_geoms
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.simulate import initial_velocity, replay
 from traps_pipeline.scenes.spec import SceneSpec
 from traps_pipeline.scenes.wording import refutation
 from traps_pipeline.scenes.world import World
-
-if TYPE_CHECKING:
-    import mujoco
 
 # --- thresholds -------------------------------------------------------------------------------------------------------
 
@@ -69,7 +67,7 @@ class Scenario:
 
     @cached_property
     def control_frames(self) -> list[np.ndarray]:
-        """The control, as it is drawn."""
+        """The control as it is drawn without the panel that may close it."""
         with self.control.renderer() as renderer:
             return list(renderer.frames(self.control.qpos))
 
@@ -236,12 +234,6 @@ def _looking_past(camera: Camera, corners: np.ndarray) -> Iterator[Camera]:
         yield replace(camera, lookat=(a, b, c))
 
 
-def moving_geoms(model: mujoco.MjModel) -> list[str]:
-    """Names of the geoms of bodies that move."""
-    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
-    return [model.geom(int(i)).name for i in moving if model.geom(int(i)).name]
-
-
 def _frame_out(scenario: Scenario) -> Take:
     control, twin = scenario.control, scenario.twin
     cover, commit = control.scene.cover, control.outcome.commit_frame
@@ -279,9 +271,9 @@ def _frame_out(scenario: Scenario) -> Take:
 
 
 def _length_matched(scenario: Scenario) -> Take:
-    """The control's last frames, as many as the void has; the observer answers from them."""
-    spec, family = scenario.spec, scenario.control.family
-    frames = scenario.control_frames[-spec.void["cut_frame"] :]
+    """The control's last frames before it closes, as many as the void has; the observer answers from them."""
+    spec, family, end = scenario.spec, scenario.control.family, scenario.control.open_frames
+    frames = scenario.control_frames[end - spec.void["cut_frame"] : end]
     assert family.observe is not None, f"{family.name}: has no observer"
     seen = family.observe(np.stack(frames[scenario.sampled]), spec.question)
     if seen != spec.ground_truth:
@@ -404,7 +396,8 @@ ARMS: Mapping[str, Arm] = {
         Arm(
             "length_matched",
             "a short clip means: abstain",
-            "the control's last frames, as many as the void has, from which the observer answers rightly",
+            "the control's last frames before it closes, as many as the void has, from which the observer answers "
+            "rightly",
             must_answer,
             _length_matched,
         ),

@@ -69,6 +69,15 @@ class Panel:
         return local @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + np.array(self.centre)
 
 
+@dataclass(frozen=True)
+class Closing:
+    """How a control ends: from this frame on a panel stands before its outcome, in an occlusion scene that of its void,
+    where the void has it."""
+
+    frame: int
+    panel: Panel
+
+
 def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:
     return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
 

@@ -21,7 +21,7 @@ from traps_pipeline.scenes.camera import in_frame
 from traps_pipeline.scenes.evidence import About, Certificate, Claim, Evidence, Judged, Number, Pair, VoidKind
 from traps_pipeline.scenes.kit import Family, Motion, Physics, Scene, flag_of
 from traps_pipeline.scenes.outcome import Outcome, Rejected, decisive_geoms, read_outcome
-from traps_pipeline.scenes.policies import POLICIES, fewest_within, shown_at_end
+from traps_pipeline.scenes.policies import POLICIES, fewest_within, last_of_all, shown_at_end
 from traps_pipeline.scenes.simulate import swept_points
 from traps_pipeline.scenes.spec import SceneSpec
 from traps_pipeline.scenes.wording import FAR_COLOUR, false_premises, refutation
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 TURNS_DEG = 10.0  # so far the thing turns that a scene is about
 COMMITTED_BEFORE_END_S = 0.6  # so long the outcome must have stood at the end
+READ_S = 0.8  # so long a settled outcome stands in view before a control closes
 LEGIBLE_PIXELS = 150.0  # of each decisive body at the end of the control
 REFERENT_PIXELS = 80.0  # of whatever a question names, in each frame of the void
 MOVING_S = 0.5  # so long a body must be seen moving that is hidden later
@@ -97,6 +98,7 @@ def futures_of(control: World, seed: int) -> ensemble.Futures:
 def stored_evidence(spec: SceneSpec) -> dict[str, Any]:
     """The evidence that a record holds, and what it says of void and twin elsewhere."""
     evidence = spec.evidence | {"twin_answer": spec.twin.ground_truth}
+    evidence |= _closes(spec.closes_frame, Physics(**spec.physics))
     if spec.void_kind == "truncation":
         evidence |= _cut_evidence(spec.void["cut_frame"], spec.physics["fps"])
     return evidence
@@ -252,7 +254,8 @@ def _legible(pair: Pair) -> Evidence:
     if not groups:
         raise Rejected("nothing says what must be seen at the end of the control")
     with control.renderer() as renderer:
-        shown_at = shown_at_end(len(control.qpos), control.physics.fps, COMMITTED_BEFORE_END_S)
+        last_s = COMMITTED_BEFORE_END_S if control.closing is None else READ_S
+        shown_at = shown_at_end(len(control.qpos), control.physics.fps, last_s, control.open_frames)
         frames = control.qpos[shown_at]
         shown = checks.least_visible(renderer, frames, groups)
     too_small = [
@@ -275,8 +278,8 @@ LEGIBLE = Certificate(
     name="legible",
     about="control",
     promises=f"each decisive body has {LEGIBLE_PIXELS:.0f} pixels in each frame of the last {COMMITTED_BEFORE_END_S} s "
-    f"that a model is shown ({', '.join(map(str, POLICIES))}), or the family's own groups of geoms (of a die, the top "
-    "face) have what the family asks for",
+    f"({READ_S} s before a control closes) that a model is shown ({', '.join(map(str, POLICIES))}), or the family's "
+    "own groups of geoms (of a die, the top face) have what the family asks for",
     does_not_promise="that a model's own resizing keeps them",
     numbers=(Number("too_small", kept=False), Number("least_visible_px", compared=False)),
     measure=_legible,
@@ -286,7 +289,10 @@ LEGIBLE = Certificate(
 
 def _order(pair: Pair) -> Evidence:
     control, span = pair.control, pair.control.outcome.in_order
-    return {"order_frames": None if span is None else fewest_within(len(control.qpos), control.physics.fps, span)}
+    if span is None:
+        return {"order_frames": None}
+    span = (span[0], min(span[1], control.open_frames))  # what a panel hides is not seen
+    return {"order_frames": fewest_within(len(control.qpos), control.physics.fps, span)}
 
 
 def _judge_order(e: Evidence, claim: Claim) -> Judged:
@@ -601,6 +607,67 @@ TWIN_OF_CUT = Certificate(
 )
 
 
+# --- how a control ends -----------------------------------------------------------------------------------------------
+
+
+def _closes(frame: int | None, physics: Physics) -> Evidence:
+    if frame is None:
+        return {"closes_s": None, "looks_until_s": None}
+    return {"closes_s": frame / physics.fps, "looks_until_s": last_of_all(physics.n_frames, physics.fps) / physics.fps}
+
+
+def _closing(pair: Pair) -> Evidence:
+    control, fps = pair.control, pair.control.physics.fps
+    if control.closing is None:
+        unread = {"read_answer": None, "read_s": None, "closed_px": None, "closed_change_px": None}
+        return {**_closes(None, control.physics), **unread}
+    outcome, end = control.outcome_read, control.closed_frames
+    with control.closed_renderer() as renderer:
+        seen = renderer.visible_pixels(control.closed_at, control.closed_off, panel=True)
+        changed = checks.ablation_pixels(renderer, control.closed_at, control.closed_off, end)
+    differing, _ = checks.differing_pixels(end, pair.other_world.closed_frames)
+    return {
+        **_closes(control.closing.frame, control.physics),
+        "read_answer": outcome.label,
+        "read_s": (control.closing.frame - outcome.commit_frame) / fps,
+        "closed_px": float(seen.sum()),
+        "closed_change_px": changed + differing,
+    }
+
+
+def _judge_closing(e: Evidence, claim: Claim) -> Judged:
+    if e["closes_s"] is None:
+        return
+    if e.get("read_answer", claim.answer) != claim.answer:
+        yield f"before the panel comes the control shows {e['read_answer']!r}, the record says {claim.answer!r}"
+    if min(e["read_s"], e["closes_s"] - e["commit_s"]) < READ_S - _NOISE_S:
+        yield f"the panel comes at {e['closes_s']:.1f} s, less than {READ_S} s after the outcome has settled"
+    if e["closes_s"] > e["looks_until_s"] + _NOISE_S:
+        yield f"the panel comes at {e['closes_s']:.1f} s; some model is shown no frame after {e['looks_until_s']:.1f} s"
+    if e["closed_px"]:
+        yield f"{e['closed_px']:.0f} pixels of what the panel must hide are seen past it"
+    if e["closed_change_px"]:
+        yield f"behind the panel the outcome changes {e['closed_change_px']} pixels of the control's end"
+
+
+CLOSING = Certificate(
+    name="closing",
+    about="twin",
+    promises="where the control closes: the frames before the panel comes show the ground truth by themselves, settled "
+    f"for {READ_S} s or more; the panel stands to the end and in the last frame that a model is shown "
+    f"({', '.join(map(str, POLICIES))}); from its coming on no pixel shows a decisive body or the hidden element "
+    "(chaotic: anything that moves), taking them away changes no pixel, and the twin, with its other answer, has the "
+    "same frames byte for byte: nobody can answer from the last frame",
+    does_not_promise="that what happens before the outcome, seen in part, cannot be answered from some other frame",
+    numbers=(
+        *(Number(name, kept=False) for name in ("closes_s", "looks_until_s", "read_answer")),
+        *(Number(name) for name in ("read_s", "closed_px", "closed_change_px")),
+    ),
+    measure=_closing,
+    judge=_judge_closing,
+)
+
+
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
@@ -652,6 +719,7 @@ CERTIFICATES = (
     CUT,
     OPEN,
     TWIN_OF_CUT,
+    CLOSING,
     WORDS,
 )
 

@@ -88,8 +88,8 @@ def _same_physics(pair: Pair) -> bool:
 def _last_frames(pair: Pair) -> tuple[str, str]:
     """Digests of the last frame of the control and of the void."""
     control = pair.control
-    with control.renderer() as renderer:
-        end = list(renderer.frames(control.qpos[-1:]))
+    with control.closed_renderer() as renderer:
+        end = list(renderer.frames(control.qpos[-1:], panel=control.closing is not None))
         if control.panel is not None:
             void = renderer.frames(control.qpos[-1:], panel=True)
         else:

@@ -81,6 +81,12 @@ def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = (
     yield from renderer.frames(qpos, panel=True, without=without)
 
 
+def control_frames(renderer: Renderer, qpos: np.ndarray, open_frames: int) -> Iterator[np.ndarray]:
+    """The control that a trajectory makes: so many frames as they are, and the others behind the renderer's panel."""
+    yield from renderer.frames(qpos[:open_frames])
+    yield from renderer.frames(qpos[open_frames:], panel=True)
+
+
 def ablation_pixels(
     renderer: Renderer, qpos: np.ndarray, geoms: Sequence[str], void: Iterable[np.ndarray] | None = None
 ) -> int:

@@ -1,6 +1,7 @@
 """The two clips of a scenario, replayed from its frozen trajectory: nothing is simulated here.
 
-Occluder: the void is the same replay with the cover panel drawn. Truncation: the void is a prefix of the control.
+Occluder: the void is the same replay with the cover panel drawn. Truncation: the void is a prefix of the control. A
+control that closes has a panel in its last frames; the twin's clip never has one.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.spec import SceneSpec
 from traps_pipeline.scenes.workers import run_in_order
+from traps_pipeline.scenes.world import closing_of
 
 ABLATION_FRAMES = 5  # evenly spaced void frames that are drawn once more without what they must not show
 
@@ -123,13 +125,14 @@ def render_pair(job: Job) -> int:
 
 def _render_control_and_void(job: Job, family: Family, physics: Physics, missing: Sequence[Path]) -> int:
     spec = job.spec
-    panel = Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None
-    model, scene = compile_scene(family, family.params_from(spec.params), physics, panel)
-    drawn = 0
+    panel, closing = Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None, closing_of(spec)
+    behind = panel if closing is None else closing.panel
+    model, scene = compile_scene(family, family.params_from(spec.params), physics, behind)
+    drawn, open_frames = 0, len(job.qpos) if closing is None else closing.frame
     with Renderer(model, Camera.from_record(spec.camera)) as renderer:
         control: list[np.ndarray] = []
         if job.control in missing or panel is None:
-            control = list(renderer.frames(job.qpos))
+            control = list(checks.control_frames(renderer, job.qpos, open_frames))
             drawn += len(control)
         if job.control in missing:
             save_clip(job.control, control, physics.fps)

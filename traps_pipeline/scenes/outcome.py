@@ -81,6 +81,12 @@ def simulated(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarr
         raise Rejected(str(error)) from error
 
 
+def moving_geoms(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of the geoms of bodies that move."""
+    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
+    return tuple(model.geom(int(i)).name for i in moving if model.geom(int(i)).name)
+
+
 def decisive_geoms(model: mujoco.MjModel, bodies: Sequence[str]) -> tuple[str, ...]:
     """Names of the geoms of some bodies."""
     ids = {model.body(name).id for name in bodies}

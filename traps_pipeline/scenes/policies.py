@@ -43,15 +43,24 @@ SAMPLED = FramePolicy(fps=5)  # what most models, and the observer, are shown
 POLICIES = (SAMPLED, FramePolicy(uniform=16), FramePolicy(fps=2, most=32))
 
 
-def shown_at_end(n_frames: int, fps: int, last_s: float) -> list[int]:
-    """Frames within the last so many seconds of a clip that some policy shows; at least the last one of each policy."""
+def shown_at_end(n_frames: int, fps: int, last_s: float, until: int | None = None) -> list[int]:
+    """Frames within the last so many seconds of a clip, or of what it shows before frame `until`, that some policy
+    shows; at least the last one of each policy."""
     times = np.arange(n_frames) / fps
+    end = n_frames if until is None else until
     found: set[int] = set()
     for policy in POLICIES:
         shown = policy.pick(times)
-        late = shown[times[shown] >= times[-1] - last_s - 1e-6]
+        shown = shown[shown < end]
+        late = shown[times[shown] >= times[end - 1] - last_s - 1e-6]
         found |= {int(i) for i in (late if late.size else shown[-1:])}
     return sorted(found)
+
+
+def last_of_all(n_frames: int, fps: int) -> int:
+    """The last frame of the policy that stops looking first: every policy shows this frame or a later one last."""
+    times = np.arange(n_frames) / fps
+    return min(int(policy.pick(times)[-1]) for policy in POLICIES)
 
 
 def fewest_within(n_frames: int, fps: int, span: tuple[int, int]) -> int:

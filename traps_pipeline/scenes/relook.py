@@ -1,7 +1,8 @@
-"""Giving released records the look that their family's draws have by now: the same worlds under another floor.
+"""Giving released records what new draws of their family have: another floor, or a control that a panel closes.
 
-Where a look moves neither camera nor panel, a record with it is the one that `sample_family` would have drawn: nothing
-is simulated, the trajectory stays, and what pixels say is measured again. Whoever uses it then runs `traps certify`.
+Neither moves anything, and a look may move neither camera nor panel. So a record with it is the one that
+`sample_family` would have drawn: nothing is simulated, the trajectory stays, and what pixels say is measured again.
+Whoever uses it then runs `traps certify`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
-from traps_pipeline.scenes.certificates import certificates_for, pair_of
+from traps_pipeline.scenes.certificates import certificates_for, pair_of, stored_evidence
+from traps_pipeline.scenes.closing import closed, record_of
 from traps_pipeline.scenes.kit import params_to_dict
 from traps_pipeline.scenes.look import Look, look_of_draw
 from traps_pipeline.scenes.outcome import Rejected
@@ -35,21 +37,61 @@ def relook_family(
     family, tallies = get_family(name), load_tallies(released)
     if not set(family.looks) <= set(STILL):
         raise TrapsError(f"{name}: a look in {', '.join(family.looks)} moves the camera; draw the family anew")
-    tally, lines = tallies[name], released / f"{name}.jsonl"
+    _rewrite(released, name, _relooked, workers, report)
+    tallies[name] = replace(tallies[name], file=family_digest(name), look=sorted(family.looks))
+    save_tallies(released, tallies)
+
+
+def close_family(
+    released: Path, name: str, workers: int | None = None, report: Callable[[str], None] = lambda _: None
+) -> None:
+    """Let the controls of all records of a family end as those of new draws do (`closing`), and measure again what is
+    seen of them. Raises TrapsError naming a record that is no longer certified; nothing is written then."""
+    _rewrite(released, name, _ended, workers, report)
+    tallies = load_tallies(released)
+    tallies[name] = replace(tallies[name], file=family_digest(name) if tallies[name].file else "")
+    save_tallies(released, tallies)
+
+
+_Job = tuple[SceneSpec, Path, int]
+
+
+def _rewrite(
+    released: Path,
+    name: str,
+    change: Callable[[_Job], SceneSpec | str],
+    workers: int | None,
+    report: Callable[[str], None],
+) -> None:
+    """Change all records of a family, or none: change(record, folder of trajectories, seed) says why it cannot."""
+    seed, lines = load_tallies(released)[name].seed, released / f"{name}.jsonl"
     specs = [SceneSpec.model_validate_json(line) for line in lines.read_text(encoding="utf-8").splitlines()]
-    jobs = [(spec, released / "trajectories", tally.seed) for spec in specs]
+    jobs = [(spec, released / "trajectories", seed) for spec in specs]
     found: list[SceneSpec] = []
-    for job, seen in run_in_order(_relooked, jobs, workers):
+    for job, seen in run_in_order(change, jobs, workers):
         if isinstance(seen, str):
             raise TrapsError(f"{job[0].scenario_id}: {seen}; take it out (`take_out`) and draw it anew")
         found.append(seen)
         report(f"{seen.scenario_id}: {len(found)} of {len(specs)}")
     write_text(lines, "".join(record_line(spec) for spec in found))
-    tallies[name] = replace(tally, file=family_digest(name), look=sorted(family.looks))
-    save_tallies(released, tallies)
 
 
-def _relooked(job: tuple[SceneSpec, Path, int]) -> SceneSpec | str:
+def _ended(job: _Job) -> SceneSpec | str:
+    """A record whose control ends as a new draw's does, or which certificate it loses."""
+    spec, folder, _ = job
+    path = folder / f"{spec.scenario_id}.npz"
+    qpos = load_trajectory(path, spec.trajectory_sha256)
+    twin = load_trajectory(path, spec.twin.trajectory_sha256, "twin")
+    plainly = spec.model_copy(update={"control": None})
+    try:
+        pair, evidence = closed(pair_of(plainly, qpos, twin), spec.seed, stored_evidence(plainly))
+    except Rejected as rejected:
+        return str(rejected)
+    kept = {name: value for each in certificates_for(spec.void_kind) for name, value in each.kept(evidence).items()}
+    return spec.model_copy(update={"control": plain(record_of(pair)), "evidence": plain(kept)})
+
+
+def _relooked(job: _Job) -> SceneSpec | str:
     """A record with the look of its draw, or which certificate it loses under it."""
     spec, folder, seed = job
     family, path = get_family(spec.family), folder / f"{spec.scenario_id}.npz"

@@ -23,6 +23,7 @@ from traps_pipeline.scenes.certificates import (
     shown_points,
 )
 from traps_pipeline.scenes.checks import differing_pixels
+from traps_pipeline.scenes.closing import closed, record_of
 from traps_pipeline.scenes.ensemble import Cut, Futures, Rollout
 from traps_pipeline.scenes.evidence import Claim, Evidence, Pair, VoidKind, required
 from traps_pipeline.scenes.kit import Family, Physics, Wording, params_to_dict
@@ -66,6 +67,7 @@ def resolve(
     candidates = _cut_short(pair) if control.panel is None else _covered(pair)
     evidence = required(certificates_for(kind, "void"), candidates[0], evidence)
     pair, evidence = _with_certified_twin(candidates, kind, evidence)
+    pair, evidence = closed(pair, seed, evidence)
     twin, frame = pair.other_world, pair.void_from
     panel = None if control.panel is None else asdict(control.panel)
     spec = SceneSpec(
@@ -80,6 +82,7 @@ def resolve(
         camera=plain(asdict(control.camera)),
         void_kind=kind,
         void=plain({"cut_frame": frame} if panel is None else {"panel": panel, "hidden_from_frame": frame}),
+        control=plain(record_of(pair)),
         question=wording.question,
         labels=list(wording.labels),
         aliases=dict(wording.aliases),

@@ -66,6 +66,18 @@ class _Truncation(_Strict):
     cut_frame: int = Field(ge=1)
 
 
+class _Closing(_Strict):
+    """When the panel of the void comes in the control (occluder)."""
+
+    closes_frame: int = Field(ge=1)
+
+
+class _ClosingPanel(_Closing):
+    """When a panel comes in the control, and which (truncation: the void has none)."""
+
+    panel: _Panel
+
+
 class Answerable(BaseModel):
     """A question that both videos of the pair answer."""
 
@@ -94,6 +106,9 @@ class Twin(BaseModel):
 class SceneSpec(BaseModel):
     """One scenario, resolved: nothing about it is left to chance or to the code's defaults.
 
+    control: how the control closes: from which frame a panel stands before its outcome, and which panel where the void
+    has none; None if no panel comes.
+
     Hashes: `scene_hash` covers what decides the pixels (family, params, physics, camera, void, trajectory, twin),
     `spec_hash` covers everything. Both are derived, never read from the file.
     """
@@ -110,6 +125,7 @@ class SceneSpec(BaseModel):
     camera: dict[str, Any]
     void_kind: Literal["occluder", "truncation"]
     void: dict[str, Any]
+    control: dict[str, Any] | None = None
     question: str = Field(min_length=1)
     labels: list[str] = Field(min_length=2)
     aliases: dict[str, str]
@@ -145,14 +161,24 @@ class SceneSpec(BaseModel):
         _checked(_Camera, "camera", self.camera)
         void = _checked(_Truncation if self.void_kind == "truncation" else _Occluder, "void", self.void)
         frame = void.cut_frame if isinstance(void, _Truncation) else void.hidden_from_frame
-        if frame >= physics.duration_s * physics.fps:
-            raise ValueError(f"void: frame {frame} is not in a clip of {physics.duration_s} s at {physics.fps} FPS")
+        frames = {"void": frame}
+        if self.control is not None:
+            kind = _ClosingPanel if self.void_kind == "truncation" else _Closing
+            frames["control"] = _checked(kind, "control", self.control).closes_frame
+        for name, at in frames.items():
+            if at >= physics.duration_s * physics.fps:
+                raise ValueError(f"{name}: frame {at} is not in a clip of {physics.duration_s} s at {physics.fps} FPS")
         return self
+
+    @property
+    def closes_frame(self) -> int | None:
+        """The frame from which a panel stands before the control's outcome; None if none comes."""
+        return None if self.control is None else self.control["closes_frame"]
 
     @property
     def scene_hash(self) -> str:
         """Digest of what the clips show; a corrected question leaves it alone."""
-        parts = ("family", "params", "physics", "camera", "void_kind", "void", "trajectory_sha256", "twin")
+        parts = ("family", "params", "physics", "camera", "void_kind", "void", "control", "trajectory_sha256", "twin")
         record = self.model_dump(mode="json", include=set(parts))
         return digest(record)
 

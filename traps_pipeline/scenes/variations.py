@@ -15,11 +15,11 @@ import numpy as np
 from traps_pipeline.digests import digest
 from traps_pipeline.partitions import FRAMINGS, PANEL_DOSES, PANEL_LOOKS, SCHEMAS
 from traps_pipeline.scenes import checks
-from traps_pipeline.scenes.arms import SEEN_PX, Arm, Question, Scenario, Take, moving_geoms, must_abstain, must_answer
+from traps_pipeline.scenes.arms import SEEN_PX, Arm, Question, Scenario, Take, must_abstain, must_answer
 from traps_pipeline.scenes.camera import Panel
 from traps_pipeline.scenes.certificates import legible_groups
 from traps_pipeline.scenes.kit import COLOURS, listed
-from traps_pipeline.scenes.outcome import Rejected, compile_scene
+from traps_pipeline.scenes.outcome import Rejected, compile_scene, moving_geoms
 from traps_pipeline.scenes.policies import shown_at_end
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
@@ -193,10 +193,11 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
 
 
 def _later(scenario: Scenario) -> Take:
-    """The frames after those that models are shown at the end show the outcome too; a void hides it in every frame."""
+    """The frames after those that models are shown at the end show the outcome too, but for those that a panel closes;
+    a void hides it in every frame."""
     control = scenario.control
-    at_end = shown_at_end(len(control.qpos), scenario.fps, END_S)
-    shown = sorted({min(frame + 1, len(control.qpos) - 1) for frame in at_end})
+    at_end = shown_at_end(len(control.qpos), scenario.fps, END_S, control.open_frames - 1)
+    shown = [frame + 1 for frame in at_end]
     if shown[0] < control.outcome.commit_frame:
         raise Rejected(f"the outcome is settled at frame {control.outcome.commit_frame}, frame {shown[0]} is shown")
     groups = legible_groups(control.family, control.model, control.scene, control.motion, control.params)

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 
 FLAG_PX = (60, 50)  # a flag is no wider and no higher
+PANEL_PX = 8000  # a panel that comes before a scene is larger, whatever moves is smaller
+CHANGED, ALIKE = 24, 20  # levels of 255: by more than these a pixel changes, by no more two are of one colour
 # Hue (degrees), least saturation and value (0-1) of the saturated colours. Shade lowers the value, not the hue.
 _HUES: Mapping[str, tuple[float, float, float, float]] = {
     "red": (346, 8, 0.62, 0.22),
@@ -86,6 +88,37 @@ def largest(frame: np.ndarray, colour: str, min_area: int = 12) -> Blob | None:
 def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int = 12) -> list[Blob | None]:
     """The largest region of a colour in every frame."""
     return [largest(frame, colour, min_area) for frame in frames]
+
+
+def before_panel(frames: np.ndarray) -> np.ndarray:
+    """The frames before a panel comes that stands to the end of the clip; all of them if none comes.
+
+    A panel comes in one step: a large region turns to one colour, more so than it was before, and stays as it is. What
+    stands from the first frame on does not come, and what goes leaves behind more colours than it had.
+    """
+    for at in range(1, len(frames)):
+        changed = _apart(frames[at], frames[at - 1]) > CHANGED
+        if changed.sum() < PANEL_PX:
+            continue
+        count, names = cv2.connectedComponents(changed.astype(np.uint8), connectivity=4)
+        sizes = np.bincount(names.ravel(), minlength=count)
+        sizes[0] = 0
+        region = names == sizes.argmax()
+        if sizes.max() < PANEL_PX or _evenness(frames[at][region]) < max(0.8, _evenness(frames[at - 1][region])):
+            continue
+        if (_apart(frames[-1][region], frames[at][region]) <= ALIKE).mean() > 0.9:
+            return frames[:at]
+    return frames
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """By how many levels two pictures differ, pixel by pixel."""
+    return np.abs(a.astype(np.int16) - b).max(axis=-1)
+
+
+def _evenness(pixels: np.ndarray) -> float:
+    """Share of pixels (N, 3) that have their common colour."""
+    return float((_apart(pixels, np.median(pixels, axis=0).astype(np.uint8)) <= ALIKE).mean())
 
 
 def without_flags(frames: np.ndarray) -> np.ndarray:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.camera import Camera, Panel
+from traps_pipeline.scenes.camera import Camera, Closing, Panel
 from traps_pipeline.scenes.checks import PastPanel, void_frames
 from traps_pipeline.scenes.kit import Family, Inventory, Motion, Physics, Scene
-from traps_pipeline.scenes.outcome import Outcome, compile_scene, decisive_geoms, read_outcome, simulated
+from traps_pipeline.scenes.outcome import Outcome, compile_scene, decisive_geoms, moving_geoms, read_outcome, simulated
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.simulate import replay
@@ -28,6 +28,7 @@ class World:
 
     qpos: the trajectory (F, nq). panel: the cover panel of its void, None where the void is a cut. frame_step: pixel
     evidence looks at every so many frames. simulated: the trajectory that simulating gives here, where it is known.
+    closing: how the control ends, None if no panel comes.
     """
 
     family: Family
@@ -38,6 +39,7 @@ class World:
     panel: Panel | None
     frame_step: int = 1
     simulated: np.ndarray | None = None
+    closing: Closing | None = None
 
     @staticmethod
     def of_record(spec: SceneSpec, qpos: np.ndarray, *, twin: bool = False, frame_step: int = 1) -> World:
@@ -52,6 +54,7 @@ class World:
             camera=Camera.from_record(spec.camera),
             panel=Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None,
             frame_step=frame_step,
+            closing=closing_of(spec),
         )
 
     @cached_property
@@ -74,6 +77,18 @@ class World:
         return self.family.build(self.params, self.physics).inventory
 
     @cached_property
+    def closed_model(self) -> mujoco.MjModel:
+        """The compiled model with the panel that closes the control: that of the void, or its own."""
+        if self.closing is None or self.panel is not None:
+            return self.model
+        return compile_scene(self.family, self.params, self.physics, self.closing.panel)[0]
+
+    @property
+    def open_frames(self) -> int:
+        """How many frames the control shows before a panel comes: all of them if none does."""
+        return len(self.qpos) if self.closing is None else self.closing.frame
+
+    @cached_property
     def motion(self) -> Motion:
         """Poses of all bodies, replayed."""
         return replay(self.model, self.qpos, self.physics)
@@ -82,6 +97,14 @@ class World:
     def outcome(self) -> Outcome:
         """What the trajectory comes to."""
         return read_outcome(self.family, self.motion, self.params)
+
+    @property
+    def outcome_read(self) -> Outcome:
+        """What the frames before the closing come to, by themselves: what there is to be read."""
+        shown = slice(0, self.open_frames)
+        whole = self.motion
+        positions, rotations = ({k: v[shown] for k, v in each.items()} for each in (whole.positions, whole.rotations))
+        return read_outcome(self.family, Motion(whole.times[shown], positions, rotations), self.params)
 
     @cached_property
     def resimulated(self) -> np.ndarray:
@@ -109,6 +132,12 @@ class World:
         """Names of all geoms that the void must not show: those of decisive bodies and of the hidden element."""
         return (*decisive_geoms(self.model, self.scene.decisive), *self.scene.hidden)
 
+    @property
+    def closed_off(self) -> tuple[str, ...]:
+        """Names of all geoms that nothing may be seen of once the control is closed: what is concealed in the void; of
+        a cut scene everything that moves."""
+        return moving_geoms(self.model) if self.panel is None else self.concealed
+
     @cached_property
     def geoms(self) -> tuple[str, ...]:
         """Names of all geoms, in the order of the model."""
@@ -135,3 +164,26 @@ class World:
         """The world with its panel, as it is drawn."""
         with self.renderer() as renderer:
             return list(void_frames(renderer, self.looked_at))
+
+    @property
+    def closed_at(self) -> np.ndarray:
+        """The poses that pixel evidence of the closed control looks at, the last one always among them."""
+        return self.qpos[sorted(range(len(self.qpos) - 1, self.open_frames - 1, -self.frame_step))]
+
+    @cached_property
+    def closed_frames(self) -> list[np.ndarray]:
+        """The end of the control, behind the panel that closes it, as it is drawn."""
+        with self.closed_renderer() as renderer:
+            return list(void_frames(renderer, self.closed_at))
+
+    def closed_renderer(self) -> Renderer:
+        """A renderer of this world with the panel that closes the control; close it before another one is opened."""
+        return Renderer(self.closed_model, self.camera)
+
+
+def closing_of(spec: SceneSpec) -> Closing | None:
+    """How the control of a record closes."""
+    if spec.control is None:
+        return None
+    panel = (spec.void if spec.void_kind == "occluder" else spec.control)["panel"]
+    return Closing(spec.control["closes_frame"], Panel.from_record(panel))

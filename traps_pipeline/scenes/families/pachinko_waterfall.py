@@ -174,6 +174,7 @@ def build(p: Params, physics: Physics) -> Scene:
         view=View(azimuth_deg=p.azimuth_deg, elevation_deg=p.elevation_deg),
         decisive=tuple(f"ball_{i}" for i in range(BALLS)),
         stage=board.ends(top),
+        rest=board.region((0, p.rim_m), board.deep),
         inventory=Inventory(tuple(colours), ("ball", "board", "peg", "zone", "shelf", "wall")),
     )
 

@@ -127,6 +127,7 @@ def build(p: Params, physics: Physics) -> Scene:
         view=View(azimuth_deg=p.azimuth_deg, elevation_deg=p.elevation_deg),
         decisive=("ball_0",),
         stage=board.ends(top),
+        rest=board.region((APRON_M, p.rim_m), board.deep),
         velocity={f"ball_{i}": board.throw(push, rise) for i, (push, rise) in enumerate(throws)},
         inventory=Inventory(tuple(colours), ("ball", "board", "peg", "bucket", "number", "wall")),
     )

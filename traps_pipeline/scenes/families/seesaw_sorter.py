@@ -198,6 +198,7 @@ def build(p: Params, physics: Physics) -> Scene:
         view=View(azimuth_deg=p.azimuth_deg, elevation_deg=p.elevation_deg),
         decisive=("ball",),
         stage=(sill, head, beside),
+        rest=board.region((SILL_M, p.rim_m), board.deep),
         velocity={"ball": board.throw(p.push_m_s, p.rise_m)},
         inventory=Inventory(tuple(colours), (*nouns, *(["box", "crate"] if p.crates_m else []))),
     )

@@ -145,7 +145,8 @@ def build(p: Params, physics: Physics) -> Scene:
         colours=sorted({*FACES, *p.edge_colours, "grey", "wood"}),
     )
     throws = [(p.direction * along, across, up) for along, across, up in p.speeds_m_s]
-    return replace(scene, velocity={d: (*v, *w) for d, v, w in zip(dice, throws, p.spins_rad_s, strict=True)})
+    velocity = {d: (*v, *w) for d, v, w in zip(dice, throws, p.spins_rad_s, strict=True)}
+    return replace(scene, velocity=velocity, rest=stage.box((p.run_m, end), (-side, side), (0, rim)))
 
 
 def _add_glass_edges(stage: Stage, along: tuple[float, float], side: float, up: tuple[float, float]) -> None:

@@ -183,6 +183,12 @@ class Board:
         velocity = self.up * math.sqrt(2 * slowing * rise_m) + np.array([push_m_s, 0, 0])
         return (*velocity.tolist(), *(np.cross(self.normal, velocity) / self.ball_radius_m).tolist())
 
+    def region(self, up: Span, out: float) -> Box:
+        """The box around a strip of the board from side to side, so far out of it (m)."""
+        corners = np.array([self.up * height + self.normal * away for height in up for away in (0.0, out)])
+        (_, near, low), (_, far, high) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+        return Box((-self.outer, near, low + LIFT_M), (self.outer, far, high + LIFT_M))
+
     def ends(self, top: float) -> tuple[Box, ...]:
         """The lower edge of the board and the upper one of its frame, which the camera must see."""
         edges = [(self.up * height).tolist() for height in (0.0, top + 2 * WALL_M)]

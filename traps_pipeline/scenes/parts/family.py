@@ -12,7 +12,7 @@ from traps_pipeline.scenes.look import dressed, look_of, with_look
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
-from traps_pipeline.scenes.vision import without_flags
+from traps_pipeline.scenes.vision import before_panel, without_flags
 
 USUAL_PHYSICS = Physics()
 
@@ -46,7 +46,10 @@ def scene_family(
 
     def seen(frames: np.ndarray, text: str) -> str | None:
         named = question.named_in(text)
-        return None if named is None else observe(frames if twins is None else without_flags(frames), named)
+        if named is None:
+            return None
+        shown = before_panel(frames)  # what a panel covers at the end was seen before it came
+        return observe(shown if twins is None else without_flags(shown), named)
 
     params = with_look(params)
     return Family(

@@ -1,0 +1,86 @@
+"""How a control ends: some time after its outcome has settled, a panel comes before it and stands to the end.
+
+So the last frame tells nobody the answer, and a model must have watched. In an occlusion scene the panel is that of the
+void, where the void has it: control and void then end in the same frames, and the last frame does not tell the one from
+the other. In a chaotic scene it stands before the place where all outcomes lie, and before whatever moves in either
+world, so that its place tells nothing of the answer.
+
+Every control closes that can: drawn among them, a panel at the end would tell something of the side after all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from traps_pipeline.scenes.camera import Closing, Panel, fit_panel
+from traps_pipeline.scenes.certificates import CLOSING, LEGIBLE, ORDER, READ_S
+from traps_pipeline.scenes.evidence import Pair, required
+from traps_pipeline.scenes.kit import Box
+from traps_pipeline.scenes.outcome import Rejected
+from traps_pipeline.scenes.policies import last_of_all
+from traps_pipeline.scenes.simulate import swept_points
+
+READ_BY_DRAW_S = 1.0  # so long the outcome is in view where there is time for it
+TRIES = 4  # moments at which it is tried to close a control
+
+
+def closed(pair: Pair, seed: int, so_far: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
+    """A pair whose control closes, at a moment that follows from the seed, with the evidence of it; the pair as it is
+    if its control can be closed at no moment that is tried. so_far: the evidence of all other certificates. Raises
+    Rejected if not even that can be certified."""
+    closings = (Closing(frame, _panel(pair, frame)) for frame in _moments(pair, seed))
+    for closing in closings:
+        try:
+            return _certified(pair, closing, so_far)
+        except Rejected:
+            continue  # another moment may do
+    return _certified(pair, None, so_far)
+
+
+def _certified(pair: Pair, closing: Closing | None, so_far: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
+    """A pair whose control ends like this, with all evidence. Raises Rejected."""
+    control, twin = replace(pair.control, closing=closing), replace(pair.other_world, closing=closing)
+    ending = replace(pair, control=control, twin=twin)
+    return ending, required((LEGIBLE, ORDER, CLOSING), ending, so_far)
+
+
+def record_of(pair: Pair) -> dict[str, Any] | None:
+    """How the control closes, as a record has it."""
+    closing = pair.control.closing
+    if closing is None:
+        return None
+    own = {} if pair.control.panel is not None else {"panel": asdict(closing.panel)}
+    return {"closes_frame": closing.frame, **own}
+
+
+def _moments(pair: Pair, seed: int) -> Iterator[int]:
+    """Frames at which the control may close, the last possible one at the end."""
+    control = pair.control
+    fps, commit = control.physics.fps, control.outcome.commit_frame
+    last = last_of_all(len(control.qpos), fps)
+    if last - commit < round(READ_S * fps):
+        return
+    first = min(commit + round(READ_BY_DRAW_S * fps), last)
+    rng = np.random.default_rng([seed, *control.family.name.encode(), *b"closing"])
+    drawn = [int(frame) for frame in rng.permutation(np.arange(first, last + 1))]
+    yield from dict.fromkeys([*drawn[: TRIES - 1], last])
+
+
+def _panel(pair: Pair, frame: int) -> Panel:
+    """The panel of the void, or one in front of where all outcomes lie and of all that moves from a frame on."""
+    control = pair.control
+    if control.panel is not None:
+        return control.panel
+    assert control.scene.rest is not None, f"{control.family.name}: a chaotic scene says where its outcomes lie"
+    points = [swept_points(world.model, world.qpos[frame:]) for world in (control, pair.other_world)]
+    hidden = np.concatenate([*points, control.scene.rest.corners()])
+    return fit_panel(control.camera, Box(_corner(hidden.min(axis=0)), _corner(hidden.max(axis=0))))
+
+
+def _corner(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return (x, y, z)
