@@ -23,7 +23,7 @@ from traps_pipeline.scoring.published import published_overall
 from traps_pipeline.storage.workspace import Workspace
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-SCENARIO, SHOWN_S = "hidden_drop-0001", 3.2  # the ball lies still from then on
+SCENARIO, SHOWN_S = "hidden_drop-0001", 3.1  # then a panel closes the control
 HOLD_MS = 2600  # the last frame, with the answers
 WIDTH, HEIGHT, HEAD, FOOT, GAP = 420, 315, 100, 62, 8  # px: a clip, the texts above and below it, between the clips
 MOST_BYTES = 1_500_000

@@ -149,6 +149,7 @@ def test_a_record_without_evidence_loses_every_certificate_that_stores_some() ->
         ["ablation", "no evidence 'ablation_px'"],
         ["referents", "no evidence 'referents'"],
         ["twin", "no evidence 'twin_px'"],
+        ["closing", "no evidence 'read_s'"],
     ]
 
 

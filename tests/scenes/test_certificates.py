@@ -286,6 +286,15 @@ GOOD: dict[str, Any] = {
         "rebuilt": True,
         "rebuilt_answer": CHAOTIC.twin_answer,
     },
+    "closing": {
+        "closes_s": 4.5,
+        "looks_until_s": 4.5,
+        "commit_s": 3.7,
+        "read_answer": CLAIM.answer,
+        "read_s": 0.8,
+        "closed_px": 0.0,
+        "closed_change_px": 0,
+    },
     "words": {"ill_posed_for": "mass", "question_refuted": None, "premises": 1},
 }
 BAD: list[tuple[str, dict[str, Any], str]] = [
@@ -321,6 +330,12 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("twin of cut", {"twin_deviation_px": 0.51}, "0.51 pixels off before the cut"),
     ("twin of cut", {"start_off": 2.6e-7}, "begins 2.6e-07 beside the start that the record names"),
     ("twin of cut", {"rebuilt": False}, "its trajectory is of another start"),
+    ("closing", {"read_answer": "teal"}, "before the panel comes the control shows 'teal'"),
+    ("closing", {"read_s": 0.7}, "less than 0.8 s after the outcome has settled"),
+    ("closing", {"commit_s": 3.8}, "less than 0.8 s after the outcome has settled"),
+    ("closing", {"closes_s": 4.6}, "some model is shown no frame after 4.5 s"),
+    ("closing", {"closed_px": 0.25}, "0.25 pixels of what the panel must hide are seen past it"),
+    ("closing", {"closed_change_px": 1}, "the outcome changes 1 pixels of the control's end"),
     ("words", {"ill_posed_for": None}, "has no answer"),
     ("words", {"question_refuted": "mass"}, "reads as ill-posed: mass"),
     ("words", {"premises": 2}, "presumes 2 things that are not so"),

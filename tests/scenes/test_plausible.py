@@ -60,6 +60,10 @@ def test_every_number_of_several_is_looked_at() -> None:
         ("bounce-0001", "void", {"panel": {}}, r"void\.panel\.centre: Field required"),
         ("plinko-0001", "void", {"cut_frame": True}, r"void\.cut_frame: Input should be a valid integer"),
         ("plinko-0001", "void", {"hidden_from_frame": 3}, r"void\.hidden_from_frame: Extra inputs are not permitted"),
+        ("plinko-0001", "control", {"closes_frame": 50}, r"control: frame 50 is not in a clip of 5\.0 s at 10 FPS"),
+        ("plinko-0001", "control", {"panel": {}}, r"control\.panel\.centre: Field required"),
+        ("bounce-0001", "control", {"closes_frame": 4.5}, r"control\.closes_frame: Input should be a valid integer"),
+        ("bounce-0001", "control", {"panel": {}}, r"control\.panel: Extra inputs are not permitted"),
     ],
 )
 def test_a_part_of_a_record_that_no_scene_has_is_named(
@@ -68,6 +72,13 @@ def test_a_part_of_a_record_that_no_scene_has_is_named(
     whole = record(scenario_id)
     with pytest.raises(ValidationError, match=complaint):
         SceneSpec.model_validate(whole | {part: whole[part] | changes})
+
+
+def test_a_panel_that_closes_a_cut_scene_is_its_own() -> None:
+    whole = record("plinko-0001")
+    with pytest.raises(ValidationError, match=r"control\.panel: Field required"):
+        SceneSpec.model_validate(whole | {"control": {"closes_frame": whole["control"]["closes_frame"]}})
+    assert SceneSpec.model_validate(whole | {"control": None}).closes_frame is None
 
 
 def test_a_void_without_its_frame_is_named() -> None:

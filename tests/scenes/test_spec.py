@@ -84,6 +84,7 @@ def test_the_scene_hash_covers_what_the_clips_show_and_nothing_else() -> None:
         "physics": spec.physics | {"fps": 5},
         "camera": spec.camera | {"fovy_deg": 36.0},
         "void": spec.void | {"hidden_from_frame": 7},
+        "control": {"closes_frame": 44},
         "trajectory_sha256": "0" * 64,
     }
     for name, value in shown.items():

@@ -60,6 +60,7 @@ scene_specs = stage(
     group=GROUP,
     deps=[released_specs, corrections],
     scheme=CATEGORY,
+    code="2",
     kinds=["parquet", "mujoco"],
     checks=[
         Check(
@@ -77,7 +78,8 @@ scene_specs = stage(
         Check(
             "void_certified",
             "By the evidence in each record, the void cannot be answered: the outcome is hidden without a trace and a "
-            "twin has another answer (occlusion), or futures disagree (chaotic). `traps certify` computes this again.",
+            "twin has another answer (occlusion), or futures disagree (chaotic); nor can a control that a panel closes "
+            "be answered from its last frame. `traps certify` computes this again.",
             _evidence("answerable_voids"),
         ),
         Check(

@@ -114,7 +114,7 @@ _PHRASES = {
     "commit_s": "outcome settled at {} s",
     "read_s": "in view for {:.1f} s before a panel comes",
     "margin_m": "margin {} m",
-    "least_visible_px": "at least {:.0f} pixels at the end",
+    "least_visible_px": "at least {:.0f} pixels when last in view",
     "ablation_px": "{} pixels change without what is hidden",
     "cause_moving_s": "cause seen moving for {} s",
     "panel_covers": "the panel covers {:.0%} of where things move",

@@ -645,7 +645,7 @@ def _judge_closing(e: Evidence, claim: Claim) -> Judged:
     if e["closes_s"] > e["looks_until_s"] + _NOISE_S:
         yield f"the panel comes at {e['closes_s']:.1f} s; some model is shown no frame after {e['looks_until_s']:.1f} s"
     if e["closed_px"]:
-        yield f"{e['closed_px']:.0f} pixels of what the panel must hide are seen past it"
+        yield f"{e['closed_px']:g} pixels of what the panel must hide are seen past it"
     if e["closed_change_px"]:
         yield f"behind the panel the outcome changes {e['closed_change_px']} pixels of the control's end"
 

@@ -75,9 +75,9 @@ def _panel(pair: Pair, frame: int) -> Panel:
     control = pair.control
     if control.panel is not None:
         return control.panel
-    assert control.scene.rest is not None, f"{control.family.name}: a chaotic scene says where its outcomes lie"
-    points = [swept_points(world.model, world.qpos[frame:]) for world in (control, pair.other_world)]
-    hidden = np.concatenate([*points, control.scene.rest.corners()])
+    zone = control.scene.stage if control.scene.rest is None else (control.scene.rest,)
+    moving = [swept_points(world.model, world.qpos[frame:]) for world in (control, pair.other_world)]
+    hidden = np.concatenate([*moving, *(box.corners() for box in zone)])
     return fit_panel(control.camera, Box(_corner(hidden.min(axis=0)), _corner(hidden.max(axis=0))))
 
 

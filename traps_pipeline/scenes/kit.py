@@ -122,7 +122,7 @@ class Scene:
     stage: boxes that must lie in frame besides everything that moves (the outcome zone above all).
     velocity: initial velocity of free bodies: linear (m/s, world) and angular (rad/s, body).
     inventory: what a viewer can name.
-    rest: where all outcomes lie (chaotic), which a panel hides that closes the control.
+    rest: where all outcomes lie (chaotic), which a panel hides that closes the control; None: all of the stage.
     marks: phrases ('left bin') of which a flag stands over the panel; its geom is `flag_of(phrase)`.
     shown_by: of a noun that no geom's name begins with: the nouns that stand for it.
     """

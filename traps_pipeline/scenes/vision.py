@@ -93,8 +93,8 @@ def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int 
 def before_panel(frames: np.ndarray) -> np.ndarray:
     """The frames before a panel comes that stands to the end of the clip; all of them if none comes.
 
-    A panel comes in one step: a large region turns to one colour, more so than it was before, and stays as it is. What
-    stands from the first frame on does not come, and what goes leaves behind more colours than it had.
+    A panel comes in one step: a large region turns to one colour, which is not that of what is around it, and stays as
+    it is. What stands from the first frame on does not come; where a panel goes, the scene goes on.
     """
     for at in range(1, len(frames)):
         changed = _apart(frames[at], frames[at - 1]) > CHANGED
@@ -104,9 +104,11 @@ def before_panel(frames: np.ndarray) -> np.ndarray:
         sizes = np.bincount(names.ravel(), minlength=count)
         sizes[0] = 0
         region = names == sizes.argmax()
-        if sizes.max() < PANEL_PX or _evenness(frames[at][region]) < max(0.8, _evenness(frames[at - 1][region])):
-            continue
-        if (_apart(frames[-1][region], frames[at][region]) <= ALIKE).mean() > 0.9:
+        around = cv2.dilate(region.astype(np.uint8), np.ones((17, 17), np.uint8)).astype(bool) & ~region
+        colour = np.median(frames[at][region], axis=0).astype(np.uint8)
+        even, beside = ((_apart(frames[at][part], colour) <= ALIKE).mean() for part in (region, around))
+        stays = (_apart(frames[-1][region], frames[at][region]) <= ALIKE).mean()
+        if sizes.max() >= PANEL_PX and even > 0.8 and beside < 0.3 and stays > 0.9:
             return frames[:at]
     return frames
 
@@ -114,11 +116,6 @@ def before_panel(frames: np.ndarray) -> np.ndarray:
 def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """By how many levels two pictures differ, pixel by pixel."""
     return np.abs(a.astype(np.int16) - b).max(axis=-1)
-
-
-def _evenness(pixels: np.ndarray) -> float:
-    """Share of pixels (N, 3) that have their common colour."""
-    return float((_apart(pixels, np.median(pixels, axis=0).astype(np.uint8)) <= ALIKE).mean())
 
 
 def without_flags(frames: np.ndarray) -> np.ndarray:

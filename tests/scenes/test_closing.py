@@ -1,0 +1,163 @@
+"""A control closes when its outcome has been seen, hides it from everybody and from every frame policy's last look; a
+record that was altered in any of this loses the certificate. Times are counted by hand for 50 frames at 10 a second."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.scenes.released import load
+from traps_pipeline.benchmark.evidence import answerable_voids
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.paths import RELEASED
+from traps_pipeline.scenes import relook
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH
+from traps_pipeline.scenes.certificates import CLOSING, LEGIBLE, ORDER, pair_of
+from traps_pipeline.scenes.checks import control_frames
+from traps_pipeline.scenes.policies import last_of_all, shown_at_end
+from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.vision import before_panel
+from traps_pipeline.scenes.world import World
+
+FLOOR, NAVY, RED = (200, 200, 188), (18, 28, 71), (219, 26, 31)
+BOARD, RACE = "plinko-0002", "hidden_race-0001"
+
+
+# --- when -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_last_frame_that_every_policy_comes_to_is_the_last_of_two_a_second() -> None:
+    assert last_of_all(50, 10) == 45  # 5 a second ends at 4.8 s, 16 evenly spaced at 4.9 s, 2 a second at 4.5 s
+
+
+def test_before_a_panel_comes_its_last_frames_are_those_that_are_shown_before_it() -> None:
+    # From 3.4 to 4.0 s. 5 a second: 3.4, 3.6, 3.8, 4.0. Of 16, 0.327 s apart: 3.6, 3.9. 2 a second: 3.5, 4.
+    assert shown_at_end(50, 10, 0.6, 41) == [34, 35, 36, 38, 39, 40]
+
+
+def test_every_released_control_closes_that_has_the_time_and_most_of_each_taxonomy_do() -> None:
+    shares: dict[str, list[bool]] = {"occlusion": [], "chaotic": []}
+    for spec in load_released().values():
+        commit, closes = round(10 * spec.evidence["commit_s"]), spec.closes_frame
+        shares[spec.taxonomy].append(closes is not None)
+        if closes is None:
+            assert spec.evidence["closed_px"] is None
+            continue
+        assert commit + 8 <= closes <= 45, spec.scenario_id
+        assert closes >= min(commit + 10, 45), spec.scenario_id
+        assert (spec.evidence["closed_px"], spec.evidence["closed_change_px"]) == (0, 0)
+    assert all(shares["occlusion"])  # so a panel at the end tells nothing of the side
+    assert np.mean(shares["chaotic"]) > 0.5
+
+
+def test_closing_times_differ() -> None:
+    times = Counter(spec.closes_frame for spec in load_released().values() if spec.taxonomy == "occlusion")
+    assert len(times) > 20 and times.most_common(1)[0][1] < 20
+
+
+def test_a_record_closes_as_a_new_draw_of_it_would() -> None:
+    spec = load_released()[BOARD]
+    plainly = spec.model_copy(update={"control": None, "evidence": spec.evidence | {"read_s": None}})
+    assert relook._ended((plainly, RELEASED / "trajectories", 1)) == spec
+
+
+# --- what is seen -----------------------------------------------------------------------------------------------------
+
+
+def test_a_closed_occlusion_control_ends_in_the_frames_of_its_void() -> None:
+    case = load(RACE)
+    world, closes = World.of_record(case.spec, case.qpos), case.spec.closes_frame
+    assert closes is not None
+    shown = case.qpos[[0, closes - 1, closes, 49]]
+    with world.closed_renderer() as renderer:
+        control = list(control_frames(renderer, shown, 2))
+        void = list(renderer.frames(shown, panel=True))
+    assert [np.array_equal(a, b) for a, b in zip(control, void, strict=True)] == [False, False, True, True]
+
+
+def altered(spec: SceneSpec, **changes: Any) -> SceneSpec:
+    assert spec.control is not None
+    return SceneSpec.model_validate(spec.model_dump() | {"control": spec.control | changes})
+
+
+def failure(scenario_id: str, spec: SceneSpec) -> str | None:
+    case = load(scenario_id)
+    pair = pair_of(spec, case.qpos, case.twin, frame_step=2)
+    return CLOSING.failure({**spec.evidence, **CLOSING.measured(pair)}, pair.claim)
+
+
+@pytest.mark.parametrize("scenario_id", [BOARD, "chain-0001"])
+def test_a_released_control_is_closed_and_one_that_closes_too_early_or_too_late_is_found(scenario_id: str) -> None:
+    spec = load_released()[scenario_id]
+    assert failure(scenario_id, spec) is None
+    early = round(10 * spec.evidence["commit_s"]) + 7
+    assert "less than 0.8 s after the outcome has settled" in str(
+        failure(scenario_id, altered(spec, closes_frame=early))
+    )
+    late = altered(spec, closes_frame=46)
+    assert "some model is shown no frame after 4.5 s" in str(failure(scenario_id, late))
+    # The table of records finds it too, without a trajectory.
+    assert [said.partition(": closing: ")[2][:26] for said in answerable_voids([late])] == [
+        "the panel comes at 4.6 s; "
+    ]
+
+
+def test_a_panel_that_is_too_small_or_beside_the_outcome_closes_nothing() -> None:
+    spec = load_released()[BOARD]
+    assert spec.control is not None
+    panel = spec.control["panel"]
+    across, thick, high = panel["half"]
+    x, y, z = panel["centre"]
+    for worse in ({"half": [across, thick, high / 4], "centre": [x, y, z / 4]}, {"centre": [x + 2 * across, y, z]}):
+        said = str(failure(BOARD, altered(spec, panel=panel | worse)))
+        assert "pixels of what the panel must hide are seen past it" in said
+
+
+def test_a_panel_that_hides_the_ball_and_not_its_shadow_is_found() -> None:
+    good = {"closes_s": 4.0, "looks_until_s": 4.5, "commit_s": 1.5, "read_s": 2.5, "closed_px": 0.0}
+    claim = pair_of(load_released()[BOARD], *(np.empty((0, 0)),) * 2).claim
+    assert CLOSING.failure({**good, "closed_change_px": 0}, claim) is None
+    assert "changes 1 pixels of the control's end" in str(CLOSING.failure({**good, "closed_change_px": 1}, claim))
+
+
+def test_legibility_and_order_are_measured_before_the_panel_comes() -> None:
+    case = load(RACE)
+    pair = pair_of(case.spec, case.qpos, case.twin)
+    assert LEGIBLE.measured(pair)["least_visible_px"] >= 150  # behind the panel there is nothing
+    assert pair.control.outcome.in_order is not None and pair.control.closing is not None
+    first, _ = pair.control.outcome.in_order
+    early = replace(pair.control, closing=replace(pair.control.closing, frame=first))
+    assert ORDER.measured(replace(pair, control=early))["order_frames"] == 0
+
+
+# --- what an observer does --------------------------------------------------------------------------------------------
+
+
+def clip(panel_from: int | None = None, panel_until: int = 25, *, size: int = 100) -> np.ndarray:
+    """25 frames of a floor on which a red square of 20 pixels moves, with a panel in some of them."""
+    frames = np.full((25, HEIGHT, WIDTH, 3), FLOOR, np.uint8)
+    for at, frame in enumerate(frames):
+        frame[300:320, 10 + 15 * at : 30 + 15 * at] = RED
+        if panel_from is not None and panel_from <= at < panel_until:
+            frame[100 : 100 + size, 100:300] = NAVY
+    return frames
+
+
+def test_an_observer_looks_at_what_is_before_a_panel_that_comes() -> None:
+    assert [len(before_panel(clip(at))) for at in (1, 12, 24)] == [1, 12, 24]
+
+
+def test_a_panel_that_stands_from_the_start_that_goes_or_that_is_small_closes_nothing() -> None:
+    for frames in (clip(), clip(0), clip(0, 20), clip(5, 20), clip(5, size=30), clip(0, 20)[::-1][5:]):
+        assert len(before_panel(frames)) == len(frames)
+
+
+def test_a_large_thing_that_comes_to_rest_in_several_steps_is_no_panel() -> None:
+    frames = clip()
+    for at, frame in enumerate(frames[5:]):
+        frame[50:250, : min(400, 20 * at)] = RED  # 4,000 new pixels in each frame
+    assert len(before_panel(frames)) == 25
