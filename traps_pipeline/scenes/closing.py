@@ -21,10 +21,14 @@ from traps_pipeline.scenes.certificates import CLOSING, LEGIBLE, ORDER, READ_S
 from traps_pipeline.scenes.evidence import Pair, required
 from traps_pipeline.scenes.kit import Box
 from traps_pipeline.scenes.outcome import Rejected
+from traps_pipeline.scenes.parts.outcome import still_from
 from traps_pipeline.scenes.policies import last_of_all
 from traps_pipeline.scenes.simulate import swept_points
 
 READ_BY_DRAW_S = 1.0  # so long the outcome is in view where there is time for it
+REST_BY_DRAW_S = 0.5  # so long it has come to rest by then
+STILL_M = 0.005  # a pixel or two
+BESIDE_M = 0.03  # from the middle of a body to the points by which it is seen to turn
 TRIES = 4  # moments at which it is tried to close a control
 
 
@@ -58,16 +62,28 @@ def record_of(pair: Pair) -> dict[str, Any] | None:
 
 
 def _moments(pair: Pair, seed: int) -> Iterator[int]:
-    """Frames at which the control may close, the last possible one at the end."""
+    """Frames at which the control may close: when the outcome has been in view, and at rest, for long enough; where
+    there is no time for that, and after all others, the last frame that is possible."""
     control = pair.control
     fps, commit = control.physics.fps, control.outcome.commit_frame
     last = last_of_all(len(control.qpos), fps)
     if last - commit < round(READ_S * fps):
         return
-    first = min(commit + round(READ_BY_DRAW_S * fps), last)
+    rests = _at_rest_from(pair) + round(REST_BY_DRAW_S * fps)
+    first = min(max(commit + round(READ_BY_DRAW_S * fps), rests), last)
     rng = np.random.default_rng([seed, *control.family.name.encode(), *b"closing"])
     drawn = [int(frame) for frame in rng.permutation(np.arange(first, last + 1))]
     yield from dict.fromkeys([*drawn[: TRIES - 1], last])
+
+
+def _at_rest_from(pair: Pair) -> int:
+    """The frame from which every decisive body stays as it lies at the end: its middle, and three points around it."""
+    motion = pair.control.motion
+    paths = [
+        motion.pos(body)[:, None] + BESIDE_M * np.pad(motion.rot(body).swapaxes(1, 2), ((0, 0), (1, 0), (0, 0)))
+        for body in pair.control.scene.decisive
+    ]
+    return still_from(*paths, within_m=STILL_M)
 
 
 def _panel(pair: Pair, frame: int) -> Panel:

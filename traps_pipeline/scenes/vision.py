@@ -14,7 +14,7 @@ import numpy as np
 
 FLAG_PX = (60, 50)  # a flag is no wider and no higher
 PANEL_PX = 8000  # a panel that comes before a scene is larger, whatever moves is smaller
-CHANGED, ALIKE = 24, 20  # levels of 255: by more than these a pixel changes, by no more two are of one colour
+CHANGED, ALIKE = 16, 12  # levels of 255: by more than these a pixel changes, by no more two are of one colour
 # Hue (degrees), least saturation and value (0-1) of the saturated colours. Shade lowers the value, not the hue.
 _HUES: Mapping[str, tuple[float, float, float, float]] = {
     "red": (346, 8, 0.62, 0.22),
