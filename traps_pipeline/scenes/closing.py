@@ -26,7 +26,7 @@ from traps_pipeline.scenes.policies import last_of_all
 from traps_pipeline.scenes.simulate import swept_points
 
 READ_BY_DRAW_S = 1.0  # so long the outcome is in view where there is time for it
-REST_BY_DRAW_S = 0.5  # so long it has come to rest by then
+REST_BY_DRAW_S = 0.6  # so long it has been at rest by then: three frames of five a second
 STILL_M = 0.005  # a pixel or two
 BESIDE_M = 0.03  # from the middle of a body to the points by which it is seen to turn
 TRIES = 4  # moments at which it is tried to close a control

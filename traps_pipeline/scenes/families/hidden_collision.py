@@ -133,16 +133,20 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """'no' if the balls end in the other order from left to right than they start in."""
-    starts, ends = [], []
+    """'no' once the balls are in the other order from left to right than they start in; 'yes' if they come to rest
+    without that."""
+    starts, ends, resting = [], [], True
     for name in ("first", "second"):
         path = [small(frame, named[name]) for frame in frames]
         start, end = next((blob for blob in path if blob), None), path[-1]
-        if start is None or end is None or not at_rest(path, tolerance_px=4):
+        if start is None or end is None:
             return None
         starts.append(start.x)
         ends.append(end.x)
-    return "yes" if (starts[0] < starts[1]) == (ends[0] < ends[1]) else "no"
+        resting &= at_rest(path, tolerance_px=4)
+    if (starts[0] < starts[1]) != (ends[0] < ends[1]):
+        return "no"
+    return "yes" if resting else None
 
 
 FAMILY = scene_family(
