@@ -96,7 +96,8 @@ class Config:
     completion; an attempt that its status does not refuse is billed, and one that is odd as the most that it may take.
     hang_s: when even the server gives up. served_suffix goes behind the model's name, as real ones answer with a date.
     blind: models that leave images and videos out, as a server of text models may; the others name the colours of a
-    clip that they are asked for. served: what the list of models holds, which comes with list_status.
+    clip that they are asked for. served: what the list of models holds, which comes with list_status. unstructured:
+    models that refuse what asks for structured output.
     """
 
     latency_s: float = 0.0
@@ -115,6 +116,7 @@ class Config:
     blind: Sequence[str] = ()
     served: Sequence[str] | None = None
     list_status: int = 200
+    unstructured: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         unknown = ({*self.faults} | {*self.fault_by_model.values()}) - {*FAULTS, None}
@@ -655,6 +657,8 @@ def reply_to(question: Question, fault: str | None, config: Config) -> Reply:
         return Reply(
             status, content, kind, raw.get("headers", {}), config.latency_s, tokens=(0, 0) if refused else most
         )
+    if question.structured and question.model in config.unstructured:
+        return json_reply(error_body(question.api, FAILURES["bad_request"]), 400)
     if fault in FAILURES:
         failure = FAILURES[fault]
         headers = {"Retry-After": f"{config.retry_after_s:g}"} if fault == "rate_limited" else {}

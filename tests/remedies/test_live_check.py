@@ -62,6 +62,16 @@ def test_a_model_without_a_schema_says_so_in_its_entry(check: Check, provider: P
 
 
 @pytest.mark.slow
+@carries_out("it refuses structured output ({}): say `json_schema: false` and why under waivers")
+def test_a_model_that_refuses_a_schema_is_asked_without_one(check: Check, provider: Provider) -> None:
+    provider.configure(unstructured=[NAME])
+    (problem,) = check().problems
+    assert "it refuses structured output (http_400): say `json_schema: false` and why under waivers" in problem
+    found = check(json_schema=False, waivers={"json_schema": "the server refuses it"})
+    assert found.problems == [], found.problems
+
+
+@pytest.mark.slow
 @carries_out("it thinks between <think> tags in its answer: say `inline_thinking: true` in its entry")
 def test_a_model_that_thinks_in_its_answer_says_so_in_its_entry(check: Check, provider: Provider) -> None:
     said = '<think>red, then blue</think>{"reason": "seen", "final_answer": "red and blue"}'

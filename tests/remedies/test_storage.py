@@ -28,6 +28,7 @@ from traps_pipeline.storage.database import FORMAT, Session, session_of
 from traps_pipeline.storage.media import MediaSpec, MediaStore, payload
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.place import place_of
+from traps_pipeline.storage.purse import Purse
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.stream import Stream, encoded
@@ -334,6 +335,16 @@ def test_a_ledger_moves_once_what_stands_in_the_way_is_done_as_told(
             )
 
     asyncio.run(while_asking())
+    spender = Session(postgres.address(), VARIABLE, "other-2")
+    purse = Purse(spender)
+    purse.open()
+    purse.grant("m", 0.0, 0.5, 0.5, {None: 1.0})
+    remedied(
+        lambda: move_back(Workspace.open(other.root)),
+        "another process spends from the budget of {}; wait for it to finish",
+        lambda: (purse.give_back({"m": 0.0}, {}), purse.close(), spender.close()),
+    )
+    move_to_database(Workspace.open(other.root), where)
     assert move_back(Workspace.open(other.root)).rows == 1
 
 

@@ -37,7 +37,10 @@ def spending(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Bu
         if workspace.session is not None:
             purse = Purse(workspace.session)
             standing = purse.open()
-            budget = SharedBudget(*caps, purse, standing, _accounts(workspace, standing.spent, opened))
+            with ExitStack() as unless_made:  # else whoever spends next in this process would wait for ever
+                unless_made.callback(purse.close)
+                budget = SharedBudget(*caps, purse, standing, _accounts(workspace, standing.spent, opened))
+                unless_made.pop_all()
             opened.callback(budget.close)
             yield budget
             return

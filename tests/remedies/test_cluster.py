@@ -1,0 +1,251 @@
+"""What errors of a study that several hosts make say to do lets the same call succeed."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import dagster as dg
+import pytest
+
+from tests.conftest import ROOT, Checkout, make_checkout
+from tests.objectstore import S3
+from tests.postgres import Postgres
+from tests.remedies.remedied import carries_out, remedied
+from tests.remedies.test_money import paid
+from traps_pipeline.defs import benchmark
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.orchestration.cluster import RayRuns, require_cluster
+from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.orchestration.run import dagster_history
+from traps_pipeline.orchestration.runs import Ran, RunsHere
+from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, require_same_code
+from traps_pipeline.orchestration.shared_history import SharedHistory
+from traps_pipeline.orchestration.stage import WorkspaceResource
+from traps_pipeline.storage.bucket import Bucket, object_name
+from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import DATABASE, RAY, Workspace
+
+PACKAGES = ("ray", "dagster_ray", "dagster_postgres")  # of the extra, which `make test` does not install
+BEAT_S = 1200  # until a daemon on the slowest machine has said that it is there
+
+
+@pytest.fixture
+def address(s3: S3, postgres: Postgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Where a study of a test's own may lie, with what this host exports for it."""
+    monkeypatch.setenv(DATABASE, postgres.address())
+    monkeypatch.setenv("TRAPS_SCRATCH", str(tmp_path / "scratch"))
+    return f"s3://lab/{secrets.token_hex(4)}"
+
+
+# --- files in an object store -----------------------------------------------------------------------------------------
+
+
+def test_a_bucket_that_is_made_and_a_key_that_is_exported_are_used(
+    s3: S3, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    s3.empty()
+    content = b"frames"
+    remedied(lambda: Bucket(address).put("a", content), "See that the bucket exists, that its keys", s3.make_bucket)
+    assert Bucket(address).get("a") == content
+    monkeypatch.setenv("AWS_ENDPOINT", "http://127.0.0.1:1")
+    found = remedied(
+        lambda: Bucket(address).get("a"),
+        "exists, that its keys and its address are in the environment",
+        lambda: monkeypatch.setenv("AWS_ENDPOINT", s3.environment["AWS_ENDPOINT"]),
+    )
+    assert found == content
+
+
+def test_what_is_gone_from_the_store_is_there_once_it_is_made_anew(address: str) -> None:
+    workspace = Workspace.create(address, Study())
+    store, path = workspace.store, workspace.root / "tables" / "a.parquet"
+    assert isinstance(store, ObjectStore)
+    store.write({path: b"rows"})
+    row = store._current(path)
+    assert row is not None
+    store.bucket.delete(row.digest)
+    (store.root / ".objects" / object_name(row.digest)).unlink()
+    here = remedied(
+        lambda: store.here(path) if store.has(path) else pytest.fail("it is not current"),
+        "storage/objects.py | {}/{}: {}; run again, and it is made anew",
+        lambda: store.write({path: b"rows"}),
+    )
+    assert here.read_bytes() == b"rows"
+
+
+def test_a_budget_of_an_account_in_a_folder_that_all_hosts_see_is_spent_from(address: str, tmp_path: Path) -> None:
+    shared = tmp_path / "openai"
+    shared.mkdir()
+    (shared / "budget.yaml").write_text("usd: 100")
+    workspace = Workspace.create(address, Study(budget_usd=50, account_budgets={"openai": "openai"}))
+    remedied(
+        paid(address),
+        "account_budgets names the folder {}, which other hosts do not see; give the path of a folder that all hosts",
+        lambda: workspace.allow(account_budgets={"openai": str(shared)}),
+    )
+
+
+# --- runs on other hosts ----------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def head(workspace: Workspace) -> Iterator[subprocess.Popen[bytes]]:
+    """`traps ui`, as the head of a cluster runs it, until the block ends."""
+    own = {
+        "TRAPS_WORKSPACE": str(workspace.place),
+        "DAGSTER_HOME": str(workspace.dagster_home),
+        "PYTHONPATH": str(ROOT),
+    }
+    command = [sys.executable, "-m", "traps_pipeline.cli", "ui", "--port", str(20_000 + secrets.randbelow(10_000))]
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=os.environ | own, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        os.killpg(process.pid, signal.SIGINT)
+        process.wait()
+
+
+@pytest.mark.slow
+@carries_out(
+    "runs on other hosts need {} here and there: install the extra `cluster`",
+    "{} is not set: export {}=http://HEAD:8265, the address of Ray's head for the study",
+    "nobody takes runs of the study {} from the queue; run `traps ui` on the head, with the same variables, and then",
+)
+def test_runs_are_submitted_once_the_extra_the_address_and_the_head_are_there(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in PACKAGES:
+        pytest.importorskip(name, reason="the extra `cluster` is not installed")
+    workspace = Workspace.create(address, Study())
+    monkeypatch.setenv("TRAPS_WORKSPACE", address)
+
+    def required() -> None:
+        monkeypatch.setenv("DAGSTER_HOME", str(workspace.dagster_home))
+        with dagster_history(workspace) as instance:
+            require_cluster(workspace, instance)
+
+    with monkeypatch.context() as bare:
+        bare.setitem(sys.modules, "ray", None)  # to Python's imports it is not there
+        with pytest.raises(TrapsError, match="need ray here and there: install"):
+            required()
+    with pytest.raises(TrapsError, match=r"TRAPS_RAY is not set: export TRAPS_RAY=http://HEAD:8265"):
+        required()
+    monkeypatch.setenv(RAY, "http://127.0.0.1:1")
+    with pytest.raises(TrapsError, match=r"nobody takes runs of the study .*run `traps ui` on the head"):
+        required()
+    with head(workspace) as process:
+        until = time.monotonic() + BEAT_S
+        while True:
+            try:
+                required()
+                break
+            except TrapsError as error:
+                assert "nobody takes runs" in str(error) and process.poll() is None and time.monotonic() < until, error
+                time.sleep(1)
+
+
+@carries_out("{} ended as {} ({}); see its log in `traps ui`")
+def test_the_log_of_a_run_that_ended_says_why_and_the_next_run_tells_nothing(tmp_path: Path) -> None:
+    @dg.op
+    def one() -> None: ...
+
+    @dg.job
+    def study() -> None:
+        one()
+
+    with dg.DagsterInstance.ephemeral() as instance:
+        runs = RayRuns(instance, Workspace(tmp_path, Study(name="lab")), 1, 0.0, "leave")
+        run = instance.create_run_for_job(study)
+        instance.report_run_failed(run, "its host died and was resumed three times")
+        ((problem,),) = (ran.problems for ran in runs._watch([run.run_id]))
+        assert "ended as failure (its host died" in problem and "see its log in `traps ui`" in problem
+        assert [entry.message for entry in instance.all_logs(run.run_id)] == [
+            "its host died and was resumed three times"
+        ]
+        again = study.execute_in_process(instance=instance)
+        assert runs._watch([again.run_id]) == [Ran([], over_budget=False)]
+
+
+class Mounted(WorkspaceResource):
+    """A study whose disk must be there before a run can begin."""
+
+    def setup_for_execution(self, context: dg.InitResourceContext) -> None:
+        """Raises FileNotFoundError."""
+        (Path(self.root) / "study.yaml").read_text()
+
+
+def test_a_run_that_could_not_begin_begins_once_what_its_log_names_is_mended(tmp_path: Path) -> None:
+    place = tmp_path / "study"
+    stage = the_graph()["scene_specs"]
+    key = str(the_graph().keys(stage.name)[0])
+    definitions = dg.Definitions(
+        assets=[benchmark.scene_specs],
+        resources={"workspace": Mounted(root=str(place))},
+        executor=dg.in_process_executor,
+    )
+    with dg.DagsterInstance.ephemeral() as instance:
+        runs = RunsHere(instance, definitions.resolve_implicit_global_asset_job_def())
+
+        def made() -> None:
+            (ran,) = runs.make([stage], [(key, key)], {})
+            if ran.problems:
+                raise TrapsError("\n".join(ran.problems))
+
+        remedied(
+            made,
+            "{} {}: the run failed; see its log in Dagster",
+            lambda: Workspace.create(place, Study()),
+        )
+        logged = [str(entry) for run in instance.get_runs() for entry in instance.all_logs(run.run_id)]
+        assert any("study/study.yaml" in entry for entry in logged)
+
+
+def of_another_host(checkout: Checkout) -> Callable[[], Mapping[str, str]]:
+    """The tags of a run that a host with the code of a checkout submits."""
+
+    def tags() -> Mapping[str, str]:
+        code = "from traps_pipeline.orchestration.same_code import code_here\nprint(code_here())"
+        said = checkout.run(sys.executable, "-c", code)
+        assert said.code == 0, said.err
+        return {CODE_TAG: said.out.strip()}
+
+    return tags
+
+
+def test_a_run_of_a_host_is_taken_once_it_has_the_same_version(tmp_path: Path) -> None:
+    checkout = Checkout(make_checkout(tmp_path / "checkout"), tmp_path / "study")
+    file, tags = checkout.root / "traps_pipeline" / "digests.py", of_another_host(checkout)
+    ours = file.read_text()
+    file.write_text(ours + "# altered on that host\n")
+    remedied(
+        lambda: require_same_code(tags(), "lab"),
+        "Install the same version of the package from the same lock on both, and run the same command again",
+        lambda: file.write_text(ours),
+    )
+    assert tags() == {CODE_TAG: code_here()}
+
+
+def test_a_host_that_exports_the_database_opens_the_history(
+    postgres: Postgres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
+    monkeypatch.delenv(DATABASE, raising=False)
+    history: Any = remedied(
+        lambda: SharedHistory.from_config_value(None, {"variable": DATABASE}),
+        "{} is not set on this host; export the address of the study's database",
+        lambda: monkeypatch.setenv(DATABASE, postgres.address()),
+    )
+    assert history.run_storage.get_runs_count() >= 0
