@@ -304,7 +304,7 @@ def test_tables_of_another_format_are_refused() -> None:
         session = Session(server.address(), VARIABLE, "my-study")
         session.run(lambda connection: connection.execute("update traps.format set version = 99"))
         with pytest.raises(
-            TrapsError, match="its tables have format 99, this version reads 1; use the version that made"
+            TrapsError, match="its tables have format 99, this version reads 2; use the version that made"
         ):
             Session(server.address(), VARIABLE, "my-study")
 

@@ -213,15 +213,18 @@ async def settle_evaluation(
     Calls and rows are made and read a cell at a time: none is held once its cell is finished, and a call that two
     cells share (a steered control stands in two datasets) is found by the second.
     """
-    told: set[str] = set()
+    told, is_finished = set[str](), True
     async with work.ledger.writing(evaluation.key, progress.current().note, stop.is_set) as writer:
         for cell in cells:
             settled = await _settle_cell(work, cell, _Evaluation(writer, told), stop)
             if settled is None:
                 return  # what was answered is in the ledger
+            is_finished &= not settled.tally.errors
             yield settled
             del settled
             await asyncio.sleep(0)  # a cell that was all known must not keep the loop from those that are asked
+        if is_finished:
+            await asyncio.to_thread(writer.finish)
 
 
 async def _settle_cell(

@@ -35,7 +35,7 @@ FRESH_S, OLD_S = 0.4, 1.5  # a look that is younger is not repeated; one that is
 PATIENCE_S = 60.0  # how long a run waits for a server that is away
 GRACE_S = 10  # after the server was started, those who held a lock before have so long to take it again
 RETRY_S = 0.2
-FORMAT = 1  # of the tables
+FORMAT = 2  # of the tables; those of format 1 have no segments, and are given them
 _KEEPALIVE: dict[str, Any] = {
     "keepalives_idle": 5,
     "keepalives_interval": 5,
@@ -68,6 +68,11 @@ create table traps.blocks (
     study int not null references traps.studies, session text not null, participant text not null,
     granted float8 not null, booked float8 not null default 0, lost float8 not null default 0,
     primary key (study, session, participant));
+"""
+_SEGMENTS = """
+create table if not exists traps.segments (  -- rows that lie in the object store (`storage/compaction.py`)
+    id bigserial primary key, evaluation int not null references traps.evaluations,
+    digest bytea not null, size bigint not null, rows bigint not null, unique (evaluation, digest))
 """
 
 
@@ -200,7 +205,10 @@ class Session:
             for statement in _SCHEMA.split(";\n"):
                 if statement.strip():
                     connection.execute(statement)
-            connection.execute("insert into traps.format values (%s)", [FORMAT])
+            connection.execute("insert into traps.format values (1)")
+        if _value(connection, "select version from traps.format") == 1:
+            connection.execute(_SEGMENTS)
+            connection.execute("update traps.format set version = 2")
         found = _value(connection, "select version from traps.format")
         if found != FORMAT:
             raise TrapsError(

@@ -131,6 +131,10 @@ class Writer(ABC):
     def sync(self) -> None:
         """Bring what was appended to the disk. Raises TrapsError."""
 
+    @abstractmethod
+    def finish(self) -> None:
+        """Say that all that was asked is answered: the rows may go where they stay. Raises TrapsError."""
+
 
 class Ledger(ABC):
     """Append-only rows by key, for each evaluation. kind: what the rows are, `answers` or `votes`."""

@@ -59,11 +59,6 @@ class Current:
     note: str | None
     at_ns: int
 
-    @property
-    def name(self) -> str:
-        """The object's name in the store."""
-        return object_name(self.digest)
-
 
 class ObjectStore(Store):
     """Files of a study whose contents lie in a bucket and whose names lie in PostgreSQL. Threads may share it."""
@@ -173,31 +168,42 @@ class ObjectStore(Store):
     def _cached(self, digest: bytes) -> Path:
         return self.root / OBJECTS / object_name(digest)
 
-    def _is_cached(self, row: Current) -> bool:
-        path = self._cached(row.digest)
-        if row.digest not in self._whole:
+    def _is_cached(self, digest: bytes) -> bool:
+        path = self._cached(digest)
+        if digest not in self._whole:
             try:
-                if sha256(path.read_bytes()).digest() != row.digest:
+                if sha256(path.read_bytes()).digest() != digest:
                     return False
             except FileNotFoundError:
                 return False
-            self._whole.add(row.digest)
+            self._whole.add(digest)
         return path.is_file()
+
+    def content(self, digest: bytes, size: int) -> tuple[Path | None, str]:
+        """The content of an object in the scratch folder, or what is wrong with it. Raises TrapsError where the store
+        cannot be used."""
+        path, wrong = self._cached(digest), ""
+        if self._is_cached(digest):
+            return path, ""
+        for _ in range(TRIES):
+            found = self.bucket.get(object_name(digest))
+            if found is not None and len(found) == size and sha256(found).digest() == digest:
+                write_bytes(path, found)
+                self._whole.add(digest)
+                self._there.add(digest)
+                return path, ""
+            wrong = "is gone from the store" if found is None else "is not what was written (it was altered)"
+        return None, wrong
+
+    def put(self, content: bytes) -> bytes:
+        """Write an object that has no path; its digest. Raises TrapsError."""
+        return self._put(content, None)
 
     def _fetched(self, row: Current, name: str) -> Path:
         """The content of an object in the scratch folder. Raises TrapsError where it is gone or altered."""
-        path = self._cached(row.digest)
-        if self._is_cached(row):
+        path, wrong = self.content(row.digest, row.size)
+        if path is not None:
             return path
-        wrong = ""
-        for _ in range(TRIES):
-            content = self.bucket.get(row.name)
-            if content is not None and len(content) == row.size and sha256(content).digest() == row.digest:
-                write_bytes(path, content)
-                self._whole.add(row.digest)
-                self._there.add(row.digest)
-                return path
-            wrong = "is gone from the store" if content is None else "is not what was written (it was altered)"
         self._withdraw([row.digest])
         raise TrapsError(f"{self.bucket.address}/{name}: {wrong}; run again, and it is made anew")
 
@@ -215,7 +221,7 @@ class ObjectStore(Store):
             row = self._current(path)
             if row is None or _is_same_file(path, self._cached(row.digest)):
                 return
-            if not self._is_cached(row) and path.is_file() and sha256(path.read_bytes()).digest() == row.digest:
+            if not self._is_cached(row.digest) and path.is_file() and sha256(path.read_bytes()).digest() == row.digest:
                 _link(path, self._cached(row.digest))
                 return
             try:

@@ -274,6 +274,9 @@ class SegmentWriter(Writer):
             self._named = True
         self._unsynced, self._synced_at = 0, time.monotonic()
 
+    def finish(self) -> None:
+        """See `Writer.finish`. They lie there already."""
+
     def close(self) -> None:
         """Sync and close; a file that nothing was written to goes."""
         try:

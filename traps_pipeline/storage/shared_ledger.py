@@ -1,4 +1,5 @@
-"""The ledger that several hosts share: rows in a PostgreSQL database.
+"""The ledger that several hosts share: rows in a PostgreSQL database, and segments of finished evaluations in the
+object store, where the study has one (`storage/compaction.py`).
 
 A settled key has one row; rows of failed calls are kept for the record. An answer counts when its group is stored
 (`storage/stream.py`), and until then its connection makes no other call; so a kill loses no more than the calls in
@@ -13,9 +14,9 @@ import time
 from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AsyncExitStack, asynccontextmanager
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
+from traps_pipeline.storage.compaction import COLUMNS, FETCHED, Segment, Segments, segments_of
 from traps_pipeline.storage.database import OLD_S, Claim, Session, lock_number
 from traps_pipeline.storage.ledger import (
     ASIDES,
@@ -47,16 +48,18 @@ from traps_pipeline.storage.stream import (
 if TYPE_CHECKING:
     from psycopg import Connection
 
+    from traps_pipeline.storage.objects import ObjectStore
+
 LOCK_POLL_S = 0.2
-FETCHED = 2000  # rows of a ledger that are held at once while it is read
 
 
 class SharedLedger(Ledger):
-    """Append-only rows by key in a database, in which each study has its own."""
+    """Append-only rows by key in a database, in which each study has its own. store: where rows of finished
+    evaluations go; None where they stay."""
 
-    def __init__(self, session: Session, kind: str) -> None:
+    def __init__(self, session: Session, kind: str, store: ObjectStore | None = None) -> None:
         super().__init__(kind)
-        self.session = session
+        self.session, self.segments = session, Segments(session, store, kind)
 
     def read(self, evaluation: str, wanted: Collection[str] | None = None) -> Known:
         """See `Ledger.read`."""
@@ -86,13 +89,14 @@ class SharedLedger(Ledger):
     def evaluations(self) -> list[str]:
         """See `Ledger.evaluations`."""
         sql = """select name from traps.evaluations e where study = %s and kind = %s
-                 and exists (select from traps.rows where evaluation = e.id) order by name"""
+                 and (exists (select from traps.rows where evaluation = e.id)
+                      or exists (select from traps.segments where evaluation = e.id)) order by name"""
         found = self.session.run(lambda c: c.execute(sql, [self.session.study_id, self.kind]).fetchall())
         return [evaluation for (evaluation,) in found]
 
     def rows(self, evaluation: str) -> Iterator[Stored]:
         """See `Ledger.rows`."""
-        for _, line, *beside in self._pages(f"line, {', '.join(ASIDES)}", evaluation):
+        for _, line, *beside in self._pages(COLUMNS, evaluation):
             if is_whole(line):
                 row = json.loads(line)
                 row.pop("sum")
@@ -102,7 +106,11 @@ class SharedLedger(Ledger):
     def damage(self) -> Iterator[str]:
         """See `Ledger.damage`."""
         for evaluation in self.evaluations():
-            for column in ("line", *ASIDES):
+            mine = self.session.run(lambda c, e=evaluation: segments_of(c, self._slot(e)))
+            if damaged := [said for one in mine if (said := self.segments.damage(one, evaluation))]:
+                yield from damaged
+                continue
+            for column in COLUMNS:
                 places = [place for place, line in self._lines(column, evaluation) if not is_whole(line)]
                 yield from (f"{place} ({column}): {NOT_WHOLE}, and not believed" for place in places)
 
@@ -110,36 +118,60 @@ class SharedLedger(Ledger):
         self, column: str, evaluation: str, wanted: Collection[str] | None = None
     ) -> Iterator[tuple[str, bytes]]:
         """Place and content of the lines of an evaluation, the oldest first."""
-        for key, line in self._pages(column, evaluation, wanted):
+        for key, line in self._pages([column], evaluation, wanted):
             if line is not None:
                 yield f"{self.session.host}: {self.kind} of {evaluation}, key {key[:16]}", line
 
-    def _pages(self, columns: str, evaluation: str, wanted: Collection[str] | None = None) -> Iterator[Sequence[Any]]:
-        """Key and columns of the rows of an evaluation, the oldest first; of the wanted keys, part of them by part."""
-        sql = f"""select r.id, r.key, {columns} from traps.rows r join traps.evaluations e on e.id = r.evaluation
-                  where e.study = %s and e.kind = %s and e.name = %s"""
-        slot = [self.session.study_id, self.kind, evaluation]
+    def _slot(self, evaluation: str) -> list[Any]:
+        return [self.session.study_id, self.kind, evaluation]
+
+    def _pages(
+        self, columns: Sequence[str], evaluation: str, wanted: Collection[str] | None = None
+    ) -> Iterator[Sequence[Any]]:
+        """Key and columns of the rows of an evaluation (of the wanted keys), the oldest first, wherever they lie: those
+        that become a segment meanwhile come once, too."""
+        sql = f"""select r.id, r.key, {", ".join(columns)} from traps.rows r
+                  join traps.evaluations e on e.id = r.evaluation where e.study = %s and e.kind = %s and e.name = %s"""
+        read = set[int]()
+
+        def fetched(condition: str, value: Any) -> tuple[Sequence[Any], list[Segment]]:
+            """Rows of the database, then the segments that were not read: what has left the rows is in one of them."""
+            slot = self._slot(evaluation)
+            statement: Any = f"{sql} and {condition}"  # of this file's own words
+            work = lambda c: (c.execute(statement, [*slot, value]).fetchall(), segments_of(c, slot))  # noqa: E731
+            found, segments = self.session.run(work)
+            new = [one for one in segments if one.id not in read]
+            read.update(one.id for one in new)
+            return found, new
+
+        def numbered(found: Sequence[Any], new: Sequence[Segment]) -> Iterator[Sequence[Any]]:
+            for one in new:
+                yield from self.segments.rows(one, evaluation, columns, wanted)
+            yield from found
+
         if wanted is not None:
-            keys = iter(wanted)
-            while part := list(islice(keys, FETCHED)):
-                for _, *row in self._fetched(f"{sql} and r.key = any(%s::text[]) order by r.id", [*slot, part]):
-                    yield row
+            keys, given = [*wanted], set[int]()
+            for first in range(0, len(keys), FETCHED):
+                for number, *row in numbered(
+                    *fetched("r.key = any(%s::text[]) order by r.id", keys[first : first + FETCHED])
+                ):
+                    if number not in given:
+                        given.add(number)
+                        yield row
             return
         last = 0
-        while found := self._fetched(f"{sql} and r.id > %s order by r.id limit {FETCHED}", [*slot, last]):
-            for last, *row in found:  # noqa: B007 - where the next part begins
-                yield row
-
-    def _fetched(self, sql: str, values: Sequence[Any]) -> Sequence[Any]:
-        """Rows of the database. sql: of this file's own words."""
-        return self.session.run(lambda c: c.execute(sql, values).fetchall())  # pyright: ignore[reportArgumentType]
+        while any(pages := fetched(f"r.id > %s order by r.id limit {FETCHED}", last)):
+            for number, *row in numbered(*pages):
+                if number > last:
+                    last = number
+                    yield row
 
     @asynccontextmanager
     async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = never) -> AsyncIterator[Writer]:
         """See `Ledger.writing`."""
         claim = await self._claim(evaluation, waiting, give_up)
         stream = stream_of(self.session)
-        writer = SharedWriter(stream, claim, self.kind)
+        writer = SharedWriter(stream, claim, self.kind, self.segments)
         stream.start()
         try:
             yield writer
@@ -206,7 +238,7 @@ class SharedLedger(Ledger):
         """The claim, or who has it."""
         session, lock = self.session, lock_number(f"{self.session.study}/{self.kind}/{evaluation}")
 
-        slot = [session.study_id, self.kind, evaluation]
+        slot = self._slot(evaluation)
 
         def work(connection: Connection[Any]) -> Claim | str:
             connection.execute("update traps.studies set is_here = true where id = %s and not is_here", slot[:1])
@@ -249,8 +281,8 @@ class SharedLedger(Ledger):
 class SharedWriter(Writer):
     """Appends rows to an evaluation of a database."""
 
-    def __init__(self, stream: Stream, claim: Claim, kind: str) -> None:
-        self.claim, self._stream, self._kind = claim, stream, kind
+    def __init__(self, stream: Stream, claim: Claim, kind: str, segments: Segments) -> None:
+        self.claim, self._stream, self._kind, self._segments = claim, stream, kind, segments
         self._groups: list[Future[None]] = []  # those that may not be stored yet
 
     async def require(self) -> None:
@@ -285,3 +317,8 @@ class SharedWriter(Writer):
         self._stream.store()
         for group in self._groups:
             group.result()
+
+    def finish(self) -> None:
+        """See `Writer.finish`. They go to the object store, where there is one."""
+        self.sync()
+        self._segments.compact(self.claim)

@@ -20,6 +20,7 @@ from traps_pipeline.paths import ROOT, WORKSPACES, require_root
 from traps_pipeline.storage.anchor import anchor_of, file_at, store_of, write_anchor
 from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.ledger import Ledger
+from traps_pipeline.storage.objects import ObjectStore
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.place import STUDY, Place, name_of, place_of, scratch_of
 from traps_pipeline.storage.segments import SegmentLedger
@@ -213,7 +214,9 @@ class Workspace:
 
     def _ledger(self, kind: str) -> Ledger:
         shared = self.session
-        return SegmentLedger(self.ledger_folder, kind) if shared is None else SharedLedger(shared, kind)
+        if shared is None:
+            return SegmentLedger(self.ledger_folder, kind)
+        return SharedLedger(shared, kind, self.store if isinstance(self.store, ObjectStore) else None)
 
     @property
     def session(self) -> Session | None:

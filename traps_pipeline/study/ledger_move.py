@@ -117,6 +117,9 @@ def _clear(connection: Connection[Any], session: Session) -> None:
     connection.execute(
         "delete from traps.rows where evaluation in (select id from traps.evaluations where study = %s)", mine
     )
+    connection.execute(
+        "delete from traps.segments where evaluation in (select id from traps.evaluations where study = %s)", mine
+    )
     connection.execute("delete from traps.evaluations where study = %s", mine)
     connection.execute("delete from traps.totals where study = %s", mine)
     connection.execute("delete from traps.spent where study = %s", mine)
