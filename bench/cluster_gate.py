@@ -45,8 +45,8 @@ def free_port() -> int:
 class Cluster:
     """A Ray head and two nodes of this machine, each recognised by a variable in the environment of its processes."""
 
-    def __init__(self, folder: Path, environment: dict[str, str]) -> None:
-        self.folder, self.environment = folder, environment
+    def __init__(self, folder: Path, environment: dict[str, str], own: dict[str, dict[str, str]] | None = None) -> None:
+        self.folder, self.environment, self.own = folder, environment, own or {}
         self.port, self.dashboard = free_port(), free_port()
 
     def start_head(self) -> None:
@@ -64,7 +64,7 @@ class Cluster:
         fixed = ["--node-ip-address=127.0.0.1", "--disable-usage-stats", "--object-store-memory=80000000"]
         fixed += [f"{port}={free_port()}" for port in ports]
         command = [sys.executable, "-m", "ray.scripts.scripts", "start", *fixed, *options]
-        own = {"TRAPS_NODE": name, "TRAPS_SCRATCH": str(scratch)}
+        own = {"TRAPS_NODE": name, "TRAPS_SCRATCH": str(scratch)} | self.own.get(name, {})
         began = time.monotonic()
         with (self.folder / f"{name}.log").open("ab") as log:
             subprocess.run(command, env=self.environment | own, check=True, stdout=log, stderr=log)

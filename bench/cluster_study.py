@@ -2,11 +2,12 @@
 two nodes, each with a scratch folder of its own; the study lies on s3:// alone. Then what a cluster must not change is
 compared with a run of one process in a folder.
 
-python bench/cluster_study.py [--kill] [--interrupt leave|cancel] [--experiment FILE]
+python bench/cluster_study.py [--kill [KIND ...]] [--interrupt leave|cancel] [--experiment FILE]
 (needs the packages of the extra `cluster`, and moto)
 
---kill: every process of a node is killed (-9) while it renders, and the node is started again. --interrupt: Ctrl-C
-after the first partition, which leaves or cancels the runs; then the same command once more.
+--kill: every process of a node is killed (-9) while it renders, and the node is started again; or, with kinds of
+`bench/cluster_kills.py`, other things while models are asked. --interrupt: Ctrl-C after the first partition, which
+leaves or cancels the runs; then the same command once more.
 """
 
 from __future__ import annotations
@@ -39,23 +40,36 @@ SUMMARY = " answers asked"
 class Study:
     """The study as this host sees it, and the daemon of the head."""
 
-    def __init__(self, folder: Path, environment: dict[str, str], experiment: Path) -> None:
-        self.folder, self.environment, self.experiment = folder, environment, experiment
+    def __init__(self, folder: Path, environment: dict[str, str], experiment: Path, root: Path = ROOT) -> None:
+        self.folder, self.environment, self.experiment, self.root = folder, environment, experiment, root
         self.daemon: subprocess.Popen[bytes] | None = None
         self.failures: list[str] = []
 
     def traps(self, *arguments: str, **own: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "traps_pipeline.cli", *arguments]
         return subprocess.run(
-            command, env=self.environment | own, cwd=ROOT, text=True, capture_output=True, check=False
+            command, env=self.environment | own, cwd=self.root, text=True, capture_output=True, check=False
         )
 
+    def python(self, code: str, *arguments: object) -> str:
+        """What code prints that works in the study."""
+        command = [sys.executable, "-c", code, *map(str, arguments)]
+        done = subprocess.run(command, env=self.environment, cwd=self.root, text=True, capture_output=True, check=False)
+        if done.returncode:
+            raise RuntimeError(done.stderr)
+        return done.stdout
+
     def start_run(self, *more: str) -> subprocess.Popen[str]:
-        command = ["run", str(self.experiment), "--cluster", "--runs", "2", "--until", "leaderboard", *more]
+        command = [sys.executable, "-m", "traps_pipeline.cli", *self._run(*more)]
         return subprocess.Popen(
-            [sys.executable, "-m", "traps_pipeline.cli", *command], env=self.environment, cwd=ROOT, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        )  # fmt: skip
+            command, env=self.environment, cwd=self.root, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+
+    def run_to_end(self, *more: str) -> subprocess.CompletedProcess[str]:
+        return self.traps(*self._run(*more))
+
+    def _run(self, *more: str) -> list[str]:
+        return ["run", str(self.experiment), "--cluster", "--runs", "2", "--until", "leaderboard", *more]
 
     def start_daemon(self) -> None:
         """What `traps ui` starts beside its pages."""
@@ -66,15 +80,16 @@ class Study:
         with (self.folder / "daemon.log").open("ab") as log:
             command = [sys.executable, "-m", "dagster._daemon", "run", "-m", "traps_pipeline.definitions"]
             environment = self.environment | {"DAGSTER_HOME": home}
-            self.daemon = subprocess.Popen(command, stdout=log, stderr=log, cwd=ROOT, env=environment)
+            self.daemon = subprocess.Popen(command, stdout=log, stderr=log, cwd=self.root, env=environment)
         time.sleep(20)
 
-    def stop(self) -> None:
+    def stop(self, keep: Path | None = None) -> None:
+        """End the daemon. keep: a file for its log."""
         if self.daemon is not None:
             self.daemon.terminate()
             self.daemon.wait()
-        if (keep := os.environ.get("TRAPS_GATE_LOG")) and self.daemon is not None:
-            shutil.copy(self.folder / "daemon.log", keep)
+            if keep:
+                shutil.copy(self.folder / "daemon.log", keep)
 
     def require(self, holds: bool, what: str) -> None:
         """Print what was looked at, and remember it where it does not hold."""
@@ -98,15 +113,21 @@ def watch(run: subprocess.Popen[str], study: Study, kill: object) -> int:
 
 def main() -> None:
     from bench.cluster_gate import Cluster
-    from bench.equality import main as compare
     from tests.objectstore import S3
     from tests.postgres import Postgres
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kill", action="store_true")
+    parser.add_argument("--kill", nargs="*", metavar="KIND")
+    parser.add_argument("--log", type=Path, help="a file for the log of Dagster's daemon")
     parser.add_argument("--interrupt", choices=("leave", "cancel"))
     parser.add_argument("--experiment", type=Path)
     arguments = parser.parse_args()
+    if arguments.kill:
+        from bench.cluster_kills import KILLS, kill_each
+
+        if unknown := {*arguments.kill} - {*KILLS}:
+            parser.error(f"no such kill: {', '.join(sorted(unknown))}; there are {', '.join(KILLS)}")
+        sys.exit("\n".join(kill_each(arguments.kill, arguments.log)) or None)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it, and so its own
     foreign = ("TRAPS_", "DAGSTER_", "RAY_", "AWS_")
     plain = {key: value for key, value in os.environ.items() if not key.startswith(foreign)}
@@ -144,10 +165,10 @@ def main() -> None:
                 print(f"  runs: {states}", flush=True)
                 is_left = not ({"CANCELED", "CANCELING", "FAILURE"} & {*states})
                 study.require(is_left == (arguments.interrupt == "leave"), f"their runs: {arguments.interrupt}")
-            code = watch(study.start_run(), study, kill if arguments.kill else None)
+            code = watch(study.start_run(), study, kill if arguments.kill is not None else None)
             print(f"  the study took {time.monotonic() - began:.0f} s on two nodes")
             study.require(code == 0, f"the run succeeds (exit code {code})")
-            again = study.traps("run", str(experiment), "--cluster", "--runs", "2", "--until", "leaderboard")
+            again = study.run_to_end()
             study.require("0 answers asked (0 from" in again.stdout, "a second run asks nothing")
             strays = [
                 path for node in ("one", "two") for path in (folder / node).rglob("*")
@@ -155,9 +176,9 @@ def main() -> None:
             ]  # fmt: skip
             made = {node: len(list((folder / node).rglob("*.parquet"))) for node in ("one", "two")}
             study.require(not strays and all(made.values()), f"each node has made tables in its own folder: {made}")
-            compare_with_one_process(study, common, compare)
+            compare_with_one_process(study, common)
         finally:
-            study.stop()
+            study.stop(arguments.log)
             for node in ("one", "two", "head"):
                 cluster.signal(node, signal.SIGKILL)
     if study.failures:
@@ -171,15 +192,11 @@ def runs_of(study: Study) -> list[str]:
         "home = Workspace.open().dagster_home\n"
         "print(*(run.status.value for run in DagsterInstance.from_config(str(home)).get_runs()))\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=study.environment, cwd=ROOT, text=True, capture_output=True, check=True
-    )
-    return done.stdout.split()
+    return study.python(code).split()
 
 
-def compare_with_one_process(study: Study, common: dict[str, str], compare: object) -> None:
-    """Make the study once more in a folder, in one process, from the clips that the cluster rendered, and compare."""
-    alone, fetched = study.folder / "alone", study.folder / "fetched"
+def fetch(study: Study, to: Path) -> Path:
+    """Bring the study's tables and clips into a folder."""
     code = (
         "import sys\nfrom pathlib import Path\nfrom traps_pipeline.storage.workspace import Workspace\n"
         "w = Workspace.open()\nfor name in ('tables', 'clips'):\n"
@@ -189,14 +206,27 @@ def compare_with_one_process(study: Study, common: dict[str, str], compare: obje
         "        to.parent.mkdir(parents=True, exist_ok=True)\n"
         "        to.write_bytes(path.read_bytes())\n"
     )
-    subprocess.run([sys.executable, "-c", code, str(fetched)], env=study.environment, cwd=ROOT, check=True)
-    began = time.monotonic()
+    study.python(code, to)
+    return to
+
+
+def compare_with_one_process(study: Study, common: dict[str, str]) -> None:
+    """Make the study once more in a folder, in one process, and compare."""
+    alone = study.folder / "alone"
+    fetched, began = fetch(study, study.folder / "fetched"), time.monotonic()
     local = subprocess.run(
         [sys.executable, "-m", "traps_pipeline.cli", "run", str(study.experiment), "--until", "leaderboard"],
         env=common | {"TRAPS_WORKSPACE": str(alone)}, cwd=ROOT, text=True, capture_output=True, check=False,
     )  # fmt: skip
     print(f"  one process took {time.monotonic() - began:.0f} s: {local.stdout.strip().splitlines()[-2]}", flush=True)
-    study.require(compare(alone, fetched) == 0, "tables are equal, byte for byte but for times")  # type: ignore[operator]
+    tables_are_equal(study, alone, fetched)
+
+
+def tables_are_equal(study: Study, alone: Path, fetched: Path) -> None:
+    """Look whether tables and clips are those of one process."""
+    from bench.equality import main as compare
+
+    study.require(compare(alone, fetched) == 0, "tables are equal, byte for byte but for times")
     clips = {path.relative_to(alone): path.read_bytes() for path in (alone / "clips").rglob("*.mp4")}
     same = all((fetched / name).read_bytes() == content for name, content in clips.items())
     study.require(bool(clips) and same, f"{len(clips)} clips have the same bytes")

@@ -2,33 +2,52 @@
 arrival at the server; CPU seconds too, which a loaded machine does not stretch. Then `traps plan` on the same ledger.
 The first of either reads every row once and keeps totals beside the segments.
 
-python bench/first_call.py [--rows 100000] [--database]        (1600000: a large lab's year; the ledger in PostgreSQL)
+python bench/first_call.py [--rows 100000] [--database | --store]    (1600000: a large lab's year)
+
+--database: the ledger in PostgreSQL; --store: the study in an object store (moto's server), before and after its
+evaluations became segments there.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import os
 import signal
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
+from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from tests.conftest import Checkout
+from tests.providers.server import Provider
+
 EVALUATION_ROWS = 4000  # four datasets of 500 pairs
-RUNS, DATABASE = 3, "BENCH_DATABASE"
+RUNS, DATABASE, ADDRESS = 3, "BENCH_DATABASE", "s3://lab/first-call"
 
 
-def fill(root: Path, rows: int) -> None:
-    """A ledger as a study leaves it: the evaluation that will be asked has rows of other keys too."""
+class Remote(Checkout):
+    """A checkout whose study lies in an object store."""
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """See `Checkout`."""
+        plain = {name: value for name, value in os.environ.items() if name != "DAGSTER_HOME"}
+        return plain | {"TRAPS_WORKSPACE": ADDRESS, "PYTHONPATH": str(self.root)}
+
+
+def ledger_rows(rows: int) -> Iterator[tuple[str, list[Any]]]:
+    """A ledger as a study leaves it, in parts of an evaluation each, its key before them: the evaluation that will be
+    asked has rows of other keys too."""
     from traps_pipeline.models.participants import ledger_row
     from traps_pipeline.models.request import Outcome, Request
     from traps_pipeline.orchestration.wanted import Wanted
     from traps_pipeline.partitions import Evaluation
-    from traps_pipeline.storage.segments import SegmentLedger
 
     params, text = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}, "The ball comes to rest on the left. " * 15
     outcome = Outcome("answer", text, None, "stop", None, "m-2026", 6500, 150, 20, 0.0002)
@@ -36,18 +55,66 @@ def fill(root: Path, rows: int) -> None:
     evaluations = [asked, *(e for e in Wanted(None).evaluations if e.model != asked.model)]
     for start in range(0, rows, EVALUATION_ROWS):
         evaluation = evaluations[start // EVALUATION_ROWS % len(evaluations)]
-        with SegmentLedger(root, "answers").writer(evaluation.key) as writer:
-            for n in range(start, min(start + EVALUATION_ROWS, rows)):
-                about = {
-                    "item_id": f"occlusion:old-{n}:void",
-                    "model": evaluation.model,
-                    "regime": "standard",
-                    "run": 1,
-                }
-                request = Request(
-                    evaluation.model, "openai/m", params, "system", "Which way?", about, None, None, "0" * 64
-                )
-                writer.append(*ledger_row(request, outcome, 1, 2.5, "1"))
+        part = list[Any]()
+        for n in range(start, min(start + EVALUATION_ROWS, rows)):
+            about = {"item_id": f"occlusion:old-{n}:void", "model": evaluation.model, "regime": "standard", "run": 1}
+            request = Request(evaluation.model, "openai/m", params, "system", "Which way?", about, None, None, "0" * 64)
+            part.append(ledger_row(request, outcome, 1, 2.5, "1"))
+        yield evaluation.key, part
+
+
+def fill(root: Path, rows: int) -> None:
+    """Such a ledger in a study's folder."""
+    from traps_pipeline.storage.segments import SegmentLedger
+
+    for evaluation, part in ledger_rows(rows):
+        with SegmentLedger(root, "answers").writer(evaluation) as writer:
+            for one in part:
+                writer.append(*one)
+
+
+def fill_database(address: str, rows: int) -> None:
+    """Such a ledger in the database of the study at an address, as its hosts would have stored it."""
+    from traps_pipeline.storage.stream import add_up, encoded
+    from traps_pipeline.storage.workspace import Workspace
+
+    session = Workspace.open(address).session
+    assert session is not None
+
+    def store(connection: Any, evaluation: str, part: list[Any]) -> None:
+        slot = [session.study_id, "answers", evaluation]
+        sql = "insert into traps.evaluations (study, kind, name) values (%s, %s, %s) on conflict do nothing"
+        connection.execute(sql, slot)
+        sql = "select id from traps.evaluations where study = %s and kind = %s and name = %s"
+        ((number,),) = connection.execute(sql, slot).fetchall()
+        columns = "evaluation, key, settled, line, digest, reasoning, raw"
+        with connection.cursor().copy(f"copy traps.rows ({columns}) from stdin (format binary)") as copy:
+            copy.set_types(["int4", "text", "bool", "bytea", "bytea", "bytea", "bytea"])
+            for one in map(encoded, part):
+                copy.write_row((number, one.row["key"], True, one.line, sha256(one.line).digest(), *one.beside))
+        add_up(connection, session, (("answers", row) for row, _ in part))
+
+    for evaluation, part in ledger_rows(rows):
+        session.run(lambda c, e=evaluation, p=part: store(c, e, p))
+    session.run(lambda c: c.execute("analyze"))  # as the server does by itself after a while
+
+
+def compact(address: str) -> int:
+    """Let every evaluation of the study become segments; how many rows."""
+    from traps_pipeline.storage.shared_ledger import SharedLedger, SharedWriter
+    from traps_pipeline.storage.workspace import Workspace
+
+    ledger, count = Workspace.open(address).answers, 0
+    assert isinstance(ledger, SharedLedger)
+
+    async def one(evaluation: str) -> int:
+        async with ledger.writing(evaluation, print) as writer:
+            assert isinstance(writer, SharedWriter)
+            return await asyncio.to_thread(ledger.segments.compact, writer.claim)
+
+    for evaluation in ledger.evaluations():
+        count += asyncio.run(one(evaluation))
+    return count
 
 
 def _cpu_s(pid: int) -> float:
@@ -56,27 +123,63 @@ def _cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def in_store(opened: ExitStack, folder: Path) -> Remote:
+    """A study in an object store of this machine, not made yet."""
+    from tests.conftest import make_checkout
+    from tests.objectstore import S3, exported
+    from tests.postgres import Postgres
+
+    opened.enter_context(exported(opened.enter_context(S3.running())))
+    os.environ["TRAPS_DATABASE"] = opened.enter_context(Postgres.running(durable=True)).address()
+    os.environ["TRAPS_SCRATCH"] = str(folder / "scratch")
+    return Remote(make_checkout(folder / "checkout"), folder)
+
+
+def first_calls(study: Checkout, provider: Provider, path: Path) -> None:
+    """Print when the first call of runs goes out, and how long plans take."""
+    for run in range(1, RUNS + 1):
+        provider.reset()
+        began = time.perf_counter()
+        process = study.start(sys.executable, "-m", "traps_pipeline.cli", "run", path, "--budget-usd", "100000")
+        while not provider.stats()["requests"]:
+            if process.poll() is not None:
+                raise SystemExit(f"no call was made: {process.communicate()}")
+            time.sleep(0.02)
+        first_s, first_cpu_s = time.perf_counter() - began, _cpu_s(process.pid)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        print(f"run {run}: first call {first_s:.1f} s after the command ({first_cpu_s:.1f} s of CPU)", flush=True)
+    for run in range(1, RUNS + 1):
+        began = time.perf_counter()
+        planned = study.traps("plan", path)
+        assert planned.code == 0, planned.err
+        print(f"plan {run}: {time.perf_counter() - began:.1f} s", flush=True)
+
+
 def main() -> None:
-    from tests.conftest import KEY, SECRET, Checkout, make_checkout
+    from tests.conftest import KEY, SECRET, make_checkout
     from tests.integration.test_network import entry, experiment, register
     from tests.postgres import Postgres
-    from tests.providers.server import Provider
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rows", type=int, default=100_000)
-    parser.add_argument("--database", action="store_true", help="move the ledger into PostgreSQL first")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--database", action="store_true", help="move the ledger into PostgreSQL first")
+    where.add_argument("--store", action="store_true", help="the study in an object store, before and after compaction")
     arguments = parser.parse_args()
     os.environ |= {KEY: SECRET, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "osmesa")}
     with ExitStack() as opened:
         name, provider = opened.enter_context(tempfile.TemporaryDirectory()), opened.enter_context(Provider.start())
         study = Checkout(make_checkout(Path(name) / "checkout"), Path(name) / "study")
+        if arguments.store:
+            study = in_store(opened, Path(name) / "shared")
         register(study, provider, entry("image-model", "images"))
         free = experiment(study, ["oracle"], regimes=["standard"])
         made = study.traps("run", free)  # clips, items and a Dagster history, as before any paid run
         assert made.code == 0, made.err
         began = time.perf_counter()
-        fill(study.workspace / "ledger", arguments.rows)
-        print(f"{arguments.rows} rows written in {time.perf_counter() - began:.1f} s")
+        fill_database(ADDRESS, arguments.rows) if arguments.store else fill(study.workspace / "ledger", arguments.rows)
+        print(f"{arguments.rows} rows written in {time.perf_counter() - began:.1f} s", flush=True)
         if arguments.database:
             os.environ[DATABASE] = opened.enter_context(Postgres.running(durable=True)).address()
             began = time.perf_counter()
@@ -84,23 +187,12 @@ def main() -> None:
             assert moved.code == 0, moved.err
             print(f"moved into PostgreSQL in {time.perf_counter() - began:.1f} s", flush=True)
         path = experiment(study, ["image-model"], regimes=["standard"])
-        for run in range(1, RUNS + 1):
-            provider.reset()
+        first_calls(study, provider, path)
+        if arguments.store:
             began = time.perf_counter()
-            process = study.start(sys.executable, "-m", "traps_pipeline.cli", "run", path, "--budget-usd", "100000")
-            while not provider.stats()["requests"]:
-                if process.poll() is not None:
-                    raise SystemExit(f"no call was made: {process.communicate()}")
-                time.sleep(0.02)
-            first_s, first_cpu_s = time.perf_counter() - began, _cpu_s(process.pid)
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
-            print(f"run {run}: first call {first_s:.1f} s after the command ({first_cpu_s:.1f} s of CPU)", flush=True)
-        for run in range(1, RUNS + 1):
-            began = time.perf_counter()
-            planned = study.traps("plan", path)
-            assert planned.code == 0, planned.err
-            print(f"plan {run}: {time.perf_counter() - began:.1f} s", flush=True)
+            rows = compact(ADDRESS)
+            print(f"{rows} rows became segments in {time.perf_counter() - began:.1f} s", flush=True)
+            first_calls(study, provider, path)
 
 
 if __name__ == "__main__":

@@ -83,6 +83,10 @@ def database_rates() -> None:
     from traps_pipeline.storage.shared_ledger import SharedLedger
 
     with Postgres.running(durable=True) as server:
+        with tempfile.TemporaryDirectory() as name:
+            alone = _rate(ledger_write, Path(name))
+            read = _rate(ledger_read, Path(name))
+        print(f"files of one machine: {alone:,.0f} rows/s, read: {read:,.0f} rows/s", flush=True)
         for count in (1, 2):
             command = [sys.executable, "-c", WRITE, server.address()]
             running = [
@@ -90,10 +94,12 @@ def database_rates() -> None:
                 for n in range(count)
             ]
             rates = [float(process.communicate()[0].splitlines()[-1]) for process in running]
-            print(f"PostgreSQL, {count} processes of 24 connections: {sum(rates):,.0f} rows/s", flush=True)
+            said = f"PostgreSQL, {count} processes of 24 connections: {sum(rates):,.0f} rows/s"
+            print(f"{said}, {sum(rates) / alone:.2f} of the files", flush=True)
         began = time.perf_counter()
         found = SharedLedger(Session(server.address(), "BENCH", "bench"), "answers").read("m10").rows
-        print(f"PostgreSQL, read: {len(found) / (time.perf_counter() - began):,.0f} rows/s")
+        rate = len(found) / (time.perf_counter() - began)
+        print(f"PostgreSQL, read: {rate:,.0f} rows/s, {rate / read:.2f} of the files")
 
 
 def _rate(work: Callable[[Path], object], folder: Path) -> float:

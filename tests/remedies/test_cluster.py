@@ -32,6 +32,7 @@ from traps_pipeline.orchestration.shared_history import SharedHistory
 from traps_pipeline.orchestration.stage import WorkspaceResource
 from traps_pipeline.storage.bucket import Bucket, object_name
 from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import DATABASE, RAY, Workspace
 
@@ -64,6 +65,46 @@ def test_a_bucket_that_is_made_and_a_key_that_is_exported_are_used(
         lambda: monkeypatch.setenv("AWS_ENDPOINT", s3.environment["AWS_ENDPOINT"]),
     )
     assert found == content
+
+
+@pytest.mark.parametrize(
+    ("address", "exported", "variable"),
+    [
+        ("gs://lab/study", {"GOOGLE_APPLICATION_CREDENTIALS": "/no/such/key.json"}, "GOOGLE_APPLICATION_CREDENTIALS"),
+        ("gs://lab/study", {"GOOGLE_APPLICATION_CREDENTIALS": __file__}, "GOOGLE_APPLICATION_CREDENTIALS"),
+        ("az://lab/study", {}, "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY"),
+        (
+            "az://lab/study",
+            {"AZURE_STORAGE_ACCOUNT_NAME": "lab", "AZURE_STORAGE_ACCOUNT_KEY": "no base64"},
+            "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+        ),
+    ],
+)
+def test_a_store_of_google_or_azure_without_its_key_is_refused_with_the_variables_that_it_reads(
+    address: str, exported: Mapping[str, str], variable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("obstore", reason="obstore is not installed; `pip install -e '.[dev]'` brings it")
+    for name in [name for name in os.environ if name.startswith(("GOOGLE_", "AZURE_"))]:
+        monkeypatch.delenv(name)
+    for name, value in exported.items():
+        monkeypatch.setenv(name, value)
+    assert place_of(f"{address}/") == address
+    with pytest.raises(
+        TrapsError, match=rf"^{address}: cannot be used from the host .* in the environment \({variable}"
+    ):
+        Bucket(address).get("a")
+
+
+def test_a_store_of_azure_is_opened_once_its_account_and_key_are_exported(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("obstore", reason="obstore is not installed; `pip install -e '.[dev]'` brings it")
+    monkeypatch.delenv("AZURE_STORAGE_ACCOUNT_NAME", raising=False)
+
+    def export() -> None:
+        monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "lab")
+        monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_KEY", "a2V5")
+
+    opened = remedied(lambda: Bucket("az://lab/study"), "and that this machine's clock is right; then run", export)
+    assert opened.address == "az://lab/study"
 
 
 def test_what_is_gone_from_the_store_is_there_once_it_is_made_anew(address: str) -> None:

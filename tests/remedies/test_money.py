@@ -17,6 +17,7 @@ from traps_pipeline.models.registry import Entry, Prices, get_model
 from traps_pipeline.models.request import Outcome
 from traps_pipeline.models.spending import spending
 from traps_pipeline.models.traffic import Breaker, Stopped
+from traps_pipeline.storage.place import Place
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -55,7 +56,7 @@ def test_a_budget_that_is_raised_leaves_room_for_the_call() -> None:
     )
 
 
-def paid(root: Path) -> Callable[[], None]:
+def paid(root: Place) -> Callable[[], None]:
     """A call of 2 dollars of a model of the account openai, in the study at `root` as its study.yaml now is."""
 
     def call() -> None:

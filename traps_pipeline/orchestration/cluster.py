@@ -24,7 +24,9 @@ from traps_pipeline.orchestration.graph import Stage
 from traps_pipeline.orchestration.runs import Ran, Range, Runs, batches, problems_of, range_tags
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
 from traps_pipeline.orchestration.schemes import Scheme
+from traps_pipeline.orchestration.shared_history import unusable
 from traps_pipeline.partitions import Cell
+from traps_pipeline.storage.database import PATIENCE_S
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 
 STUDY_TAG = "traps/study"
@@ -112,6 +114,7 @@ class RayRuns(Runs):
         self._most, self._gpus = most, gpus
         self._stack, self._n_keys = ExitStack(), 0
         self._cursors: dict[str, str | None] = {}
+        self._failures: dict[str, list[dg.DagsterEvent]] = {}  # steps of runs that failed
         self._chunks: dict[Range, Sequence[str | None]] = {}  # what a range is a part of
 
     def __enter__(self) -> RayRuns:
@@ -201,17 +204,17 @@ class RayRuns(Runs):
         return json.dumps(given | {"runtime_env": {"env_vars": {VARIABLE: str(self._workspace.place)}}})
 
     def _watch(self, run_ids: Sequence[str]) -> list[Ran]:
-        """Tell what runs do until all have ended."""
-        left, done = [*run_ids], list[Ran]()
+        """Tell what runs do until all have ended. While the database is away, for as long as runs themselves wait for
+        it, they are not given up."""
+        left, done, seen_at = [*run_ids], list[Ran](), time.monotonic()
         try:
             while left:
-                runs = {run.run_id: run for run in self._instance.get_runs(dg.RunsFilter(run_ids=left))}
-                for run_id in [*left]:
-                    run = runs.get(run_id)
-                    failures = self._tell(run_id)
-                    if run is None or run.is_finished:
-                        left.remove(run_id)
-                        done.append(self._ended(run_id, run, [*failures, *self._tell(run_id)]))
+                try:
+                    self._look_at(left, done)
+                    seen_at = time.monotonic()
+                except unusable():
+                    if time.monotonic() - seen_at > PATIENCE_S:
+                        raise
                 if left:
                     time.sleep(POLL_S)
         except KeyboardInterrupt:
@@ -219,21 +222,30 @@ class RayRuns(Runs):
             raise
         return done
 
-    def _tell(self, run_id: str) -> list[dg.DagsterEvent]:
-        """Tell of partitions that a run has made since the last time; returns steps that failed."""
-        failures = list[dg.DagsterEvent]()
+    def _look_at(self, left: list[str], done: list[Ran]) -> None:
+        """Tell what these runs have done since the last time. What came of those that have ended is added to `done`."""
+        runs = {run.run_id: run for run in self._instance.get_runs(dg.RunsFilter(run_ids=left))}
+        for run_id in [*left]:
+            run = runs.get(run_id)
+            self._tell(run_id)
+            if run is None or run.is_finished:
+                done.append(self._ended(run_id, run, self._failures.get(run_id, [])))
+                left.remove(run_id)
+
+    def _tell(self, run_id: str) -> None:
+        """Tell of partitions that a run has made since the last time, and remember steps that failed."""
         while True:
             found = self._instance.get_records_for_run(run_id, self._cursors.get(run_id), {_MADE, _FAILED}, limit=1000)
             self._cursors[run_id] = found.cursor
             for record in found.records:
                 event = record.event_log_entry.get_dagster_event()
                 if event.is_step_failure:
-                    failures.append(event)
+                    self._failures.setdefault(run_id, []).append(event)
                 elif (made := event.step_materialization_data.materialization).metadata.get("tally") is not None:
                     tally = progress.Tally(**json.loads(str(made.metadata["tally"].value)))
                     progress.current().partition(made.asset_key.path[-1], made.partition or "", tally)
             if not found.has_more:
-                return failures
+                return
 
     def _ended(self, run_id: str, run: dg.DagsterRun | None, failures: Sequence[dg.DagsterEvent]) -> Ran:
         name = f"run {run_id[:8]} of the study {self._workspace.study.name}"

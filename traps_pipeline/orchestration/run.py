@@ -21,6 +21,7 @@ from traps_pipeline.orchestration.graph import name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.runs import HOST_TAG, PID_TAG, Runs, this_host
+from traps_pipeline.orchestration.shared_history import unusable
 from traps_pipeline.orchestration.step import EXPERIMENT_TAG, MAKE_TAG, OUTDATED, STALE, to_make
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.workspace import Workspace
@@ -43,8 +44,6 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
     anew, and so does one that is no history any more, which is kept beside it: what counts stands in the tables.
     Raises TrapsError when the history cannot be read or written.
     """
-    from sqlalchemy.exc import DBAPIError
-
     home = Path(os.environ.get("DAGSTER_HOME") or workspace.dagster_home)
     try:
         workspace.locks.mkdir(parents=True, exist_ok=True)
@@ -59,7 +58,7 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
             yield instance
     except BrokenPipeError:
         raise  # of what is printed to
-    except (DBAPIError, OSError) as error:
+    except (OSError, *unusable()) as error:
         what = remedy(error) if isinstance(error, OSError) else "free some space, or move that folder away"
         raise TrapsError(
             f"{home}: Dagster's history cannot be read or written ({' '.join(str(error).split())[:300]}); {what} and "

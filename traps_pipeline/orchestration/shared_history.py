@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 from dagster import StringSource
@@ -11,6 +12,15 @@ from dagster._core.storage.base_storage import DagsterStorage
 from dagster._serdes import ConfigurableClassData
 
 from traps_pipeline.errors import TrapsError
+
+
+def unusable() -> tuple[type[Exception], ...]:
+    """What is raised where the database of a history cannot be reached, or breaks."""
+    from sqlalchemy.exc import DBAPIError
+
+    if find_spec("dagster_postgres") is None:
+        return (DBAPIError,)
+    return DBAPIError, import_module("dagster_postgres.utils").DagsterPostgresException
 
 
 class SharedHistory(DagsterStorage):

@@ -7,6 +7,14 @@ import socket
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.extras import require
 
+# What a host exports for a store of each kind: names that obstore reads.
+KEYS = {
+    "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, and AWS_ENDPOINT for a server of your own",
+    "gs": "GOOGLE_APPLICATION_CREDENTIALS, the path of a file with a service account's key",
+    "az": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY; the bucket is a container of that account",
+}
+_NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")  # what the services call it; Azure the latter
+
 
 def object_name(digest: bytes) -> str:
     """Where the content with that SHA-256 lies, in the store and in a scratch folder."""
@@ -78,11 +86,10 @@ class Bucket:
         said = " ".join(str(error).split())[:300]
         return TrapsError(
             f"{self.address}: cannot be used from the host {socket.gethostname()} ({said}). See that the bucket "
-            "exists, that its keys and its address are in the environment (for S3: AWS_ACCESS_KEY_ID, "
-            "AWS_SECRET_ACCESS_KEY, AWS_REGION, and AWS_ENDPOINT for a server of your own), and that this machine's "
-            "clock is right; then run the same command again: what is finished is kept"
+            f"exists, that its keys and its address are in the environment ({KEYS[self.address.partition(':')[0]]}), "
+            "and that this machine's clock is right; then run the same command again: what is finished is kept"
         )
 
 
 def _is_no_bucket(error: Exception) -> bool:
-    return "NoSuchBucket" in str(error)
+    return any(code in str(error) for code in _NO_BUCKET)
