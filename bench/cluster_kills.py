@@ -8,6 +8,7 @@ the run of one process, but for `store`, which loses them.
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import shutil
 import signal
@@ -15,20 +16,22 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.request
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from bench.cluster_gate import Cluster
-from bench.cluster_study import Study, fetch, tables_are_equal
+from bench.cluster_gate import Cluster, free_port
+from bench.cluster_study import Study, fetch, runs_of, tables_are_equal
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.providers.server import Provider
 
 MODELS, CONNECTIONS, WANTED, BUDGET_USD = ("seer-a", "seer-b"), 2, 64, 3.0
 LATENCY_S, CUT_S, STOP_S, DOWN_S = 1.5, 45, 90, 5
+CODE = "traps_pipeline.definitions"
 LATE_S = 60  # no run may be STARTED for longer without a process that executes it
 NODES = ("one", "two")
 EXPERIMENT = f"""
@@ -206,9 +209,52 @@ def empty_store(scene: Scene) -> None:
     """After the study was made: every clip is removed from the store; the next run makes them again."""
 
 
+def want_together(scene: Scene) -> None:
+    """Nothing is killed: a second experiment on another host, and a backfill as Dagster's page launches it, want the
+    same cells at once."""
+    study, port = scene.study, free_port()
+    command = [sys.executable, "-m", "dagster_webserver", "-h", "127.0.0.1", "-p", f"{port}", "-m", CODE]
+    path = study.root / "again.yaml"
+    path.write_text(study.experiment.read_text().replace("name: kills", "name: again"))
+    other = Study(study.folder, study.environment | {"TRAPS_SCRATCH": str(study.folder / "other")}, path, study.root)
+    with (study.folder / "webserver.log").open("ab") as log:
+        environment = study.environment | {"DAGSTER_HOME": study.home}
+        pages = subprocess.Popen(command, stdout=log, stderr=log, cwd=study.root, env=environment)
+    try:
+        began = time.monotonic()
+        second = other.start_run("--no-preflight", "--budget-usd", f"{BUDGET_USD}")
+        said = _launched(port, study.python(NAME).strip())
+        print(f"  {time.monotonic() - began:6.1f} s  the page says {said}", flush=True)
+        lines = _shown(second, began)
+        study.require(second.wait() == 0 and "LaunchBackfillSuccess" in said, "both others end well")
+        print(f"  the other command: {lines[-2].strip()}", flush=True)
+        while {"QUEUED", "STARTING", "STARTED", "NOT_STARTED"} & {*(ended := runs_of(study))}:
+            time.sleep(2)
+        study.require({*ended} == {"SUCCESS"}, f"all runs, those of the backfill too: {ended}")
+    finally:
+        pages.terminate()
+        pages.wait()
+
+
+def _launched(port: int, study: str) -> str:
+    """What Dagster's web server answers to what its page sends when answers of all cells are to be made."""
+    query = f"""mutation {{ launchPartitionBackfill(backfillParams: {{
+        allPartitions: true, assetSelection: [{{path: ["{study}", "responses"]}}]
+    }}) {{ __typename ... on LaunchBackfillSuccess {{ backfillId }} ... on PythonError {{ message }} }} }}"""
+    body, until = json.dumps({"query": query}).encode(), time.monotonic() + 180
+    request = urllib.request.Request(f"http://127.0.0.1:{port}/graphql", body, {"Content-Type": "application/json"})
+    while True:
+        try:
+            return urllib.request.urlopen(request, timeout=120).read().decode()
+        except OSError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.5)
+
+
 KILLS: dict[str, Callable[[Scene], None]] = {
     "run": kill_run, "node": kill_node, "head": kill_head, "postgres": kill_postgres, "stopped": stop_node,
-    "network": cut_network, "store": empty_store,
+    "network": cut_network, "store": empty_store, "together": want_together,
 }  # fmt: skip
 EMPTY = """
 from traps_pipeline.storage.workspace import Workspace
@@ -227,6 +273,7 @@ standing = purse.open()
 print(sum(standing.spent.values()) + sum(standing.out.values()))
 purse.close()
 """
+NAME = "from traps_pipeline.storage.workspace import Workspace\nprint(Workspace.open().study.name)"
 SEGMENTS = """
 select count(distinct s.id), coalesce(sum(s.rows), 0),
        (select count(*) from traps.rows r join traps.evaluations e on e.id = r.evaluation where e.study = t.id)
@@ -321,7 +368,9 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     out = list[str]()
     reading = threading.Thread(target=lambda: out.extend(_shown(run, began)), daemon=True)
     reading.start()
-    if kind != "store":
+    if kind == "together":
+        want_together(scene)
+    elif kind != "store":
         while provider.stats()["answered_in_full"] < WANTED // 8:
             if run.poll() is not None:
                 raise RuntimeError("the run ended before anything was asked")
@@ -339,7 +388,7 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     seconds, stats = time.monotonic() - began, provider.stats()
     calls, billed = stats["answered_in_full"], stats["billed_usd"]
     study.require(code == 0, f"the study is made, with {tries} command(s), in {seconds:.0f} s")
-    most = WANTED + CONNECTIONS * len(MODELS)
+    most = WANTED + (CONNECTIONS * len(MODELS) if kind not in ("store", "together") else 0)
     study.require(WANTED <= calls <= most, f"{calls} calls at the provider, {WANTED} wanted, at most {most}")
     counted = float(study.python(SPENT).split()[-1])
     study.require(
@@ -365,10 +414,7 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     import psycopg
 
     with psycopg.connect(scene.database.address(), autocommit=True) as connection:
-        name = study.python(
-            "from traps_pipeline.storage.workspace import Workspace\nprint(Workspace.open().study.name)"
-        )
-        (found,) = connection.execute(SEGMENTS, [name.strip()]).fetchall()
+        (found,) = connection.execute(SEGMENTS, [study.python(NAME).strip()]).fetchall()
     study.require(found[0] > 0 and found[2] == 0, f"{found[0]} segments hold {found[1]} rows, the database {found[2]}")
 
 

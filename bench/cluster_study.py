@@ -43,6 +43,7 @@ class Study:
     def __init__(self, folder: Path, environment: dict[str, str], experiment: Path, root: Path = ROOT) -> None:
         self.folder, self.environment, self.experiment, self.root = folder, environment, experiment, root
         self.daemon: subprocess.Popen[bytes] | None = None
+        self.home = ""  # Dagster's, once the study is there
         self.failures: list[str] = []
 
     def traps(self, *arguments: str, **own: str) -> subprocess.CompletedProcess[str]:
@@ -76,10 +77,11 @@ class Study:
         said = self.traps("init", str(self.experiment))
         if said.returncode:
             raise SystemExit(said.stderr)
-        home = next(line for line in said.stdout.splitlines() if "DAGSTER_HOME=" in line).partition("DAGSTER_HOME=")[2]
+        line = next(line for line in said.stdout.splitlines() if "DAGSTER_HOME=" in line)
+        self.home = line.partition("DAGSTER_HOME=")[2]
         with (self.folder / "daemon.log").open("ab") as log:
             command = [sys.executable, "-m", "dagster._daemon", "run", "-m", "traps_pipeline.definitions"]
-            environment = self.environment | {"DAGSTER_HOME": home}
+            environment = self.environment | {"DAGSTER_HOME": self.home}
             self.daemon = subprocess.Popen(command, stdout=log, stderr=log, cwd=self.root, env=environment)
         time.sleep(20)
 

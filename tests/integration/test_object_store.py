@@ -17,11 +17,13 @@ from tests.conftest import ROOT, SMALL, Checkout, Finished
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
 pytestmark = pytest.mark.slow
 EXPERIMENT = SMALL.with_name("one_regime.yaml")
-ANSWERS = 4 * 2 * 2 * 12  # models, datasets of a taxonomy, sides, scenarios
+MODELS = ("confidence-noise", "oracle", "prior", "random-50")
+ANSWERS = len(MODELS) * 2 * 2 * 12  # datasets of a taxonomy, sides, scenarios
 ADDRESS = "s3://lab/one-regime"
 
 
@@ -47,6 +49,12 @@ class Host:
     def files(self) -> list[Path]:
         """What it has of tables, clips and media."""
         return [path for kind in ("tables", "clips", "media") for path in (self.root / kind).rglob("*.*")]
+
+
+def rows_of(ledger: SharedLedger) -> int:
+    """How many rows of the study's ledgers lie in the database."""
+    sql = "select count(*) from traps.rows r join traps.evaluations e on e.id = r.evaluation where e.study = %s"
+    return ledger.session.run(lambda c: c.execute(sql, [ledger.session.study_id]).fetchall())[0][0]
 
 
 @pytest.fixture
@@ -94,6 +102,9 @@ def test_hosts_make_one_study_together_and_it_is_that_of_a_single_machine(
     assert [row and row.digest for row in made] == [*before.values()]
     nothing = one.traps("run", EXPERIMENT, "--until", "leaderboard")
     assert (nothing.code, nothing.counts()) == (0, {"answers": 0, "votes": 0, "frames": 0}), nothing.err
+    ledger = workspace.answers
+    assert isinstance(ledger, SharedLedger) and ledger.evaluations() == [f"{m}__standard__run1" for m in MODELS]
+    assert rows_of(ledger) == 0  # what is finished lies in segments, from which the last runs were answered
     strays = [path for host in hosts for path in host.files() if not path.resolve().is_relative_to(host.scratch)]
     assert strays == []
 

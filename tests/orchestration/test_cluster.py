@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import shlex
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
 import dagster as dg
 import pytest
+import yaml
 
+from tests.postgres import Postgres
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.cluster import RayRuns, dagster_yaml, require_cluster
 from traps_pipeline.orchestration.runs import batches
@@ -82,9 +86,11 @@ def test_a_study_in_a_folder_and_a_missing_head_are_refused_with_the_remedy(
 def test_what_dagster_is_told_holds_no_address_of_the_database(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(RAY, "http://head:8265")
     monkeypatch.setenv("TRAPS_DATABASE", "postgresql://user:secret@host/db")
-    said = dagster_yaml("TRAPS_DATABASE")
+    said = dagster_yaml("TRAPS_DATABASE", "s3://lab/study")
     assert "secret" not in str(said) and said["concurrency"]["runs"]["max_concurrent_runs"] == 40
-    assert said["run_launcher"]["config"]["ray"] == {"address": "http://head:8265", "num_cpus": 1}
+    assert said["run_launcher"]["config"]["ray"] == {
+        "address": "http://head:8265", "num_cpus": 1, "runtime_env": {"env_vars": {"TRAPS_WORKSPACE": "s3://lab/study"}},
+    }  # fmt: skip
 
 
 def test_the_command_line_of_a_run_survives_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,3 +103,44 @@ def test_the_command_line_of_a_run_survives_a_shell(monkeypatch: pytest.MonkeyPa
     told = """{"config_yaml": "'variable: X'", "a": 1}"""
     launcher.QuotingRayRunLauncher("http://head:8265")._launch_ray_job("1", f"dagster api execute_run '{told}'", None)
     assert shlex.split(sent[0]) == ["dagster", "api", "execute_run", told]
+
+
+def test_a_command_that_watches_runs_outlives_a_database_that_is_stopped_and_started(
+    workspace: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
+    with Postgres.running() as server:
+        monkeypatch.setenv("TRAPS_TEST_HISTORY", server.address())
+        storage = dagster_yaml_of_history("TRAPS_TEST_HISTORY")
+        (tmp_path / "dagster.yaml").write_text(yaml.safe_dump(storage))
+        with dg.DagsterInstance.from_config(str(tmp_path)) as instance:
+            run = instance.create_run_for_job(_nothing)
+            watching = RayRuns(instance, workspace, 1, 0.0, "leave")
+            ended = list[Any]()
+            thread = threading.Thread(target=lambda: ended.extend(watching._watch([run.run_id])))
+            thread.start()
+            server.stop()
+            time.sleep(3)
+            assert thread.is_alive()
+            server.start()
+            instance.report_run_failed(run, "it was ended")
+            thread.join(300)
+    assert [problem for ran in ended for problem in ran.problems] == [
+        f"run {run.run_id[:8]} of the study lab ended as failure (it was ended); see its log in `traps ui`"
+    ]
+
+
+def dagster_yaml_of_history(variable: str) -> dict[str, Any]:
+    """Of what a study's Dagster is told, where its history lies."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv(RAY, "http://127.0.0.1:1")
+        return {"storage": dagster_yaml(variable, "s3://lab/study")["storage"], "telemetry": {"enabled": False}}
+
+
+@dg.op
+def _nothing_op() -> None: ...
+
+
+@dg.job
+def _nothing() -> None:
+    _nothing_op()

@@ -47,8 +47,9 @@ _MADE, _FAILED = dg.DagsterEventType.ASSET_MATERIALIZATION, dg.DagsterEventType.
 _ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED}
 
 
-def dagster_yaml(variable: str) -> dict[str, Any]:
-    """The `dagster.yaml` of a study whose runs go to a cluster. variable: with the database's address."""
+def dagster_yaml(variable: str, place: str) -> dict[str, Any]:
+    """The `dagster.yaml` of a study whose runs go to a cluster. variable: with the database's address; place: of the
+    study, for runs that are launched in Dagster's pages, whose tags do not name it."""
     return {
         "telemetry": {"enabled": False},
         "nux": {"enabled": False},
@@ -62,7 +63,7 @@ def dagster_yaml(variable: str) -> dict[str, Any]:
         "run_launcher": {
             "module": "traps_pipeline.orchestration.ray_launcher",
             "class": "QuotingRayRunLauncher",
-            "config": {"ray": {"address": os.environ[RAY], "num_cpus": 1}},
+            "config": {"ray": {"address": os.environ[RAY], "num_cpus": 1, "runtime_env": _works_in(place)}},
         },
         # Ray keeps what a job prints; Dagster would write it below a path of the host that submitted the run.
         "compute_logs": {
@@ -201,7 +202,7 @@ class RayRuns(Runs):
         if memory:
             takes["memory"] = int(memory * 2**30)
         given = {name: value for name, value in takes.items() if value}
-        return json.dumps(given | {"runtime_env": {"env_vars": {VARIABLE: str(self._workspace.place)}}})
+        return json.dumps(given | {"runtime_env": _works_in(str(self._workspace.place))})
 
     def _watch(self, run_ids: Sequence[str]) -> list[Ran]:
         """Tell what runs do until all have ended. While the database is away, for as long as runs themselves wait for
@@ -270,6 +271,10 @@ class RayRuns(Runs):
         for run_id in left:
             self._instance.run_coordinator.cancel_run(run_id)
         progress.current().note(f"{len(left)} runs were told to end; what they asked and made is kept")
+
+
+def _works_in(place: str) -> dict[str, Any]:
+    return {"env_vars": {VARIABLE: place}}
 
 
 def _is_local(cell: str | None) -> bool:

@@ -73,7 +73,7 @@ def _opened(workspace: Workspace, home: Path) -> dg.DagsterInstance:
         if workspace.is_on_cluster and home == workspace.dagster_home:
             from traps_pipeline.orchestration.cluster import dagster_yaml
 
-            said = yaml.safe_dump(dagster_yaml(str(workspace.study.database)), sort_keys=False)
+            said = yaml.safe_dump(dagster_yaml(str(workspace.study.database), str(workspace.place)), sort_keys=False)
             write_text(home / "dagster.yaml", said)
         workspace.copy_dagster_yaml(home)
         try:
