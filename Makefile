@@ -10,7 +10,7 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test all-tests test-cluster test-cluster-gate cluster-setup ui bench explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
+.PHONY: demo demo-mechanism check fast-tests test all-tests test-cluster test-cluster-gate test-cluster-kills cluster-setup ui bench explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
 
 demo: setup-core ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -40,7 +40,10 @@ all-tests: setup
 # Ray is 80 MB and in no other test, so these are not part of `make test`.
 test-cluster: cluster-setup ## a study on two nodes of Ray, one killed in mid-run, against a run of one process; tests of runs
 	$(BIN)/python bench/cluster_study.py --kill
-	$(BIN)/python -m pytest tests/orchestration/test_cluster.py
+	$(BIN)/python -m pytest tests/orchestration/test_cluster.py tests/remedies/test_cluster.py
+
+test-cluster-kills: cluster-setup ## a study on a cluster while this and that is killed, in about half an hour (docs/cluster.md)
+	$(BIN)/python bench/cluster_study.py --kill run node stopped postgres network head store together
 
 test-cluster-gate: cluster-setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
 	$(BIN)/python bench/cluster_gate.py
