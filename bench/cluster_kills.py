@@ -98,7 +98,9 @@ def executing() -> dict[int, tuple[str, str]]:
                 is_stopped = (entry / "stat").read_text().rsplit(")", 1)[1].split()[0] in "TZ"
                 if is_stopped or b"python" not in said[:200] or not (b"execute_run" in said or b"resume_run" in said):
                     continue
-                environ = dict(part.partition(b"=")[::2] for part in (entry / "environ").read_bytes().split(b"\0"))
+                environ = dict(
+                    part.split(b"=", 1) for part in (entry / "environ").read_bytes().split(b"\0") if b"=" in part
+                )
                 found[int(entry.name)] = said.decode(errors="replace"), environ.get(b"TRAPS_NODE", b"").decode()
     return found
 

@@ -15,7 +15,7 @@ import yaml
 from tests.postgres import Postgres
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.cluster import RayRuns, dagster_yaml, require_cluster
-from traps_pipeline.orchestration.runs import batches
+from traps_pipeline.orchestration.runs import batches, broke_off
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, require_same_code
 from traps_pipeline.orchestration.schemes import CELL, DATASET, Scheme
 from traps_pipeline.storage.study import Study
@@ -128,6 +128,45 @@ def test_a_command_that_watches_runs_outlives_a_database_that_is_stopped_and_sta
     assert [problem for ran in ended for problem in ran.problems] == [
         f"run {run.run_id[:8]} of the study lab ended as failure (it was ended); see its log in `traps ui`"
     ]
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_run_that_breaks_off_is_made_once_more_and_then_told(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, times: int
+) -> None:
+    with dg.DagsterInstance.ephemeral() as instance:
+        watching, submitted = RayRuns(instance, workspace, 1, 0.0, "leave"), list[str]()
+
+        def submit(*_: object) -> str:
+            run = instance.create_run_for_job(_nothing)
+            submitted.append(run.run_id)
+            if len(submitted) <= times:
+                instance.report_run_failed(run, "its host is gone")
+                return run.run_id
+            return _nothing.execute_in_process(instance=instance).run_id
+
+        monkeypatch.setattr(watching, "_submit", submit)
+        told = [problem for ran in watching.make([], [(None, None)], {}) for problem in ran.problems]
+    assert len(submitted) == 2
+    assert (told == []) == (times == 1) and all("ended as failure (its host is gone)" in one for one in told)
+
+
+@pytest.mark.parametrize("error", [TrapsError("the budget is reached"), ValueError("a defect")])
+def test_a_run_that_says_why_it_failed_did_not_break_off(error: Exception) -> None:
+    @dg.op
+    def fails() -> None:
+        raise error
+
+    @dg.job
+    def failing() -> None:
+        fails()
+
+    with dg.DagsterInstance.ephemeral() as instance:
+        result = failing.execute_in_process(instance=instance, raise_on_error=False)
+        run = instance.get_run_by_id(result.run_id)
+        assert run is not None
+        failures = [event for event in result.all_events if event.is_step_failure]
+        assert broke_off(run, failures) == isinstance(error, ValueError)
 
 
 def dagster_yaml_of_history(variable: str) -> dict[str, Any]:

@@ -305,10 +305,8 @@ def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -
     either way KeyboardInterrupt is raised and the same command goes on later. A caller that closes the iterator early
     stops it in the same way. Exceptions of models are raised together after the others have finished.
     """
-    loop = asyncio.new_event_loop()
-    stop = asyncio.Event()
-    results = settle(work, cells, stop)
-    problems: list[Exception] = []
+    loop, stop = asyncio.new_event_loop(), asyncio.Event()
+    results, problems = settle(work, cells, stop), list[Exception]()
     try:
         while True:
             try:

@@ -21,7 +21,7 @@ from traps_pipeline.extras import missing
 from traps_pipeline.models.registry import LOCAL, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Stage
-from traps_pipeline.orchestration.runs import Ran, Range, Runs, batches, problems_of, range_tags
+from traps_pipeline.orchestration.runs import Ran, Range, Runs, batches, broke_off, problems_of, range_tags
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
 from traps_pipeline.orchestration.schemes import Scheme
 from traps_pipeline.orchestration.shared_history import unusable
@@ -115,6 +115,7 @@ class RayRuns(Runs):
         self._most, self._gpus = most, gpus
         self._stack, self._n_keys = ExitStack(), 0
         self._cursors: dict[str, str | None] = {}
+        self._retries: dict[str, tuple[Sequence[Stage], Range, Mapping[str, str]]] = {}  # once, what broke off
         self._failures: dict[str, list[dg.DagsterEvent]] = {}  # steps of runs that failed
         self._chunks: dict[Range, Sequence[str | None]] = {}  # what a range is a part of
 
@@ -156,7 +157,8 @@ class RayRuns(Runs):
         """See `Runs`."""
         if ranges:
             progress.current().stage(", ".join(stage.name for stage in stages), self._n_keys * len(stages))
-            yield from self._watch([self._submit(stages, one, tags) for one in ranges])
+            self._retries = {self._submit(stages, one, tags): (stages, one, tags) for one in ranges}
+            yield from self._watch([*self._retries])
 
     def _submit(self, stages: Sequence[Stage], of: Range, tags: Mapping[str, str]) -> str:
         from dagster._core.definitions.selector import JobSubsetSelector
@@ -229,7 +231,12 @@ class RayRuns(Runs):
         for run_id in [*left]:
             run = runs.get(run_id)
             self._tell(run_id)
-            if run is None or run.is_finished:
+            if run is not None and run_id in self._retries and broke_off(run, self._failures.get(run_id, [])):
+                again = self._submit(*self._retries[run_id])
+                del self._retries[run_id]
+                left[left.index(run_id)] = again
+                progress.current().note(f"run {run_id[:8]} broke off, and is made once more as run {again[:8]}")
+            elif run is None or run.is_finished:
                 done.append(self._ended(run_id, run, self._failures.get(run_id, [])))
                 left.remove(run_id)
 

@@ -147,6 +147,12 @@ def problems_of(failures: Sequence[dg.DagsterEvent]) -> Ran:
     return Ran(problems, over)
 
 
+def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
+    """Whether a run ended for no reason that it could tell: its host, the network or the database failed."""
+    named = {error.cls_name for event in failures for error in _chain(event)}
+    return run.status == dg.DagsterRunStatus.FAILURE and not named & {*_SENTENCES, *_INTERRUPTS}
+
+
 def _chain(event: dg.DagsterEvent) -> list[Any]:
     """The error of a failed step and its causes, outermost first."""
     chain, error = [], event.step_failure_data.error
