@@ -29,7 +29,12 @@ from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.providers.server import Provider
 
-MODELS, CONNECTIONS, WANTED, BUDGET_USD = ("seer-a", "seer-b"), 2, 64, 3.0
+MODELS, CONNECTIONS, WANTED, BUDGET_USD = (
+    ("seer-a", "seer-b"),
+    2,
+    64,
+    6.0,
+)  # two dead blocks of 16 worst cases are $2.84
 LATENCY_S, CUT_S, STOP_S, DOWN_S = 1.5, 45, 90, 5
 CODE = "traps_pipeline.definitions"
 LATE_S = 60  # no run may be STARTED for longer without a process that executes it

@@ -151,22 +151,27 @@ def test_a_run_that_breaks_off_is_made_once_more_and_then_told(
     assert (told == []) == (times == 1) and all("ended as failure (its host is gone)" in one for one in told)
 
 
-@pytest.mark.parametrize("error", [TrapsError("the budget is reached"), ValueError("a defect")])
+@pytest.mark.parametrize("error", [TrapsError("the budget is reached"), ConnectionError("the server is gone")])
 def test_a_run_that_says_why_it_failed_did_not_break_off(error: Exception) -> None:
     @dg.op
     def fails() -> None:
         raise error
 
+    @dg.op
+    def waits() -> None:
+        raise TrapsError("responses are not made")
+
     @dg.job
     def failing() -> None:
         fails()
+        waits()
 
     with dg.DagsterInstance.ephemeral() as instance:
         result = failing.execute_in_process(instance=instance, raise_on_error=False)
         run = instance.get_run_by_id(result.run_id)
         assert run is not None
         failures = [event for event in result.all_events if event.is_step_failure]
-        assert broke_off(run, failures) == isinstance(error, ValueError)
+        assert broke_off(run, failures) == isinstance(error, ConnectionError)
 
 
 def dagster_yaml_of_history(variable: str) -> dict[str, Any]:

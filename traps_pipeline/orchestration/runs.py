@@ -148,9 +148,12 @@ def problems_of(failures: Sequence[dg.DagsterEvent]) -> Ran:
 
 
 def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
-    """Whether a run ended for no reason that it could tell: its host, the network or the database failed."""
-    named = {error.cls_name for event in failures for error in _chain(event)}
-    return run.status == dg.DagsterRunStatus.FAILURE and not named & {*_SENTENCES, *_INTERRUPTS}
+    """Whether a run, or a step of it that others wait for, ended for no reason that it could tell: its host, the
+    network or the database failed."""
+    named = [{error.cls_name for error in _chain(event)} for event in failures]
+    is_interrupted = any(names & {*_INTERRUPTS} for names in named)
+    unnamed = not failures or any(not names & {*_SENTENCES} for names in named)
+    return run.status == dg.DagsterRunStatus.FAILURE and unnamed and not is_interrupted
 
 
 def _chain(event: dg.DagsterEvent) -> list[Any]:
