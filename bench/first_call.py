@@ -175,7 +175,8 @@ def main() -> None:
             study = in_store(opened, Path(name) / "shared")
         register(study, provider, entry("image-model", "images"))
         free = experiment(study, ["oracle"], regimes=["standard"])
-        made = study.traps("run", free)  # clips, items and a Dagster history, as before any paid run
+        until = ("--until", "items") if arguments.store else ()
+        made = study.traps("run", free, *until)  # clips, items and a Dagster history, as before any paid run
         assert made.code == 0, made.err
         began = time.perf_counter()
         fill_database(ADDRESS, arguments.rows) if arguments.store else fill(study.workspace / "ledger", arguments.rows)
