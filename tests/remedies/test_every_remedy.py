@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from tests.conftest import ROOT
 from tests.remedies.remedied import says
 from tests.remedies.sentences import by_sentence, carried_out, remedies
 
@@ -18,9 +17,6 @@ NO_REMEDIES: dict[str, str] = {
     ),
     "scoring/contrasts.py | the two studies share no whole pair of the same model, regime and run": "run is a noun",
 }
-# Remedies that no test carries out yet, one a line: `FILE.py | sentence`. The list only becomes shorter.
-NOT_YET = (ROOT / "tests" / "remedies" / "not_yet.txt").read_text().splitlines()
-LISTED = {**NO_REMEDIES, **dict.fromkeys(NOT_YET, "not yet")}
 
 
 def test_many_errors_name_a_remedy() -> None:
@@ -28,18 +24,17 @@ def test_many_errors_name_a_remedy() -> None:
 
 
 def test_each_remedy_is_carried_out_by_a_test() -> None:
-    listed = set(LISTED)
+    listed = set(NO_REMEDIES)
     nobody = [one.where for one in remedies() if one not in by_sentence() and f"{one.file} | {one.text}" not in listed]
     assert not nobody, "no test carries out what these errors say (tests/remedies/remedied.py):\n" + "\n".join(nobody)
 
 
-def test_what_is_listed_as_not_carried_out_is_a_remedy_and_is_not() -> None:
+def test_what_is_listed_as_no_remedy_is_a_sentence_that_no_test_carries_out() -> None:
     there = {f"{one.file} | {one.text}": one for one in remedies()}
-    gone = [line for line in LISTED if line not in there]
+    gone = [line for line in NO_REMEDIES if line not in there]
     assert not gone, "the package no longer says these; take them off the list:\n" + "\n".join(gone)
-    done = [line for line in LISTED if there[line] in by_sentence()]
+    done = [line for line in NO_REMEDIES if there[line] in by_sentence()]
     assert not done, "a test carries these out; take them off the list:\n" + "\n".join(done)
-    assert sorted(set(NOT_YET)) == NOT_YET
 
 
 def test_what_a_test_carries_out_is_a_sentence_of_the_package() -> None:

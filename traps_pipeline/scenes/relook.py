@@ -32,11 +32,10 @@ STILL = ("floor", "light", "bystanders")  # parts of a look that move neither ca
 def relook_family(
     released: Path, name: str, workers: int | None = None, report: Callable[[str], None] = lambda _: None
 ) -> None:
-    """Give all records of a family the look of their draw, and measure again what pixels say. Raises TrapsError if a
-    part of the look moves the camera, or naming a record that is no longer certified; nothing is written then."""
+    """Give all records of a family, whose looks are in STILL, the look of their draw, and measure again what pixels
+    say. Raises TrapsError naming a record that is no longer certified; nothing is written then."""
     family, tallies = get_family(name), load_tallies(released)
-    if not set(family.looks) <= set(STILL):
-        raise TrapsError(f"{name}: a look in {', '.join(family.looks)} moves the camera; draw the family anew")
+    assert set(family.looks) <= set(STILL), f"{name}: looks in {', '.join(family.looks)}, of which some move the camera"
     _rewrite(released, name, _relooked, workers, report)
     tallies[name] = replace(tallies[name], file=family_digest(name), look=sorted(family.looks))
     save_tallies(released, tallies)
