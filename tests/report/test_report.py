@@ -13,7 +13,7 @@ import pytest
 
 from traps_pipeline.partitions import DATASETS, REGIMES, SHORT
 from traps_pipeline.report.arms_sheet import FRAME_IN, GAP_IN, arms_sheets
-from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet, six_pairs
+from traps_pipeline.report.contact_sheet import chosen_pairs, contact_sheet, six_pairs, telling_times
 from traps_pipeline.report.figures.labels import Label, merged_labels
 from traps_pipeline.report.figures.landscape import landscape_figure
 from traps_pipeline.report.leaderboard import leaderboard_markdown, leaderboard_text, leaderboards
@@ -402,6 +402,14 @@ def test_a_contact_sheet_is_a_png_and_hatches_what_the_void_does_not_show(tmp_pa
     assert full.shape == hatched.shape
     assert down.min() > 0.5 * full.shape[0]
     assert right.min() > 0.5 * full.shape[1]
+
+
+def test_a_contact_sheet_shows_the_outcome_of_a_control_before_a_panel_closes_it():
+    frames, at = np.full((50, 360, 480, 3), 180, np.uint8), np.arange(50) / 10
+    assert telling_times(frames, at, 4).tolist() == [0.0, 1.6, 3.3, 4.9]
+    frames[40:, 100:300, 150:350] = (16, 24, 64)
+    assert telling_times(frames, at, 4).tolist() == [0.0, 2.0, 3.9, 4.9]
+    assert telling_times(frames, at, 3).tolist() == [0.0, 2.0, 3.9]
 
 
 def test_a_contact_sheet_takes_the_first_pairs_of_each_sub_scenario(tmp_path):

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.partitions import ARMS, PANEL_DOSES, PANEL_LOOKS
-from traps_pipeline.report.contact_sheet import SampledClip, sampled
+from traps_pipeline.report.contact_sheet import SampledClip, sampled, telling_times
 from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
 from traps_pipeline.scenes.encode import decode
 
@@ -59,9 +59,8 @@ def arms_sheets(items: pd.DataFrame, arms: pd.DataFrame, root: Path) -> dict[str
 
 
 def _moments(clip: Path) -> np.ndarray:
-    """Times (MOMENTS,) in seconds, from a clip's first frame to its last."""
-    _, at = decode(clip)
-    return at[np.linspace(0, len(at) - 1, MOMENTS).round().astype(int)]
+    """Times (MOMENTS,) in seconds that tell what a control shows."""
+    return telling_times(*decode(clip), MOMENTS)
 
 
 def _rows(sides: pd.DataFrame, arms: pd.DataFrame, scenario: str, root: Path, times: np.ndarray) -> Iterator[Row]:

@@ -13,6 +13,7 @@ import pandas as pd
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report.writing import figure_bytes, figure_style, new_figure
 from traps_pipeline.scenes.encode import decode
+from traps_pipeline.scenes.vision import before_panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -122,11 +123,20 @@ def _in_order(values: pd.Series) -> pd.Series:
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
-    """Control, void and the times (moments,) in seconds, from the control's first frame to its last."""
+    """Control, void and the times (moments,) in seconds, from the control's first frame to its last. Of a control that
+    a panel closes they end with the last frame that shows its outcome, and, where there is room, the very last one."""
     control, at = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
-    times = at[np.linspace(0, len(at) - 1, moments).round().astype(int)]
+    times = telling_times(control, at, moments)
     return sampled(control, at, times), sampled(void, void_at, times), times
+
+
+def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarray:
+    """Times (moments,) from the first to the last of a clip's, `at`; where a panel closes the clip (frames, RGB), to
+    the last one before it comes, and if there are four or more, the clip's last one too."""
+    seen = len(before_panel(frames))
+    closed = [len(at) - 1] if seen < len(at) and moments > 3 else []
+    return at[np.append(np.linspace(0, seen - 1, moments - len(closed)).round(), closed).astype(int)]
 
 
 def sampled(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
