@@ -114,5 +114,5 @@ def test_frames_that_are_shown_later_show_the_outcome():
     take = variations.VARIATIONS["frames_later"].film(of)
     late = take.evidence["late_frames"]
     assert take.frames == [] and of.control.open_frames < 50
-    assert of.control.outcome.commit_frame <= min(late) and max(late) == of.control.open_frames - 1
+    assert of.control.outcome.commit_frame <= min(late) and max(late) < of.control.open_frames
     assert np.isfinite(take.evidence["least_visible_px"])
