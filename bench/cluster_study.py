@@ -2,12 +2,12 @@
 two nodes, each with a scratch folder of its own; the study lies on s3:// alone. Then what a cluster must not change is
 compared with a run of one process in a folder.
 
-python bench/cluster_study.py [--kill [KIND ...]] [--interrupt leave|cancel] [--experiment FILE]
+python bench/cluster_study.py [--kill] [--interrupt leave|cancel] [--experiment FILE]
 (needs the packages of the extra `cluster`, and moto)
 
---kill: every process of a node is killed (-9) while it renders, and the node is started again; or, with kinds of
-`bench/cluster_kills.py`, other things while models are asked. --interrupt: Ctrl-C after the first partition, which
-leaves or cancels the runs; then the same command once more.
+--kill: every process of a node is killed (-9) while it renders, and the node is started again. --interrupt: Ctrl-C
+after the first partition, which leaves or cancels the runs; then the same command once more. What else may be killed,
+while models are asked: `bench/cluster_kills.py`.
 """
 
 from __future__ import annotations
@@ -119,17 +119,11 @@ def main() -> None:
     from tests.postgres import Postgres
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kill", nargs="*", metavar="KIND")
+    parser.add_argument("--kill", action="store_true")
     parser.add_argument("--log", type=Path, help="a file for the log of Dagster's daemon")
     parser.add_argument("--interrupt", choices=("leave", "cancel"))
     parser.add_argument("--experiment", type=Path)
     arguments = parser.parse_args()
-    if arguments.kill:
-        from bench.cluster_kills import KILLS, kill_each
-
-        if unknown := {*arguments.kill} - {*KILLS}:
-            parser.error(f"no such kill: {', '.join(sorted(unknown))}; there are {', '.join(KILLS)}")
-        sys.exit("\n".join(kill_each(arguments.kill, arguments.log)) or None)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it, and so its own
     foreign = ("TRAPS_", "DAGSTER_", "RAY_", "AWS_")
     plain = {key: value for key, value in os.environ.items() if not key.startswith(foreign)}
@@ -167,7 +161,7 @@ def main() -> None:
                 print(f"  runs: {states}", flush=True)
                 is_left = not ({"CANCELED", "CANCELING", "FAILURE"} & {*states})
                 study.require(is_left == (arguments.interrupt == "leave"), f"their runs: {arguments.interrupt}")
-            code = watch(study.start_run(), study, kill if arguments.kill is not None else None)
+            code = watch(study.start_run(), study, kill if arguments.kill else None)
             print(f"  the study took {time.monotonic() - began:.0f} s on two nodes")
             study.require(code == 0, f"the run succeeds (exit code {code})")
             again = study.run_to_end()
