@@ -143,6 +143,7 @@ def test_a_record_without_evidence_loses_every_certificate_that_stores_some() ->
     lost = [said.split(": ")[1:] for said in (*unanswerable_controls([bare]), *answerable_voids([bare]))]
     assert lost == [
         ["outcome", "no evidence 'commit_s'"],
+        ["pace", "no evidence 'settles_share'"],
         ["legible", "no evidence 'least_visible_px'"],
         ["order", "no evidence 'order_frames'"],
         ["hidden", "no evidence 'hidden_from_s'"],

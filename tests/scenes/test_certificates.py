@@ -261,6 +261,7 @@ CLAIM = Claim.of_record(load("hidden_race-0001").spec)
 CHAOTIC = Claim.of_record(load("plinko-0001").spec)
 GOOD: dict[str, Any] = {
     "outcome": {"label": CLAIM.answer, "commit_s": 2.3, "margin_m": 0.17},
+    "pace": {"settles_share": 0.3},
     "turns": {"turns_deg": 10.0},
     "physics": {"same_physics": False, "simulated_answer": CLAIM.answer, "parted_m": 0.005},
     "in_frame": {"in_frame": True},
@@ -303,6 +304,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("outcome", {"commit_s": 4.4}, "is committed only 0.5 s before the end"),
     ("outcome", {"margin_m": 0.0}, "has a margin of 0.0000 m, below"),
     ("outcome", {"margin_m": float("nan")}, "has a margin of nan m, below"),
+    ("pace", {"settles_share": 0.29}, "settles after 29% of the clip, 30% is wanted"),
     ("turns", {"turns_deg": 9.9}, "turns by 9.9 degrees, 10 wanted"),
     ("physics", {"simulated_answer": "teal"}, "simulated here, the scene ends in 'teal'"),
     ("physics", {"parted_m": 0.0051}, "parts from its trajectory at once"),

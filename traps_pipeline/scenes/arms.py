@@ -35,7 +35,7 @@ from traps_pipeline.scenes.world import World
 
 # --- thresholds -------------------------------------------------------------------------------------------------------
 
-REMOVED_S = 4.0  # so long the panel of `removed` stands
+SHOWN_AGAIN_S = 1.0  # before the end the panel of `removed` goes
 SEEN_PX = 150.0  # of what must be seen of a moving thing, or must differ between two worlds, in one sampled frame
 PANEL_PX = 2000.0  # of a decoy in the first frame: 1 % of the picture
 EARLIEST_COVER_S = 0.5  # the late panel comes no earlier
@@ -192,13 +192,13 @@ def _decoy(scenario: Scenario) -> Take:
 
 
 def _removed(scenario: Scenario) -> Take:
-    spec, at = scenario.spec, round(REMOVED_S * scenario.fps)
+    spec, at = scenario.spec, len(scenario.control.qpos) - round(SHOWN_AGAIN_S * scenario.fps)
     commit = scenario.control.outcome.commit_frame
     last_seen = checks.last_sampled(len(scenario.control.qpos), scenario.fps)[0]
     if spec.void["hidden_from_frame"] >= at or commit > last_seen or last_seen < at:
         raise Rejected("the outcome is not both hidden before the panel goes and settled after it")
     frames = [*scenario.void_frames[:at], *scenario.control_frames[at:]]
-    return Take(frames, {"hidden_until_s": REMOVED_S, "settled_s": commit / scenario.fps})
+    return Take(frames, {"hidden_until_s": at / scenario.fps, "settled_s": commit / scenario.fps})
 
 
 def _late_panel(scenario: Scenario) -> Take:
@@ -380,8 +380,8 @@ ARMS: Mapping[str, Arm] = {
         Arm(
             "removed",
             "a panel in the first frames means: abstain",
-            f"the panel stands as in the void until {REMOVED_S:.0f} s; the last three sampled frames are the "
-            "control's, with the outcome settled",
+            f"the panel stands as in the void until {SHOWN_AGAIN_S} s before the end; the last three sampled frames "
+            "are the control's, with the outcome settled",
             must_answer,
             _removed,
         ),

@@ -21,6 +21,7 @@ from traps_pipeline.scenes.camera import in_frame
 from traps_pipeline.scenes.evidence import About, Certificate, Claim, Evidence, Judged, Number, Pair, VoidKind
 from traps_pipeline.scenes.kit import Family, Motion, Physics, Scene, flag_of
 from traps_pipeline.scenes.outcome import Outcome, Rejected, decisive_geoms, read_outcome
+from traps_pipeline.scenes.pace import EARLIEST_SHARE, settles_share
 from traps_pipeline.scenes.policies import POLICIES, fewest_within, last_of_all, shown_at_end
 from traps_pipeline.scenes.simulate import swept_points
 from traps_pipeline.scenes.spec import SceneSpec
@@ -98,7 +99,10 @@ def futures_of(control: World, seed: int) -> ensemble.Futures:
 def stored_evidence(spec: SceneSpec) -> dict[str, Any]:
     """The evidence that a record holds, and what it says of void and twin elsewhere."""
     evidence = spec.evidence | {"twin_answer": spec.twin.ground_truth}
-    evidence |= _closes(spec.closes_frame, Physics(**spec.physics))
+    physics = Physics(**spec.physics)
+    evidence |= _closes(spec.closes_frame, physics)
+    if "commit_s" in evidence:
+        evidence["settles_share"] = settles_share(round(evidence["commit_s"] * physics.fps), physics.n_frames)
     if spec.void_kind == "truncation":
         evidence |= _cut_evidence(spec.void["cut_frame"], spec.physics["fps"])
     return evidence
@@ -156,6 +160,22 @@ def settled_answer(world: World) -> str | None:
         return settled_outcome(world.family, world.motion, world.params).label
     except Rejected:
         return None
+
+
+def _judge_pace(e: Evidence, claim: Claim) -> Judged:
+    if e["settles_share"] < EARLIEST_SHARE:
+        yield f"the outcome settles after {e['settles_share']:.0%} of the clip, {EARLIEST_SHARE:.0%} is wanted"
+
+
+PACE = Certificate(
+    name="pace",
+    about="control",
+    promises=f"the outcome settles after {EARLIEST_SHARE:.0%} of the clip's frames or later",
+    does_not_promise="",
+    numbers=(Number("settles_share", kept=False),),
+    measure=lambda pair: {"settles_share": settles_share(pair.control.outcome.commit_frame, len(pair.control.qpos))},
+    judge=_judge_pace,
+)
 
 
 def _judge_turns(e: Evidence, claim: Claim) -> Judged:
@@ -707,6 +727,7 @@ WORDS = Certificate(
 
 CERTIFICATES = (
     OUTCOME,
+    PACE,
     TURNS,
     PHYSICS,
     IN_FRAME,

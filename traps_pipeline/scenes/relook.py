@@ -1,14 +1,15 @@
-"""Giving released records what new draws of their family have: another floor, or a control that a panel closes.
+"""Giving released records what new draws of their family have: another floor, a control that a panel closes, or a clip
+that ends earlier.
 
-Neither moves anything, and a look may move neither camera nor panel. So a record with it is the one that
-`sample_family` would have drawn: nothing is simulated, the trajectory stays, and what pixels say is measured again.
-Whoever uses it then runs `traps certify`.
+None moves anything, and a look may move neither camera nor panel. So a record with it is the one that `sample_family`
+would have drawn: the trajectory stays, or its beginning does, and what pixels say is measured again. Whoever uses it
+then runs `traps certify`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,15 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
 from traps_pipeline.scenes.certificates import certificates_for, pair_of, stored_evidence
 from traps_pipeline.scenes.closing import closed, record_of
-from traps_pipeline.scenes.kit import params_to_dict
+from traps_pipeline.scenes.evidence import required
+from traps_pipeline.scenes.kit import Physics, params_to_dict
 from traps_pipeline.scenes.look import Look, look_of_draw
 from traps_pipeline.scenes.outcome import Rejected
+from traps_pipeline.scenes.pace import lengths, with_length
 from traps_pipeline.scenes.registry import family_digest, get_family
 from traps_pipeline.scenes.resolve import plain
 from traps_pipeline.scenes.sample import load_tallies, record_line, save_tallies
-from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory, trajectory_digest
 from traps_pipeline.scenes.workers import run_in_order
 
 STILL = ("floor", "light", "bystanders")  # parts of a look that move neither camera nor panel
@@ -52,6 +55,20 @@ def close_family(
     save_tallies(released, tallies)
 
 
+def pace_family(
+    released: Path, name: str, workers: int | None = None, report: Callable[[str], None] = lambda _: None
+) -> None:
+    """Let the clips of all records of a family whose outcome settles too early end earlier (`pace`), and measure
+    everything again. Raises TrapsError naming a record that is no longer certified; nothing is written then."""
+    folder = released / "trajectories"
+    for before, after in _rewrite(released, name, _shortened, workers, report):
+        if before.trajectory_sha256 != after.trajectory_sha256:
+            path, end = folder / f"{before.scenario_id}.npz", Physics(**after.physics).n_frames
+            qpos = load_trajectory(path, before.trajectory_sha256)
+            twin = load_trajectory(path, before.twin.trajectory_sha256, "twin")
+            save_trajectory(folder, before.scenario_id, qpos[:end], twin[:end])
+
+
 _Job = tuple[SceneSpec, Path, int]
 
 
@@ -61,8 +78,9 @@ def _rewrite(
     change: Callable[[_Job], SceneSpec | str],
     workers: int | None,
     report: Callable[[str], None],
-) -> None:
-    """Change all records of a family, or none: change(record, folder of trajectories, seed) says why it cannot."""
+) -> list[tuple[SceneSpec, SceneSpec]]:
+    """Change all records of a family, or none: change(record, folder of trajectories, seed) says why it cannot. Returns
+    each record before and after."""
     seed, lines = load_tallies(released)[name].seed, released / f"{name}.jsonl"
     specs = [SceneSpec.model_validate_json(line) for line in lines.read_text(encoding="utf-8").splitlines()]
     jobs = [(spec, released / "trajectories", seed) for spec in specs]
@@ -73,6 +91,7 @@ def _rewrite(
         found.append(seen)
         report(f"{seen.scenario_id}: {len(found)} of {len(specs)}")
     write_text(lines, "".join(record_line(spec) for spec in found))
+    return list(zip(specs, found, strict=True))
 
 
 def _ended(job: _Job) -> SceneSpec | str:
@@ -88,6 +107,34 @@ def _ended(job: _Job) -> SceneSpec | str:
         return str(rejected)
     kept = {name: value for each in certificates_for(spec.void_kind) for name, value in each.kept(evidence).items()}
     return spec.model_copy(update={"control": plain(record_of(pair)), "evidence": plain(kept)})
+
+
+def _shortened(job: _Job) -> SceneSpec | str:
+    """A record whose clips end as a new draw's do, or which certificate it loses."""
+    spec, folder, _ = job
+    path = folder / f"{spec.scenario_id}.npz"
+    qpos = load_trajectory(path, spec.trajectory_sha256)
+    twin = load_trajectory(path, spec.twin.trajectory_sha256, "twin")
+    whole = spec.model_copy(update={"control": None})
+    found = "there is no length"
+    for n_frames in lengths(pair_of(whole, qpos, twin).control, spec.seed):
+        if n_frames == len(qpos):
+            return spec
+        control, other = qpos[:n_frames], twin[:n_frames]
+        physics = plain(asdict(with_length(Physics(**spec.physics), n_frames)))
+        ends = {"physics": physics, "trajectory_sha256": trajectory_digest(control)}
+        ends["twin"] = spec.twin.model_copy(update={"trajectory_sha256": trajectory_digest(other)})
+        pair = pair_of(whole.model_copy(update=ends), control, other)
+        certificates = certificates_for(spec.void_kind)
+        try:
+            measured = required([c for c in certificates if c.name != "closing"], pair, {})
+            closing, evidence = closed(pair, spec.seed, measured)
+        except Rejected as rejected:
+            found = str(rejected)
+            continue
+        kept = {name: value for each in certificates for name, value in each.kept(evidence).items()}
+        return whole.model_copy(update={**ends, "control": plain(record_of(closing)), "evidence": plain(kept)})
+    return found
 
 
 def _relooked(job: _Job) -> SceneSpec | str:

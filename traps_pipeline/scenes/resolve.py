@@ -28,6 +28,7 @@ from traps_pipeline.scenes.ensemble import Cut, Futures, Rollout
 from traps_pipeline.scenes.evidence import Claim, Evidence, Pair, VoidKind, required
 from traps_pipeline.scenes.kit import Family, Physics, Wording, params_to_dict
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, simulated
+from traps_pipeline.scenes.pace import cut_to, lengths
 from traps_pipeline.scenes.spec import SceneSpec, Twin, trajectory_digest
 from traps_pipeline.scenes.world import World
 
@@ -55,19 +56,13 @@ def resolve(
 ) -> Resolved:
     """The record of a scenario with its trajectories. Raises Rejected when it makes no valid pair."""
     physics = physics or family.physics
-    control = _control(family, params, physics)
-    answer = control.outcome.label
+    whole = _control(family, params, physics)
+    answer = whole.outcome.label
     if answer is not None and answer not in wording.labels:
         raise ValueError(f"{family.name}: reading {answer!r} is not one of the labels {list(wording.labels)}")
-    end_s = (physics.n_frames - 1) / physics.fps
-    claim = Claim(family, end_s, len(wording.labels), answer, None, wording.question, ill_posed_question)
-    pair = Pair(control, claim, futures_of(control, seed))
-    kind: VoidKind = "truncation" if control.panel is None else "occluder"
-    evidence = required(certificates_for(kind, "control"), pair, {})
-    candidates = _cut_short(pair) if control.panel is None else _covered(pair)
-    evidence = required(certificates_for(kind, "void"), candidates[0], evidence)
-    pair, evidence = _with_certified_twin(candidates, kind, evidence)
-    pair, evidence = closed(pair, seed, evidence)
+    kind: VoidKind = "truncation" if whole.panel is None else "occluder"
+    pair, evidence = _of_some_length(whole, kind, wording, ill_posed_question, seed)
+    control, physics = pair.control, pair.control.physics
     twin, frame = pair.other_world, pair.void_from
     panel = None if control.panel is None else asdict(control.panel)
     spec = SceneSpec(
@@ -100,6 +95,29 @@ def resolve(
         evidence={name: value for each in certificates_for(kind) for name, value in each.kept(evidence).items()},
     )
     return Resolved(spec, control.qpos, twin.qpos)
+
+
+def _of_some_length(
+    whole: World, kind: VoidKind, wording: Wording, ill_posed_question: str, seed: int
+) -> tuple[Pair, Mapping[str, Any]]:
+    """The pair of a simulated control, with all its evidence, of the first length for which it has all certificates.
+    Raises Rejected if there is none."""
+    rejected = Rejected("there is no length")
+    for n_frames in lengths(whole, seed):
+        control = cut_to(whole, n_frames)
+        end_s = (n_frames - 1) / control.physics.fps
+        answer = control.outcome.label
+        claim = Claim(whole.family, end_s, len(wording.labels), answer, None, wording.question, ill_posed_question)
+        try:
+            pair = Pair(control, claim, futures_of(control, seed))
+            evidence = required(certificates_for(kind, "control"), pair, {})
+            candidates = _cut_short(pair) if control.panel is None else _covered(pair)
+            evidence = required(certificates_for(kind, "void"), candidates[0], evidence)
+            pair, evidence = _with_certified_twin(candidates, kind, evidence)
+            return closed(pair, seed, evidence)
+        except Rejected as failure:
+            rejected = failure  # another length may do
+    raise rejected
 
 
 def _control(family: Family, params: Any, physics: Physics) -> World:

@@ -1,0 +1,87 @@
+"""A clip ends early enough that its outcome settles after 30 % of it or later, control and void alike; the numbers of
+frames are counted by hand for 50 frames at 10 a second."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes.released import load
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.models.shortcut_rules import CUT_FRAMES
+from traps_pipeline.scenes import relook
+from traps_pipeline.scenes.certificates import PACE, pair_of, stored_evidence
+from traps_pipeline.scenes.evidence import Claim
+from traps_pipeline.scenes.kit import Physics
+from traps_pipeline.scenes.outcome import compile_scene, simulated
+from traps_pipeline.scenes.pace import cut_to, lengths, settles_share
+from traps_pipeline.scenes.spec import save_trajectory, trajectory_digest
+from traps_pipeline.scenes.world import World
+
+EARLY, LATE = "catch-0001", "domino_branch-0001"
+
+
+def whole(scenario_id: str) -> World:
+    """A record's control over its family's five seconds."""
+    case = load(scenario_id)
+    physics = case.family.physics
+    qpos = simulated(*compile_scene(case.family, case.params, physics), physics)
+    return replace(World.of_record(case.spec, qpos), physics=physics)
+
+
+def test_an_early_outcome_ends_the_clip_after_a_second_and_six_tenths_more_and_before_it_is_too_early() -> None:
+    world = whole(EARLY)
+    assert world.outcome.commit_frame == 8
+    # 8 / 0.3 = 26.7 at most, and 8 + 16 = 24 at least: both even.
+    found = [lengths(world, seed) for seed in range(40)]
+    assert {tuple(each) for each in found} == {(24, 26), (26,)}
+    assert all(settles_share(8, n) >= 0.3 for each in found for n in each)
+
+
+def test_an_outcome_that_is_not_early_leaves_the_clip_as_long_as_it_is() -> None:
+    world = whole(LATE)
+    assert world.outcome.commit_frame >= 15
+    assert lengths(world, 0) == [50]
+    assert cut_to(world, 50) is world
+
+
+def test_no_released_outcome_settles_before_three_tenths_of_its_clip() -> None:
+    for spec in load_released().values():
+        n_frames = Physics(**spec.physics).n_frames
+        assert CUT_FRAMES <= n_frames <= 50, spec.scenario_id
+        assert PACE.failure(stored_evidence(spec), Claim.of_record(spec)) is None, spec.scenario_id
+
+
+def test_a_clip_that_ends_earlier_is_the_beginning_of_the_same_motion() -> None:
+    case = load(EARLY)
+    assert np.array_equal(case.qpos, whole(EARLY).qpos[: len(case.qpos)])
+    assert len(case.qpos) == len(case.twin) < 50
+
+
+@pytest.mark.parametrize(("n_frames", "failure"), [(50, "after 16% of the clip"), (24, None)])
+def test_a_clip_that_goes_on_for_too_long_loses_the_certificate(n_frames: int, failure: str | None) -> None:
+    case, world = load(EARLY), cut_to(whole(EARLY), n_frames)
+    pair = replace(pair_of(case.spec, case.qpos, case.twin), control=world)
+    said = PACE.failure(PACE.measured(pair), pair.claim)
+    assert (said is None) if failure is None else (said is not None and failure in said)
+
+
+@pytest.mark.slow
+def test_a_record_that_goes_on_for_too_long_is_cut_to_the_released_one(tmp_path: Path) -> None:
+    case, physics, twin = load(EARLY), whole(EARLY).physics, load(EARLY).spec.twin
+    other = case.family.params_from(twin.params or {})
+    qpos, beside = whole(EARLY).qpos, simulated(*compile_scene(case.family, other, physics), physics)
+    save_trajectory(tmp_path, EARLY, qpos, beside)
+    longer = case.spec.model_copy(
+        update={
+            "physics": asdict(physics),
+            "trajectory_sha256": trajectory_digest(qpos),
+            "twin": twin.model_copy(update={"trajectory_sha256": trajectory_digest(beside)}),
+            "control": None,
+            "evidence": {},
+        }
+    )
+    assert relook._shortened((longer, tmp_path, 1)) == case.spec
