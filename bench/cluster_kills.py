@@ -11,7 +11,6 @@ the run of one process, but for `store`, which loses them.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import json
 import os
 import shutil
@@ -21,127 +20,55 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from bench.cluster_gate import Cluster, free_port
-from bench.cluster_study import Study, fetch, runs_of, tables_are_equal
+from bench.cluster_study import NODES, Study, fetch, nodes_are_apart, runs_of, tables_are_equal
+from bench.cluster_watch import Opened, Orphans, Proxy, executing
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.providers.server import Provider
 
-MODELS, CONNECTIONS, WANTED, BUDGET_USD = (
-    ("seer-a", "seer-b"),
-    2,
-    64,
-    6.0,
-)  # two dead blocks of 16 worst cases are $2.84
-LATENCY_S, CUT_S, STOP_S, DOWN_S = 1.5, 45, 90, 5
+MODELS, CONNECTIONS = ("seer-a", "seer-b"), 2
+BUDGET_USD = 6.0  # two dead blocks of 16 worst cases are $2.84
+CUT_S, STOP_S, DOWN_S = 45, 90, 5
 CODE = "traps_pipeline.definitions"
 LATE_S = 60  # no run may be STARTED for longer without a process that executes it
-NODES = ("one", "two")
-EXPERIMENT = f"""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large the studies are. wanted: calls, counted by hand: scenarios x datasets of a taxonomy (2) x sides (2) x
+    regimes x models; until: the last stage; latency_s: of each call, long enough for a kill to come in between."""
+
+    scenarios: Sequence[str]
+    regimes: Sequence[str]
+    wanted: int
+    until: str
+    latency_s: float
+
+    @property
+    def experiment(self) -> str:
+        """The file."""
+        return f"""
 name: kills
-description: Two models at a provider, on one scenario of four families.
+description: Two models at a provider.
 models: [{", ".join(MODELS)}]
-regimes: [standard, json]
+regimes: [{", ".join(self.regimes)}]
 runs: [1]
 panel: rules
 judged_by_rules: true
-scenarios: [plinko-0001, tumbling_dice-0001, domino_chain-0001, hidden_race-0001]
+scenarios: [{", ".join(self.scenarios)}]
 """
 
 
-class Proxy:
-    """A way to a port of this machine that can be cut: connections break, and new ones are refused."""
-
-    def __init__(self, port: int) -> None:
-        self._to, self._open, self.is_cut = port, set[asyncio.StreamWriter](), False
-        self._loop = asyncio.new_event_loop()
-        threading.Thread(target=self._loop.run_forever, daemon=True).start()
-        server = asyncio.run_coroutine_threadsafe(asyncio.start_server(self._serve, "127.0.0.1", 0), self._loop)
-        self.port = int(server.result().sockets[0].getsockname()[1])
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self.is_cut:
-            writer.transport.abort()
-            return
-        try:
-            there, onward = await asyncio.open_connection("127.0.0.1", self._to)
-        except OSError:
-            writer.transport.abort()
-            return
-        both = {writer, onward}
-        self._open |= both
-        await asyncio.gather(self._copy(reader, onward), self._copy(there, writer))
-        self._open -= both
-
-    @staticmethod
-    async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with suppress(OSError):
-            while some := await reader.read(65536):
-                writer.write(some)
-                await writer.drain()
-        writer.close()
-
-    def cut(self) -> None:
-        """Break all connections and take no other."""
-        self.is_cut = True
-        self._loop.call_soon_threadsafe(lambda: [writer.transport.abort() for writer in self._open])
-
-    def mend(self) -> None:
-        """Take connections again."""
-        self.is_cut = False
-
-
-def executing() -> dict[int, tuple[str, str]]:
-    """The processes that execute a run of Dagster: the run's id and the node."""
-    found = dict[int, tuple[str, str]]()
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            with suppress(OSError, IndexError):
-                said = (entry / "cmdline").read_bytes()
-                is_stopped = (entry / "stat").read_text().rsplit(")", 1)[1].split()[0] in "TZ"
-                if is_stopped or b"python" not in said[:200] or not (b"execute_run" in said or b"resume_run" in said):
-                    continue
-                environ = dict(
-                    part.split(b"=", 1) for part in (entry / "environ").read_bytes().split(b"\0") if b"=" in part
-                )
-                found[int(entry.name)] = said.decode(errors="replace"), environ.get(b"TRAPS_NODE", b"").decode()
-    return found
-
-
-@dataclass
-class Orphans(threading.Thread):
-    """Looks every second how long runs are STARTED that no process executes, and remembers the longest time."""
-
-    address: str
-    longest_s: float = 0.0
-    ended: threading.Event = field(default_factory=threading.Event)
-
-    def __post_init__(self) -> None:
-        super().__init__(daemon=True)
-
-    def __hash__(self) -> int:
-        return id(self)
-
-    def run(self) -> None:
-        import psycopg
-
-        since = dict[str, float]()
-        while not self.ended.wait(1.0):
-            try:
-                with psycopg.connect(self.address, autocommit=True, connect_timeout=5) as opened:
-                    rows = opened.execute("select run_id from runs where status = 'STARTED'").fetchall()
-            except psycopg.Error:
-                continue  # PostgreSQL is one of those that are killed
-            alive, now = [said for said, _ in executing().values()], time.monotonic()
-            orphans = {run for (run,) in rows if not any(run in said for said in alive)}
-            since = {run: since.get(run, now) for run in orphans}
-            self.longest_s = max([self.longest_s, *(now - began for began in since.values())])
+FAMILIES = ("plinko-0001", "tumbling_dice-0001", "domino_chain-0001", "hidden_race-0001")
+FULL = Size(FAMILIES, ("standard", "json"), 64, "leaderboard", 1.5)
+SMALL = Size(FAMILIES[:1], ("standard",), 8, "verdicts", 4.0)
 
 
 @dataclass
@@ -153,6 +80,8 @@ class Scene:
     store: S3
     proxies: Mapping[str, Proxy]
     study: Study
+    size: Size
+    opens: Opened
 
     def busy(self) -> tuple[str, list[int]]:
         """A node that executes a run, and the processes that do."""
@@ -227,7 +156,9 @@ def want_together(scene: Scene) -> None:
     command = [sys.executable, "-m", "dagster_webserver", "-h", "127.0.0.1", "-p", f"{port}", "-m", CODE]
     path = study.root / "again.yaml"
     path.write_text(study.experiment.read_text().replace("name: kills", "name: again"))
-    other = Study(study.folder, study.environment | {"TRAPS_SCRATCH": str(study.folder / "other")}, path, study.root)
+    other = Study(
+        study.folder, study.environment | {"TRAPS_SCRATCH": str(study.folder / "other")}, path, study.root, study.until
+    )
     with (study.folder / "webserver.log").open("ab") as log:
         environment = study.environment | {"DAGSTER_HOME": study.home}
         pages = subprocess.Popen(command, stdout=log, stderr=log, cwd=study.root, env=environment)
@@ -293,7 +224,7 @@ left join traps.segments s on s.evaluation = e.id where t.name = %s group by t.i
 """
 
 
-def kill_each(kinds: list[str], keep: Path | None) -> list[str]:
+def kill_each(kinds: Sequence[str], keep: Path | None = None, size: Size = FULL) -> list[str]:
     """Make a study with each kind of kill; what did not hold. keep: a file for the daemon's log."""
     from tests.conftest import KEY, SECRET, Checkout, make_checkout
     from tests.integration.test_network import entry, register
@@ -313,15 +244,17 @@ def kill_each(kinds: list[str], keep: Path | None) -> list[str]:
         ]
         register(checkout, provider, *entries)
         experiment = checkout.root / "kills.yaml"
-        experiment.write_text(EXPERIMENT)
+        experiment.write_text(size.experiment)
         common = plain | {"PYTHONPATH": str(checkout.root), "TMPDIR": name}
-        alone = Study(folder, common | {"TRAPS_WORKSPACE": str(checkout.workspace)}, experiment, checkout.root)
-        _alone(alone, provider)
-        provider.configure(latency_s=LATENCY_S)
+        environment = common | {"TRAPS_WORKSPACE": str(checkout.workspace)}
+        _alone(Study(folder, environment, experiment, checkout.root, size.until), provider, size)
+        provider.configure(latency_s=size.latency_s)
         shared = common | store.environment | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
         proxies = {node: Proxy(database.port) for node in NODES}
         own = {node: {"TRAPS_DATABASE": database.address(port=proxy.port)} for node, proxy in proxies.items()}
         shared["TRAPS_DATABASE"] = database.address()
+        opens = Opened({node: folder / node for node in NODES})
+        opened.callback(opens.let_go)
         cluster = Cluster(folder, shared, own)
         shared["TRAPS_RAY"] = f"http://127.0.0.1:{cluster.dashboard}"
         try:
@@ -333,8 +266,8 @@ def kill_each(kinds: list[str], keep: Path | None) -> list[str]:
                 environment = shared | {
                     "TRAPS_WORKSPACE": f"s3://lab/{kind}", "TRAPS_SCRATCH": str(folder / f"here-{kind}")
                 }  # fmt: skip
-                study = Study(folder, environment, experiment, checkout.root)
-                scene = Scene(cluster, database, store, proxies, study)
+                study = Study(folder, environment, experiment, checkout.root, size.until)
+                scene = Scene(cluster, database, store, proxies, study, size, opens)
                 try:
                     _one(kind, scene, provider, checkout.workspace)
                 except Exception as error:  # noqa: BLE001 - the other kinds are tried all the same
@@ -350,19 +283,19 @@ def kill_each(kinds: list[str], keep: Path | None) -> list[str]:
     return failures
 
 
-def _alone(study: Study, provider: Provider) -> None:
+def _alone(study: Study, provider: Provider, size: Size) -> None:
     began = time.monotonic()
-    made = study.traps("run", str(study.experiment), "--until", "leaderboard", "--no-preflight",
+    made = study.traps("run", str(study.experiment), "--until", size.until, "--no-preflight",
                        "--budget-usd", f"{BUDGET_USD}")  # fmt: skip
     if made.returncode:
         raise SystemExit(made.stdout + made.stderr)
     sent = provider.stats()["answered_in_full"]
     print(f"one process took {time.monotonic() - began:.0f} s, {sent} calls", flush=True)
-    assert sent == WANTED, "what is wanted was counted by hand"
+    assert sent == size.wanted, "what is wanted was counted by hand"
 
 
 def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
-    study = scene.study
+    study, wanted = scene.study, scene.size.wanted
     said = study.traps("init", str(study.experiment))
     if said.returncode:
         raise RuntimeError(said.stderr)
@@ -382,7 +315,7 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     if kind == "together":
         want_together(scene)
     elif kind != "store":
-        while provider.stats()["answered_in_full"] < WANTED // 8:
+        while provider.stats()["answered_in_full"] < wanted // 8:
             if run.poll() is not None:
                 raise RuntimeError("the run ended before anything was asked")
             time.sleep(0.2)
@@ -399,8 +332,8 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     seconds, stats = time.monotonic() - began, provider.stats()
     calls, billed = stats["answered_in_full"], stats["billed_usd"]
     study.require(code == 0, f"the study is made, with {tries} command(s), in {seconds:.0f} s")
-    most = WANTED + (CONNECTIONS * len(MODELS) if kind not in ("store", "together") else 0)
-    study.require(WANTED <= calls <= most, f"{calls} calls at the provider, {WANTED} wanted, at most {most}")
+    most = wanted + (CONNECTIONS * len(MODELS) if kind not in ("store", "together") else 0)
+    study.require(wanted <= calls <= most, f"{calls} calls at the provider, {wanted} wanted, at most {most}")
     counted = float(study.python(SPENT).split()[-1])
     study.require(
         billed - 1e-9 <= counted <= BUDGET_USD, f"${billed:.4f} billed, ${counted:.4f} counted, ${BUDGET_USD} allowed"
@@ -422,6 +355,7 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     study.require("0 answers asked (0 from" in made.stdout, "a second run asks nothing")
     study.require(provider.stats()["answered_in_full"] == calls, "and the provider saw no other call")
     tables_are_equal(study, alone, fetch(study, study.folder / f"fetched-{kind}"))
+    nodes_are_apart(study, scene.opens)
     import psycopg
 
     with psycopg.connect(scene.database.address(), autocommit=True) as connection:

@@ -21,6 +21,10 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from bench.cluster_watch import Opened
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -34,14 +38,22 @@ epoch: cluster
 scenarios: [plinko-0001, tumbling_dice-0001, domino_chain-0001, hidden_race-0001]
 """
 ADDRESS = "s3://lab/cluster-study"
-SUMMARY = " answers asked"
+NODES = ("one", "two")
 
 
 class Study:
     """The study as this host sees it, and the daemon of the head."""
 
-    def __init__(self, folder: Path, environment: dict[str, str], experiment: Path, root: Path = ROOT) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        environment: dict[str, str],
+        experiment: Path,
+        root: Path = ROOT,
+        until: str = "leaderboard",
+    ) -> None:
         self.folder, self.environment, self.experiment, self.root = folder, environment, experiment, root
+        self.until = until  # the last stages
         self.daemon: subprocess.Popen[bytes] | None = None
         self.home = ""  # Dagster's, once the study is there
         self.failures: list[str] = []
@@ -70,7 +82,7 @@ class Study:
         return self.traps(*self._run(*more))
 
     def _run(self, *more: str) -> list[str]:
-        return ["run", str(self.experiment), "--cluster", "--runs", "2", "--until", "leaderboard", *more]
+        return ["run", str(self.experiment), "--cluster", "--runs", "2", "--until", self.until, *more]
 
     def start_daemon(self) -> None:
         """What `traps ui` starts beside its pages."""
@@ -115,6 +127,7 @@ def watch(run: subprocess.Popen[str], study: Study, kill: object) -> int:
 
 def main() -> None:
     from bench.cluster_gate import Cluster
+    from bench.cluster_watch import Opened
     from tests.objectstore import S3
     from tests.postgres import Postgres
 
@@ -137,17 +150,18 @@ def main() -> None:
             "TRAPS_DATABASE": database.address(),
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",  # the launcher calls `dagster`
         }  # fmt: skip
+        opens = Opened({node: folder / node for node in NODES})
         cluster = Cluster(folder, shared)
         own = {"TRAPS_RAY": f"http://127.0.0.1:{cluster.dashboard}", "TRAPS_WORKSPACE": ADDRESS}
         study = Study(folder, shared | own | {"TRAPS_SCRATCH": str(folder / "here")}, experiment)
         try:
             cluster.start_head()
-            for node in ("one", "two"):
+            for node in NODES:
                 cluster.start_node(node)
             study.start_daemon()
 
             def kill() -> None:
-                busy = [node for node in ("one", "two") if list((folder / node).glob("*/clips/*"))] or ["one"]
+                busy = [node for node in NODES if list((folder / node).glob("*/clips/*"))] or ["one"]
                 print(f"  {cluster.signal(busy[0], signal.SIGKILL)} processes of {busy[0]} killed", flush=True)
                 cluster.start_node(busy[0])
 
@@ -166,17 +180,13 @@ def main() -> None:
             study.require(code == 0, f"the run succeeds (exit code {code})")
             again = study.run_to_end()
             study.require("0 answers asked (0 from" in again.stdout, "a second run asks nothing")
-            strays = [
-                path for node in ("one", "two") for path in (folder / node).rglob("*")
-                if path.is_symlink() or not path.resolve().is_relative_to(folder / node)
-            ]  # fmt: skip
-            made = {node: len(list((folder / node).rglob("*.parquet"))) for node in ("one", "two")}
-            study.require(not strays and all(made.values()), f"each node has made tables in its own folder: {made}")
+            nodes_are_apart(study, opens)
             compare_with_one_process(study, common)
         finally:
             study.stop(arguments.log)
-            for node in ("one", "two", "head"):
+            for node in (*NODES, "head"):
                 cluster.signal(node, signal.SIGKILL)
+            opens.let_go()
     if study.failures:
         sys.exit("\n".join(study.failures))
 
@@ -189,6 +199,23 @@ def runs_of(study: Study) -> list[str]:
         "print(*(run.status.value for run in DagsterInstance.from_config(str(home)).get_runs()))\n"
     )
     return study.python(code).split()
+
+
+def nodes_are_apart(study: Study, opens: Opened) -> None:
+    """Look whether each node has worked in its own scratch folder, and none has opened a file of another's."""
+    folders = {node: study.folder / node for node in NODES}
+    strays = [
+        path for folder in folders.values() for path in folder.rglob("*")
+        if path.is_symlink() or not path.resolve().is_relative_to(folder)
+    ]  # fmt: skip
+    made = {node: len([*folder.rglob("*.parquet")]) for node, folder in folders.items()}
+    study.require(not strays and all(made.values()), f"each node has tables in its own folder: {made}")
+    if not opens.is_on:
+        print("  not looked at: which files nodes open (that needs root, and mounts)", flush=True)
+        return
+    own = {node: opens.counts.get((node, node), 0) for node in NODES}
+    study.require(all(own.values()), f"each node opens files of its own folder: {own}")
+    study.require(not opens.strangers(), f"and no files of the other's: {opens.strangers()}")
 
 
 def fetch(study: Study, to: Path) -> Path:

@@ -286,7 +286,7 @@ def test_a_host_that_exports_the_database_opens_the_history(
     monkeypatch.delenv(DATABASE, raising=False)
     history: Any = remedied(
         lambda: SharedHistory.from_config_value(None, {"variable": DATABASE}),
-        "{} is not set on this host; export the address of the study's database",
+        "{} is not set on the host {}; export the address of the study's database",
         lambda: monkeypatch.setenv(DATABASE, postgres.address()),
     )
     assert history.run_storage.get_runs_count() >= 0

@@ -285,6 +285,32 @@ def test_an_address_that_is_exported_and_right_leads_to_the_database(
     assert session.study == "remedied"
 
 
+def test_a_host_whose_clock_is_an_hour_off_works_once_it_is_set(postgres: Postgres) -> None:
+    """The database's clock is altered: nobody may set this machine's."""
+    psycopg = pytest.importorskip("psycopg")
+    with psycopg.connect(postgres.address(), autocommit=True) as connection:
+        connection.execute("create database late")
+        connection.execute("alter database late set search_path = altered, pg_catalog")
+    late = postgres.address(database="late")
+    with psycopg.connect(late, autocommit=True) as connection:
+        connection.execute("create schema altered")
+        connection.execute(
+            """create function altered.clock_timestamp() returns timestamptz language sql
+               as $$ select pg_catalog.clock_timestamp() + interval '1 hour' $$"""
+        )
+
+    def set_clock() -> None:
+        with psycopg.connect(late, autocommit=True) as connection:
+            connection.execute("drop function altered.clock_timestamp()")
+
+    session = remedied(
+        lambda: Session(late, VARIABLE, "clocks"),
+        "and hosts of the study {} may be {} s apart; set the clocks of both by NTP, then run the same command again",
+        set_clock,
+    )
+    assert session.study_id > 0
+
+
 def test_tables_of_another_format_are_left_for_another_database(postgres: Postgres) -> None:
     session = Session(postgres.address(), VARIABLE, "formats")
     psycopg = pytest.importorskip("psycopg")

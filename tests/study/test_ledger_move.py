@@ -153,4 +153,5 @@ def test_an_address_in_the_place_of_a_variable_is_refused_and_not_repeated(
 def test_a_study_whose_database_cannot_be_reached_says_so(study: Workspace, capsys: pytest.CaptureFixture[str]) -> None:
     study.allow(database="NOT_SET")
     assert main(["ledger", "move", "--back", "--workspace", str(study.root)]) == 1
-    assert f"traps: NOT_SET is not set: study.yaml of {study.study.name} says" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "traps: NOT_SET is not set on the host " in said and f": study.yaml of {study.study.name} says" in said

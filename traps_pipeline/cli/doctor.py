@@ -21,17 +21,28 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--verify", action="store_true", help="read every table, ledger and clip of the study whole, and name damage"
     )
+    parser.add_argument(
+        "--unused",
+        nargs="?",
+        choices=("show", "remove"),
+        const="show",
+        help="what lies in the study's object store and is named by nobody any more: shown (default) or removed",
+    )
 
 
 def doctor(arguments: argparse.Namespace) -> int:
     """See `traps doctor --help`."""
-    from traps_pipeline.study.doctor import examine, examine_files, examine_local
+    from traps_pipeline.study.doctor import examine, examine_files, examine_local, examine_unused
 
     if arguments.verify:
         findings = [*examine_files(place_of(arguments))]
         for finding in findings:
             print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}", flush=True)
         return OK if all(finding.ok for finding in findings) else FAILED
+    if arguments.unused is not None:
+        finding = examine_unused(place_of(arguments), is_removed=arguments.unused == "remove")
+        print(f"ok   {finding.what}: {plain(finding.detail)}")
+        return OK
     local = arguments.local is not None
     if local:
         require("local")

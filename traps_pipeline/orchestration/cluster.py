@@ -11,7 +11,8 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from typing import Any, Literal
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
 
 import dagster as dg
 
@@ -28,6 +29,9 @@ from traps_pipeline.orchestration.shared_history import unusable
 from traps_pipeline.partitions import Cell
 from traps_pipeline.storage.database import PATIENCE_S
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
+
+if TYPE_CHECKING:
+    from dagster._core.workspace.context import WorkspaceRequestContext
 
 STUDY_TAG = "traps/study"
 AT_ONCE = 40  # runs; Ray keeps a process of some 85 MB for each on the head
@@ -120,17 +124,7 @@ class RayRuns(Runs):
         self._chunks: dict[Range, Sequence[str | None]] = {}  # what a range is a part of
 
     def __enter__(self) -> RayRuns:
-        """Load the code location in which runs are submitted; then wait for runs that were left."""
-        from dagster._core.workspace.context import WorkspaceProcessContext
-        from dagster._core.workspace.load_target import ModuleTarget
-
-        target = ModuleTarget("traps_pipeline.definitions", None, None, None)
-        context = self._stack.enter_context(
-            WorkspaceProcessContext(self._instance, target, version=dg.__version__, code_server_log_level="ERROR")
-        )
-        self._context = context.create_request_context()
-        (self._location,) = self._context.code_locations
-        (self._repository,) = self._location.get_repositories().values()
+        """Wait for runs that were left."""
         ours = dg.RunsFilter(statuses=[*_WAITING], tags={STUDY_TAG: self._workspace.study.name})
         if left := [run.run_id for run in self._instance.get_runs(ours)]:
             progress.current().note(f"{len(left)} runs of this study go on that were left; waiting for them first")
@@ -139,6 +133,19 @@ class RayRuns(Runs):
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
+
+    @cached_property
+    def _context(self) -> WorkspaceRequestContext:
+        """With the code location in which runs are submitted: a process of its own, so where there is nothing to make
+        it is not loaded."""
+        from dagster._core.workspace.context import WorkspaceProcessContext
+        from dagster._core.workspace.load_target import ModuleTarget
+
+        target = ModuleTarget("traps_pipeline.definitions", None, None, None)
+        context = self._stack.enter_context(
+            WorkspaceProcessContext(self._instance, target, version=dg.__version__, code_server_log_level="ERROR")
+        )
+        return context.create_request_context()
 
     def ranges(self, scheme: Scheme | None, keys: Sequence[str | None]) -> list[Range]:
         """Ranges for several hosts: so many that all have work, and so few that starting them costs little. What one
@@ -163,10 +170,12 @@ class RayRuns(Runs):
     def _submit(self, stages: Sequence[Stage], of: Range, tags: Mapping[str, str]) -> str:
         from dagster._core.definitions.selector import JobSubsetSelector
 
+        (location,) = self._context.code_locations
+        (repository,) = location.get_repositories().values()
         selected = frozenset(stage.spec.key for stage in stages)
-        selector = JobSubsetSelector(self._location.name, self._repository.name, "__ASSET_JOB", None, selected)
-        job = self._location.get_job(selector)
-        plan = self._location.get_execution_plan(job, {}, None, None, instance=self._instance)
+        selector = JobSubsetSelector(location.name, repository.name, "__ASSET_JOB", None, selected)
+        job = location.get_job(selector)
+        plan = location.get_execution_plan(job, {}, None, None, instance=self._instance)
         own = {
             STUDY_TAG: self._workspace.study.name,
             CODE_TAG: code_here(),
@@ -190,7 +199,7 @@ class RayRuns(Runs):
             op_selection=None,
             remote_job_origin=job.get_remote_origin(),
             job_code_origin=job.get_python_origin(),
-            asset_graph=self._repository.asset_graph,
+            asset_graph=repository.asset_graph,
         )
         return self._instance.submit_run(run.run_id, self._context).run_id
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -38,7 +39,9 @@ class SharedHistory(DagsterStorage):
         variable = config_value["variable"]
         address = os.environ.get(variable)
         if not address:
-            raise TrapsError(f"{variable} is not set on this host; export the address of the study's database")
+            raise TrapsError(
+                f"{variable} is not set on the host {socket.gethostname()}; export the address of the study's database"
+            )
         # SQLAlchemy 2.1 takes psycopg 3 for a plain postgresql://, and dagster-postgres's NOTIFY fails with it.
         url = "postgresql+psycopg2://" + address.partition("://")[2]
         storage = import_module("dagster_postgres").DagsterPostgresStorage

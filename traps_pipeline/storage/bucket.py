@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Iterator, Sequence
+from datetime import datetime
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.extras import require
@@ -61,11 +63,26 @@ class Bucket:
 
     def delete(self, digest: bytes) -> None:
         """Remove an object. Raises TrapsError."""
+        self.delete_all([object_name(digest)])
+
+    def delete_all(self, names: Sequence[str]) -> None:
+        """Remove objects. Raises TrapsError."""
         import obstore
         from obstore.exceptions import BaseError
 
         try:
-            obstore.delete(self._store, object_name(digest))
+            obstore.delete(self._store, names)
+        except (BaseError, FileNotFoundError) as error:
+            raise self.error(error) from None
+
+    def names(self) -> Iterator[tuple[str, int, datetime]]:
+        """Name, size in bytes and time of writing of all objects. Raises TrapsError."""
+        import obstore
+        from obstore.exceptions import BaseError
+
+        try:
+            for page in obstore.list(self._store):
+                yield from ((one["path"], one["size"], one["last_modified"]) for one in page)
         except (BaseError, FileNotFoundError) as error:
             raise self.error(error) from None
 

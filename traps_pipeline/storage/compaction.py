@@ -17,6 +17,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.database import Claim, Session
 from traps_pipeline.storage.ledger import ASIDES
+from traps_pipeline.storage.unused import removed
 
 if TYPE_CHECKING:
     from psycopg import Connection
@@ -90,14 +91,14 @@ class Segments:
     def compact(self, claim: Claim) -> int:
         """Let all rows of an evaluation whose writer this process is become segments; how many. Raises TrapsError where
         the store cannot be used, or another process has taken over."""
-        count = 0
+        count, study = 0, self._session.study_id
         while self._store is not None and (written := self._encoded(claim)) is not None:
             content, first, last, rows = written
             digest = self._store.put(content)
             if (kept := self._store.bucket.get(object_name(digest))) is None or sha256(kept).digest() != digest:
                 return count  # the store does not give back what it took; the rows stay where they are
             segment = Segment(0, digest, len(content), rows)
-            if not self._session.run(lambda c, s=segment, f=first, n=last: _release(c, claim, s, f, n)):
+            if not self._session.run(lambda c, s=segment, f=first, n=last: _release(c, study, claim, s, f, n)):
                 return count
             count += rows
         return count
@@ -123,9 +124,11 @@ class Segments:
         return self._session.run(lambda c: c.execute(sql, [claim.evaluation, last, FETCHED]).fetchall())
 
 
-def _release(connection: Connection[Any], claim: Claim, segment: Segment, first: int, last: int) -> bool:
-    """Put a segment in the place of its rows, unless another process is the evaluation's writer by now; whether it is
-    there. What was committed when the connection broke is not done again."""
+def _release(connection: Connection[Any], study: int, claim: Claim, segment: Segment, first: int, last: int) -> bool:
+    """Put a segment in the place of its rows, unless another process is the evaluation's writer by now, or its object
+    is being removed; whether it is there. What was committed when the connection broke is not done again."""
+    if removed(connection, study, [segment.digest]):
+        return False
     sql = "select number from traps.evaluations where id = %s for update"
     if connection.execute(sql, [claim.evaluation]).fetchone() != (claim.number,):
         claim.lost = True

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import socket
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -35,6 +36,7 @@ FRESH_S, OLD_S = 0.4, 1.5  # a look that is younger is not repeated; one that is
 PATIENCE_S = 60.0  # how long a run waits for a server that is away
 GRACE_S = 10  # after the server was started, those who held a lock before have so long to take it again
 RETRY_S = 0.2
+SKEW_S = 60  # Dagster compares times of several hosts to tell a run that never began; stores refuse 15 minutes
 FORMAT = 2  # of the tables; those of format 1 have no segments, and are given them
 _KEEPALIVE: dict[str, Any] = {
     "keepalives_idle": 5,
@@ -118,6 +120,7 @@ class Session:
             self.host = f"{parts.hostname}:{parts.port or 5432}{parts.path}"
         except ValueError:
             self.host = "an address that cannot be read"
+        self.run(self._compare_clocks, patience_s=0.0)
         self.study_id = self.run(self._prepare, patience_s=0.0)
 
     # --- connecting -------------------------------------------------------------------------------------------------
@@ -193,10 +196,24 @@ class Session:
     def _told(self, error: Exception) -> str:
         said = " ".join(f"{error}".split()) or type(error).__name__
         return (
-            f"{self._variable}: the database at {self.host} cannot be used ({said}); the study {self.study} keeps its "
-            "ledger there. See that the server runs and that address, user and password are right (`psql "
-            f'"${self._variable}"` tries them), then run the same command again: what is stored is kept'
+            f"{self._variable}: the database at {self.host} cannot be used from the host {socket.gethostname()} "
+            f"({said}); the study {self.study} keeps its ledger there. See that the server runs and that address, user "
+            f'and password are right (`psql "${self._variable}"` tries them), then run the same command again: what is '
+            "stored is kept"
         )
+
+    def _compare_clocks(self, connection: Connection[Any]) -> None:
+        """Raises TrapsError where this host's clock and the database's are too far apart."""
+        before = time.time()
+        theirs = float(_value(connection, "select extract(epoch from clock_timestamp())"))
+        apart = max(theirs - time.time(), before - theirs)
+        if apart > SKEW_S:
+            behind = "behind" if theirs > before else "ahead of"
+            raise TrapsError(
+                f"the clock of the host {socket.gethostname()} is {apart:.0f} s {behind} that of the database at "
+                f"{self.host}, and hosts of the study {self.study} may be {SKEW_S} s apart; set the clocks of both by "
+                "NTP, then run the same command again"
+            )
 
     def _prepare(self, connection: Connection[Any]) -> int:
         """Make the tables if there are none; the study's number."""
@@ -326,8 +343,8 @@ def session_of(variable: str, study: str) -> Session:
     address = os.environ.get(variable)
     if not address:
         raise TrapsError(
-            f"{variable} is not set: study.yaml of {study} says that it holds the address of the PostgreSQL database "
-            f"with the study's ledger; export {variable}=postgresql://USER:PASSWORD@HOST:5432/DATABASE"
+            f"{variable} is not set on the host {socket.gethostname()}: study.yaml of {study} says that it holds the "
+            f"address of the PostgreSQL database with the study's ledger; export {variable}=postgresql://USER:PASSWORD@HOST:5432/DATABASE"
         )
     return _session_of(os.getpid(), address, variable, study)
 

@@ -25,6 +25,7 @@ from traps_pipeline.files import write_bytes
 from traps_pipeline.storage.bucket import Bucket, object_name
 from traps_pipeline.storage.database import Session, lock_number
 from traps_pipeline.storage.store import Store, is_hidden
+from traps_pipeline.storage.unused import SCHEMA, forget, removed
 
 if TYPE_CHECKING:
     from psycopg import Connection
@@ -65,7 +66,7 @@ class ObjectStore(Store):
 
     def __init__(self, root: Path, bucket: Bucket, session: Session) -> None:
         super().__init__(root)
-        self.bucket, self._session = bucket, session
+        self.bucket, self.session = bucket, session
         self._rows: dict[str, Current] = {}
         self._names: dict[tuple[str, ...], set[str]] = {}  # by the folder that they lie below, at most two deep
         self._asked = set[str]()  # names in MANY that were looked up; of what changes later every host hears anyhow
@@ -85,7 +86,7 @@ class ObjectStore(Store):
         with self._guard:
             if time.monotonic() - self._looked_at <= age_s:
                 return
-            began, study = time.monotonic(), self._session.study_id
+            began, study = time.monotonic(), self.session.study_id
 
             def work(connection: Connection[Any]) -> tuple[int, list[Any]]:
                 # The number first: what is committed after it is seen, or seen once more the next time.
@@ -95,14 +96,14 @@ class ObjectStore(Store):
                 newer = self._read(connection, "number > %s", self._number)
                 return max([self._number, *(row[-1] for row in newer)]), newer
 
-            self._number, rows = self._session.run(work)
+            self._number, rows = self.session.run(work)
             self._take(rows)
             self._looked_at = began
 
     def _read(self, connection: Connection[Any], condition: LiteralString, *values: Any) -> list[Any]:
         sql: LiteralString = """select name, digest, size, note, (extract(epoch from at) * 1e9)::bigint, number
                                 from traps.objects where study = %s and """
-        return connection.execute(sql + condition, [self._session.study_id, *values]).fetchall()
+        return connection.execute(sql + condition, [self.session.study_id, *values]).fetchall()
 
     def _take(self, rows: Iterable[Any]) -> None:
         for name, digest, size, note, at_ns, _ in rows:
@@ -119,7 +120,7 @@ class ObjectStore(Store):
         with self._guard:
             if new := sorted(names - self._asked):
                 self._refresh()  # from here on, of what changes everybody hears
-                self._take(self._session.run(lambda c: self._read(c, "name = any(%s)", new)))
+                self._take(self.session.run(lambda c: self._read(c, "name = any(%s)", new)))
                 self._asked |= {*new}
 
     def _name(self, path: Path) -> str:
@@ -133,10 +134,13 @@ class ObjectStore(Store):
     def _change(self, rows: Sequence[tuple[str, bytes | None, int | None, str | None]]) -> None:
         """Let other objects be current, all in one transaction. The row of the study's changes is locked until then,
         so that changes are numbered in the order in which they are seen."""
-        study = self._session.study_id
+        study = self.session.study_id
         columns = [list(column) for column in zip(*rows, strict=True)]
+        digests = [digest for _, digest, *_ in rows if digest is not None]
 
-        def work(connection: Connection[Any]) -> None:
+        def work(connection: Connection[Any]) -> list[bytes]:
+            if gone := removed(connection, study, digests):
+                return gone
             ((number,),) = connection.execute(
                 """insert into traps.changes (study, number) values (%s, 1)
                    on conflict (study) do update set number = traps.changes.number + 1 returning number""",
@@ -150,9 +154,12 @@ class ObjectStore(Store):
                        note = excluded.note, number = excluded.number, at = excluded.at""",
                 [study, number, *columns],
             )
+            return []
 
         if rows:
-            self._session.run(work)
+            while gone := self.session.run(work):
+                forget(self, gone)
+                _side_by_side(lambda d: self.bucket.put(object_name(d), self._cached(d).read_bytes()), gone)
             self.look()
 
     def _withdraw(self, lost: Iterable[bytes]) -> None:
@@ -160,7 +167,7 @@ class ObjectStore(Store):
         gone = {*lost}
         with self._guard:
             self._there -= gone
-            rows = self._session.run(lambda c: self._read(c, "digest = any(%s)", [*gone]))
+            rows = self.session.run(lambda c: self._read(c, "digest = any(%s)", [*gone]))
             self._change([(row[0], None, None, None) for row in rows])
 
     # --- contents ---------------------------------------------------------------------------------------------------
@@ -197,6 +204,7 @@ class ObjectStore(Store):
 
     def put(self, content: bytes) -> bytes:
         """Write an object that has no path; its digest. Raises TrapsError."""
+        forget(self, [sha256(content).digest()])
         return self._put(content, None)
 
     def _fetched(self, row: Current, name: str) -> Path:
@@ -310,7 +318,7 @@ class ObjectStore(Store):
             return [folder / pattern] if self.has(folder / pattern) else []
         if f"{self._name(folder)}/".startswith(MANY):
             prefix = f"{self._name(folder)}/"
-            self._take(self._session.run(lambda c: self._read(c, "starts_with(name, %s)", prefix)))
+            self._take(self.session.run(lambda c: self._read(c, "starts_with(name, %s)", prefix)))
         start, group = f"{self._name(folder)}/", self._name(folder).split("/")[:2]
         with self._guard:
             near = [names for key, names in self._names.items() if list(key[: len(group)]) == group[: len(key)]]
@@ -346,6 +354,7 @@ def _prepare(connection: Connection[Any]) -> None:
     for statement in _SCHEMA.split(";\n"):
         if statement.strip():
             connection.execute(statement)
+    connection.execute(SCHEMA)
 
 
 def _side_by_side(work: Callable[[T], R], of: Iterable[T]) -> list[R]:

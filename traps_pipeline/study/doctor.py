@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import PART
+from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.place import Place, scratch_of
 
 if TYPE_CHECKING:
@@ -129,6 +130,31 @@ def examine_files(place: Place) -> Iterator[Finding]:
     said = [*workspace.answers.damage(), *workspace.votes.damage(), *_damaged_journal(workspace.root)]
     yield Finding(not said, "ledger", "; ".join(said[:SHOWN]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
+
+
+def examine_unused(place: Place, *, is_removed: bool) -> Finding:
+    """The objects in a study's store that nobody names and that are older than the grace period, and which of them were
+    removed. Raises TrapsError where the study is in a folder, and where the store or the database cannot be used."""
+    from traps_pipeline.storage.objects import ObjectStore
+    from traps_pipeline.storage.unused import GRACE_DAYS, remove, unused
+    from traps_pipeline.storage.workspace import Workspace
+
+    store = Workspace.open(place).store
+    if not isinstance(store, ObjectStore):
+        raise TrapsError(
+            f"{place}: a study in a folder has no objects that nobody names; give the address of one in an object "
+            "store with --workspace s3://BUCKET/STUDY"
+        )
+    found = unused(store)
+    shown = remove(store, found) if is_removed else found
+    what = f"{len(shown)} objects ({sum(one.size for one in shown) / 1e6:.1f} MB)"
+    if shown:
+        what += f", the oldest of {shown[0].at:%Y-%m-%d}: {', '.join(object_name(one.digest) for one in shown[:SHOWN])}"
+        what += ", .." * (len(shown) > SHOWN)
+    done = "removed" if is_removed else "would be removed by `traps doctor --unused remove`"
+    return Finding(
+        True, "unused", f"{done}, since nobody names them and they are older than {GRACE_DAYS:.0f} days: {what}"
+    )
 
 
 def _damaged_table(path: Path) -> str:
