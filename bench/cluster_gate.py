@@ -23,6 +23,8 @@ from typing import Any, LiteralString
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 POLL_S, WATCH_S, STEPS = 15, 240, 60
+# As `deploy/` sets them: a node that does not answer is dead after 24 s; as Ray has them (5 times 10 s), after 65.
+HEALTH = {"RAY_health_check_timeout_ms": "5000", "RAY_health_check_failure_threshold": "3"}
 ENDED = ("SUCCESS", "FAILURE", "CANCELED")
 DAGSTER_YAML = """
 telemetry: {{enabled: false}}
@@ -64,7 +66,7 @@ class Cluster:
         fixed = ["--node-ip-address=127.0.0.1", "--disable-usage-stats", "--object-store-memory=80000000"]
         fixed += [f"{port}={free_port()}" for port in ports]
         command = [sys.executable, "-m", "ray.scripts.scripts", "start", *fixed, *options]
-        own = {"TRAPS_NODE": name, "TRAPS_SCRATCH": str(scratch)} | self.own.get(name, {})
+        own = {"TRAPS_NODE": name, "TRAPS_SCRATCH": str(scratch)} | HEALTH | self.own.get(name, {})
         began = time.monotonic()
         with (self.folder / f"{name}.log").open("ab") as log:
             subprocess.run(command, env=self.environment | own, check=True, stdout=log, stderr=log)

@@ -2,11 +2,12 @@
 two nodes, each with a scratch folder of its own; the study lies on s3:// alone. Then what a cluster must not change is
 compared with a run of one process in a folder.
 
-python bench/cluster_study.py [--kill] [--interrupt leave|cancel] [--experiment FILE]
+python bench/cluster_study.py [--kill] [--interrupt leave|cancel] [--experiment FILE | --mechanism]
 (needs the packages of the extra `cluster`, and moto)
 
 --kill: every process of a node is killed (-9) while it renders, and the node is started again. --interrupt: Ctrl-C
-after the first partition, which leaves or cancels the runs; then the same command once more. What else may be killed,
+after the first partition, which leaves or cancels the runs; then the same command once more. --mechanism: hidden
+states, probes and steering of a tiny random checkpoint, too, on four scenarios of one family. What else may be killed,
 while models are asked: `bench/cluster_kills.py`.
 """
 
@@ -20,14 +21,18 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
     from bench.cluster_watch import Opened
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
 EXPERIMENT = """
 name: cluster
 description: Reference models, one behind a bad provider, on one scenario of four families.
@@ -37,6 +42,7 @@ panel: rules
 epoch: cluster
 scenarios: [plinko-0001, tumbling_dice-0001, domino_chain-0001, hidden_race-0001]
 """
+MECHANISM_UNTIL = "probes,steering_effects,steering_nulls"
 ADDRESS = "s3://lab/cluster-study"
 NODES = ("one", "two")
 
@@ -71,6 +77,24 @@ class Study:
         if done.returncode:
             raise RuntimeError(done.stderr)
         return done.stdout
+
+    @contextmanager
+    def opened(self) -> Iterator[Workspace]:
+        """The study as a process sees it that has this host's variables: this one, within the block."""
+        with self.exported():
+            yield Workspace.open()
+
+    @contextmanager
+    def exported(self) -> Iterator[None]:
+        """This host's variables, within the block those of this process."""
+        former = {**os.environ}
+        os.environ.clear()
+        os.environ.update(self.environment)
+        try:
+            yield
+        finally:
+            os.environ.clear()
+            os.environ.update(former)
 
     def start_run(self, *more: str) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "traps_pipeline.cli", *self._run(*more)]
@@ -112,6 +136,24 @@ class Study:
             self.failures.append(what)
 
 
+def look_inside(folder: Path, experiment: Path) -> dict[str, str]:
+    """Write a tiny checkpoint, a registry with it, and an experiment that looks into it; what a shell exports."""
+    import yaml
+
+    from tests.mechanism.test_stages_run import ENTRY, MECHANISM
+    from traps_pipeline.models.local.tiny import build_tiny
+
+    build_tiny("qwen3-vl", folder / "tiny")
+    registry = folder / "models.yaml"
+    entry = ENTRY.replace("checkpoint: tiny", f"checkpoint: {folder / 'tiny'}")
+    registry.write_text((ROOT / "assets" / "models.yaml").read_text() + entry)
+    asked = {"models": ["oracle", "flaky"], "regimes": ["standard"], "datasets": ["chaotic", "chaotic_ill_posed"]}
+    chosen = {"scenarios": [f"plinko-000{n}" for n in range(1, 5)], "panel": "rules", "judged_by_rules": True}
+    about = {"name": "inside", "description": "A look into a tiny model.", "epoch": "cluster"}
+    experiment.write_text(yaml.safe_dump({**about, **asked, **chosen, "mechanism": MECHANISM}))
+    return {"TRAPS_MODELS": str(registry)}
+
+
 def watch(run: subprocess.Popen[str], study: Study, kill: object) -> int:
     """Print what a run says, and kill a node once it renders; its exit code."""
     began, killed = time.monotonic(), kill is None
@@ -135,7 +177,9 @@ def main() -> None:
     parser.add_argument("--kill", action="store_true")
     parser.add_argument("--log", type=Path, help="a file for the log of Dagster's daemon")
     parser.add_argument("--interrupt", choices=("leave", "cancel"))
-    parser.add_argument("--experiment", type=Path)
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--experiment", type=Path)
+    what.add_argument("--mechanism", action="store_true")
     arguments = parser.parse_args()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it, and so its own
     foreign = ("TRAPS_", "DAGSTER_", "RAY_", "AWS_")
@@ -143,9 +187,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="study-") as name, Postgres.running() as database, S3.running() as store:
         folder = Path(name)
         experiment = arguments.experiment or folder / "cluster.yaml"
-        if not arguments.experiment:
+        if not arguments.experiment and not arguments.mechanism:
             experiment.write_text(EXPERIMENT)
         common = plain | {"PYTHONPATH": str(ROOT), "TMPDIR": name}
+        if arguments.mechanism:
+            common |= look_inside(folder, experiment)
         shared = common | store.environment | {
             "TRAPS_DATABASE": database.address(),
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",  # the launcher calls `dagster`
@@ -153,7 +199,8 @@ def main() -> None:
         opens = Opened({node: folder / node for node in NODES})
         cluster = Cluster(folder, shared)
         own = {"TRAPS_RAY": f"http://127.0.0.1:{cluster.dashboard}", "TRAPS_WORKSPACE": ADDRESS}
-        study = Study(folder, shared | own | {"TRAPS_SCRATCH": str(folder / "here")}, experiment)
+        until = MECHANISM_UNTIL if arguments.mechanism else "leaderboard"
+        study = Study(folder, shared | own | {"TRAPS_SCRATCH": str(folder / "here")}, experiment, until=until)
         try:
             cluster.start_head()
             for node in NODES:
@@ -180,6 +227,9 @@ def main() -> None:
             study.require(code == 0, f"the run succeeds (exit code {code})")
             again = study.run_to_end()
             study.require("0 answers asked (0 from" in again.stdout, "a second run asks nothing")
+            if arguments.mechanism:
+                said = "inside models: 0 items extracted, 0 steered answers asked (0 from"
+                study.require(said in again.stdout, "and extracts and steers nothing")
             nodes_are_apart(study, opens)
             compare_with_one_process(study, common)
         finally:
@@ -220,16 +270,13 @@ def nodes_are_apart(study: Study, opens: Opened) -> None:
 
 def fetch(study: Study, to: Path) -> Path:
     """Bring the study's tables and clips into a folder."""
-    code = (
-        "import sys\nfrom pathlib import Path\nfrom traps_pipeline.storage.workspace import Workspace\n"
-        "w = Workspace.open()\nfor name in ('tables', 'clips'):\n"
-        "    w.bring_folder(w.root / name)\n"
-        "    for path in w.store.below(w.root / name):\n"
-        "        to = Path(sys.argv[1]) / path.relative_to(w.root)\n"
-        "        to.parent.mkdir(parents=True, exist_ok=True)\n"
-        "        to.write_bytes(path.read_bytes())\n"
-    )
-    study.python(code, to)
+    with study.opened() as workspace:
+        for name in ("tables", "clips", "states"):
+            workspace.bring_folder(workspace.root / name)
+            for path in workspace.store.below(workspace.root / name):
+                copy = to / path.relative_to(workspace.root)
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                copy.write_bytes(path.read_bytes())
     return to
 
 
@@ -238,9 +285,10 @@ def compare_with_one_process(study: Study, common: dict[str, str]) -> None:
     alone = study.folder / "alone"
     fetched, began = fetch(study, study.folder / "fetched"), time.monotonic()
     local = subprocess.run(
-        [sys.executable, "-m", "traps_pipeline.cli", "run", str(study.experiment), "--until", "leaderboard"],
+        [sys.executable, "-m", "traps_pipeline.cli", "run", str(study.experiment), "--until", study.until],
         env=common | {"TRAPS_WORKSPACE": str(alone)}, cwd=ROOT, text=True, capture_output=True, check=False,
     )  # fmt: skip
+    study.require(local.returncode == 0, f"one process makes it too: {local.stderr[-500:]}")
     print(f"  one process took {time.monotonic() - began:.0f} s: {local.stdout.strip().splitlines()[-2]}", flush=True)
     tables_are_equal(study, alone, fetched)
 
@@ -250,9 +298,12 @@ def tables_are_equal(study: Study, alone: Path, fetched: Path) -> None:
     from bench.equality import main as compare
 
     study.require(compare(alone, fetched) == 0, "tables are equal, byte for byte but for times")
-    clips = {path.relative_to(alone): path.read_bytes() for path in (alone / "clips").rglob("*.mp4")}
-    same = all((fetched / name).read_bytes() == content for name, content in clips.items())
+    clips = {path.relative_to(fetched): path.read_bytes() for path in (fetched / "clips").rglob("*.mp4")}
+    same = all((alone / name).is_file() and (alone / name).read_bytes() == content for name, content in clips.items())
     study.require(bool(clips) and same, f"{len(clips)} clips have the same bytes")
+    states = {path.relative_to(alone): path.read_bytes() for path in (alone / "states").rglob("*.safetensors")}
+    same = all((fetched / name).read_bytes() == content for name, content in states.items())
+    study.require(same, f"{len(states)} files of hidden states have the same bytes")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 # of the package (its `dagster` must be on the PATH), with the variables of deploy/README.md.
 set -eu
 : "${TRAPS_WORKSPACE:?}" "${TRAPS_DATABASE:?}"
+# A node that does not answer is dead after three checks of 5 s (docs/cluster.md, "Killed while models were asked").
+export RAY_health_check_timeout_ms=5000 RAY_health_check_failure_threshold=3
 ADDRESS="${1:?the address of this machine in your own network}"
 ray start --head --node-ip-address="$ADDRESS" --num-cpus=0 --disable-usage-stats \
     --include-dashboard=true --dashboard-host="$ADDRESS" --dashboard-port=8265

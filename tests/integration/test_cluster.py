@@ -5,12 +5,13 @@ from __future__ import annotations
 import pytest
 
 from tests import objectstore
+from tests.conftest import Checkout
 from tests.postgres import LACKING, programs
 
 pytestmark = pytest.mark.slow
 
 
-def test_a_run_that_is_killed_on_a_node_changes_nothing_in_the_study() -> None:
+def test_a_run_that_is_killed_on_a_node_changes_nothing_in_the_study(small: Checkout) -> None:
     """Tables are those of one process, calls are made once, a second run asks nothing, nodes keep to their folders."""
     for name in ("ray", "dagster_ray", "dagster_postgres"):
         pytest.importorskip(name, reason="the extra `cluster` is not installed (`make cluster-setup` does it)")
@@ -20,4 +21,4 @@ def test_a_run_that_is_killed_on_a_node_changes_nothing_in_the_study() -> None:
         pytest.skip(objectstore.LACKING)
     from bench.cluster_kills import SMALL, kill_each
 
-    assert kill_each(["run"], size=SMALL) == []
+    assert kill_each(["run"], size=SMALL, clips=small.workspace / "clips") == []

@@ -285,7 +285,7 @@ def test_an_address_that_leads_nowhere_names_variable_host_study_and_remedy(
 def test_a_variable_that_is_not_set_and_a_package_that_is_not_there_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
     with pytest.raises(
-        TrapsError, match=rf"{VARIABLE} is not set on the host .*: study.yaml of my-study says .* export {VARIABLE}=post"
+        TrapsError, match=rf"{VARIABLE} is not set on the host .*: study.yaml of my-study .* export {VARIABLE}=post"
     ):
         session_of(VARIABLE, "my-study")
     code = f"""

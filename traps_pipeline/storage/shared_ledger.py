@@ -283,7 +283,8 @@ class SharedWriter(Writer):
 
     def __init__(self, stream: Stream, claim: Claim, kind: str, segments: Segments) -> None:
         self.claim, self._stream, self._kind, self._segments = claim, stream, kind, segments
-        self._groups: list[Future[None]] = []  # those that may not be stored yet
+        # Those that may not be stored yet, and what this loop's connections wait for: one for all of them.
+        self._groups: dict[Future[None], asyncio.Future[None] | None] = {}
 
     async def require(self) -> None:
         """See `Writer.require`. While the database is away, or too slow to say, wait for a while."""
@@ -300,14 +301,16 @@ class SharedWriter(Writer):
     def append(self, row: Mapping[str, Any], beside: Mapping[str, str] | None = None) -> None:
         """See `Writer.append`."""
         group = self._stream.put(self.claim, self._kind, encoded((row, beside or {})))
-        if not self._groups or self._groups[-1] is not group:
-            self._groups = [one for one in self._groups if not (one.done() and one.exception() is None)]
-            self._groups.append(group)
+        if group not in self._groups:
+            self._groups = {one: by for one, by in self._groups.items() if not (one.done() and one.exception() is None)}
+            self._groups[group] = None
 
     async def kept(self) -> None:
         """See `Writer.kept`. The database has what was appended."""
-        for group in list(self._groups):
-            await asyncio.shield(asyncio.wrap_future(group))
+        for group, waited in [*self._groups.items()]:
+            if waited is None:
+                waited = self._groups[group] = self._groups.get(group) or asyncio.wrap_future(group)
+            await asyncio.shield(waited)
 
     def sync_if_due(self) -> None:
         """See `Writer.sync_if_due`. The stream's thread stores rows as they come."""

@@ -1,0 +1,118 @@
+"""What a cluster costs and gains, against what a user would otherwise use: one machine, its files, and its processes.
+
+python bench/cluster.py [rendering] [calls] [ledger] [first-call] [pages]
+(needs the packages of the extra `cluster`, and moto; `pages` also Chromium)
+
+rendering: two nodes against one, each bound to a core of its own, in frames a second from the first partition's start
+to the last one's end, and as a whole. calls: 2,000 calls of 50 ms with the ledger in PostgreSQL against one in a
+folder. ledger: rows a second, against files. first-call: of a study in an object store whose ledger holds 10^6 rows.
+pages: Dagster's, of studies of 10,000 and 50,000 cells whose history lies in PostgreSQL, against a stock project's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from bench.cluster_gate import Cluster
+from bench.cluster_study import NODES, Study
+from tests.objectstore import S3
+from tests.postgres import Postgres
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENARIOS = 8  # of each of two families of different categories: a category is the least that a run renders
+EXPERIMENT = f"""
+name: rendering
+description: Clips of two categories of one size.
+models: [oracle]
+regimes: [standard]
+panel: rules
+scenarios: [{", ".join(f"{family}-{n:04d}" for family in ("plinko", "tumbling_dice") for n in range(1, SCENARIOS + 1))}]
+"""
+OTHERS = {
+    "calls": ["bench/calls.py", "--database"],
+    "ledger": ["bench/ledger.py", "--database"],
+    "first-call": ["bench/first_call.py", "--rows", "1000000", "--store"],
+    "pages": ["bench/ui.py", "--database", "--cells", "10000", "50000"],
+}
+
+
+def rendered(study: Study) -> tuple[float, list[tuple[float, float]]]:
+    """Make the clips of a study on the cluster: seconds in all, and when each run began and ended."""
+    began = time.monotonic()
+    made = study.run_to_end()
+    seconds = time.monotonic() - began
+    if made.returncode:
+        raise SystemExit(made.stdout + made.stderr)
+    with study.opened() as workspace:
+        from dagster import DagsterInstance
+
+        instance = DagsterInstance.from_config(str(workspace.dagster_home))
+        stats = [instance.get_run_stats(run.run_id) for run in instance.get_runs()]
+        instance.dispose()
+    return seconds, sorted((one.start_time or 0.0, one.end_time or 0.0) for one in stats)
+
+
+def rendering() -> None:
+    """Print how long rendering takes on one node and on two."""
+    cores = sorted(os.sched_getaffinity(0))[: len(NODES)]
+    foreign = ("TRAPS_", "DAGSTER_", "RAY_", "AWS_")
+    plain = {key: value for key, value in os.environ.items() if not key.startswith(foreign)}
+    whole, runs = dict[int, float](), dict[int, list[tuple[float, float]]]()
+    for count in (1, 2):
+        with ExitStack() as opened:
+            name = opened.enter_context(tempfile.TemporaryDirectory(prefix="scale-", ignore_cleanup_errors=True))
+            database, store = opened.enter_context(Postgres.running()), opened.enter_context(S3.running())
+            folder = Path(name)
+            (folder / "rendering.yaml").write_text(EXPERIMENT)
+            shared = plain | store.environment | {
+                "PYTHONPATH": str(ROOT), "TMPDIR": name, "TRAPS_DATABASE": database.address(),
+                "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+            }  # fmt: skip
+            cluster = Cluster(folder, shared)
+            own = {"TRAPS_RAY": f"http://127.0.0.1:{cluster.dashboard}", "TRAPS_WORKSPACE": "s3://lab/rendering"}
+            environment = shared | own | {"TRAPS_SCRATCH": str(folder / "here")}
+            study = Study(folder, environment, folder / "rendering.yaml", until="videos")
+            try:
+                cluster.start_head()
+                for node, core in list(zip(NODES, cores, strict=True))[:count]:
+                    os.sched_setaffinity(0, {core})
+                    cluster.start_node(node)
+                    os.sched_setaffinity(0, cores)
+                study.start_daemon()
+                whole[count], runs[count] = rendered(study)
+            finally:
+                study.stop()
+                for node in (*NODES, "head"):
+                    cluster.signal(node, signal.SIGKILL)
+        each = ", ".join(f"{end - begin:.0f} s" for begin, end in runs[count])
+        print(f"rendering, {count} node(s) of one core: {whole[count]:.0f} s, with runs of {each}", flush=True)
+    one, two = (max(end for _, end in of) - min(begin for begin, _ in of) for of in (runs[1], runs[2]))
+    longest = max(end - begin for begin, end in runs[1])
+    print(
+        f"two nodes against one, load {os.getloadavg()[0]:.0f}: {one / two:.2f} times as fast ({one / two / 2:.2f} of "
+        f"twice), {longest / two:.2f} of what categories of these sizes allow; as a whole {whole[1] / whole[2]:.2f}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="*", choices=["rendering", *OTHERS, []], default=[])
+    for what in parser.parse_args().what or ["rendering", *OTHERS]:
+        if what == "rendering":
+            rendering()
+        else:
+            print(f"{what}: python {' '.join(OTHERS[what])}; load {os.getloadavg()[0]:.0f}", flush=True)
+            subprocess.run([sys.executable, *OTHERS[what]], cwd=ROOT, check=True)
+
+
+if __name__ == "__main__":
+    main()
