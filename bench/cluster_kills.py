@@ -264,8 +264,9 @@ def kill_each(
         experiment = checkout.root / "kills.yaml"
         experiment.write_text(size.experiment)
         common = plain | {"PYTHONPATH": str(checkout.root), "TMPDIR": name}
-        for name in size.scenarios if clips else ():
-            shutil.copytree(clips / name, checkout.workspace / "clips" / name)
+        if clips is not None:
+            for name in size.scenarios:
+                shutil.copytree(clips / name, checkout.workspace / "clips" / name)
         environment = common | {"TRAPS_WORKSPACE": str(checkout.workspace)}
         _alone(Study(folder, environment, experiment, checkout.root, size.until), provider, size)
         provider.configure(latency_s=size.latency_s)
