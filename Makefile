@@ -10,7 +10,7 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test all-tests test-cluster test-cluster-gate test-cluster-kills cluster-setup ui bench explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
+.PHONY: demo demo-mechanism check fast-tests test all-tests test-cluster test-cluster-gate test-cluster-kills cluster-setup ui bench bench-cluster explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
 
 demo: setup-core ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -29,7 +29,7 @@ fast-tests: setup
 	$(PYTEST) -n 2 -m "not slow"
 
 # One more worker than the two cores that are needed: tests of servers and of Dagster's daemon wait for much of their time.
-test: test-packages setup ## lint, types and all tests, the slow ones too
+test: test-packages cluster-setup ## lint, types and all tests, the slow ones too
 	$(MAKE) --no-print-directory -j2 lint all-tests
 
 # What is compiled is copied to the checkouts of the tests, whose hundreds of commands would each compile it again.
@@ -37,7 +37,7 @@ all-tests: setup
 	$(BIN)/python -m compileall -q traps_pipeline
 	$(PYTEST) -n 3
 
-# Ray is 80 MB and in no other test, so these are not part of `make test`.
+# Of these `make test` has a small version (tests/integration/test_cluster.py).
 test-cluster: cluster-setup ## a study on two nodes of Ray, one killed in mid-run, against a run of one process; tests of runs
 	$(BIN)/python bench/cluster_study.py --kill
 	$(BIN)/python -m pytest tests/orchestration/test_cluster.py tests/remedies/test_cluster.py
@@ -48,8 +48,7 @@ test-cluster-kills: cluster-setup ## a study on a cluster while this and that is
 test-cluster-gate: cluster-setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
 	$(BIN)/python bench/cluster_gate.py
 
-cluster-setup: test-packages setup
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-cluster.lock
+cluster-setup: test-packages setup $(VENV)/.cluster
 
 ui: setup ## Dagster's web server and daemon on 127.0.0.1:$(PORT); open the address that it prints
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
@@ -65,6 +64,9 @@ bench: setup ## ratios against what one would otherwise use
 	$(BIN)/python bench/scoring.py
 	$(BIN)/python bench/shortcuts.py
 	$(BIN)/python bench/explorer.py
+
+bench-cluster: cluster-setup ## what a cluster costs and gains, against one machine; half an hour to an hour
+	$(BIN)/python bench/cluster.py
 
 # For maintainers, after a version in the explorer's package.json was changed; the bundle is checked in.
 explorer-vendor:
@@ -87,6 +89,10 @@ $(VENV)/.installed: requirements.lock pyproject.toml hatch_build.py
 	$(PIP_INSTALL) $(TORCH)
 	$(PIP_INSTALL) --no-deps --no-build-isolation --editable .
 	touch $(VENV)/.core $@
+
+$(VENV)/.cluster: requirements-cluster.lock $(VENV)/.installed
+	$(PIP_INSTALL) --no-deps --require-hashes -r requirements-cluster.lock
+	touch $@
 
 $(VENV)/.core: requirements-core.lock pyproject.toml hatch_build.py
 	$(make-venv)
