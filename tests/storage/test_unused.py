@@ -19,9 +19,10 @@ from traps_pipeline.storage import unused as module
 from traps_pipeline.storage.bucket import Bucket, object_name
 from traps_pipeline.storage.database import Session
 from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.storage.removal import ENDS_S
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.study import Study
-from traps_pipeline.storage.unused import ENDS_S, _tell, remove, unused
+from traps_pipeline.storage.unused import _tell, remove, unused
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
 Open = Callable[[str], ObjectStore]

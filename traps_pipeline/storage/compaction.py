@@ -17,7 +17,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.database import Claim, Session
 from traps_pipeline.storage.ledger import ASIDES
-from traps_pipeline.storage.unused import removed
+from traps_pipeline.storage.removal import removed
 
 if TYPE_CHECKING:
     from psycopg import Connection

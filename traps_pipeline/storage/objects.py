@@ -24,8 +24,8 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_bytes
 from traps_pipeline.storage.bucket import Bucket, object_name
 from traps_pipeline.storage.database import Session, lock_number
+from traps_pipeline.storage.removal import SCHEMA, forget, removed
 from traps_pipeline.storage.store import Store, is_hidden
-from traps_pipeline.storage.unused import SCHEMA, forget, removed
 
 if TYPE_CHECKING:
     from psycopg import Connection
@@ -158,7 +158,7 @@ class ObjectStore(Store):
 
         if rows:
             while gone := self.session.run(work):
-                forget(self, gone)
+                forget(self.session, self.bucket.address, gone)
                 _side_by_side(lambda d: self.bucket.put(object_name(d), self._cached(d).read_bytes()), gone)
             self.look()
 
@@ -204,7 +204,7 @@ class ObjectStore(Store):
 
     def put(self, content: bytes) -> bytes:
         """Write an object that has no path; its digest. Raises TrapsError."""
-        forget(self, [sha256(content).digest()])
+        forget(self.session, self.bucket.address, [sha256(content).digest()])
         return self._put(content, None)
 
     def _fetched(self, row: Current, name: str) -> Path:

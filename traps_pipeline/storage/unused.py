@@ -1,9 +1,7 @@
 """Objects in a study's store that nobody names any more: what is found, and how it is removed.
 
 The store's list only proposes. What is removed is named by no row of `traps.objects` or `traps.segments`, and is older
-than a grace period. A host may bring the same content to the store again at that moment, so each removal is told first:
-a row of `traps.removed` is written under a lock that whoever names an object holds too (`removed`). Who finds one
-brings the content once more, after the removal has ended.
+than a grace period; each removal is told first, for those who bring the same content again (`storage/removal.py`).
 """
 
 from __future__ import annotations
@@ -16,21 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.storage.bucket import object_name
-from traps_pipeline.storage.database import awake_s, lock_number
+from traps_pipeline.storage.database import awake_s
+from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.storage.removal import removal_lock, tell, tell_end
 
 if TYPE_CHECKING:
     from psycopg import Connection
 
-    from traps_pipeline.storage.objects import ObjectStore
-
 GRACE_DAYS = 7.0
 BATCH = 1000  # objects that are removed by one request
 BEGINS_S = 30  # after it was told, a removal has begun, or is left; a process may have been stopped between
-ENDS_S = 600  # so long after it was told no removal acts any more, even if its process died
-TOLD_DAYS = 90  # for so long it is remembered what was removed
-SCHEMA = """create table if not exists traps.removed (
-    study int not null references traps.studies, digest bytea not null, at timestamptz not null default now(),
-    is_over boolean not null default false, primary key (study, digest))"""
 _OBJECT = re.compile(r"([0-9a-f]{2})/(\1[0-9a-f]{62})")
 
 
@@ -72,7 +65,7 @@ def remove(store: ObjectStore, found: Sequence[Unused]) -> list[Unused]:
         if awake_s() - began > BEGINS_S:
             continue  # this process was stopped: others may have brought them again by now
         store.bucket.delete_all([object_name(digest) for digest in digests])
-        store.session.run(lambda c, of=digests: _over(c, store.session.study_id, of))
+        store.session.run(lambda c, of=digests: tell_end(c, store.session.study_id, of))
         done += [batch[digest] for digest in digests]
     return done
 
@@ -88,51 +81,9 @@ def _named(connection: Connection[Any], study: int, of: Sequence[bytes] | None) 
     return {bytes(digest) for (digest,) in connection.execute(sql, values).fetchall()}
 
 
-def _lock(study: int) -> int:
-    return lock_number(f"objects of {study}")
-
-
 def _tell(connection: Connection[Any], study: int, digests: Sequence[bytes]) -> list[bytes]:
     """Tell all that these objects are removed now, but for those that somebody names; which are left."""
-    connection.execute("select pg_advisory_xact_lock(%s)", [_lock(study)])
+    connection.execute("select pg_advisory_xact_lock(%s)", [removal_lock(study)])
     left = sorted({*digests} - _named(connection, study, digests))
-    connection.execute(
-        """insert into traps.removed (study, digest) select %s, * from unnest(%s::bytea[])
-           on conflict (study, digest) do update set at = now(), is_over = false""",
-        [study, left],
-    )
-    old = "delete from traps.removed where study = %s and at < now() - make_interval(days => %s)"
-    connection.execute(old, [study, TOLD_DAYS])
+    tell(connection, study, left)
     return left
-
-
-def _over(connection: Connection[Any], study: int, digests: Sequence[bytes]) -> None:
-    sql = "update traps.removed set is_over = true where study = %s and digest = any(%s)"
-    connection.execute(sql, [study, [*digests]])
-
-
-def removed(connection: Connection[Any], study: int, digests: Sequence[bytes]) -> list[bytes]:
-    """Those of these objects that are being removed, or were, since somebody brought them to the store: they may not
-    be named before they are brought again. Until the transaction ends no removal begins."""
-    connection.execute("select pg_advisory_xact_lock_shared(%s)", [_lock(study)])
-    sql = "select digest from traps.removed where study = %s and digest = any(%s)"
-    return [bytes(digest) for (digest,) in connection.execute(sql, [study, [*digests]]).fetchall()]
-
-
-def forget(store: ObjectStore, digests: Sequence[bytes]) -> None:
-    """To be called before objects that were removed are brought to the store again. Raises TrapsError where a removal
-    goes on."""
-    study = store.session.study_id
-
-    def work(connection: Connection[Any]) -> list[bytes]:
-        sql = """delete from traps.removed where study = %s and digest = any(%s)
-                 and (is_over or at < now() - make_interval(secs => %s))"""
-        connection.execute(sql, [study, [*digests], ENDS_S])
-        return removed(connection, study, digests)
-
-    if left := store.session.run(work):
-        raise TrapsError(
-            f"{store.bucket.address}/{object_name(left[0])}: is being removed at this moment by `traps doctor --unused "
-            f"remove` of the study {store.session.study}; run the same command again in {ENDS_S // 60} minutes: what "
-            "is finished is kept"
-        )
