@@ -22,6 +22,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from dagster import DagsterInstance
+
 from bench.cluster_gate import Cluster
 from bench.cluster_study import NODES, Study
 from tests.objectstore import S3
@@ -53,8 +55,6 @@ def rendered(study: Study) -> tuple[float, list[tuple[float, float]]]:
     if made.returncode:
         raise SystemExit(made.stdout + made.stderr)
     with study.opened() as workspace:
-        from dagster import DagsterInstance
-
         instance = DagsterInstance.from_config(str(workspace.dagster_home))
         stats = [instance.get_run_stats(run.run_id) for run in instance.get_runs()]
         instance.dispose()

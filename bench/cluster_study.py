@@ -27,6 +27,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from dagster import DagsterInstance
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.orchestration.cluster import require_cluster
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -119,7 +123,15 @@ class Study:
             command = [sys.executable, "-m", "dagster._daemon", "run", "-m", "traps_pipeline.definitions"]
             environment = self.environment | {"DAGSTER_HOME": self.home}
             self.daemon = subprocess.Popen(command, stdout=log, stderr=log, cwd=self.root, env=environment)
-        time.sleep(20)
+        with self.opened() as workspace, DagsterInstance.from_config(self.home) as instance:
+            while True:
+                try:
+                    require_cluster(workspace, instance)
+                    return
+                except TrapsError:
+                    if self.daemon.poll() is not None:
+                        raise
+                    time.sleep(0.5)
 
     def stop(self, keep: Path | None = None) -> None:
         """End the daemon. keep: a file for its log."""
