@@ -26,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from traps_pipeline.benchmark.records import load_release, load_released
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import CATEGORIES
+from traps_pipeline.partitions import ALL_CATEGORIES
 from traps_pipeline.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS_VARIABLE
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.spec import Answerable, SceneSpec, Slug
@@ -246,4 +246,4 @@ def _ever_known() -> set[str]:
 def categories_of(scenarios: Mapping[str, Scenario]) -> list[str]:
     """The categories that have scenarios, in their fixed order."""
     present = {scenario.category for scenario in scenarios.values()}
-    return [category for category in CATEGORIES if category in present]
+    return [category for category in ALL_CATEGORIES if category in present]

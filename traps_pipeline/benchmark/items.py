@@ -13,7 +13,7 @@ from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import BESIDE, CATEGORIES, SIDES, all_datasets_of, is_ill_posed
+from traps_pipeline.partitions import BESIDE, ALL_CATEGORIES, SIDES, all_datasets_of, is_ill_posed
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace
@@ -23,7 +23,7 @@ Record = Mapping[str, Any]
 
 def categories_of_dataset(dataset: str) -> list[str]:
     """The categories whose scenarios make a dataset."""
-    return [category for category in CATEGORIES if dataset in all_datasets_of(category)]
+    return [category for category in ALL_CATEGORIES if dataset in all_datasets_of(category)]
 
 
 def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import CATEGORIES
+from traps_pipeline.partitions import ALL_CATEGORIES
 from traps_pipeline.paths import RELEASED, SCENE_SPECS
 from traps_pipeline.scenes.registry import family_names
 from traps_pipeline.scenes.spec import SceneSpec
@@ -60,8 +60,8 @@ def parse_record(line: str, where: str) -> SceneSpec:
         raise TrapsError(
             f"{where}: {spec.scenario_id}: unknown family {spec.family!r}; known: {', '.join(family_names())}"
         )
-    if spec.category not in CATEGORIES:
+    if spec.category not in ALL_CATEGORIES:
         raise TrapsError(
-            f"{where}: {spec.scenario_id}: unknown category {spec.category!r}; known: {', '.join(CATEGORIES)}"
+            f"{where}: {spec.scenario_id}: unknown category {spec.category!r}; known: {', '.join(ALL_CATEGORIES)}"
         )
     return spec

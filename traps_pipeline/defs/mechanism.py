@@ -49,7 +49,7 @@ from traps_pipeline.orchestration.wanted import PROBE_PROMPT, Wanted
 from traps_pipeline.partitions import (
     ANSWERABLE,
     DATASETS,
-    OCCLUSION_CATEGORIES,
+    taxonomy_of_category,
     TIME_SWAPPED,
     Cell,
     Evaluation,
@@ -91,7 +91,7 @@ steering_settings = source(
 )
 # Cells in which the local models answered under Standard in run 1: their verdicts say what the models confabulated on.
 _ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
-_OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if key in OCCLUSION_CATEGORIES else [])
+_OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if taxonomy_of_category(key) == "occlusion" else [])
 
 
 def _probed_from(dataset: str) -> list[str]:

@@ -14,6 +14,7 @@ from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
 from traps_pipeline.benchmark.tables import SCENE_SPECS
 from traps_pipeline.models.registry import get_model, load_models, local_models
 from traps_pipeline.partitions import (
+    ALL_CATEGORIES,
     ANSWERABLE,
     BESIDE,
     CATEGORIES,
@@ -59,7 +60,7 @@ class Wanted:
         if self._workspace is None:
             return [*CATEGORIES]
         made = {part["category"] for part in self._workspace.tables.partitions(SCENE_SPECS)}
-        return [c for c in CATEGORIES if c in made or c in self._present]
+        return [c for c in ALL_CATEGORIES if c in made or c in self._present]
 
     @cached_property
     def _present(self) -> list[str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from traps_pipeline.scenes.outcome import Outcome, Rejected, decisive_geoms, rea
 from traps_pipeline.scenes.pace import EARLIEST_SHARE, settles_share
 from traps_pipeline.scenes.policies import POLICIES, fewest_within, last_of_all, shown_at_end
 from traps_pipeline.scenes.simulate import swept_points
+from traps_pipeline.scenes.soft import flexes, is_carrier
 from traps_pipeline.scenes.spec import SceneSpec
 from traps_pipeline.scenes.wording import FAR_COLOUR, false_premises, refutation
 from traps_pipeline.scenes.world import World
@@ -447,7 +448,8 @@ def _referents(pair: Pair) -> Evidence:
     control = pair.control
     assert control.panel is not None, "a pair with an occluder has a panel"
     scene, model, fps = control.scene, control.model, control.physics.fps / control.frame_step
-    moving = {model.body(i).name for i in range(1, model.nbody) if model.body_weldid[i] > 0}
+    rigid = np.flatnonzero((model.body_weldid > 0) & ~is_carrier(model))
+    moving = {*(model.body(int(i)).name for i in rigid), *flexes(model)}
     moves: dict[str, float] = {}
     for body in sorted(moving):
         pixels = control.pixels_of(decisive_geoms(model, [body]))
@@ -459,7 +461,7 @@ def _referents(pair: Pair) -> Evidence:
         nouns = (noun, *scene.shown_by.get(noun, ()))
         marked = any(phrase.split()[-1] in nouns for phrase in scene.marks)
         bodies = [moves[body] for body in moves if _called(body, nouns)]
-        still = [name for name in control.geoms if _called(name, nouns) and _body_of(model, name) not in moving]
+        still = [name for name in control.geoms if _called(name, nouns) and not _is_of(model, name, moving)]
         if marked:
             shown[noun] = "marked"
         elif bodies:
@@ -478,8 +480,9 @@ def _referents(pair: Pair) -> Evidence:
     }
 
 
-def _body_of(model: mujoco.MjModel, geom: str) -> str:
-    return model.body(int(model.geom(geom).bodyid[0])).name
+def _is_of(model: mujoco.MjModel, drawn: str, bodies: Collection[str]) -> bool:
+    """Whether a soft body, or a geom's body, is one of some bodies."""
+    return drawn in bodies if drawn in flexes(model) else model.body(int(model.geom(drawn).bodyid[0])).name in bodies
 
 
 def _judge_referents(e: Evidence, claim: Claim) -> Judged:

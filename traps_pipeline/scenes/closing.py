@@ -79,10 +79,7 @@ def _moments(pair: Pair, seed: int) -> Iterator[int]:
 def _at_rest_from(pair: Pair) -> int:
     """The frame from which every decisive body stays as it lies at the end: its middle, and three points around it."""
     motion = pair.control.motion
-    paths = [
-        motion.pos(body)[:, None] + BESIDE_M * np.pad(motion.rot(body).swapaxes(1, 2), ((0, 0), (1, 0), (0, 0)))
-        for body in pair.control.scene.decisive
-    ]
+    paths = [motion.places(body, BESIDE_M) for body in pair.control.scene.decisive]
     return still_from(*paths, within_m=STILL_M)
 
 

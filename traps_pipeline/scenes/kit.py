@@ -116,11 +116,12 @@ class Inventory:
 class Scene:
     """A built scene: the model description and the roles its parts play.
 
-    decisive: bodies whose end state is the outcome; in frame throughout, invisible in an occlusion void from hiding on.
+    decisive: bodies (soft ones too) whose end state is the outcome; in frame throughout, invisible in an occlusion void
+        from hiding on.
     hidden: geoms of the hidden element (occlusion), never visible in the void.
     cover: what the cover panel must hide: everything decisive from hiding on, and the hidden element (occlusion).
     stage: boxes that must lie in frame besides everything that moves (the outcome zone above all).
-    velocity: initial velocity of free bodies: linear (m/s, world) and angular (rad/s, body).
+    velocity: initial velocity of free bodies: linear (m/s, world) and angular (rad/s, body); of soft bodies linear.
     inventory: what a viewer can name.
     rest: where all outcomes lie (chaotic), which a panel hides that closes the control; None: all of the stage.
     marks: phrases ('left bin') of which a flag stands over the panel; its geom is `flag_of(phrase)`.
@@ -150,19 +151,34 @@ class Motion:
     """Poses of all named bodies at the frame times.
 
     times: (F,) seconds. positions: body -> (F, 3) m. rotations: body -> (F, 3, 3), columns are the body's axes.
+    vertices: soft body -> (F, V, 3) m.
     """
 
     times: np.ndarray
     positions: Mapping[str, np.ndarray]
     rotations: Mapping[str, np.ndarray]
+    vertices: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def pos(self, body: str) -> np.ndarray:
-        """World position of a body's frame, shape (F, 3)."""
-        return self.positions[body]
+        """World position of a body's frame, or of the middle of a soft body's vertices, shape (F, 3)."""
+        return self.vertices[body].mean(axis=1) if body in self.vertices else self.positions[body]
 
     def rot(self, body: str) -> np.ndarray:
         """Rotation matrices of a body, shape (F, 3, 3)."""
         return self.rotations[body]
+
+    def places(self, body: str, beside_m: float) -> np.ndarray:
+        """By what a body is seen to move, (F, N, 3) m: its middle, and points so far from it on its axes; of a soft body
+        all vertices."""
+        if body in self.vertices:
+            return self.vertices[body]
+        beside = np.pad(self.rot(body).swapaxes(1, 2), ((0, 0), (1, 0), (0, 0)))
+        return self.pos(body)[:, None] + beside_m * beside
+
+    def first(self, frames: int) -> Motion:
+        """The same, of so many first frames."""
+        parts = ({k: v[:frames] for k, v in each.items()} for each in (self.positions, self.rotations, self.vertices))
+        return Motion(self.times[:frames], *parts)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from traps_pipeline.scenes.camera import Panel
 from traps_pipeline.scenes.kit import PANEL_GROUP, Family, Motion, Physics, Scene, add_box
 from traps_pipeline.scenes.look import panel_rgba
 from traps_pipeline.scenes.simulate import simulate
+from traps_pipeline.scenes.soft import flexes
 
 if TYPE_CHECKING:
     import mujoco
@@ -82,12 +83,14 @@ def simulated(model: mujoco.MjModel, scene: Scene, physics: Physics) -> np.ndarr
 
 
 def moving_geoms(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Names of the geoms of bodies that move."""
+    """Names of the geoms of bodies that move, and of soft bodies."""
     moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
-    return tuple(model.geom(int(i)).name for i in moving if model.geom(int(i)).name)
+    return (*(model.geom(int(i)).name for i in moving if model.geom(int(i)).name), *flexes(model))
 
 
 def decisive_geoms(model: mujoco.MjModel, bodies: Sequence[str]) -> tuple[str, ...]:
-    """Names of the geoms of some bodies."""
-    ids = {model.body(name).id for name in bodies}
-    return tuple(model.geom(i).name for i in range(model.ngeom) if int(model.geom_bodyid[i]) in ids)
+    """Names of the geoms of some bodies, and of those that are soft."""
+    soft = flexes(model)
+    ids = {model.body(name).id for name in bodies if name not in soft}
+    geoms = (model.geom(i).name for i in range(model.ngeom) if int(model.geom_bodyid[i]) in ids)
+    return (*geoms, *(name for name in soft if name in bodies))

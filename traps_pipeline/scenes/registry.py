@@ -15,12 +15,12 @@ from pathlib import Path
 
 from traps_pipeline.digests import file_digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import CHAOTIC_CATEGORIES, OCCLUSION_CATEGORIES
+from traps_pipeline.partitions import CHAOTIC_CATEGORIES, EXTENSION_CATEGORIES, OCCLUSION_CATEGORIES
 from traps_pipeline.scenes import families as package
 from traps_pipeline.scenes.independence import dependence
 from traps_pipeline.scenes.kit import Family
 
-CATEGORIES = {"occlusion": OCCLUSION_CATEGORIES, "chaotic": CHAOTIC_CATEGORIES}
+CATEGORIES = {"occlusion": OCCLUSION_CATEGORIES + EXTENSION_CATEGORIES, "chaotic": CHAOTIC_CATEGORIES}
 
 
 @cache

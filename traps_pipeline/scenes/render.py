@@ -14,6 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera
 from traps_pipeline.scenes.kit import PANEL_GROUP, REMOVED_GROUP
+from traps_pipeline.scenes.soft import flexes
 
 if TYPE_CHECKING:
     import mujoco
@@ -68,7 +69,7 @@ class Renderer:
         model.stat.extent = camera.extent
         model.stat.center[:] = camera.centre
         self._pixels = np.empty((self._height, self._width, 4), np.uint8)
-        self._model, self._data = model, mujoco.MjData(model)
+        self._model, self._data, self._soft = model, mujoco.MjData(model), flexes(model)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=2000)
@@ -102,20 +103,23 @@ class Renderer:
     def visible_pixels(
         self, qpos: Sequence[np.ndarray] | np.ndarray, geoms: Sequence[str], *, panel: bool = False
     ) -> np.ndarray:
-        """How many pixels (of the 480x360 frame, so quarters occur) each geom has in each frame, shape (F, G)."""
+        """How many pixels (of the 480x360 frame, so quarters occur) each geom or soft body has in each frame, shape
+        (F, G)."""
         import mujoco
 
-        ids = [self._model.geom(name).id for name in geoms]
-        counts = np.zeros((len(qpos), len(ids)))
+        kinds = (int(mujoco.mjtObj.mjOBJ_GEOM), int(mujoco.mjtObj.mjOBJ_FLEX))
+        things = [(kinds[self._is_soft(name)], self._number(name)) for name in geoms]
+        counts = np.zeros((len(qpos), len(things)))
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
         try:
             for i, row in enumerate(qpos):
                 rgba = self._draw(row, panel=panel, without=())
                 pixels = np.bincount((rgba.view("<u4") & 0xFFFFFF).ravel())  # a segment's id is its colour
-                drawn = {g.segid + 1: g.objid for g in self._scene.geoms[: self._scene.ngeom] if g.objtype == 5}
-                seen = {geom: pixels[id_] for id_, geom in drawn.items() if id_ < len(pixels)}
-                counts[i] = [seen.get(g, 0) / SUPERSAMPLE**2 for g in ids]
+                shapes = self._scene.geoms[: self._scene.ngeom]
+                drawn = {g.segid + 1: (g.objtype, g.objid) for g in shapes if g.objtype in kinds}
+                seen = {thing: pixels[id_] for id_, thing in drawn.items() if id_ < len(pixels)}
+                counts[i] = [seen.get(thing, 0) / SUPERSAMPLE**2 for thing in things]
         finally:
             flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
         return counts
@@ -126,10 +130,11 @@ class Renderer:
         option = mujoco.MjvOption()
         option.geomgroup[:] = 1
         option.geomgroup[PANEL_GROUP] = int(panel)
-        option.geomgroup[REMOVED_GROUP] = 0
-        groups = self._model.geom_group.copy()
+        option.geomgroup[REMOVED_GROUP] = option.flexgroup[REMOVED_GROUP] = 0
+        groups, soft_groups = self._model.geom_group.copy(), self._model.flex_group.copy()
         for name in without:
-            self._model.geom_group[self._model.geom(name).id] = REMOVED_GROUP
+            of = self._model.flex_group if self._is_soft(name) else self._model.geom_group
+            of[self._number(name)] = REMOVED_GROUP
         try:
             self._data.qpos[:] = qpos
             self._place()
@@ -138,16 +143,23 @@ class Renderer:
                 self._model, self._data, option, mujoco.MjvPerturb(), self._camera, everything, self._scene
             )
         finally:
-            self._model.geom_group[:] = groups
+            self._model.geom_group[:], self._model.flex_group[:] = groups, soft_groups
         viewport = mujoco.MjrRect(0, 0, self._width, self._height)
         mujoco.mjr_render(viewport, self._scene, self._context)
         return self._read()
+
+    def _is_soft(self, name: str) -> bool:
+        return name in self._soft
+
+    def _number(self, name: str) -> int:
+        """Of a geom, or of a soft body."""
+        return self._soft[name] if self._is_soft(name) else self._model.geom(name).id
 
     def _place(self) -> None:
         """Where everything is at the present qpos: all that drawing needs of mj_forward (no contacts, no dynamics)."""
         import mujoco
 
-        for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_tendon):
+        for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_flex, mujoco.mj_tendon):
             step(self._model, self._data)
 
     def _read(self) -> np.ndarray:

@@ -16,6 +16,7 @@ from traps_pipeline.scenes.outcome import Outcome, compile_scene, decisive_geoms
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.simulate import replay
+from traps_pipeline.scenes.soft import flexes
 from traps_pipeline.scenes.spec import SceneSpec
 
 if TYPE_CHECKING:
@@ -101,10 +102,7 @@ class World:
     @property
     def outcome_read(self) -> Outcome:
         """What the frames before the closing come to, by themselves: what there is to be read."""
-        shown = slice(0, self.open_frames)
-        whole = self.motion
-        positions, rotations = ({k: v[shown] for k, v in each.items()} for each in (whole.positions, whole.rotations))
-        return read_outcome(self.family, Motion(whole.times[shown], positions, rotations), self.params)
+        return read_outcome(self.family, self.motion.first(self.open_frames), self.params)
 
     @cached_property
     def resimulated(self) -> np.ndarray:
@@ -140,8 +138,8 @@ class World:
 
     @cached_property
     def geoms(self) -> tuple[str, ...]:
-        """Names of all geoms, in the order of the model."""
-        return tuple(self.model.geom(i).name for i in range(self.model.ngeom))
+        """Names of all geoms, in the order of the model, and of all soft bodies, which are drawn like one."""
+        return (*(self.model.geom(i).name for i in range(self.model.ngeom)), *flexes(self.model))
 
     @cached_property
     def void_pixels(self) -> np.ndarray:

@@ -253,11 +253,15 @@ class Stage:
         geom = add_ball(self.spec, name, (self.direction * at[0], at[1], at[2]), radius, colour, density=density)
         geom.friction = [sliding, 0.005, rolling]
         if thrown is not None:
-            self._velocity[name] = (self.direction * thrown[0], 0.0, thrown[1], 0.0, 0.0, 0.0)
+            self.throw(name, *thrown)
         elif speed:
             along = self.direction * speed
             self._velocity[name] = (along, 0.0, 0.0, 0.0, along / radius, 0.0)
         return geom
+
+    def throw(self, name: str, along: float, up: float) -> None:
+        """Let a free or soft body begin with speeds (m/s) along and up, without spin."""
+        self._velocity[name] = (self.direction * along, 0.0, up, 0.0, 0.0, 0.0)
 
     def free_box(
         self,

@@ -1,0 +1,168 @@
+"""A soft ball is tossed up and falls between two pairs of bars; the question is on which of them it gets stuck.
+
+Control: both pairs and the tray below are in view. Void: the panel stands before them.
+Hidden element: how far apart the bars are. No gap is as wide as the ball: through the wider ones it squeezes, on the
+narrow ones it stays. An extension: no part of the benchmark (docs/scenes.md, "Soft bodies").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import rounded
+from traps_pipeline.scenes.parts.outcome import Reading, still_from
+from traps_pipeline.scenes.parts.questions import colour_from, either, which_colour
+from traps_pipeline.scenes.parts.soft import soft_ball
+from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface
+from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
+from traps_pipeline.scenes.vision import at_rest, colour_mask
+from traps_pipeline.scenes.wording import choices_in
+
+FLOOR_M = 0.02  # thickness of the tray's floor
+WALL_M = 0.012
+DEPTH_M = 0.13  # half of the tray's depth
+BAR_M = 0.026  # radius of the bars
+PIECES = 6
+STILL_M = 0.015
+NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "white")
+
+
+@dataclass(frozen=True)
+class Params:
+    """passes: through how many pairs of bars the ball squeezes. wide, narrow: gaps as shares of the ball's diameter."""
+
+    ball_colour: str = PLAY()
+    upper_colour: str = PLAY()
+    lower_colour: str = PLAY()
+    tray_colour: str = PLAY()
+    cube_colour: str = PLAIN()
+    board_colour: str = PLAIN()
+    passes: int = hidden(0, 1, 2)
+    radius_m: float = between(0.072, 0.080)
+    young_pa: float = between(3500.0, 4500.0)
+    wide: float = between(0.84, 0.88)
+    narrow: float = between(0.40, 0.46)
+    upper_m: float = between(0.41, 0.45)  # height of the upper bars' middle
+    lower_m: float = between(0.21, 0.24)
+    half_m: float = between(0.26, 0.32)  # of the tray's width
+    release_m: float = between(0.82, 0.88)  # height of the ball's middle at first
+    toss_m_s: float = between(2.4, 2.6)
+    drift_m_s: float = between(-0.01, 0.01)
+    cube_side: int = one_of(-1, 1)
+    cube_m: float = between(0.12, 0.16)
+    azimuth_deg: float = in_front(-16, 16)
+    elevation_deg: float = between(-24, -16)
+
+    def gap_m(self, pair: int) -> float:
+        """From bar to bar of the upper pair (0) or the lower one (1)."""
+        return 2 * self.radius_m * (self.wide if pair < self.passes else self.narrow)
+
+
+def build(p: Params, physics: Physics) -> Scene:
+    """Two pairs of bars that reach out of a board, one above the other, the tray below, a cube to one side."""
+    stage = Stage(physics, surface=Surface(solref=SOFT))
+    end, high = p.half_m, p.upper_m + 0.10
+    outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
+    stage.tray("tray", (-end, end), deep, (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10, front=0.04)
+    stage.block("board", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.board_colour)
+    bars = []
+    for pair, (name, height, colour) in enumerate(
+        (("upper", p.upper_m, p.upper_colour), ("lower", p.lower_m, p.lower_colour))
+    ):
+        for side, sign in (("left", -1), ("right", 1)):
+            along = sign * (p.gap_m(pair) / 2 + BAR_M)
+            bar = stage.rod(f"{name}_{side}", (along, -0.9 * DEPTH_M, height), (along, DEPTH_M, height), BAR_M, colour)
+            bar.friction, bar.priority = [0.05, 0.005, 0.0001], 2
+            bars.append(bar.name)
+    half = p.cube_m / 2
+    beside = p.cube_side * (outer + 0.12 + half + (0.14 if p.cube_side > 0 else 0.0))
+    stage.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+    soft_ball(
+        stage,
+        "ball",
+        (0, 0, p.release_m),
+        p.radius_m,
+        p.ball_colour,
+        thrown=(p.drift_m_s, p.toss_m_s),
+        young=p.young_pa,
+        mass=0.4,
+        pieces=PIECES,
+    )
+    stage.mark("upper bars", (-0.6 * end, DEPTH_M), p.upper_colour)
+    stage.mark("lower bars", (0.0, DEPTH_M), p.lower_colour)
+    stage.mark("tray", (0.6 * end, DEPTH_M), p.tray_colour)
+    return stage.scene(
+        p,
+        decisive=["ball"],
+        hidden=bars,
+        cover=stage.box((-outer, outer), (-DEPTH_M, DEPTH_M + 0.08), (0, high + 0.02), left=0.01, right=0.06),
+        in_view=[
+            stage.box((-outer, outer), (-DEPTH_M, DEPTH_M + WALL_M), (0, high)),
+            stage.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+        ],
+        things=[f"{p.ball_colour} ball", f"{p.cube_colour} cube", f"{p.tray_colour} tray"],
+        also=["bar", "board"],
+        shown_by={"bar": ["bars"]},
+    )
+
+
+def outcome(motion: Motion, p: Params) -> Reading:
+    """What is nearest below the ball where it ends, from when it stays there: the upper bars, the lower ones or the
+    tray. The margin is how far its middle ends from the height halfway to where it would lie otherwise."""
+    height = motion.pos("ball")[:, 2]
+    lies = [p.upper_m + 0.9 * p.radius_m, p.lower_m + 0.9 * p.radius_m, FLOOR_M + p.radius_m]
+    halfway = [(lies[0] + lies[1]) / 2, (lies[1] + lies[2]) / 2]
+    colours = (p.upper_colour, p.lower_colour, p.tray_colour)
+    label = colours[sum(height[-1] < line for line in halfway)]
+    first = still_from(motion.vertices["ball"], within_m=STILL_M)
+    margin = min(abs(float(height[-1]) - line) for line in halfway)
+    return Reading([label if i >= first else None for i in range(len(height))], margin)
+
+
+def _height(frame: np.ndarray, colour: str) -> float | None:
+    """The mean row (px) of all that has a colour; None if there is little of it."""
+    rows = np.flatnonzero(colour_mask(frame, colour).any(axis=1))
+    return float(rows.mean()) if len(rows) >= 4 else None
+
+
+def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """Which of the colours is nearest to the underside of the resting ball; None while it is not to be seen."""
+    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
+    end = path[-1]
+    heights = {colour: _height(frames[-1], colour) for colour in choices_in(named["choices"])}
+    if end is None or not at_rest(path, tolerance_px=4) or None in heights.values():
+        return None
+    under = end.box[1] + end.box[3]
+    return min(heights, key=lambda colour: abs((heights[colour] or 0.0) - under))
+
+
+FAMILY = scene_family(
+    "soft_ball",
+    category="soft_bodies",
+    params=Params,
+    build=build,
+    outcome=outcome,
+    question=which_colour(
+        "What does the soft {ball} ball come to rest on, by its colour: {choices}?",
+        "On the bars of which colour, or in the tray of which colour, does the soft {ball} ball lie in the end: {choices}?",
+        "Where does the soft {ball} ball get stuck, or come to lie if it squeezes past all bars: {choices}?",
+        colours=lambda p: (p.upper_colour, p.lower_colour, p.tray_colour),
+        forms=["the {} one", "the {} ones", "on {}"],
+    ),
+    asides=[
+        colour_from("ball", "What colour is the soft ball: {choices}?", NAMED, unlike=("ball", "upper", "lower")),
+        either(
+            "At which side of the bars is the {cube} cube, left or right?",
+            ("left", "right"),
+            lambda p: "right" if p.cube_side > 0 else "left",
+        ),
+    ],
+    observe=observe,
+    min_margin_m=0.03,
+)

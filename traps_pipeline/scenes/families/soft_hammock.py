@@ -1,0 +1,137 @@
+"""A ball is tossed up and falls on a cloth that hangs between posts; the question is whether the cloth catches it.
+
+Control: cloth, posts and tray are in view. Void: the panel stands before them.
+Hidden element: the cloth, which is tied to the posts at both ends, so that the ball comes to lie in it, or at one end
+alone, so that it hangs down there and lets the ball pass. An extension: no part of the benchmark (docs/scenes.md, "Soft
+bodies").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import rounded
+from traps_pipeline.scenes.parts.outcome import Reading, lasting_from, still_from
+from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
+from traps_pipeline.scenes.parts.soft import hammock
+from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface
+from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
+from traps_pipeline.scenes.vision import at_rest, largest
+
+FLOOR_M = 0.02  # thickness of the tray's floor
+WALL_M = 0.012
+POST_M = 0.012  # radius of the posts
+CELLS = (8, 6)
+STILL_M = 0.02
+FELT = Surface(0.004, sliding=0.6, solref=SOFT)
+PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN = shuffled("wood", "grey", "white")
+
+
+@dataclass(frozen=True)
+class Params:
+    """direction: +1 has the cube on the right, and the cloth tied at the left where it is tied at one end."""
+
+    direction: int = one_of(-1, 1)
+    ball_colour: str = PLAY()
+    cloth_colour: str = PLAY()
+    tray_colour: str = PLAY()
+    cube_colour: str = PLAY()
+    board_colour: str = PLAIN()
+    post_colour: str = PLAIN()
+    ends_tied: int = hidden(1, 2)
+    radius_m: float = between(0.055, 0.065)
+    span_m: float = between(0.44, 0.50)  # from post to post
+    deep_m: float = between(0.26, 0.30)  # of the cloth
+    sag_m: float = between(0.06, 0.08)
+    post_m: float = between(0.38, 0.44)  # height at which the cloth is tied
+    release_m: float = between(0.80, 0.88)  # height of the ball's middle at first
+    toss_m_s: float = between(2.3, 2.6)
+    drift_m_s: float = between(-0.04, 0.04)
+    cube_m: float = between(0.12, 0.16)
+    azimuth_deg: float = in_front(-16, 16)
+    elevation_deg: float = between(-26, -16)
+
+
+def build(p: Params, physics: Physics) -> Scene:
+    """Two pairs of posts with the cloth between them, the tray below, a board behind, a cube to one side."""
+    stage = Stage(physics, p.direction, FELT)
+    end, side, high = p.span_m / 2 + 0.06, p.deep_m / 2 + 0.03, p.post_m + 0.02
+    outer, back = end + WALL_M, side + WALL_M
+    stage.tray("tray", (-end, end), (-side, side), (0, FLOOR_M), p.tray_colour, wall=WALL_M, near=0.10, far=0.10)
+    stage.block("tray_front", (-outer, outer), (-back, -side), (0, 0.06), p.tray_colour)
+    stage.block("board", (-outer, outer), (side, back), (0, high), p.board_colour)
+    for name, along in (("near", -1), ("far", 1)):
+        for where, across in (("front", -1), ("back", 1)):
+            at = (along * (p.span_m / 2 + POST_M), across * p.deep_m / 2, high / 2)
+            stage.post(f"post_{name}_{where}", at, POST_M, high / 2, p.post_colour)
+    half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2 + stage.ahead(0.10)
+    stage.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+
+    size, tied = (p.span_m, p.deep_m), (-1, 1) if p.ends_tied == 2 else (-1,)
+    hammock(stage, "cloth", (0, 0, p.post_m), size, CELLS, p.cloth_colour, sag=p.sag_m, tied=tied)
+    stage.ball("ball", (0, 0, p.release_m), p.radius_m, p.ball_colour, thrown=(p.drift_m_s, p.toss_m_s), density=350)
+    stage.mark("cloth", (0.55 * end, side), p.cloth_colour)
+    stage.mark("tray", (-0.55 * end, side), p.tray_colour)
+    return stage.scene(
+        p,
+        decisive=["ball"],
+        hidden=["cloth"],
+        cover=stage.box((-outer, outer), (-back, back + 0.06), (0, high + 0.02), left=0.01, right=0.05),
+        in_view=[
+            stage.box((-outer, outer), (-back, back), (0, high)),
+            stage.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+        ],
+        things=[f"{p.ball_colour} ball", f"{p.cube_colour} cube", f"{p.cloth_colour} cloth", f"{p.tray_colour} tray"],
+        also=["post", "board"],
+    )
+
+
+def outcome(motion: Motion, p: Params) -> Reading:
+    """'no' from when the ball is below half the height of the posts, 'yes' from when it stays over that where it ends.
+    The margin is how far its middle ends from that height."""
+    ball = motion.pos("ball")
+    over = ball[:, 2] - p.post_m / 2
+    first = lasting_from(over < 0) if over[-1] < 0 else still_from(ball, within_m=STILL_M)
+    label = "no" if over[-1] < 0 else "yes"
+    return Reading([label if i >= first else None for i in range(len(over))], float(abs(over[-1])))
+
+
+def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """Whether the ball, at rest, is far over the lower edge of the tray; None while it is not to be seen."""
+    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
+    tray, end = largest(frames[-1], named["tray"], 200), path[-1]
+    if end is None or tray is None or not at_rest(path, tolerance_px=4):
+        return None
+    return "yes" if end.y < tray.box[1] - 0.5 * end.box[3] else "no"
+
+
+FAMILY = scene_family(
+    "soft_hammock",
+    category="soft_bodies",
+    params=Params,
+    build=build,
+    outcome=outcome,
+    question=yes_no(
+        "Does the {cloth} cloth catch the {ball} ball before it gets to the {tray} tray, yes or no?",
+        "Is the {ball} ball lying in the {cloth} cloth, and not in the {tray} tray, in the end: yes or no?",
+        "Thrown up, is the {ball} ball caught by the {cloth} cloth above the {tray} tray: yes or no?",
+        yes=["yes it does", "it is caught", "the cloth catches it", "it lies in the cloth"],
+        no=["no it does not", "it is not caught", "it falls into the tray", "it lies in the tray"],
+    ),
+    asides=[
+        colour_of("ball", "What colour is the ball that flies up: {choices}?", ("ball", "tray", "cube")),
+        either(
+            "At which side of the picture is the {cube} cube, left or right?",
+            ("left", "right"),
+            lambda p: "right" if p.direction > 0 else "left",
+        ),
+    ],
+    observe=observe,
+    min_margin_m=0.05,
+)

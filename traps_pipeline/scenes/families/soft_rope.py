@@ -1,0 +1,139 @@
+"""A rope is tossed up and falls onto a peg; the question is whether it stays hanging there.
+
+Control: the peg in the board and the tray below are in view. Void: the panel stands before them.
+Hidden element: the peg, which sticks out of the board below the middle of the rope, where the rope comes to hang over
+it, or below one end, where the rope slides off into the tray. No part of the rope is seen any more when it meets the
+peg. An extension: no part of the benchmark (docs/scenes.md, "Soft bodies").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from traps_pipeline.scenes.kit import Motion, Physics, Scene
+from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.outcome import Reading, lasting_from, still_from
+from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
+from traps_pipeline.scenes.parts.soft import rope
+from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface
+from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
+from traps_pipeline.scenes.vision import at_rest, largest
+
+FLOOR_M = 0.02  # thickness of the tray's floor
+WALL_M = 0.012
+DEPTH_M = 0.10  # half of the tray's depth
+PEG_RADIUS_M = 0.022
+PEG_FROM_M = -0.07  # how far before the board the peg reaches
+STILL_M = 0.02
+PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+PLAIN = shuffled("wood", "grey", "white")
+
+
+@dataclass(frozen=True)
+class Params:
+    """direction: +1 has the cube on the right, and the peg off to the right where it is not below the middle."""
+
+    direction: int = one_of(-1, 1)
+    rope_colour: str = PLAY()
+    tray_colour: str = PLAY()
+    cube_colour: str = PLAY()
+    board_colour: str = PLAIN()
+    peg_colour: str = PLAIN()
+    peg_in_middle: bool = hidden(False, True)
+    length_m: float = between(0.66, 0.76)
+    radius_m: float = between(0.011, 0.0125)
+    peg_m: float = between(0.46, 0.54)  # height of the peg
+    off_m: float = between(0.25, 0.29)  # how far from the middle the peg is otherwise
+    release_m: float = between(0.88, 0.98)  # height of the rope at first
+    toss_m_s: float = between(2.4, 2.7)
+    drift_m_s: float = between(-0.02, 0.02)
+    cube_m: float = between(0.10, 0.14)
+    azimuth_deg: float = in_front(-16, 16)
+    elevation_deg: float = between(-24, -14)
+
+
+def build(p: Params, physics: Physics) -> Scene:
+    """A board with the peg in it, the tray before it, a cube to one side."""
+    stage = Stage(physics, p.direction)
+    end, high = p.length_m / 2 + 0.08, p.peg_m + 0.06
+    outer, deep = end + WALL_M, (-DEPTH_M, DEPTH_M)
+    floor = ((-end, end), deep, (0, FLOOR_M))
+    stage.tray("tray", *floor, p.tray_colour, wall=WALL_M, near=0.08, far=0.08, front=0.05, floor=Surface(solref=SOFT))
+    stage.block("board", (-outer, outer), (DEPTH_M, DEPTH_M + WALL_M), (0, high), p.board_colour)
+    along = 0.0 if p.peg_in_middle else p.off_m
+    peg = stage.rod("peg", (along, PEG_FROM_M, p.peg_m), (along, DEPTH_M, p.peg_m), PEG_RADIUS_M, p.peg_colour)
+    peg.friction, peg.priority = [0.4, 0.005, 0.0001], 2
+
+    half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2
+    stage.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
+    rope(
+        stage,
+        "rope",
+        (0, 0, p.release_m),
+        p.length_m,
+        p.radius_m,
+        p.rope_colour,
+        thrown=(p.drift_m_s, p.toss_m_s),
+    )
+    stage.mark("peg", (0.0, DEPTH_M), p.peg_colour)
+    stage.mark("tray", (-0.7 * end, DEPTH_M), p.tray_colour)
+    return stage.scene(
+        p,
+        decisive=["rope"],
+        hidden=["peg"],
+        cover=stage.box((-outer, outer), (-DEPTH_M, DEPTH_M + 0.06), (0, high + 0.02), left=0.01, right=0.04),
+        in_view=[
+            stage.box((-outer, outer), (-DEPTH_M, DEPTH_M + WALL_M), (0, high)),
+            stage.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
+        ],
+        things=[f"{p.rope_colour} rope", f"{p.cube_colour} cube", f"{p.tray_colour} tray"],
+        also=["peg", "board"],
+    )
+
+
+def outcome(motion: Motion, p: Params) -> Reading:
+    """'no' from when the whole rope is below half the height of the peg, 'yes' from when it stays over that where it
+    ends. The margin is how far its highest point ends from that height."""
+    rope = motion.vertices["rope"]
+    top = rope[:, :, 2].max(axis=1) - p.peg_m / 2
+    first = lasting_from(top < 0) if top[-1] < 0 else still_from(rope, within_m=STILL_M)
+    label = "no" if top[-1] < 0 else "yes"
+    return Reading([label if i >= first else None for i in range(len(top))], float(abs(top[-1])))
+
+
+def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """The rope, at rest, is tall and ends over the tray, or lies low in it; None while it is not to be seen."""
+    path = [largest(frame, named["rope"], 60) for frame in frames[-3:]]
+    end = path[-1]
+    if end is None or not at_rest(path, tolerance_px=4):
+        return None
+    return "yes" if end.box[3] > 0.5 * end.box[2] else "no"
+
+
+FAMILY = scene_family(
+    "soft_rope",
+    category="soft_bodies",
+    params=Params,
+    build=build,
+    outcome=outcome,
+    question=yes_no(
+        "Does the {rope} rope stay hanging over the peg above the {tray} tray, yes or no?",
+        "Thrown up, does the {rope} rope come to hang over the peg in the end: yes or no?",
+        "Is the {rope} rope hanging over the peg, and not lying in the {tray} tray, when it has come to rest: yes or no?",
+        yes=["yes it does", "it hangs over the peg", "the rope hangs over the peg", "it stays hanging"],
+        no=["no it does not", "it lies in the tray", "it slides off", "the rope falls into the tray"],
+    ),
+    asides=[
+        colour_of("rope", "What colour is the rope: {choices}?", ("rope", "tray", "cube")),
+        either(
+            "On which side of the picture does the {cube} cube stand, left or right?",
+            ("left", "right"),
+            lambda p: "right" if p.direction > 0 else "left",
+        ),
+    ],
+    observe=observe,
+    min_margin_m=0.08,
+)

@@ -1,0 +1,143 @@
+"""Soft bodies on a stage: a rope, a cloth and a ball that give way.
+
+Each is one of MuJoCo's flexes, by whose name it is called in the roles of a scene; its family reads it by
+`motion.vertices`. Places are those of `parts.stage`. Nothing of them collides with itself. They are integrated with
+MuJoCo's `discrete` integrator, the only one that takes their elasticity implicitly (docs/engineering-notes.md,
+"Physics"), and the air brakes them, or they would sway to the end of the clip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING, Any
+
+from traps_pipeline.scenes.kit import Vec3, rgba
+from traps_pipeline.scenes.parts.stage import Stage
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+def rope(
+    stage: Stage,
+    name: str,
+    middle: Vec3,
+    length: float,
+    radius: float,
+    colour: str,
+    *,
+    thrown: tuple[float, float],
+    mass: float = 0.15,
+    links: int = 24,
+    sliding: float = 0.6,
+    drag: float = 0.1,
+) -> mujoco.MjsFlex:
+    """A rope that lies straight along the way at the start and does not stretch. thrown: speeds along and up (m/s).
+    sliding: friction, no unit. drag: N s/m of each link."""
+    count, spacing = (links + 1, 1, 1), (length / links,) * 3
+    flex = _flex(stage, name, middle, colour, thrown, drag, dim=1, count=count, spacing=spacing, radius=radius, mass=mass)
+    flex.friction = [sliding, 0.005, 0.0001]
+    return flex
+
+
+def hammock(
+    stage: Stage,
+    name: str,
+    middle: Vec3,
+    size: tuple[float, float],
+    cells: tuple[int, int],
+    colour: str,
+    *,
+    sag: float,
+    tied: Collection[int],
+    thick: float = 0.006,
+    mass: float = 0.12,
+    sliding: float = 0.6,
+    drag: float = 0.1,
+) -> mujoco.MjsFlex:
+    """A cloth that hangs through between its ends and does not stretch; its corners are where it is tied.
+
+    middle: between its four corners. size, cells: along and across, in metres and in pieces. sag: how far (m) its
+    middle hangs below. tied: at which ends: -1 is the near one along the way, 1 the far one. thick: half of its
+    thickness (m). sliding, drag: as of a rope, for each corner of a piece.
+    """
+    import mujoco
+
+    count, spacing = (cells[0] + 1, cells[1] + 1, 1), (size[0] / cells[0], size[1] / cells[1], 3 * thick)
+    flex = _flex(stage, name, middle, colour, None, drag, dim=2, count=count, spacing=spacing, radius=thick, mass=mass)
+    flex.friction, flex.selfcollide = [sliding, 0.005, 0.0001], mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+    for body in _vertices(stage, name):
+        along, across = (2 * (float(body.pos[i]) - middle[i] * (stage.direction, 1)[i]) / size[i] for i in (0, 1))
+        body.pos[2] -= sag * (1 - along**2) * (1 - 0.4 * across**2)
+        at_corner = abs(along) > 1 - 1e-6 and abs(across) > 1 - 1e-6
+        if at_corner and round(along) * stage.direction in tied:
+            knot = stage.spec.add_equality(type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY)
+            knot.name1, knot.name2 = body.name, "world"
+    return flex
+
+
+def soft_ball(
+    stage: Stage,
+    name: str,
+    middle: Vec3,
+    radius: float,
+    colour: str,
+    *,
+    thrown: tuple[float, float],
+    young: float,
+    mass: float,
+    sliding: float = 0.3,
+    pieces: int = 6,
+) -> mujoco.MjsFlex:
+    """A ball that can be squeezed. young: its stiffness (Pa). pieces: of a diameter. It bends as one (quadratic)."""
+    skin = 0.004
+    spacing = (2 * (radius - skin) / pieces,) * 3
+    flex = _flex(
+        stage,
+        name,
+        middle,
+        colour,
+        thrown,
+        0.0,
+        type="ellipsoid",
+        dim=3,
+        dof="quadratic",
+        count=(pieces + 1,) * 3,
+        spacing=spacing,
+        radius=skin,
+        mass=mass,
+    )
+    flex.young, flex.poisson, flex.damping = young, 0.3, 0.01
+    flex.friction = [sliding, 0.005, 0.0001]
+    return flex
+
+
+def _flex(
+    stage: Stage,
+    name: str,
+    middle: Vec3,
+    colour: str,
+    thrown: tuple[float, float] | None,
+    drag: float,
+    *,
+    count: Sequence[int],
+    **shape: Any,
+) -> mujoco.MjsFlex:
+    import mujoco
+
+    stage.spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    stage.spec.option.viscosity = drag
+    ground = stage.spec.worldbody
+    at = [stage.direction * middle[0], middle[1], middle[2]]
+    shape = {"type": "grid", "equality": int(shape["dim"] < 3), **shape}
+    flex = ground.make_flex(name, count=list(count), pos=at, inertiabox=0.01, **shape)
+    flex.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_AUTO
+    flex.condim, flex.priority, flex.rgba = 3, 1, rgba(colour)
+    if thrown is not None:
+        stage.throw(name, *thrown)
+    return flex
+
+
+def _vertices(stage: Stage, name: str) -> list[mujoco.MjsBody]:
+    """The bodies that carry a rope or a cloth, one a vertex."""
+    return [body for body in stage.spec.worldbody.bodies if body.name.rpartition("_")[0] == name]

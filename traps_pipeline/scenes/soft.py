@@ -1,0 +1,53 @@
+"""Soft bodies (MuJoCo's flexes) of a compiled model: their names, what carries them, where they are.
+
+A soft body is named in the roles of a scene as any other body is. It has no pose: it is where its vertices are, which
+follow from the poses of the bodies that carry it, and it is drawn as a whole.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+def flexes(model: mujoco.MjModel) -> dict[str, int]:
+    """The number of each soft body, by its name, in the order of the model."""
+    import mujoco
+
+    return {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, i): i for i in range(model.nflex)}
+
+
+def carriers(model: mujoco.MjModel, flex: int) -> np.ndarray:
+    """Numbers of the bodies that carry a soft body: one a vertex, or the nodes of the cage around it."""
+    if model.flex_interp[flex]:
+        first, count, bodies = model.flex_nodeadr[flex], model.flex_nodenum[flex], model.flex_nodebodyid
+    else:
+        first, count, bodies = model.flex_vertadr[flex], model.flex_vertnum[flex], model.flex_vertbodyid
+    return bodies[int(first) : int(first) + int(count)]
+
+
+def is_carrier(model: mujoco.MjModel) -> np.ndarray:
+    """Whether each body is no thing of its own but carries a soft body, (nbody,) bool."""
+    found = np.zeros(model.nbody, bool)
+    for flex in range(model.nflex):
+        found[carriers(model, flex)] = True
+    return found
+
+
+def vertices(model: mujoco.MjModel, data: mujoco.MjData, flex: int) -> np.ndarray:
+    """Where the vertices of a soft body are (m), (V, 3), once the bodies' poses are computed."""
+    import mujoco
+
+    mujoco.mj_flex(model, data)
+    first = int(model.flex_vertadr[flex])
+    return data.flexvert_xpos[first : first + int(model.flex_vertnum[flex])]
+
+
+def elements(model: mujoco.MjModel, flex: int) -> np.ndarray:
+    """The vertices of each element of a soft body (two of a rope, three of a cloth, four of a solid), (E, 2 to 4)."""
+    corners, first = int(model.flex_dim[flex]) + 1, int(model.flex_elemdataadr[flex])
+    return model.flex_elem[first : first + corners * int(model.flex_elemnum[flex])].reshape(-1, corners)
