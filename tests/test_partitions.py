@@ -6,9 +6,11 @@ import pytest
 
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import (
+    ALL_CATEGORIES,
     CATEGORIES,
     CHAOTIC_CATEGORIES,
     DATASETS,
+    EXTENSION_CATEGORIES,
     OCCLUSION_CATEGORIES,
     Cell,
     Evaluation,
@@ -64,6 +66,12 @@ def test_an_id_that_would_break_keys_is_refused(slug: str) -> None:
 
 def test_a_category_belongs_to_its_taxonomys_two_datasets() -> None:
     assert (len(OCCLUSION_CATEGORIES), len(CHAOTIC_CATEGORIES), len(set(CATEGORIES))) == (8, 4, 12)
+
+
+def test_an_extension_is_no_category_of_the_benchmark_and_its_voids_are_those_of_a_panel() -> None:
+    assert not set(EXTENSION_CATEGORIES) & set(CATEGORIES)
+    assert (*CATEGORIES, *EXTENSION_CATEGORIES) == ALL_CATEGORIES
+    assert {datasets_of_category(name) for name in EXTENSION_CATEGORIES} == {("occlusion", "occlusion_ill_posed")}
     assert datasets_of_category("hidden") == ("occlusion", "occlusion_ill_posed")
     assert datasets_of_category("plinko") == ("chaotic", "chaotic_ill_posed")
     assert [taxonomy_of(d) for d in DATASETS] == ["occlusion", "occlusion", "chaotic", "chaotic"]

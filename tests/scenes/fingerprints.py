@@ -243,4 +243,4 @@ def freeze(names: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    freeze(sys.argv[1:] or family_names())
+    freeze(sys.argv[1:] or [name for name in family_names() if records_of(name)])

@@ -90,7 +90,7 @@ class Released:
 
 def load(scenario_id: str, folder: Path = RELEASED) -> Released:
     """A released scenario by id."""
-    spec = load_released()[scenario_id]
+    spec = load_released(folder)[scenario_id]
     path = folder / "trajectories" / f"{scenario_id}.npz"
     qpos = load_trajectory(path, spec.trajectory_sha256)
     return Released(spec, qpos, load_trajectory(path, spec.twin.trajectory_sha256, "twin"))

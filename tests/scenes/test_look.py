@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from tests.scenes.released import load
 from traps_pipeline.cli.benchmark import LOOKS
 from traps_pipeline.scenes.certify import certify
 from traps_pipeline.scenes.kit import params_to_dict
-from traps_pipeline.scenes.look import PANELS, PARTS, Look, look_of_draw
+from traps_pipeline.scenes.look import MATERIALS, PANELS, PARTS, Look, frame_size, look_of_draw
 from traps_pipeline.scenes.outcome import compile_scene, simulated
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.relook import with_look
@@ -49,6 +50,8 @@ def test_a_look_is_read_back_from_a_record_and_one_that_is_not_there_leaves_none
     [
         ({"floor_tones": ["chalk", "gold"]}, "no tone 'gold'; there are chalk"),
         ({"panel": "pink"}, "no panel 'pink'; there are navy"),
+        ({"material": "felt"}, "no material 'felt'; there are plain"),
+        ({"size": "4k"}, "no size '4k'; there are 360p, 720p"),
         ({"fog": 1.0}, "look: .*'fog'"),
     ],
 )
@@ -63,6 +66,8 @@ def test_a_draws_look_follows_from_its_number_and_varies_in_the_parts_that_are_n
     everything = look_of_draw(1, "bounce", 4, PARTS)
     assert everything == look_of_draw(1, "bounce", 4, PARTS) != look_of_draw(1, "bounce", 5, PARTS)
     assert look_of_draw(1, "bounce", 4, ("panel",)) in [Look(panel=name) for name in PANELS]
+    assert look_of_draw(1, "bounce", 4, ("material",)) in [Look(material=name) for name in MATERIALS]
+    assert {look_of_draw(1, "bounce", number, ("size",)) for number in range(20)} == {Look(size="720p")}
     floor = look_of_draw(1, "bounce", 4, ("floor",))
     assert floor is not None and floor.floor_pattern is not None
     assert replace(floor, **{f: getattr(Look(), f) for f in vars(floor) if f.startswith("floor_")}) == Look()
@@ -91,6 +96,47 @@ def test_the_floor_the_light_and_the_panel_are_seen() -> None:
     assert (red["floor"] != red["plain"]).any(axis=2).mean() > 0.3
 
 
+def test_a_panel_of_slats_or_tiles_has_thin_paler_lines_and_is_as_opaque() -> None:
+    case = load("bounce-0001")
+    assert case.panel is not None
+    shown = {}
+    for material in MATERIALS:
+        world = replace(
+            World.of_record(case.spec, case.qpos), params=replace(case.params, look=Look(material=material))
+        )
+        with world.renderer() as renderer:
+            (frame,) = renderer.frames(case.qpos[:1], panel=True)
+            assert renderer.visible_pixels(case.qpos[-1:], world.concealed, panel=True).sum() == 0
+        shown[material] = frame.astype(int).sum(axis=2)
+    paler = {name: (frame > shown["plain"] + 20).sum() for name, frame in shown.items()}
+    changed = (shown["tiles"] != shown["plain"]).any(axis=None) and (shown["tiles"] < shown["plain"] - 20).sum()
+    on_panel = (shown["plain"] < 200).sum()  # navy; the floor is pale
+    assert changed == 0  # lines are paler, and nothing else is darker
+    assert 0 == paler["plain"] < paler["slats"] < paler["tiles"] < 0.3 * on_panel
+
+
+def test_a_frame_of_720_lines_shows_the_same_scene_twice_as_fine_and_counts_the_same_pixels() -> None:
+    case = load("bounce-0001")
+    world = World.of_record(case.spec, case.qpos)
+    fine = replace(world, params=replace(case.params, look=Look(size="720p")))
+    with world.renderer() as renderer:
+        (coarse,) = renderer.frames(case.qpos[:1])
+        pixels = renderer.visible_pixels(case.qpos[:1], ["ball"])[0, 0]
+    for _ in range(2):  # the second renderer of the same model, too
+        with fine.renderer() as renderer:
+            (large,) = renderer.frames(case.qpos[:1])
+            assert renderer.visible_pixels(case.qpos[:1], ["ball"])[0, 0] == pytest.approx(pixels, rel=0.03)
+    assert large.shape == (720, 960, 3) and coarse.shape == (360, 480, 3)
+    halved = large.reshape(360, 2, 480, 2, 3).mean(axis=(1, 3))
+    assert abs(halved - coarse).mean() < 1.0  # levels of 255
+    assert frame_size(params_to_dict(fine.params)) == (960, 720) and frame_size(case.spec.params) == (480, 360)
+    assert case.family.observe is not None
+    frames = np.stack([large, large])
+    assert case.family.observe(frames, case.spec.question) == case.family.observe(
+        np.stack([cv2.resize(large, (480, 360), interpolation=cv2.INTER_AREA)] * 2), case.spec.question
+    )
+
+
 @pytest.mark.slow
 def test_a_record_under_another_floor_has_the_same_worlds_and_is_certified() -> None:
     case = load("plinko-0001")
@@ -107,11 +153,12 @@ def test_a_record_under_another_floor_has_the_same_worlds_and_is_certified() -> 
 
 @pytest.mark.slow
 def test_a_scene_is_drawn_and_certified_under_a_look(tmp_path: Path) -> None:
-    tally = sample_family("bounce", 1, 3, tmp_path, look=("floor", "panel"), workers=1)
-    assert load_tallies(tmp_path)["bounce"].look == tally.look == ["floor", "panel"]
-    found = try_draw(Draw("bounce", 3, tally.draws - 1, frozenset(), ("floor", "panel")))
+    parts = ("floor", "material", "panel", "size")
+    tally = sample_family("bounce", 1, 3, tmp_path, look=parts, workers=1)
+    assert load_tallies(tmp_path)["bounce"].look == tally.look == [*parts]
+    found = try_draw(Draw("bounce", 3, tally.draws - 1, frozenset(), parts))
     assert isinstance(found, Resolved)
-    look = look_of_draw(3, "bounce", tally.draws - 1, ("floor", "panel"))
+    look = look_of_draw(3, "bounce", tally.draws - 1, parts)
     params = get_family("bounce").params_from(found.spec.params)
     twin = get_family("bounce").params_from(found.spec.twin.params or {})
     assert params.look == twin.look == look

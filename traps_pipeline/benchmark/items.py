@@ -13,7 +13,7 @@ from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import BESIDE, ALL_CATEGORIES, SIDES, all_datasets_of, is_ill_posed
+from traps_pipeline.partitions import ALL_CATEGORIES, BESIDE, SIDES, all_datasets_of, is_ill_posed
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace

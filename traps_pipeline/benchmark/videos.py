@@ -10,9 +10,9 @@ from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajector
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.clips import Job, note_of, read_clip, render_pairs
 from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.scenes.look import frame_size
 from traps_pipeline.storage.workspace import Workspace
 
 CLIPS = ("control", "void", "twin")
@@ -48,7 +48,7 @@ def _job(workspace: Workspace, row: dict[str, Any]) -> Job:
 
 
 def _rows(workspace: Workspace, spec: dict[str, Any], job: Job, version: str) -> list[VideoRow]:
-    rows = []
+    rows, (width, height) = [], frame_size(job.spec.params)
     for side, path in zip(CLIPS, job.clips, strict=True):
         clip = read_clip(path)
         if clip is None:
@@ -63,8 +63,8 @@ def _rows(workspace: Workspace, spec: dict[str, Any], job: Job, version: str) ->
                 frames_sha256=clip.frames_sha256,
                 n_frames=clip.n_frames,
                 fps=clip.fps,
-                width=WIDTH,
-                height=HEIGHT,
+                width=width,
+                height=height,
                 duration_s=clip.duration_s,
                 size_bytes=clip.size_bytes,
                 scene_hash=spec["scene_hash"],

@@ -9,7 +9,15 @@ from pathlib import Path
 from traps_pipeline.cli.command import FAILED, OK, Commands, number, whole
 from traps_pipeline.errors import TrapsError
 
-LOOKS = ("floor", "light", "panel", "bystanders", "camera")  # `scenes.look.PARTS`, which takes long to import
+LOOKS = (
+    "floor",
+    "light",
+    "panel",
+    "bystanders",
+    "camera",
+    "material",
+    "size",
+)  # `scenes.look.PARTS`, which takes long to import
 
 
 def add(commands: Commands) -> None:

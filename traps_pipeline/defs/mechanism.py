@@ -49,13 +49,13 @@ from traps_pipeline.orchestration.wanted import PROBE_PROMPT, Wanted
 from traps_pipeline.partitions import (
     ANSWERABLE,
     DATASETS,
-    taxonomy_of_category,
     TIME_SWAPPED,
     Cell,
     Evaluation,
     Extraction,
     StatesCell,
     SteeringCell,
+    taxonomy_of_category,
 )
 from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made

@@ -20,6 +20,7 @@ from traps_pipeline.scenes import checks, ensemble
 from traps_pipeline.scenes.camera import in_frame
 from traps_pipeline.scenes.evidence import About, Certificate, Claim, Evidence, Judged, Number, Pair, VoidKind
 from traps_pipeline.scenes.kit import Family, Motion, Physics, Scene, flag_of
+from traps_pipeline.scenes.look import fineness
 from traps_pipeline.scenes.outcome import Outcome, Rejected, decisive_geoms, read_outcome
 from traps_pipeline.scenes.pace import EARLIEST_SHARE, settles_share
 from traps_pipeline.scenes.policies import POLICIES, fewest_within, last_of_all, shown_at_end
@@ -94,7 +95,8 @@ def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
 def futures_of(control: World, seed: int) -> ensemble.Futures:
     """The futures of a control by which a cut is chosen and certified."""
     first = earliest_cut(control.physics)
-    return ensemble.Futures(control, seed, first=first, alike_px=MAX_DEVIATION_PX, held_s=COMMITTED_BEFORE_END_S)
+    alike_px = MAX_DEVIATION_PX / fineness(control.params)
+    return ensemble.Futures(control, seed, first=first, alike_px=alike_px, held_s=COMMITTED_BEFORE_END_S)
 
 
 def stored_evidence(spec: SceneSpec) -> dict[str, Any]:
@@ -588,12 +590,13 @@ def _twin_of_cut(pair: Pair) -> Evidence:
     start, future = pair.futures.start(pair.rollout), pair.futures.rollout(pair.rollout)
     control, twin, cut = pair.control, pair.other_world, slice(0, pair.void_from)
     shown = slice(0, pair.void_from, control.frame_step)
+    apart_px = ensemble.deviation_px(control.model, control.camera, control.qpos[cut], twin.qpos[cut])
     with control.renderer() as renderer:
         frames = list(renderer.frames(control.qpos[shown]))
         _, largest = checks.differing_pixels(frames, renderer.frames(twin.qpos[shown]))
     return {
         "twin_answer": settled_answer(twin),
-        "twin_deviation_px": ensemble.deviation_px(control.model, control.camera, control.qpos[cut], twin.qpos[cut]),
+        "twin_deviation_px": apart_px * fineness(control.params),
         "twin_largest_difference": largest,
         "start_off": float(np.abs(start.astype(np.float32) - twin.qpos[0]).max()),
         "rebuilt": future.qpos is not None and np.array_equal(future.qpos, twin.qpos),

@@ -10,15 +10,20 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, make_dataclass, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.kit import COLOURS, READ, Scene, uniform
-from traps_pipeline.scenes.parts.floor import TONES, floors, lay
+from traps_pipeline.scenes.parts.floor import TEXELS, TONES, floors, lay
+from traps_pipeline.scenes.render import SUPERSAMPLE
+
+if TYPE_CHECKING:
+    import mujoco
 
 # What may vary, as `traps sample --look` names it.
-PARTS = ("floor", "light", "panel", "bystanders", "camera")
+PARTS = ("floor", "light", "panel", "bystanders", "camera", "material", "size")
 # Colours of the panel (sRGB): dark or dull, and none that a question names.
 PANELS: Mapping[str, tuple[float, float, float]] = {
     "navy": COLOURS["navy"],
@@ -27,6 +32,10 @@ PANELS: Mapping[str, tuple[float, float, float]] = {
     "petrol": (0.05, 0.26, 0.28),
     "umber": (0.30, 0.21, 0.14),
 }
+# What the panel is of, besides its colour: thin lines, paler by so much, at so many to the metre and so wide.
+MATERIALS = ("plain", "slats", "tiles")
+LINE_TONE, LINES_PER_M, LINE_SHARE = 1.6, 8.0, 0.08
+SIZES = {"360p": 1, "720p": 2}  # of a frame: how many times as fine as 480x360
 _FLOOR = floors()
 _FLOOR_FIELDS = ("floor_pattern", "floor_tones", "floor_repeat_m", "floor_turn_deg", "floor_shift_m")
 BEHIND_M = (0.25, 0.9)  # so far behind all that is shown a bystander stands: it hides nothing and shades nothing
@@ -38,7 +47,8 @@ class Look:
 
     floor_*: `parts.floor`. light_turn_deg: of the key light about the vertical; light: what its brightness is
     multiplied by, RGB. panel: a name of `PANELS`. bystanders: (across, behind, half width, half height) in metres, from
-    the middle of the back edge of what is shown, and a tone each. orbit_deg: camera, around and up.
+    the middle of the back edge of what is shown, and a tone each. orbit_deg: camera, around and up. material: of the
+    panel, of `MATERIALS`. size: of a frame, of `SIZES`.
     """
 
     floor_pattern: str | None = None
@@ -52,10 +62,12 @@ class Look:
     bystanders: tuple[tuple[float, ...], ...] = ()
     bystander_tones: tuple[str, ...] = ()
     orbit_deg: tuple[float, ...] = (0.0, 0.0)
+    material: str = "plain"
+    size: str = "360p"
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> Look:
-        """The look in a record's parameters. Raises ValueError for an unknown field, tone or panel."""
+        """The look in a record's parameters. Raises ValueError for an unknown field, tone, panel, material or size."""
         try:
             look = Look(**{name: _tuples(value) for name, value in record.items()})
         except TypeError as error:
@@ -65,6 +77,9 @@ class Look:
                 raise ValueError(f"look: no tone {name!r}; there are {', '.join(TONES)}")
         if look.panel not in (None, *PANELS):
             raise ValueError(f"look: no panel {look.panel!r}; there are {', '.join(PANELS)}")
+        for name, known in (("material", MATERIALS), ("size", SIZES)):
+            if getattr(look, name) not in known:
+                raise ValueError(f"look: no {name} {getattr(look, name)!r}; there are {', '.join(known)}")
         return look
 
 
@@ -95,6 +110,10 @@ def draw_look(rng: np.random.Generator, parts: Collection[str]) -> Look | None:
         drawn["bystander_tones"] = tuple(str(tone) for tone in rng.choice(list(TONES), len(places)))
     if "camera" in parts:
         drawn["orbit_deg"] = (uniform(rng, -8, 8), uniform(rng, -4, 4))
+    if "material" in parts:
+        drawn["material"] = str(rng.choice(MATERIALS))
+    if "size" in parts:
+        drawn["size"] = "720p"  # of all alike: a size that varied would be a cue
     return Look(**drawn)
 
 
@@ -114,10 +133,40 @@ def look_of(params: Any) -> Look | None:
     return getattr(params, "look", None)
 
 
-def panel_rgba(params: Any) -> list[float]:
-    """Colour of the cover panel."""
+def fineness(params: Any) -> int:
+    """How many times as fine as 480x360 the frames of a scene are."""
     look = look_of(params)
-    return [*PANELS["navy" if look is None or look.panel is None else look.panel], 1.0]
+    return 1 if look is None else SIZES[look.size]
+
+
+def frame_size(record: Mapping[str, Any]) -> tuple[int, int]:
+    """Width and height (px) of the clips of a record, from its parameters."""
+    look = record.get("look")
+    fine = 1 if look is None else SIZES[Look.from_record(look).size]
+    return WIDTH * fine, HEIGHT * fine
+
+
+def paint_panel(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, params: Any) -> None:
+    """Give the cover panel its colour and its material. What it is of is seen on it alone: it neither mirrors nor lets
+    anything through."""
+    import mujoco
+
+    look = look_of(params)
+    colour = PANELS["navy" if look is None or look.panel is None else look.panel]
+    geom.rgba = [*colour, 1.0]
+    if look is None or look.material == "plain":
+        return
+    down, right = np.mgrid[:TEXELS, :TEXELS] / TEXELS
+    line = (down < LINE_SHARE) | ((right < LINE_SHARE) & (look.material == "tiles"))
+    texture = spec.add_texture(name="panel", type=mujoco.mjtTexture.mjTEXTURE_2D)
+    texture.width = texture.height = TEXELS
+    texture.nchannel = 3
+    tone = np.where(line[..., None], np.minimum(1.0, LINE_TONE * np.array(colour) + 0.06), np.array(colour))
+    texture.data = np.rint(255 * tone).astype(np.uint8).tobytes()
+    material = spec.add_material(name="panel", specular=0.0, shininess=0.0, reflectance=0.0, rgba=[1, 1, 1, 1])
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "panel"
+    material.texuniform, material.texrepeat = True, [LINES_PER_M] * 2
+    geom.material, geom.rgba = "panel", [1, 1, 1, 1]
 
 
 def dressed(scene: Scene, look: Look | None) -> Scene:
@@ -128,6 +177,8 @@ def dressed(scene: Scene, look: Look | None) -> Scene:
         lay(scene.spec, SimpleNamespace(**{name: getattr(look, name) for name in _FLOOR_FIELDS}))
     _light(scene, look)
     _add_bystanders(scene, look)
+    drawn = SUPERSAMPLE * SIZES[look.size]
+    scene.spec.visual.global_.offwidth, scene.spec.visual.global_.offheight = WIDTH * drawn, HEIGHT * drawn
     around, up = look.orbit_deg
     view = scene.view
     return replace(

@@ -10,7 +10,7 @@ import numpy as np
 
 from traps_pipeline.scenes.camera import Panel
 from traps_pipeline.scenes.kit import PANEL_GROUP, Family, Motion, Physics, Scene, add_box
-from traps_pipeline.scenes.look import panel_rgba
+from traps_pipeline.scenes.look import paint_panel
 from traps_pipeline.scenes.simulate import simulate
 from traps_pipeline.scenes.soft import flexes
 
@@ -66,7 +66,7 @@ def compile_scene(
     scene = family.build(params, physics)
     if panel is not None:
         geom = add_box(scene.spec.worldbody, "cover_panel", panel.centre, panel.half, "navy")
-        geom.rgba = panel_rgba(params)
+        paint_panel(scene.spec, geom, params)
         half = np.radians(panel.yaw_deg) / 2
         geom.quat = [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))]
         geom.contype = geom.conaffinity = 0

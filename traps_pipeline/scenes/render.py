@@ -54,13 +54,15 @@ def gl_version() -> str:
 
 
 class Renderer:
-    """Draws one model from one camera. Use as a context manager; every frame is (360, 480, 3) uint8 RGB."""
+    """Draws one model from one camera. Use as a context manager; every frame is (360, 480, 3) uint8 RGB, or
+    (720, 960, 3) of a model whose look is as fine as that."""
 
     def __init__(self, model: mujoco.MjModel, camera: Camera) -> None:
         global _renderer_open
         if _renderer_open:
             raise RuntimeError("a Renderer is open in this process; close it before the next one")
-        self._width, self._height = WIDTH * SUPERSAMPLE, HEIGHT * SUPERSAMPLE
+        self._fine = max(1, model.vis.global_.offheight // (HEIGHT * SUPERSAMPLE))  # where a look says so
+        self._width, self._height = (side * SUPERSAMPLE * self._fine for side in (WIDTH, HEIGHT))
         _make_current(self._width, self._height)
         import mujoco
 
@@ -97,7 +99,7 @@ class Renderer:
 
         for row in qpos:
             raw = self._draw(row, panel=panel, without=without)
-            small = cv2.resize(raw, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+            small = cv2.resize(raw, (WIDTH * self._fine, HEIGHT * self._fine), interpolation=cv2.INTER_AREA)
             yield cv2.flip(cv2.cvtColor(small, cv2.COLOR_RGBA2RGB), 0)
 
     def visible_pixels(
@@ -119,7 +121,7 @@ class Renderer:
                 shapes = self._scene.geoms[: self._scene.ngeom]
                 drawn = {g.segid + 1: (g.objtype, g.objid) for g in shapes if g.objtype in kinds}
                 seen = {thing: pixels[id_] for id_, thing in drawn.items() if id_ < len(pixels)}
-                counts[i] = [seen.get(thing, 0) / SUPERSAMPLE**2 for thing in things]
+                counts[i] = [seen.get(thing, 0) / (SUPERSAMPLE * self._fine) ** 2 for thing in things]
         finally:
             flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
         return counts

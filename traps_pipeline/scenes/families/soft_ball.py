@@ -52,7 +52,7 @@ class Params:
     lower_m: float = between(0.21, 0.24)
     half_m: float = between(0.26, 0.32)  # of the tray's width
     release_m: float = between(0.82, 0.88)  # height of the ball's middle at first
-    toss_m_s: float = between(2.4, 2.6)
+    toss_m_s: float = between(2.6, 2.8)
     drift_m_s: float = between(-0.01, 0.01)
     cube_side: int = one_of(-1, 1)
     cube_m: float = between(0.12, 0.16)
@@ -150,7 +150,7 @@ FAMILY = scene_family(
     outcome=outcome,
     question=which_colour(
         "What does the soft {ball} ball come to rest on, by its colour: {choices}?",
-        "On the bars of which colour, or in the tray of which colour, does the soft {ball} ball lie in the end: {choices}?",
+        "On bars or in a tray of which colour does the soft {ball} ball lie in the end: {choices}?",
         "Where does the soft {ball} ball get stuck, or come to lie if it squeezes past all bars: {choices}?",
         colours=lambda p: (p.upper_colour, p.lower_colour, p.tray_colour),
         forms=["the {} one", "the {} ones", "on {}"],

@@ -51,7 +51,7 @@ class Params:
     sag_m: float = between(0.06, 0.08)
     post_m: float = between(0.38, 0.44)  # height at which the cloth is tied
     release_m: float = between(0.80, 0.88)  # height of the ball's middle at first
-    toss_m_s: float = between(2.3, 2.6)
+    toss_m_s: float = between(2.4, 2.7)
     drift_m_s: float = between(-0.04, 0.04)
     cube_m: float = between(0.12, 0.16)
     azimuth_deg: float = in_front(-16, 16)

@@ -122,7 +122,7 @@ FAMILY = scene_family(
     question=yes_no(
         "Does the {rope} rope stay hanging over the peg above the {tray} tray, yes or no?",
         "Thrown up, does the {rope} rope come to hang over the peg in the end: yes or no?",
-        "Is the {rope} rope hanging over the peg, and not lying in the {tray} tray, when it has come to rest: yes or no?",
+        "Is the {rope} rope hanging over the peg, and not lying in the {tray} tray, in the end: yes or no?",
         yes=["yes it does", "it hangs over the peg", "the rope hangs over the peg", "it stays hanging"],
         no=["no it does not", "it lies in the tray", "it slides off", "the rope falls into the tray"],
     ),

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.kit import Family, Motion, Physics, Reading, Scene
 from traps_pipeline.scenes.look import dressed, look_of, with_look
 from traps_pipeline.scenes.parts import vary
@@ -48,6 +50,8 @@ def scene_family(
         named = question.named_in(text)
         if named is None:
             return None
+        if frames.shape[1:3] != (HEIGHT, WIDTH):  # what an observer takes for large is so at this size
+            frames = np.stack([cv2.resize(frame, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for frame in frames])
         shown = before_panel(frames)  # what a panel covers at the end was seen before it came
         return observe(shown if twins is None else without_flags(shown), named)
 

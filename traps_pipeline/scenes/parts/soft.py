@@ -1,9 +1,9 @@
 """Soft bodies on a stage: a rope, a cloth and a ball that give way.
 
 Each is one of MuJoCo's flexes, by whose name it is called in the roles of a scene; its family reads it by
-`motion.vertices`. Places are those of `parts.stage`. Nothing of them collides with itself. They are integrated with
-MuJoCo's `discrete` integrator, the only one that takes their elasticity implicitly (docs/engineering-notes.md,
-"Physics"), and the air brakes them, or they would sway to the end of the clip.
+`motion.vertices`. Places are those of `parts.stage`. A scene with one is integrated with MuJoCo's `discrete`
+integrator, the only one that takes elasticity implicitly, and its air is thick enough to brake what is light, or a rope
+would sway to the end of the clip (docs/engineering-notes.md, "Physics").
 """
 
 from __future__ import annotations
@@ -32,10 +32,14 @@ def rope(
     sliding: float = 0.6,
     drag: float = 0.1,
 ) -> mujoco.MjsFlex:
-    """A rope that lies straight along the way at the start and does not stretch. thrown: speeds along and up (m/s).
-    sliding: friction, no unit. drag: N s/m of each link."""
+    """A rope that lies straight along the way at the start and does not stretch.
+
+    thrown: speeds along and up (m/s). links: of which it is made, each longer than the rope is thick. sliding:
+    friction, no unit. drag: viscosity of the air (Pa s).
+    """
     count, spacing = (links + 1, 1, 1), (length / links,) * 3
-    flex = _flex(stage, name, middle, colour, thrown, drag, dim=1, count=count, spacing=spacing, radius=radius, mass=mass)
+    shape = {"dim": 1, "spacing": spacing, "radius": radius, "mass": mass}
+    flex = _flex(stage, name, middle, colour, thrown, drag, count=count, **shape)
     flex.friction = [sliding, 0.005, 0.0001]
     return flex
 
@@ -59,7 +63,7 @@ def hammock(
 
     middle: between its four corners. size, cells: along and across, in metres and in pieces. sag: how far (m) its
     middle hangs below. tied: at which ends: -1 is the near one along the way, 1 the far one. thick: half of its
-    thickness (m). sliding, drag: as of a rope, for each corner of a piece.
+    thickness (m). sliding, drag: as of a rope.
     """
     import mujoco
 
