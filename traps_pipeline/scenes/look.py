@@ -167,6 +167,9 @@ def paint_panel(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, params: Any) -> None:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "panel"
     material.texuniform, material.texrepeat = True, [LINES_PER_M] * 2
     geom.material, geom.rgba = "panel", [1, 1, 1, 1]
+    wide, thick, tall = (float(half) for half in geom.size)  # a texture lies in a box's own x and y: stand it upright
+    cos, _, _, sin = (float(part) for part in geom.quat)
+    geom.size, geom.quat = [wide, tall, thick], [part / np.sqrt(2) for part in (cos, cos, sin, sin)]
 
 
 def dressed(scene: Scene, look: Look | None) -> Scene:

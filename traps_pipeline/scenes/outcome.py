@@ -66,9 +66,9 @@ def compile_scene(
     scene = family.build(params, physics)
     if panel is not None:
         geom = add_box(scene.spec.worldbody, "cover_panel", panel.centre, panel.half, "navy")
-        paint_panel(scene.spec, geom, params)
         half = np.radians(panel.yaw_deg) / 2
         geom.quat = [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))]
+        paint_panel(scene.spec, geom, params)
         geom.contype = geom.conaffinity = 0
         geom.group = PANEL_GROUP
     return scene.spec.compile(), scene
