@@ -50,7 +50,7 @@ class Params:
     narrow: float = between(0.40, 0.46)
     upper_m: float = between(0.41, 0.45)  # height of the upper bars' middle
     lower_m: float = between(0.21, 0.24)
-    half_m: float = between(0.26, 0.32)  # of the tray's width
+    half_m: float = between(0.30, 0.36)  # of the tray's width
     release_m: float = between(0.82, 0.88)  # height of the ball's middle at first
     toss_m_s: float = between(2.6, 2.8)
     drift_m_s: float = between(-0.01, 0.01)
@@ -94,8 +94,8 @@ def build(p: Params, physics: Physics) -> Scene:
         mass=0.4,
         pieces=PIECES,
     )
-    stage.mark("upper bars", (-0.6 * end, DEPTH_M), p.upper_colour)
-    stage.mark("lower bars", (0.0, DEPTH_M), p.lower_colour)
+    stage.mark("upper bars", (-0.95 * end, DEPTH_M), p.upper_colour)
+    stage.mark("lower bars", (-0.6 * end, DEPTH_M), p.lower_colour)
     stage.mark("tray", (0.6 * end, DEPTH_M), p.tray_colour)
     return stage.scene(
         p,

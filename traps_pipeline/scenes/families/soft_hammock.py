@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.observers import rounded
 from traps_pipeline.scenes.parts.outcome import Reading, lasting_from, still_from
 from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
 from traps_pipeline.scenes.parts.soft import hammock
-from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface
+from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, SOFT, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
 from traps_pipeline.scenes.vision import at_rest, largest
 
@@ -70,7 +70,7 @@ def build(p: Params, physics: Physics) -> Scene:
         for where, across in (("front", -1), ("back", 1)):
             at = (along * (p.span_m / 2 + POST_M), across * p.deep_m / 2, high / 2)
             stage.post(f"post_{name}_{where}", at, POST_M, high / 2, p.post_colour)
-    half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2 + stage.ahead(0.10)
+    half, beside = p.cube_m / 2, outer + 0.12 + p.cube_m / 2 + stage.ahead(0.22)
     stage.block("cube", (beside - half, beside + half), (-half, half), (0, p.cube_m), p.cube_colour)
 
     size, tied = (p.span_m, p.deep_m), (-1, 1) if p.ends_tied == 2 else (-1,)
@@ -82,7 +82,7 @@ def build(p: Params, physics: Physics) -> Scene:
         p,
         decisive=["ball"],
         hidden=["cloth"],
-        cover=stage.box((-outer, outer), (-back, back + 0.06), (0, high + 0.02), left=0.01, right=0.05),
+        cover=stage.box((-outer, outer), (-back, back + 0.06), (0, high + 0.02), left=0.01, right=SHADOW_RIGHT * high),
         in_view=[
             stage.box((-outer, outer), (-back, back), (0, high)),
             stage.box((beside - half, beside + half), (-half, half), (0, p.cube_m)),
