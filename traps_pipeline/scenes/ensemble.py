@@ -19,6 +19,7 @@ import numpy as np
 from traps_pipeline.scenes.camera import Camera
 from traps_pipeline.scenes.outcome import Rejected, last_run
 from traps_pipeline.scenes.simulate import initial_velocity, replay
+from traps_pipeline.scenes.soft import vertices
 from traps_pipeline.scenes.world import World
 
 if TYPE_CHECKING:
@@ -193,7 +194,8 @@ def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, se
 
 
 class _Silhouette:
-    """Pixels by which two poses are told apart: the corners of moving geoms' boxes, the outline of moving balls.
+    """Pixels by which two poses are told apart: the corners of moving geoms' boxes, the outline of moving balls, the
+    vertices of soft bodies.
 
     A ball's outline does not turn with the ball: its spin cannot be seen.
     """
@@ -222,4 +224,5 @@ class _Silhouette:
         rotation = data.geom_xmat[self._solids].reshape(-1, 3, 3)
         corners = np.einsum("gij,gkj->gki", rotation, self._corners) + data.geom_xpos[self._solids, None]
         outline = self._outline + data.geom_xpos[self._balls, None]
-        return self._camera.project(np.concatenate([corners.reshape(-1, 3), outline.reshape(-1, 3)]))
+        soft = [vertices(self._model, data, flex) for flex in range(self._model.nflex)]
+        return self._camera.project(np.concatenate([corners.reshape(-1, 3), outline.reshape(-1, 3), *soft]))
