@@ -149,9 +149,9 @@ FAMILY = scene_family(
     build=build,
     outcome=outcome,
     question=which_colour(
-        "What does the soft {ball} ball come to rest on, by its colour: {choices}?",
+        "The soft {ball} ball comes to rest on bars or in the tray: which colour has what it rests on, {choices}?",
         "On bars or in a tray of which colour does the soft {ball} ball lie in the end: {choices}?",
-        "Where does the soft {ball} ball get stuck, or come to lie if it squeezes past all bars: {choices}?",
+        "Which colour have the bars that stop the soft {ball} ball, or the tray if no bars do: {choices}?",
         colours=lambda p: (p.upper_colour, p.lower_colour, p.tray_colour),
         forms=["the {} one", "the {} ones", "on {}"],
     ),
