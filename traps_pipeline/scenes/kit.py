@@ -116,8 +116,7 @@ class Inventory:
 class Scene:
     """A built scene: the model description and the roles its parts play.
 
-    decisive: bodies (soft ones too) whose end state is the outcome; in frame throughout, invisible in an occlusion void
-        from hiding on.
+    decisive: bodies whose end state is the outcome; in frame throughout, invisible in an occlusion void from hiding on.
     hidden: geoms of the hidden element (occlusion), never visible in the void.
     cover: what the cover panel must hide: everything decisive from hiding on, and the hidden element (occlusion).
     stage: boxes that must lie in frame besides everything that moves (the outcome zone above all).
@@ -168,17 +167,11 @@ class Motion:
         return self.rotations[body]
 
     def places(self, body: str, beside_m: float) -> np.ndarray:
-        """By what a body is seen to move, (F, N, 3) m: its middle and points so far from it on its axes, or all
-        vertices of a soft body."""
+        """By what a body is seen to move, (F, N, 3) m: its middle and points beside it, or a soft body's vertices."""
         if body in self.vertices:
             return self.vertices[body]
         beside = np.pad(self.rot(body).swapaxes(1, 2), ((0, 0), (1, 0), (0, 0)))
         return self.pos(body)[:, None] + beside_m * beside
-
-    def first(self, frames: int) -> Motion:
-        """The same, of so many first frames."""
-        parts = ({k: v[:frames] for k, v in each.items()} for each in (self.positions, self.rotations, self.vertices))
-        return Motion(self.times[:frames], *parts)
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,9 @@ class World:
     @property
     def outcome_read(self) -> Outcome:
         """What the frames before the closing come to, by themselves: what there is to be read."""
-        return read_outcome(self.family, self.motion.first(self.open_frames), self.params)
+        shown, whole = slice(0, self.open_frames), self.motion
+        parts = ({k: v[shown] for k, v in each.items()} for each in (whole.positions, whole.rotations, whole.vertices))
+        return read_outcome(self.family, Motion(whole.times[shown], *parts), self.params)
 
     @cached_property
     def resimulated(self) -> np.ndarray:
