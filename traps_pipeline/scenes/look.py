@@ -180,8 +180,9 @@ def dressed(scene: Scene, look: Look | None) -> Scene:
         lay(scene.spec, SimpleNamespace(**{name: getattr(look, name) for name in _FLOOR_FIELDS}))
     _light(scene, look)
     _add_bystanders(scene, look)
-    drawn = SUPERSAMPLE * SIZES[look.size]
-    scene.spec.visual.global_.offwidth, scene.spec.visual.global_.offheight = WIDTH * drawn, HEIGHT * drawn
+    if SIZES[look.size] > 1:  # a renderer reads from the model how fine it draws
+        drawn = SUPERSAMPLE * SIZES[look.size]
+        scene.spec.visual.global_.offwidth, scene.spec.visual.global_.offheight = WIDTH * drawn, HEIGHT * drawn
     around, up = look.orbit_deg
     view = scene.view
     return replace(
