@@ -11,6 +11,7 @@ import pytest
 
 from tests.scenes.released import load
 from traps_pipeline.cli.benchmark import LOOKS
+from traps_pipeline.scenes.certificates import ABLATION, HIDDEN, TWIN_BEHIND_PANEL, pair_of
 from traps_pipeline.scenes.certify import certify
 from traps_pipeline.scenes.kit import params_to_dict
 from traps_pipeline.scenes.look import MATERIALS, PANELS, PARTS, Look, frame_size, look_of_draw
@@ -152,8 +153,24 @@ def test_a_record_under_another_floor_has_the_same_worlds_and_is_certified() -> 
 
 
 @pytest.mark.slow
+def test_a_panel_of_tiles_hides_the_worlds_at_720_lines_as_well() -> None:
+    case = load("bounce-0001")
+    pair = pair_of(case.spec, case.qpos, case.twin, frame_step=10)
+    look = Look(material="tiles", size="720p")
+    control, twin = (
+        replace(world, params=replace(world.params, look=look)) for world in (pair.control, pair.other_world)
+    )
+    found: dict[str, object] = {}
+    for certificate in (HIDDEN, ABLATION, TWIN_BEHIND_PANEL):
+        found |= certificate.measured(replace(pair, control=control, twin=twin))
+    assert (found["past_panel_px"], found["ablation_px"], found["twin_px"]) == (0, 0, 0)
+    assert found["hidden_alone"] and found["twin_answer"] == case.spec.twin.ground_truth
+    assert control.void_frames[0].shape == (720, 960, 3)
+
+
+@pytest.mark.slow
 def test_a_scene_is_drawn_and_certified_under_a_look(tmp_path: Path) -> None:
-    parts = ("floor", "material", "panel", "size")
+    parts = ("floor", "material", "panel")
     tally = sample_family("bounce", 1, 3, tmp_path, look=parts, workers=1)
     assert load_tallies(tmp_path)["bounce"].look == tally.look == [*parts]
     found = try_draw(Draw("bounce", 3, tally.draws - 1, frozenset(), parts))
