@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+from tests.conftest import ROOT
 from tests.scenes.released import SAMPLED, load
 from traps_pipeline.benchmark.composition import load_composition
 from traps_pipeline.benchmark.records import load_released
@@ -55,6 +58,27 @@ def test_a_soft_ball_that_is_thrown_falls_as_any_body_does() -> None:
     assert middle[:, 0] == pytest.approx(-0.2 - 0.5 * t, abs=2e-3)
     assert middle[:, 2] == pytest.approx(1.0 + 2.0 * t - 4.905 * t**2, abs=9.81 * 0.002 * 0.3)
     assert middle[:, 1] == pytest.approx(0.0, abs=1e-6)
+
+
+BUILD = """
+import sys
+from traps_pipeline.scenes.kit import Physics
+from traps_pipeline.scenes.parts.soft import soft_ball
+from traps_pipeline.scenes.parts.stage import Stage
+for radius in map(float, sys.argv[1:]):
+    stage = Stage(Physics())
+    soft_ball(stage, "ball", (0, 0, 1.0), radius, "red", thrown=(0.0, 0.0), young=4000.0, mass=0.4)
+    model = stage.spec.compile()
+print(model.body_mass.tobytes().hex(), model.flex_stiffness.tobytes().hex())
+"""
+
+
+def test_a_soft_ball_is_the_same_to_the_last_bit_whatever_a_process_built_before() -> None:
+    built = [
+        subprocess.run([sys.executable, "-c", BUILD, *radii], cwd=ROOT, capture_output=True, text=True, check=True)
+        for radii in (["0.0731"], ["0.0787", "0.0731"])
+    ]
+    assert built[0].stdout == built[1].stdout != ""
 
 
 def test_a_hammock_stays_where_it_is_tied_and_falls_where_it_is_not() -> None:

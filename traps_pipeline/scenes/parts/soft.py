@@ -9,6 +9,7 @@ would sway to the end of the clip (docs/engineering-notes.md, "Physics").
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.scenes.kit import Vec3, rgba
@@ -94,6 +95,7 @@ def soft_ball(
     pieces: int = 6,
 ) -> mujoco.MjsFlex:
     """A ball that can be squeezed. young: its stiffness (Pa). pieces: of a diameter. It bends as one (quadratic)."""
+    _settle(pieces)
     skin = 0.004
     spacing = (2 * (radius - skin) / pieces,) * 3
     flex = _flex(
@@ -114,6 +116,16 @@ def soft_ball(
     flex.young, flex.poisson, flex.damping = young, 0.3, 0.01
     flex.friction = [sliding, 0.005, 0.0001]
     return flex
+
+
+@cache
+def _settle(pieces: int) -> None:
+    """Make one ball that is always the same before a process makes its first: MuJoCo 4.0 takes the last bits of the
+    masses and stiffness of all later balls from the first one (docs/engineering-notes.md, "Physics")."""
+    import mujoco
+
+    ball: dict[str, Any] = {"type": "ellipsoid", "dim": 3, "dof": "quadratic", "count": [pieces + 1] * 3}
+    mujoco.MjSpec().worldbody.make_flex("ball", spacing=[0.02] * 3, radius=0.004, mass=0.4, inertiabox=0.01, **ball)
 
 
 def _flex(
