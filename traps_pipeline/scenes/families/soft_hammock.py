@@ -21,13 +21,14 @@ from traps_pipeline.scenes.parts.questions import colour_of, either, yes_no
 from traps_pipeline.scenes.parts.soft import hammock
 from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, SOFT, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, largest
+from traps_pipeline.scenes.vision import at_rest, colour_mask
 
 FLOOR_M = 0.02  # thickness of the tray's floor
 WALL_M = 0.012
 POST_M = 0.012  # radius of the posts
 CELLS = (8, 6)
 STILL_M = 0.02
+CLOTH_PX = 300  # of the cloth, for an observer
 FELT = Surface(0.004, sliding=0.6, solref=SOFT)
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 PLAIN = shuffled("wood", "grey", "white")
@@ -103,12 +104,14 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Whether the ball, at rest, is far over the lower edge of the tray; None while it is not to be seen."""
+    """Whether the cloth, once the ball is at rest, is wider than high: it hangs from both sides and holds it. None
+    while either is not to be seen."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    tray, end = largest(frames[-1], named["tray"], 200), path[-1]
-    if end is None or tray is None or not at_rest(path, tolerance_px=4):
+    rows, columns = np.nonzero(colour_mask(frames[-1], named["cloth"]))
+    if len(rows) < CLOTH_PX or not at_rest(path, tolerance_px=4):
         return None
-    return "yes" if end.y < tray.box[1] - 0.5 * end.box[3] else "no"
+    wide, high = (float(np.ptp(np.percentile(along, (1, 99)))) for along in (columns, rows))
+    return "yes" if wide > 1.2 * high else "no"
 
 
 FAMILY = scene_family(
