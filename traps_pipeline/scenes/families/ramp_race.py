@@ -150,11 +150,14 @@ def _higher_or_side(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, choices, p.colours[side])
 
 
+SETTLING_PX = 8.0  # so far a ball may still roll in the tray when a panel comes
+
+
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     """Which ball is first near the place where it rests in the end: the same part of the tray for both."""
     choices = choices_in(named["choices"])
     paths = [[compact(frame, colour) for frame in frames] for colour in choices]
-    if len(choices) != 2 or not all(at_rest(path) for path in paths):
+    if len(choices) != 2 or not all(at_rest(path, tolerance_px=SETTLING_PX) for path in paths):
         return None
     rates = [_progress(path) for path in paths]
     near_end = [int(np.argmax(rate > 0.9 * rate.max())) for rate in rates]
