@@ -6,9 +6,11 @@ import os
 import random
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pandas as pd
@@ -64,6 +66,30 @@ def test_kills_while_answering_and_voting_leave_the_same_tables_and_no_call_is_m
     for kind, wanted in (("answers", ANSWERS), ("votes", VOTES)):
         keys = [row["key"] for row in unasked.ledger_rows(kind)]
         assert len(keys) == len(set(keys)) == wanted
+    assert_same_tables(unasked.workspace, one_regime.workspace)
+
+
+def test_a_history_that_cannot_be_written_in_mid_evaluation_ends_the_run_and_loses_nothing(
+    unasked: Checkout, one_regime: Checkout
+) -> None:
+    """Dagster drops a step whose event it cannot store, in the middle of its calls."""
+    (history,) = (unasked.workspace / "dagster").rglob("runs/index.db")
+    of_answers = """WHEN NEW.dagster_event_type = 'ASSET_MATERIALIZATION' AND NEW.asset_key = '["responses"]'"""
+    with closing(sqlite3.connect(history)) as database:
+        database.execute(
+            f"CREATE TRIGGER full BEFORE INSERT ON event_logs {of_answers} "
+            "BEGIN SELECT RAISE(ABORT, 'database or disk is full'); END"
+        )
+        database.commit()
+        stopped = unasked.score(ONE_REGIME)
+        assert stopped.code == 1 and "database or disk is full" in stopped.err, stopped.err
+        database.execute("DROP TRIGGER full")
+        database.commit()
+    assert 0 < rows_written(unasked, "answers") < ANSWERS
+    finished = unasked.score(ONE_REGIME)
+    assert finished.code == 0, finished.err
+    keys = [row["key"] for row in unasked.ledger_rows("answers")]
+    assert len(keys) == len(set(keys)) == ANSWERS
     assert_same_tables(unasked.workspace, one_regime.workspace)
 
 

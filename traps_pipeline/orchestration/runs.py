@@ -18,6 +18,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Stage
 from traps_pipeline.orchestration.schemes import Scheme
+from traps_pipeline.orchestration.step import close_dropped
 
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
 Range = tuple[str | None, str | None]  # first and last key
@@ -129,6 +130,8 @@ def _execute(
         )
     except dg.DagsterExecutionInterruptedError:
         raise KeyboardInterrupt from None
+    finally:
+        close_dropped()
     failures = [event for event in result.all_events if event.is_step_failure]
     if any(error.cls_name in _INTERRUPTS for event in failures for error in _chain(event)):
         raise KeyboardInterrupt

@@ -9,7 +9,7 @@ raises with all that is missing.
 
 import hashlib
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, cast
 
@@ -39,6 +39,17 @@ SHOWN = 12  # unmade partitions named in an error
 # an output that is handed on, unless it carries this mark: observable sources that tell their own versions carry it.
 _TOLD_ALREADY = {"__source_asset_observation__": True}
 Event = dg.AssetMaterialization | dg.AssetCheckEvaluation | dg.MaterializeResult | dg.Output
+# Steps that have begun and not ended. Where Dagster cannot write an event down it drops a step in the middle, in a
+# reference cycle; the garbage collector would close it later, after the threads are gone that its calls in flight need,
+# and wait for them for ever. What is held here is closed by us instead.
+_BEGUN: list[Generator[Event, None, None]] = []
+
+
+def close_dropped() -> None:
+    """Close the steps of this process that were dropped in the middle: calls in flight come back and are stored, locks
+    are given back."""
+    while _BEGUN:
+        _BEGUN.pop().close()
 
 
 class Step:
@@ -53,6 +64,16 @@ class Step:
 
     def run(self) -> Iterator[Event]:
         """See the module."""
+        close_dropped()
+        events = self._events()
+        _BEGUN.append(events)
+        try:
+            yield from events
+        finally:
+            if events in _BEGUN:
+                _BEGUN.remove(events)
+
+    def _events(self) -> Generator[Event, None, None]:
         stage, name = self.stage, self.stage.name
         require_same_code(self.context.run.tags, self.workspace.study.name)
         lineage = Lineage(self.workspace, thorough=True)
