@@ -104,8 +104,9 @@ def stored_evidence(spec: SceneSpec) -> dict[str, Any]:
     evidence = spec.evidence | {"twin_answer": spec.twin.ground_truth}
     physics = Physics(**spec.physics)
     evidence |= _closes(spec.closes_frame, physics)
-    if "commit_s" in evidence:
-        evidence["settles_share"] = settles_share(round(evidence["commit_s"] * physics.fps), physics.n_frames)
+    if "commit_s" in spec.evidence:
+        commit_s: float = spec.evidence["commit_s"]
+        evidence["settles_share"] = settles_share(round(commit_s * physics.fps), physics.n_frames)
     if spec.void_kind == "truncation":
         evidence |= _cut_evidence(spec.void["cut_frame"], spec.physics["fps"])
     return evidence
