@@ -59,6 +59,14 @@ class Cluster:
     def start_node(self, name: str) -> None:
         self._start(name, f"--address=127.0.0.1:{self.port}", "--num-cpus=1")
 
+    def mend(self, *names: str) -> None:
+        """Start those again that are not whole, as an init system would: a node that was taken for dead ends itself."""
+        for name in ("head", *names):
+            if not any(b"/raylet" in Path(f"/proc/{pid}/cmdline").read_bytes() for pid in self.processes(name)):
+                print(f"{name} is no part of the cluster any more, and is started again", flush=True)
+                self.signal(name, signal.SIGKILL)
+                self.start_head() if name == "head" else self.start_node(name)
+
     def _start(self, name: str, *options: str) -> None:
         scratch = self.folder / name
         scratch.mkdir(exist_ok=True)

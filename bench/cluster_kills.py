@@ -283,6 +283,7 @@ def kill_each(
             for node in NODES:
                 cluster.start_node(node)
             for kind in kinds:
+                cluster.mend(*NODES)
                 print(f"{kind}: {KILLS[kind].__doc__} Load {os.getloadavg()[0]:.0f}.", flush=True)
                 environment = shared | {
                     "TRAPS_WORKSPACE": f"s3://lab/{kind}", "TRAPS_SCRATCH": str(folder / f"here-{kind}")
