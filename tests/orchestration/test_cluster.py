@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import threading
 import time
@@ -11,6 +12,7 @@ from typing import Any
 import dagster as dg
 import pytest
 import yaml
+from dagster._daemon.monitoring.run_monitoring import RESUME_RUN_LOG_MESSAGE
 
 from tests.postgres import Postgres
 from traps_pipeline.errors import TrapsError
@@ -18,6 +20,7 @@ from traps_pipeline.orchestration.cluster import RayRuns, dagster_yaml, require_
 from traps_pipeline.orchestration.runs import batches, broke_off
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, require_same_code
 from traps_pipeline.orchestration.schemes import CELL, DATASET, Scheme
+from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, end_if_resumed
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 
@@ -172,6 +175,19 @@ def test_a_run_that_says_why_it_failed_did_not_break_off(error: Exception) -> No
         assert run is not None
         failures = [event for event in result.all_events if event.is_step_failure]
         assert broke_off(run, failures) == isinstance(error, ConnectionError)
+
+
+def test_a_process_whose_run_was_resumed_elsewhere_ends_without_a_word(tmp_path: Path) -> None:
+    with dg.DagsterInstance.local_temp(str(tmp_path)) as instance:
+        run = instance.create_run_for_job(_nothing)
+        end_if_resumed(instance, run.run_id, 0)  # goes on: nobody has resumed it
+        instance.report_engine_event(RESUME_RUN_LOG_MESSAGE, run)
+        end_if_resumed(instance, run.run_id, 1)  # is the one that goes on with it
+        pid = os.fork()
+        if pid == 0:
+            end_if_resumed(instance, run.run_id, 0)
+            os._exit(0)
+        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == RESUMED_ELSEWHERE
 
 
 def dagster_yaml_of_history(variable: str) -> dict[str, Any]:

@@ -9,6 +9,7 @@ raises with all that is missing.
 
 import hashlib
 import json
+import os
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, cast
@@ -34,6 +35,8 @@ STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is th
 REACHED = "a budget is reached"  # in a check's metadata
 STILL = "still failing"  # in a check's metadata: of a partition that the run did not touch
 PREVIEWED = 5  # rows
+_ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process began with it
+RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another one goes on with
 SHOWN = 12  # unmade partitions named in an error
 # Dagster skips a step below one that hands on no output, and writes an event with one version for all partitions for
 # an output that is handed on, unless it carries this mark: observable sources that tell their own versions carry it.
@@ -59,6 +62,8 @@ class Step:
         self.stage, self.context, self.workspace = stage, context, workspace
         self.graph = the_graph()
         self.history = History(context.instance, self.graph)
+        if context.run_id not in _ATTEMPTS:
+            _ATTEMPTS[context.run_id] = context.instance.count_resume_run_attempts(context.run_id)
         self.unmade: dict[str | None, TrapsError] = {}
         self.failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}  # checks, with what is wrong
 
@@ -96,6 +101,8 @@ class Step:
             yield from self._checks(key, made)
             progress.current().partition(name, key or "", made.tally)
             yield self.history.event(stage, key, version, provenance, self._metadata(made))
+        if self.unmade:
+            end_if_resumed(self.context.instance, self.context.run_id, _ATTEMPTS[self.context.run_id])
         for key, error in self.unmade.items():
             reached = isinstance(error, BudgetReached)
             yield self._evaluation(CURRENT, key, {"not made": str(error), REACHED: reached})
@@ -248,6 +255,14 @@ class Step:
             more = [f"... and {len(shown) - SHOWN} more"] if len(shown) > SHOWN else []
             reached = any(e.metadata[REACHED].value for e in failed.values() if REACHED in e.metadata)
             raise (BudgetReached if reached else TrapsError)("\n".join([*shown[:SHOWN], *more]))
+
+
+def end_if_resumed(instance: dg.DagsterInstance, run_id: str, attempts: int) -> None:
+    """End this process where its run was resumed elsewhere since it had been resumed so many times: its host was
+    stopped and taken for dead. What it could not make another process makes, and it must not tell Dagster that the run
+    failed, which both of them are."""
+    if instance.count_resume_run_attempts(run_id) > attempts:
+        os._exit(RESUMED_ELSEWHERE)
 
 
 def to_make(
