@@ -305,6 +305,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("outcome", {"margin_m": 0.0}, "has a margin of 0.0000 m, below"),
     ("outcome", {"margin_m": float("nan")}, "has a margin of nan m, below"),
     ("pace", {"settles_share": 0.29}, "settles after 29% of the clip, 30% is wanted"),
+    ("pace", {"settles_share": 0.82}, "settles after 82% of the clip, 80% at most is wanted"),
     ("turns", {"turns_deg": 9.9}, "turns by 9.9 degrees, 10 wanted"),
     ("physics", {"simulated_answer": "teal"}, "simulated here, the scene ends in 'teal'"),
     ("physics", {"parted_m": 0.0051}, "parts from its trajectory at once"),

@@ -22,7 +22,7 @@ from traps_pipeline.scenes.evidence import About, Certificate, Claim, Evidence, 
 from traps_pipeline.scenes.kit import Family, Motion, Physics, Scene, flag_of
 from traps_pipeline.scenes.look import fineness
 from traps_pipeline.scenes.outcome import Outcome, Rejected, decisive_geoms, read_outcome
-from traps_pipeline.scenes.pace import EARLIEST_SHARE, settles_share
+from traps_pipeline.scenes.pace import EARLIEST_SHARE, LATEST_SHARE, out_of_pace, settles_share
 from traps_pipeline.scenes.policies import POLICIES, fewest_within, last_of_all, shown_at_end
 from traps_pipeline.scenes.simulate import swept_points
 from traps_pipeline.scenes.soft import flexes, is_carrier
@@ -167,14 +167,15 @@ def settled_answer(world: World) -> str | None:
 
 
 def _judge_pace(e: Evidence, claim: Claim) -> Judged:
-    if e["settles_share"] < EARLIEST_SHARE:
-        yield f"the outcome settles after {e['settles_share']:.0%} of the clip, {EARLIEST_SHARE:.0%} is wanted"
+    said = out_of_pace(e["settles_share"])
+    if said is not None:
+        yield said
 
 
 PACE = Certificate(
     name="pace",
     about="control",
-    promises=f"the outcome settles after {EARLIEST_SHARE:.0%} of the clip's frames or later",
+    promises=f"the outcome settles after {EARLIEST_SHARE:.0%} to {LATEST_SHARE:.0%} of the clip's frames",
     does_not_promise="",
     numbers=(Number("settles_share", kept=False),),
     measure=lambda pair: {"settles_share": settles_share(pair.control.outcome.commit_frame, len(pair.control.qpos))},

@@ -1,8 +1,8 @@
-"""How long a clip is: its outcome does not settle at its beginning, so that watching on were idle.
+"""How long a clip is: its outcome settles neither at its beginning, so that watching on were idle, nor at its very end.
 
 A scene is simulated for as long as its family says. Where the outcome settles early the clip ends earlier, void and
 control alike, so that its length tells nothing of the side. A clip is never longer than its family's: 25 frames of five
-a second are what models are shown.
+a second are what models are shown. So where the outcome settles too late the scene is drawn anew.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from traps_pipeline.scenes.kit import Physics
 from traps_pipeline.scenes.world import World
 
 EARLIEST_SHARE = 0.3  # of the clip's frames, before the outcome settles
+LATEST_SHARE = 0.8
 DRAWN_SHARE = 0.5  # in a clip that ends earlier the outcome settles after a share between the earliest and this
 FRAMES_AFTER = 16  # to see the outcome for a second, and a panel before it until the end
 
@@ -22,6 +23,15 @@ FRAMES_AFTER = 16  # to see the outcome for a second, and a panel before it unti
 def settles_share(commit_frame: int, n_frames: int) -> float:
     """After which share of a clip's frames its outcome settles."""
     return commit_frame / n_frames
+
+
+def out_of_pace(share: float) -> str | None:
+    """What is wrong with an outcome that settles after a share of a clip."""
+    if share < EARLIEST_SHARE:
+        return f"the outcome settles after {share:.0%} of the clip, {EARLIEST_SHARE:.0%} is wanted"
+    if share > LATEST_SHARE:
+        return f"the outcome settles after {share:.0%} of the clip, {LATEST_SHARE:.0%} at most is wanted"
+    return None
 
 
 def lengths(control: World, seed: int) -> list[int]:

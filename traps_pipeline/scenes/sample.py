@@ -23,6 +23,7 @@ from traps_pipeline.scenes.certificates import settled_outcome
 from traps_pipeline.scenes.kit import Family
 from traps_pipeline.scenes.look import look_of_draw
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, simulated
+from traps_pipeline.scenes.pace import LATEST_SHARE, out_of_pace, settles_share
 from traps_pipeline.scenes.registry import family_digest, fit_to_sample, get_family
 from traps_pipeline.scenes.resolve import Resolved, resolve
 from traps_pipeline.scenes.simulate import replay
@@ -266,4 +267,8 @@ def simulated_answer(family: Family, params: Any) -> str:
     """What the control of a draw shows: a second's work, so that a draw without a place costs no certificates."""
     model, scene = compile_scene(family, params, family.physics)
     qpos = simulated(model, scene, family.physics)
-    return settled_outcome(family, replay(model, qpos, family.physics), params).answer
+    outcome = settled_outcome(family, replay(model, qpos, family.physics), params)
+    share = settles_share(outcome.commit_frame, len(qpos))
+    if share > LATEST_SHARE:  # where it settles too early the clip will end earlier
+        raise Rejected(str(out_of_pace(share)))
+    return outcome.answer
