@@ -1,8 +1,9 @@
-"""Draws the README's two pictures: a moving pair, from clips of a study, and the finding, from the paper's numbers.
+"""Draws pictures of README and docs: a moving pair and two pairs on a sheet, from clips of a study, and the finding, from
+the paper's numbers.
 
     python tools/readme_pictures.py .workspaces/demo        # after `make demo`
 
-Writes docs/moving_pair.gif and docs/finding.png; the same clips and numbers give the same bytes.
+Writes docs/moving_pair.gif, docs/two_pairs.png and docs/finding.png; the same clips and numbers give the same bytes.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.report.contact_sheet import contact_sheet
 from traps_pipeline.report.figures.looks import family_colour, family_of
 from traps_pipeline.report.writing import INK, SOFT, figure_bytes, figure_style, new_figure
 from traps_pipeline.scenes.encode import decode
@@ -24,6 +26,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCENARIO, SHOWN_S = "hidden_drop-0001", 3.1  # then a panel closes the control
+ON_SHEET = ("tumbling_dice-0006", "domino_chain-0005")
 HOLD_MS = 2600  # the last frame, with the answers
 WIDTH, HEIGHT, HEAD, FOOT, GAP = 420, 315, 100, 62, 8  # px: a clip, the texts above and below it, between the clips
 MOST_BYTES = 1_500_000
@@ -98,13 +101,16 @@ def finding() -> bytes:
 
 
 def main() -> None:
-    """Draw both, from the workspace that the first argument names."""
+    """Draw all, from the workspace that the first argument names."""
     (root,) = map(Path, sys.argv[1:])
-    moving = moving_pair(Workspace.open(root))
+    workspace = Workspace.open(root)
+    moving = moving_pair(workspace)
     if len(moving) > MOST_BYTES:
         raise SystemExit(f"docs/moving_pair.gif has {len(moving)} bytes, more than {MOST_BYTES}; shorten SHOWN_S")
+    items = workspace.tables.read_all(ITEMS).query("scenario_id in @ON_SHEET and dataset in ('chaotic', 'occlusion')")
+    (DOCS / "two_pairs.png").write_bytes(contact_sheet(items, workspace.root))
     (DOCS / "finding.png").write_bytes(finding())
-    print(f"docs/moving_pair.gif: {len(moving)} bytes; docs/finding.png")
+    print(f"docs/moving_pair.gif: {len(moving)} bytes; docs/two_pairs.png, docs/finding.png")
 
 
 if __name__ == "__main__":

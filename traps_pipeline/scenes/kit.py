@@ -118,7 +118,8 @@ class Scene:
 
     decisive: bodies whose end state is the outcome; in frame throughout, invisible in an occlusion void from hiding on.
     hidden: geoms of the hidden element (occlusion), never visible in the void.
-    cover: what the cover panel must hide: everything decisive from hiding on, and the hidden element (occlusion).
+    cover: what the cover panel may hide: everything decisive from hiding on, and the hidden element (occlusion). It is
+        cut to what the twin needs.
     stage: boxes that must lie in frame besides everything that moves (the outcome zone above all).
     velocity: initial velocity of free bodies: linear (m/s, world) and angular (rad/s, body); of soft bodies linear.
     inventory: what a viewer can name.

@@ -1,5 +1,5 @@
-"""Giving released records what new draws of their family have: another floor, a control that a panel closes, or a clip
-that ends earlier.
+"""Giving released records what new draws of their family have: another floor, a control that a panel closes, a clip
+that ends earlier, or a panel that covers no more than it must.
 
 None moves anything, and a look may move neither camera nor panel. So a record with it is the one that `sample_family`
 would have drawn: the trajectory stays, or its beginning does, and what pixels say is measured again. Whoever uses it
@@ -18,7 +18,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_text
 from traps_pipeline.scenes.certificates import certificates_for, pair_of, stored_evidence
 from traps_pipeline.scenes.closing import closed, record_of
-from traps_pipeline.scenes.evidence import required
+from traps_pipeline.scenes.evidence import Pair, required
 from traps_pipeline.scenes.kit import Physics, params_to_dict
 from traps_pipeline.scenes.look import Look, look_of_draw
 from traps_pipeline.scenes.outcome import Rejected
@@ -27,6 +27,7 @@ from traps_pipeline.scenes.registry import family_digest, get_family
 from traps_pipeline.scenes.resolve import plain
 from traps_pipeline.scenes.sample import load_tallies, record_line, save_tallies
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory, trajectory_digest
+from traps_pipeline.scenes.trim import trimmed
 from traps_pipeline.scenes.workers import run_in_order
 
 STILL = ("floor", "light", "bystanders")  # parts of a look that move neither camera nor panel
@@ -67,6 +68,14 @@ def pace_family(
             qpos = load_trajectory(path, before.trajectory_sha256)
             twin = load_trajectory(path, before.twin.trajectory_sha256, "twin")
             save_trajectory(folder, before.scenario_id, qpos[:end], twin[:end])
+
+
+def trim_family(
+    released: Path, name: str, workers: int | None = None, report: Callable[[str], None] = lambda _: None
+) -> None:
+    """Cut the panels of all records of an occlusion family to what their twins need (`trim`), and measure everything
+    again. Raises TrapsError naming a record that is certified with none; nothing is written then."""
+    _rewrite(released, name, _cut, workers, report)
 
 
 _Job = tuple[SceneSpec, Path, int]
@@ -124,17 +133,38 @@ def _shortened(job: _Job) -> SceneSpec | str:
         physics = plain(asdict(with_length(Physics(**spec.physics), n_frames)))
         ends = {"physics": physics, "trajectory_sha256": trajectory_digest(control)}
         ends["twin"] = spec.twin.model_copy(update={"trajectory_sha256": trajectory_digest(other)})
-        pair = pair_of(whole.model_copy(update=ends), control, other)
-        certificates = certificates_for(spec.void_kind)
+        shorter = whole.model_copy(update=ends)
         try:
-            measured = required([c for c in certificates if c.name != "closing"], pair, {})
-            closing, evidence = closed(pair, spec.seed, measured)
+            return _measured(shorter, pair_of(shorter, control, other))
         except Rejected as rejected:
             found = str(rejected)
-            continue
-        kept = {name: value for each in certificates for name, value in each.kept(evidence).items()}
-        return whole.model_copy(update={**ends, "control": plain(record_of(closing)), "evidence": plain(kept)})
     return found
+
+
+def _cut(job: _Job) -> SceneSpec | str:
+    """A record whose panel covers what a new draw's does, or which certificate it loses."""
+    spec, folder, _ = job
+    path = folder / f"{spec.scenario_id}.npz"
+    qpos = load_trajectory(path, spec.trajectory_sha256)
+    twin = load_trajectory(path, spec.twin.trajectory_sha256, "twin")
+    found = "there is no panel"
+    for pair in trimmed(pair_of(spec.model_copy(update={"control": None}), qpos, twin)):
+        assert pair.control.panel is not None, "only a panel can be trimmed"
+        void = {"panel": asdict(pair.control.panel), "hidden_from_frame": pair.void_from}
+        try:
+            return _measured(spec.model_copy(update={"void": plain(void)}), pair)
+        except Rejected as rejected:
+            found = str(rejected)
+    return found
+
+
+def _measured(spec: SceneSpec, pair: Pair) -> SceneSpec:
+    """A record with all its evidence and how its control closes, from its pair as it is before. Raises Rejected."""
+    certificates = certificates_for(spec.void_kind)
+    measured = required([c for c in certificates if c.name != "closing"], pair, {})
+    closing, evidence = closed(pair, spec.seed, measured)
+    kept = {name: value for each in certificates for name, value in each.kept(evidence).items()}
+    return spec.model_copy(update={"control": plain(record_of(closing)), "evidence": plain(kept)})
 
 
 def _relooked(job: _Job) -> SceneSpec | str:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -30,6 +30,7 @@ from traps_pipeline.scenes.kit import Family, Physics, Wording, params_to_dict
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, simulated
 from traps_pipeline.scenes.pace import cut_to, lengths
 from traps_pipeline.scenes.spec import SceneSpec, Twin, trajectory_digest
+from traps_pipeline.scenes.trim import trimmed
 from traps_pipeline.scenes.world import World
 
 HOPELESS_SHARE = 0.9  # of the scouts; a scene whose true top share is 65 % looks like that less than once in 300 times
@@ -112,8 +113,7 @@ def _of_some_length(
             pair = Pair(control, claim, futures_of(control, seed))
             evidence = required(certificates_for(kind, "control"), pair, {})
             candidates = _cut_short(pair) if control.panel is None else _covered(pair)
-            evidence = required(certificates_for(kind, "void"), candidates[0], evidence)
-            pair, evidence = _with_certified_twin(candidates, kind, evidence)
+            pair, evidence = _with_certified_void(candidates, kind, evidence)
             return closed(pair, seed, evidence)
         except Rejected as failure:
             rejected = failure  # another length may do
@@ -128,35 +128,36 @@ def _control(family: Family, params: Any, physics: Physics) -> World:
     return World(family, params, physics, qpos, camera, panel, simulated=qpos)
 
 
-def _with_certified_twin(
-    candidates: Sequence[Pair], kind: VoidKind, so_far: Evidence
+def _with_certified_void(
+    candidates: Iterable[Pair], kind: VoidKind, so_far: Evidence
 ) -> tuple[Pair, Mapping[str, Any]]:
-    """The first of some pairs, which differ in their twin, whose twin is certified. Raises Rejected if none is."""
+    """The first of some pairs, which differ in twin and panel, whose void and twin are certified. Raises Rejected if
+    none is."""
     rejected = Rejected("there is no twin")
     for pair in candidates:
         try:
-            evidence = required(certificates_for(kind, "twin"), pair, so_far)
+            evidence = required(certificates_for(kind, "void", "twin"), pair, so_far)
             if kind == "occluder":
                 _reject_if_unlike_when_drawn_first(pair)
             return pair, evidence
         except Rejected as failure:
-            rejected = failure  # the next one may be alike
+            rejected = failure  # the next one may hide more, or be alike
     raise rejected
 
 
 # --- occlusion --------------------------------------------------------------------------------------------------------
 
 
-def _covered(pair: Pair) -> list[Pair]:
-    """The pair with its void, once for each other world that may be its twin."""
+def _covered(pair: Pair) -> Iterator[Pair]:
+    """The pair with its void, for each other world that may be its twin, behind the panels that this twin may do with.
+    Raises Rejected if there is no other world."""
     worlds = _other_worlds(pair.control)
     if not worlds:
         raise Rejected("no other hidden element gives another outcome")
-    frame = pair.control.past_panel.hidden_from()
-    return [_with_twin(pair, frame, world) for world in worlds]
+    return (shown for world in worlds for shown in trimmed(_with_twin(pair, None, world)))
 
 
-def _with_twin(pair: Pair, frame: int, twin: World) -> Pair:
+def _with_twin(pair: Pair, frame: int | None, twin: World) -> Pair:
     claim = replace(pair.claim, twin_answer=twin.outcome.label)
     return replace(pair, claim=claim, void_frame=frame, twin=twin)
 

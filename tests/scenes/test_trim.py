@@ -1,0 +1,76 @@
+"""A panel covers what its twin needs and no more."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes.released import load
+from traps_pipeline.scenes import relook
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel, fit_shot
+from traps_pipeline.scenes.certificates import TWIN_BEHIND_PANEL, pair_of, shown_points
+from traps_pipeline.scenes.evidence import Pair
+from traps_pipeline.scenes.outcome import compile_scene
+from traps_pipeline.scenes.spec import save_trajectory
+from traps_pipeline.scenes.trim import cut_to, must_hide, trimmed
+
+RACE = "hidden_race-0001"
+# From 2 m away, half a metre up, along y; 180 pixels are a metre where a panel stands 1 m away.
+CAMERA = Camera((0.0, 0.0, 0.5), 2.0, 90.0, 0.0, 90.0, 1.0, (0.0, 0.0, 0.5))
+PANEL = Panel((0.0, -0.9, 0.6), (1.2, 0.1, 0.6), 0.0)  # its front is at y = -1
+
+
+def pixels(rows: slice, columns: slice) -> np.ndarray:
+    found = np.zeros((HEIGHT, WIDTH), bool)
+    found[rows, columns] = True
+    return found
+
+
+def pair(scenario_id: str) -> Pair:
+    case = load(scenario_id)
+    return pair_of(case.spec.model_copy(update={"control": None}), case.qpos, case.twin)
+
+
+def test_a_panel_is_cut_to_the_pixels_that_it_must_hide_and_stands_on_the_floor() -> None:
+    # Columns 240 to 330 are the half metre to the right of the middle; row 144 is 0.2 m above the eye.
+    cut = cut_to(PANEL, CAMERA, pixels(slice(144, 200), slice(240, 330)), 0)
+    assert cut.half == pytest.approx((0.25, 0.1, 0.35), abs=1e-6)
+    assert cut.centre == pytest.approx((0.25, -0.9, 0.35), abs=1e-6)
+    wider = cut_to(PANEL, CAMERA, pixels(slice(144, 200), slice(240, 330)), 9)  # 0.05 m on each side
+    assert wider.half == pytest.approx((0.3, 0.1, 0.375), abs=1e-6)
+
+
+def test_a_panel_is_never_larger_than_it_was() -> None:
+    everything = pixels(slice(None), slice(None))
+    assert cut_to(PANEL, CAMERA, everything, 9) == PANEL
+    assert cut_to(PANEL, CAMERA, ~everything, 3) == PANEL
+
+
+@pytest.mark.slow
+def test_a_released_panel_covers_what_its_pair_needs_and_a_smaller_one_shows_the_twin() -> None:
+    released = pair(RACE)
+    panel, needed = released.control.panel, must_hide(released)
+    assert panel is not None
+    assert cut_to(panel, released.control.camera, needed, 3) == panel
+    less = cut_to(panel, released.control.camera, needed, -6)
+    control, twin = (replace(world, panel=less) for world in (released.control, released.other_world))
+    shown = replace(released, control=control, twin=twin)
+    assert "the twin's void differs" in str(TWIN_BEHIND_PANEL.failure(TWIN_BEHIND_PANEL.measured(shown), shown.claim))
+
+
+@pytest.mark.slow
+def test_a_record_whose_panel_covers_all_that_its_family_names_is_cut_to_the_released_one(tmp_path: Path) -> None:
+    case = load(RACE)
+    model, scene = compile_scene(case.family, case.params, case.family.physics)
+    camera, panel = fit_shot(scene.view, shown_points(model, scene, case.qpos), scene.cover)
+    assert panel is not None
+    assert asdict(camera) == asdict(Camera.from_record(case.spec.camera))
+    generous = case.spec.model_copy(update={"void": {"panel": asdict(panel), "hidden_from_frame": 0}, "evidence": {}})
+    save_trajectory(tmp_path, RACE, case.qpos, case.twin)
+    assert relook._cut((generous, tmp_path, 1)) == case.spec
+    cut = next(trimmed(pair_of(generous.model_copy(update={"control": None}), case.qpos, case.twin))).control.panel
+    assert cut is not None
+    assert cut.half[0] < panel.half[0] / 1.5
