@@ -1,5 +1,5 @@
-"""Draws pictures of README and docs: a moving pair and two pairs on a sheet, from clips of a study, and the finding, from
-the paper's numbers.
+"""Draws pictures of README and docs: a moving pair and two pairs on a sheet, from clips of a study, and the finding,
+from the paper's numbers.
 
     python tools/readme_pictures.py .workspaces/demo        # after `make demo`
 

@@ -93,8 +93,9 @@ def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int 
 def before_panel(frames: np.ndarray) -> np.ndarray:
     """The frames before a panel comes that stands to the end of the clip; all of them if none comes.
 
-    A panel comes in one step: a large region turns to one colour, which is not that of what is around it, and stays as
-    it is. What stands from the first frame on does not come; where a panel goes, the scene goes on.
+    A panel comes in one step: a large region turns to one colour (but for its shadow), which is not that of what is
+    around it, and stays as it is. What stands from the first frame on does not come; where a panel goes, the scene goes
+    on.
     """
     for at in range(1, len(frames)):
         changed = _apart(frames[at], frames[at - 1]) > CHANGED
@@ -108,7 +109,7 @@ def before_panel(frames: np.ndarray) -> np.ndarray:
         colour = np.median(frames[at][region], axis=0).astype(np.uint8)
         even, beside = ((_apart(frames[at][part], colour) <= ALIKE).mean() for part in (region, around))
         stays = (_apart(frames[-1][region], frames[at][region]) <= ALIKE).mean()
-        if sizes.max() >= PANEL_PX and even > 0.8 and beside < 0.3 and stays > 0.9:
+        if sizes.max() >= PANEL_PX and even > 0.7 and beside < 0.3 and stays > 0.9:
             return frames[:at]
     return frames
 
