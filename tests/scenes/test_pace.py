@@ -1,5 +1,5 @@
-"""A clip ends early enough that its outcome settles after 30 % of it or later, control and void alike, and is drawn so that
-it settles after 80 % or earlier; the numbers of frames are counted by hand for 50 frames at 10 a second."""
+"""A clip ends early enough that its outcome settles after 30 % of it or later, control and void alike, and is drawn so
+that it settles after 80 % or earlier; the numbers of frames are counted by hand for 50 frames at 10 a second."""
 
 from __future__ import annotations
 

@@ -91,9 +91,9 @@ def test_a_panel_of_another_look_hides_as_much_and_one_that_lets_light_through_d
     assert grey.evidence["twin_px"] == 0 and len(grey.frames) == len(bounce.control_frames)
     assert largest(grey.frames[0], "navy", 1000) is None  # the cue of the panel rule is gone
     assert grey.evidence["contrast"] < 30  # against 65 of the pair's own panel, which is larger here
-    small = variations.VARIATIONS["panel_small"].film(bounce)
-    assert small.evidence["wide"] in variations.SMALLER
-    assert small.evidence["panel_px"] < grey.evidence["panel_px"]
+    large = variations.VARIATIONS["panel_large"].film(bounce)
+    assert large.evidence["wide"] == variations.WIDER
+    assert large.evidence["panel_px"] > grey.evidence["panel_px"]
     sheer = variations.VARIATIONS["panel_alpha_50"].film(bounce)
     assert sheer.evidence["seen_through_px"] >= SEEN_PX and sheer.evidence["levels"] >= NOTICED
     assert sides_of("panel_alpha_50") == ("control",) and "panel_alpha_50" in PANEL_DOSES

@@ -31,7 +31,6 @@ from traps_pipeline.scenes.world import World
 
 NOTICED = 8  # levels of 255 by which a channel must differ for a pixel to count as seen through a panel
 WIDER = 1.4  # by which the large panel is wider: a higher one would hide the flags of what the question names
-SMALLER = (0.7, 0.8, 0.9, 0.95)  # by which the small panel may be, the smallest first
 GREY, MAGENTA = (0.55, 0.55, 0.57), (1.0, 0.0, 1.0)  # a colour near the floor's; one that nothing in any scene has
 END_S = 0.5  # of the control's end, in which frames shown later must show the outcome
 PALETTE = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")  # colours that may be offered as answers
@@ -157,16 +156,6 @@ def _large(scenario: Scenario) -> Take:
     return _void_with(scenario, Look(wide=WIDER))
 
 
-def _small(scenario: Scenario) -> Take:
-    reason = ""
-    for scale in SMALLER:
-        try:
-            return _void_with(scenario, Look(wide=scale, high=scale))
-        except Rejected as why:
-            reason = str(why)
-    raise Rejected(f"no smaller panel hides the outcome (at {SMALLER[-1]:g} of its size: {reason})")
-
-
 def _sheer(alpha: float) -> Callable[[Scenario], Take]:
     def film(scenario: Scenario) -> Take:
         """A panel that lets light through, where it lets the outcome through: what tells the two worlds apart is seen
@@ -230,7 +219,6 @@ _ALPHAS = {name: int(name.removeprefix("panel_alpha_")) / 100 for name in PANEL_
 _CHANGES: Mapping[str, str] = {
     "panel_grey": "the panel is grey, near the floor's colour",
     "panel_magenta": "the panel is magenta, which nothing in any scene is",
-    "panel_small": f"the panel is as small as hides the outcome, {SMALLER[0]:g} to {SMALLER[-1]:g} of its size",
     "panel_large": f"the panel is {WIDER:g} times as wide",
     "panel_alpha_95": f"the panel has alpha {_FAINT:g}",
     "schema_answer": 'the prompt asks for the object `{"final_answer"}`',
@@ -242,7 +230,6 @@ _CHANGES: Mapping[str, str] = {
 }
 _FILMED: Mapping[str, Callable[[Scenario], Take]] = {
     **{name: _coloured(colour) for name, colour in _COLOURED.items()},
-    "panel_small": _small,
     "panel_large": _large,
     "panel_alpha_95": lambda scenario: _void_with(scenario, Look(alpha=_FAINT)),
 }
