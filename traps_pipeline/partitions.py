@@ -268,7 +268,8 @@ class SteeringCell(Cell):
         """Inverse of `key`. Raises ValueError."""
         dataset, _, run = key.partition("|")
         parts = run.split("__")
-        if dataset not in DATASETS or len(parts) != 3 or not {parts[1], parts[2]} <= set(VQA_PROMPTS):
+        # A graph has a key of each dataset of its study, arms too; only those of the pairs are ever wanted.
+        if dataset not in (*DATASETS, *BESIDE) or len(parts) != 3 or not {parts[1], parts[2]} <= set(VQA_PROMPTS):
             raise ValueError(
                 f"steering key {key!r} is not dataset|model__directions__regime with regimes of {VQA_PROMPTS}"
             )
