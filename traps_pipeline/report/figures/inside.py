@@ -121,7 +121,7 @@ def _arrows(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
     points = pd.DataFrame({"acc": [*rows["acc"], *rows["plain_acc"]], "j": [*rows["j"], *rows["plain_j"]]})
     frame_plane(ax, points, "Acc, overall")
     for row in rows.to_dict("records"):
-        start, end = (row["plain_acc"], row["plain_j"]), (row["acc"], row["j"])
+        start, end = (row["plain_j"], row["plain_acc"]), (row["j"], row["acc"])
         arrow(ax, start, end, colour[row["features"]])
         ax.scatter(*end, s=16, color=colour[row["features"]], zorder=4, clip_on=False)
         ax.scatter(*start, s=22, facecolors="white", edgecolors=INK, linewidths=0.9, zorder=5, clip_on=False)
