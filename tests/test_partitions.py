@@ -7,6 +7,7 @@ import pytest
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import (
     ALL_CATEGORIES,
+    BESIDE,
     CATEGORIES,
     CHAOTIC_CATEGORIES,
     DATASETS,
@@ -14,6 +15,7 @@ from traps_pipeline.partitions import (
     OCCLUSION_CATEGORIES,
     Cell,
     Evaluation,
+    SteeringCell,
     check_slug,
     datasets_of_category,
     is_ill_posed,
@@ -29,6 +31,13 @@ def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None
     assert all(Evaluation.parse(e.key) == e for e in every)
     assert not any(set(key) & set("|,[]") for key in (*CATEGORIES, *DATASETS, *(e.key for e in every)))
     assert len({cell.key for cell in cells}) == len(cells)
+
+
+def test_steering_keys_of_a_study_with_arms_are_read_though_no_arm_is_steered() -> None:
+    cells = [SteeringCell.make(dataset, "pocket", "standard", "guided") for dataset in (*DATASETS, *BESIDE)]
+    assert all(SteeringCell.parse(cell.key) == cell for cell in cells)
+    with pytest.raises(ValueError, match="is not dataset"):
+        SteeringCell.parse("pachinko|pocket__standard__guided")
 
 
 def test_a_cell_reads_as_the_design_says() -> None:

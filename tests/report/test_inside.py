@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import product
 from typing import ClassVar
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -168,3 +169,11 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
     report = next(report for report in FIGURES if report.name == name)
     axes = report.make(Made()).axes
     assert axes and any(ax.has_data() for ax in axes)
+
+
+def test_a_gate_moves_a_model_in_the_plane_of_j_and_accuracy() -> None:
+    plane = next(report for report in FIGURES if report.name == "gate_arrows").make(Made()).axes[0]
+    assert plane.get_xlabel().startswith("J =") and plane.get_ylabel().startswith("Acc")
+    points = {(round(x, 6), round(y, 6)) for marks in plane.collections for x, y in np.asarray(marks.get_offsets())}
+    assert points >= {(0.5, 0.9), (0.8, 0.8)}  # J = 0.5 - 0 before the gate, 0.9 - 0.1 behind it
+    assert (0.9, 0.5) not in points
