@@ -374,7 +374,8 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     study.require("0 answers asked (0 from" in made.stdout, "a second run asks nothing")
     study.require(provider.stats()["answered_in_full"] == calls, "and the provider saw no other call")
     tables_are_equal(study, alone, fetch(study, study.folder / f"fetched-{kind}"))
-    nodes_are_apart(study, scene.opens)
+    # With eight calls one node may make all that is left, where the other's run was killed before it wrote a table.
+    nodes_are_apart(study, scene.opens, least=1 if scene.size is SMALL else len(NODES))
     import psycopg
 
     with psycopg.connect(scene.database.address(), autocommit=True) as connection:

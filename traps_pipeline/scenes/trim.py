@@ -22,8 +22,9 @@ MARGINS_PX = (3, 9)  # around what must be hidden, to be tried one after the oth
 
 
 def trimmed(pair: Pair) -> Iterator[Pair]:
-    """The pair with smaller and smaller demands on its panel: cut to what its twin needs, with two margins, and as it
-    is. Each may still lose a certificate. The pair must have a panel, a twin, and an outcome."""
+    """The pair behind one panel after another, the smallest first: cut to what its twin needs with the one margin and
+    with the other, and as it is. Each may still lose a certificate. The pair must have a panel, a twin and an
+    outcome."""
     panel = pair.control.panel
     assert panel is not None, "only a panel can be trimmed"
     needed = must_hide(pair)

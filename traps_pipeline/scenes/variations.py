@@ -8,7 +8,7 @@ one. Not every scenario admits every variation; `Rejected` says why.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from traps_pipeline.digests import digest
 from traps_pipeline.partitions import FRAMINGS, PANEL_DOSES, PANEL_LOOKS, SCHEMAS
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.arms import SEEN_PX, Arm, Question, Scenario, Take, must_abstain, must_answer
-from traps_pipeline.scenes.camera import Panel
 from traps_pipeline.scenes.certificates import legible_groups
 from traps_pipeline.scenes.kit import COLOURS, listed
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, moving_geoms
@@ -99,21 +98,19 @@ def _offered(scenario: Scenario) -> Take:
 
 @dataclass(frozen=True)
 class Look:
-    """How a panel looks. colour: RGB in [0, 1], None for the panel's own; alpha: 1 is opaque; wide, high: in terms of
-    its own width and its own height above the floor."""
+    """How a panel looks. colour: RGB in [0, 1], None for the panel's own; alpha: 1 is opaque; wide: in terms of its
+    own width."""
 
     colour: tuple[float, float, float] | None = None
     alpha: float = 1.0
     wide: float = 1.0
-    high: float = 1.0
 
 
 def _renderer(world: World, look: Look) -> Renderer:
     """A renderer of a world whose panel has another look, from the pair's camera."""
     assert world.panel is not None, "an occlusion scenario has a panel"
-    (across, thickness, up), (x, y, _) = world.panel.half, world.panel.centre
-    half = (round(across * look.wide, 6), thickness, round(up * look.high, 6))
-    panel = Panel((x, y, half[2]), half, world.panel.yaw_deg)
+    across, thickness, up = world.panel.half
+    panel = replace(world.panel, half=(round(across * look.wide, 6), thickness, up))
     model, _ = compile_scene(world.family, world.params, world.physics, panel)
     model.geom("cover_panel").rgba[:] = (*(look.colour or COLOURS["navy"]), look.alpha)
     return Renderer(model, world.camera)
@@ -135,7 +132,7 @@ def _void_with(scenario: Scenario, look: Look) -> Take:
     if cause < SEEN_PX:
         raise Rejected(f"past this panel at most {cause:.0f} pixels of what moves are seen, {SEEN_PX:.0f} are wanted")
     evidence = {"panel_px": shown, "cause_px": cause, "twin_px": differing, "twin_levels": levels}
-    looks = {"wide": look.wide, "high": look.high, "contrast": _contrast(frames[0], scenario.control_frames[0])}
+    looks = {"wide": look.wide, "contrast": _contrast(frames[0], scenario.control_frames[0])}
     return Take(frames, evidence | looks)
 
 
