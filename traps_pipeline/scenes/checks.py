@@ -73,11 +73,7 @@ def swept_behind(camera: Camera, swept: Sequence[np.ndarray], panel: Panel) -> f
 
 
 def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
-    """The void that a trajectory makes, without the geoms that are named.
-
-    Its first frame is drawn twice: what a renderer draws first may differ by a pixel from what it draws later on.
-    """
-    next(renderer.frames(qpos[:1], panel=True, without=without), None)
+    """The void that a trajectory makes, without the geoms that are named."""
     yield from renderer.frames(qpos, panel=True, without=without)
 
 

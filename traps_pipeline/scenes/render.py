@@ -82,6 +82,7 @@ class Renderer:
         self._camera.distance = camera.distance
         self._camera.azimuth, self._camera.elevation = camera.azimuth_deg, camera.elevation_deg
         _renderer_open = True
+        self._draw(model.qpos0, panel=True, without=())  # a first picture differs from later ones, in single pixels
 
     def __enter__(self) -> Renderer:
         return self

@@ -22,7 +22,6 @@ from traps_pipeline.scenes.certificates import (
     settled_answer,
     shown_points,
 )
-from traps_pipeline.scenes.checks import differing_pixels
 from traps_pipeline.scenes.closing import closed, record_of
 from traps_pipeline.scenes.ensemble import Cut, Futures, Rollout
 from traps_pipeline.scenes.evidence import Claim, Evidence, Pair, VoidKind, required
@@ -136,10 +135,7 @@ def _with_certified_void(
     rejected = Rejected("there is no twin")
     for pair in candidates:
         try:
-            evidence = required(certificates_for(kind, "void", "twin"), pair, so_far)
-            if kind == "occluder":
-                _reject_if_unlike_when_drawn_first(pair)
-            return pair, evidence
+            return pair, required(certificates_for(kind, "void", "twin"), pair, so_far)
         except Rejected as failure:
             rejected = failure  # the next one may hide more, or be alike
     raise rejected
@@ -160,16 +156,6 @@ def _covered(pair: Pair) -> Iterator[Pair]:
 def _with_twin(pair: Pair, frame: int | None, twin: World) -> Pair:
     claim = replace(pair.claim, twin_answer=twin.outcome.label)
     return replace(pair, claim=claim, void_frame=frame, twin=twin)
-
-
-def _reject_if_unlike_when_drawn_first(pair: Pair) -> None:
-    """Raises Rejected if the twin's first void frame, drawn by a fresh renderer, differs from the void's, which was not
-    drawn first: such a scene looks a pixel different by what was drawn before it, and is not worth the doubt."""
-    twin = pair.other_world
-    with twin.renderer() as renderer:
-        pixels, _ = differing_pixels(pair.control.void_frames[:1], renderer.frames(twin.qpos[:1], panel=True))
-    if pixels:
-        raise Rejected(f"the twin's void differs from the void: in {pixels} pixels when it is drawn first")
 
 
 def _other_worlds(control: World) -> list[World]:

@@ -16,7 +16,6 @@ import numpy as np
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel
 from traps_pipeline.scenes.evidence import Pair
 from traps_pipeline.scenes.outcome import decisive_geoms
-from traps_pipeline.scenes.render import Renderer
 
 MARGINS_PX = (3, 9)  # around what must be hidden, to be tried one after the other
 
@@ -40,7 +39,7 @@ def must_hide(pair: Pair) -> np.ndarray:
     until = max(control.outcome.commit_frame - 1, 0)
     decisive = decisive_geoms(control.model, control.scene.decisive)
     with control.renderer() as renderer:
-        whole = _frames(renderer, control.qpos)
+        whole = list(renderer.frames(control.qpos))
         needed = _differ(whole, renderer.frames(control.qpos, without=control.scene.hidden))
         needed |= _differ(whole[until:], renderer.frames(control.qpos[until:], without=decisive))
     with twin.renderer() as renderer:
@@ -65,12 +64,6 @@ def cut_to(panel: Panel, camera: Camera, needed: np.ndarray, margin_px: int) -> 
     x, y = (round(float(v), 6) for v in centre[:2])
     half = (round((high - low) / 2, 6), panel.half[1], round(height / 2, 6))
     return replace(panel, centre=(x, y, half[2]), half=half)
-
-
-def _frames(renderer: Renderer, qpos: np.ndarray) -> list[np.ndarray]:
-    """All frames at 480x360; what is drawn first may differ by a pixel from what is drawn later on."""
-    next(renderer.frames(qpos[:1]), None)
-    return list(renderer.frames(qpos))
 
 
 def _differ(frames: Sequence[np.ndarray], others: Iterator[np.ndarray]) -> np.ndarray:
