@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,14 @@ from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.reference import ABSTENTION
 from traps_pipeline.models.registry import get_model, load_models
 from traps_pipeline.models.request import Request
-from traps_pipeline.models.shortcut_rules import CUES, CUT_FRAMES, RULES, names_no_choices
+from traps_pipeline.models.shortcut_rules import CUES, CUT_FRAMES, PANEL_PX, RULES, names_no_choices
 from traps_pipeline.scenes.encode import count_frames, encode
 from traps_pipeline.scenes.kit import COLOURS
+from traps_pipeline.scenes.look import MATERIALS, PANELS, Look
 from traps_pipeline.scenes.outcome import compile_scene
 from traps_pipeline.scenes.render import Renderer
+from traps_pipeline.scenes.vision import largest_board
+from traps_pipeline.scenes.world import World
 
 FLOOR, NAVY = (200, 200, 188), tuple(round(255 * part) for part in COLOURS["navy"])
 CHOICES, OPEN = "Is the ball in the tray, yes or no?", "What did the ball cost?"
@@ -68,6 +72,21 @@ def test_a_rule_abstains_by_its_own_cue_and_by_no_other(
 ) -> None:
     media = clip(tmp_path, "clip.mp4", **what)
     assert {rule for rule in RULES if abstains(rule, media, question)} == abstaining
+
+
+@pytest.mark.parametrize("panel", PANELS)
+def test_the_panel_rule_sees_panels_of_every_colour_and_material_and_no_panel_where_there_is_none(panel: str) -> None:
+    case = load("bounce-0001")
+    for material in MATERIALS:
+        look = Look(panel=panel, material=material, light=(0.8, 0.82, 0.85))
+        world = replace(World.of_record(case.spec, case.qpos), params=replace(case.params, look=look))
+        with world.renderer() as renderer:
+            (control,) = renderer.frames(case.qpos[:1])
+            control = control.copy()
+            (void,) = renderer.frames(case.qpos[:1], panel=True)
+        assert largest_board(control, PANEL_PX) is None
+        board = largest_board(void, PANEL_PX)
+        assert board is not None and board.area > 0.8 * (void != control).any(axis=2).sum()
 
 
 def test_without_its_cue_a_rule_says_what_the_observer_sees_and_else_the_commonest_answer(

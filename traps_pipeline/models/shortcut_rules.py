@@ -26,9 +26,9 @@ CUT_FRAMES = 24  # the shortest control has so many, and each cut clip has fewer
 @lru_cache(maxsize=100_000)
 def _panel(media_digest: str, clip: Path) -> bool:
     from traps_pipeline.scenes.encode import decode_first
-    from traps_pipeline.scenes.vision import largest
+    from traps_pipeline.scenes.vision import largest_board
 
-    return largest(decode_first(clip), "navy", PANEL_PX) is not None
+    return largest_board(decode_first(clip), PANEL_PX) is not None
 
 
 @lru_cache(maxsize=100_000)

@@ -1,7 +1,7 @@
 """Classical vision for observers: where a colour is in a frame, and how it moves (OpenCV, no knowledge of the scene).
 
 Frames are RGB uint8, shape (360, 480, 3); pixel coordinates are x to the right, y down. Colours are named as in
-`kit.COLOURS`. A colour that is none of them (a repainted panel) belongs to no mask.
+`kit.COLOURS`. A colour that is none of them (most panels') belongs to no mask.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
+from traps_pipeline.scenes.look import PANELS
 
 FLAG_PX = (60, 50)  # a flag is no wider and no higher
 PANEL_PX = 8000  # a panel that comes before a scene is larger, whatever moves is smaller
@@ -83,6 +85,18 @@ def blobs(mask: np.ndarray, min_area: int = 12) -> list[Blob]:
 def largest(frame: np.ndarray, colour: str, min_area: int = 12) -> Blob | None:
     """The largest region of a colour, None if the colour is not seen."""
     return next(iter(blobs(colour_mask(frame, colour), min_area)), None)
+
+
+def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
+    """The largest region of a colour that cover panels have, in light or shade, with the lines on it."""
+    pixels, found = frame.astype(np.float32) / 255, np.zeros(frame.shape[:2], bool)
+    for named in PANELS.values():
+        colour = np.array(named, np.float32)
+        bright = pixels @ colour / (colour @ colour)
+        off = np.linalg.norm(pixels - bright[..., None] * colour, axis=2) / np.linalg.norm(colour)
+        found |= (bright > 0.5) & (bright < 2.0) & (off < 0.1 * bright)
+    lines = np.ones((9, 9), np.uint8)  # are no wider
+    return next(iter(blobs(cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, lines), min_area)), None)
 
 
 def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int = 12) -> list[Blob | None]:
@@ -160,8 +174,9 @@ def _patch(still: np.ndarray, seed: tuple[int, int]) -> tuple[int, int, int, int
 
 def _masts(still: np.ndarray) -> list[tuple[int, int, int]]:
     """Upper ends (left, top, width) of thin, dark, colourless lines that stand upright, or nearly."""
-    dark = ((still.max(axis=2) < 125) & (np.ptp(still, axis=2) < 30)).astype(np.uint8)
-    thin = cv2.subtract(dark, cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((1, 7), np.uint8)))
+    light = still.max(axis=2)
+    beside = cv2.morphologyEx(light, cv2.MORPH_CLOSE, np.ones((1, 7), np.uint8))
+    thin = ((light < 125) & (np.ptp(still, axis=2) < 30) & (cv2.subtract(beside, light) > 30)).astype(np.uint8)
     tall = cv2.morphologyEx(cv2.dilate(thin, np.ones((1, 3), np.uint8)), cv2.MORPH_OPEN, np.ones((6, 1), np.uint8))
     count, names = cv2.connectedComponents(tall, connectivity=8)
     found = []
