@@ -13,8 +13,6 @@ import pytest
 from tests.scenes.released import load
 from traps_pipeline.benchmark.evidence import answerable_voids
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.paths import RELEASED
-from traps_pipeline.scenes import relook
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.certificates import CLOSING, LEGIBLE, ORDER, pair_of
 from traps_pipeline.scenes.checks import control_frames
@@ -57,12 +55,6 @@ def test_every_released_control_closes_that_has_the_time_and_most_of_each_taxono
 def test_closing_times_differ() -> None:
     times = Counter(spec.closes_frame for spec in load_released().values() if spec.taxonomy == "occlusion")
     assert len(times) > 20 and times.most_common(1)[0][1] < 20
-
-
-def test_a_record_closes_as_a_new_draw_of_it_would() -> None:
-    spec = load_released()[BOARD]
-    plainly = spec.model_copy(update={"control": None, "evidence": spec.evidence | {"read_s": None}})
-    assert relook._ended((plainly, RELEASED / "trajectories", 1)) == spec
 
 
 # --- what is seen -----------------------------------------------------------------------------------------------------

@@ -3,8 +3,7 @@ that it settles after 80 % or earlier; the numbers of frames are counted by hand
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,14 +11,12 @@ import pytest
 from tests.scenes.released import load
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.shortcut_rules import CUT_FRAMES
-from traps_pipeline.scenes import relook
 from traps_pipeline.scenes.certificates import PACE, pair_of, stored_evidence
 from traps_pipeline.scenes.evidence import Claim
 from traps_pipeline.scenes.kit import Physics
 from traps_pipeline.scenes.outcome import compile_scene, simulated
 from traps_pipeline.scenes.pace import cut_to, lengths, settles_share
 from traps_pipeline.scenes.sample import Draw, try_draw
-from traps_pipeline.scenes.spec import save_trajectory, trajectory_digest
 from traps_pipeline.scenes.world import World
 
 EARLY, LATE = "catch-0001", "domino_branch-0001"
@@ -73,21 +70,3 @@ def test_a_clip_that_goes_on_for_too_long_loses_the_certificate(n_frames: int, f
     pair = replace(pair_of(case.spec, case.qpos, case.twin), control=world)
     said = PACE.failure(PACE.measured(pair), pair.claim)
     assert (said is None) if failure is None else (said is not None and failure in said)
-
-
-@pytest.mark.slow
-def test_a_record_that_goes_on_for_too_long_is_cut_to_the_released_one(tmp_path: Path) -> None:
-    case, physics, twin = load(EARLY), whole(EARLY).physics, load(EARLY).spec.twin
-    other = case.family.params_from(twin.params or {})
-    qpos, beside = whole(EARLY).qpos, simulated(*compile_scene(case.family, other, physics), physics)
-    save_trajectory(tmp_path, EARLY, qpos, beside)
-    longer = case.spec.model_copy(
-        update={
-            "physics": asdict(physics),
-            "trajectory_sha256": trajectory_digest(qpos),
-            "twin": twin.model_copy(update={"trajectory_sha256": trajectory_digest(beside)}),
-            "control": None,
-            "evidence": {},
-        }
-    )
-    assert relook._shortened((longer, tmp_path, 1)) == case.spec

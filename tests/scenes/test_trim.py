@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.scenes.released import load
-from traps_pipeline.scenes import relook
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel, fit_shot
-from traps_pipeline.scenes.certificates import TWIN_BEHIND_PANEL, pair_of, shown_points
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel
+from traps_pipeline.scenes.certificates import TWIN_BEHIND_PANEL, pair_of
 from traps_pipeline.scenes.evidence import Pair
-from traps_pipeline.scenes.outcome import compile_scene
-from traps_pipeline.scenes.spec import save_trajectory
-from traps_pipeline.scenes.trim import cut_to, must_hide, trimmed
+from traps_pipeline.scenes.trim import cut_to, must_hide
 
 RACE = "hidden_race-0001"
 # From 2 m away, half a metre up, along y; 180 pixels are a metre where a panel stands 1 m away.
@@ -59,18 +55,3 @@ def test_a_released_panel_covers_what_its_pair_needs_and_a_smaller_one_shows_the
     control, twin = (replace(world, panel=less) for world in (released.control, released.other_world))
     shown = replace(released, control=control, twin=twin)
     assert "the twin's void differs" in str(TWIN_BEHIND_PANEL.failure(TWIN_BEHIND_PANEL.measured(shown), shown.claim))
-
-
-@pytest.mark.slow
-def test_a_record_whose_panel_covers_all_that_its_family_names_is_cut_to_the_released_one(tmp_path: Path) -> None:
-    case = load(RACE)
-    model, scene = compile_scene(case.family, case.params, case.family.physics)
-    camera, panel = fit_shot(scene.view, shown_points(model, scene, case.qpos), scene.cover)
-    assert panel is not None
-    assert asdict(camera) == asdict(Camera.from_record(case.spec.camera))
-    generous = case.spec.model_copy(update={"void": {"panel": asdict(panel), "hidden_from_frame": 0}, "evidence": {}})
-    save_trajectory(tmp_path, RACE, case.qpos, case.twin)
-    assert relook._cut((generous, tmp_path, 1)) == case.spec
-    cut = next(trimmed(pair_of(generous.model_copy(update={"control": None}), case.qpos, case.twin))).control.panel
-    assert cut is not None
-    assert cut.half[0] < panel.half[0] / 1.5
