@@ -45,7 +45,7 @@ def test_a_dose_is_compared_with_its_reference_on_the_scenarios_that_both_have(r
         of(rows, "occlusion", [no] * 4, model="wording-rule"),
         of(rows, "panel_grey", [no, no], first=0, model="wording-rule"),
     ).set_index(["model", "dose"])
-    navy, grey = made.loc[("m", "navy, as in the pairs")], made.loc[("m", "grey")]
+    navy, grey = made.loc[("m", "as in the pairs")], made.loc[("m", "grey")]
     assert (navy["abs_rec"], navy["n_scenarios"]) == (0.5, 4) and pd.isna(navy["change"]) and pd.isna(navy["acc"])
     # On the two scenarios that have a grey panel the model abstains on both navy ones and on one grey one.
     assert (grey["value"], grey["at_reference"], grey["change"]) == (0.5, 1.0, -0.5)

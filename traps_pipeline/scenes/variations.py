@@ -17,7 +17,7 @@ from traps_pipeline.partitions import FRAMINGS, PANEL_DOSES, PANEL_LOOKS, SCHEMA
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.arms import SEEN_PX, Arm, Question, Scenario, Take, must_abstain, must_answer
 from traps_pipeline.scenes.certificates import legible_groups
-from traps_pipeline.scenes.kit import COLOURS, listed
+from traps_pipeline.scenes.kit import listed
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, moving_geoms
 from traps_pipeline.scenes.policies import shown_at_end
 from traps_pipeline.scenes.registry import get_family
@@ -112,7 +112,10 @@ def _renderer(world: World, look: Look) -> Renderer:
     across, thickness, up = world.panel.half
     panel = replace(world.panel, half=(round(across * look.wide, 6), thickness, up))
     model, _ = compile_scene(world.family, world.params, world.physics, panel)
-    model.geom("cover_panel").rgba[:] = (*(look.colour or COLOURS["navy"]), look.alpha)
+    geom = model.geom("cover_panel")
+    if look.colour is not None:
+        geom.matid[:], geom.rgba[:3] = -1, look.colour  # of one colour, whatever the panel is of
+    geom.rgba[3] = look.alpha
     return Renderer(model, world.camera)
 
 

@@ -73,7 +73,7 @@ HYPOTHESES = (
         "panel",
         "abstains",
         (
-            _void("navy, as in the pairs", "occlusion"),
+            _void("as in the pairs", "occlusion"),
             _void("grey", "panel_grey"),
             _void("magenta", "panel_magenta"),
             _void("large", "panel_large"),
