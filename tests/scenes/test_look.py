@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,12 +11,15 @@ import numpy as np
 import pytest
 
 from tests.scenes.released import load
+from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli.benchmark import LOOKS
+from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.certificates import ABLATION, HIDDEN, TWIN_BEHIND_PANEL, pair_of
 from traps_pipeline.scenes.certify import certify
 from traps_pipeline.scenes.kit import params_to_dict
 from traps_pipeline.scenes.look import MATERIALS, PANELS, PARTS, Look, frame_size, look_of_draw
 from traps_pipeline.scenes.outcome import compile_scene, simulated
+from traps_pipeline.scenes.parts.floor import PALE
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.relook import with_look
 from traps_pipeline.scenes.render import Renderer
@@ -72,6 +76,35 @@ def test_a_draws_look_follows_from_its_number_and_varies_in_the_parts_that_are_n
     floor = look_of_draw(1, "bounce", 4, ("floor",))
     assert floor is not None and floor.floor_pattern is not None
     assert replace(floor, **{f: getattr(Look(), f) for f in vars(floor) if f.startswith("floor_")}) == Look()
+
+
+def test_pale_floors_have_no_dark_tone_and_count_before_others() -> None:
+    pale = [look_of_draw(1, "bounce", number, ("pale-floor",)) for number in range(60)]
+    assert {tone for look in pale if look for tone in look.floor_tones} == set(PALE)
+    assert pale == [look_of_draw(1, "bounce", number, ("floor", "pale-floor")) for number in range(60)]
+    assert pale != [look_of_draw(1, "bounce", number, ("floor",)) for number in range(60)]
+
+
+def test_nobody_stands_behind_half_of_the_scenes_and_two_or_three_behind_the_others() -> None:
+    drawn = [look_of_draw(1, "bounce", number, ("bystanders",)) for number in range(200)]
+    count = Counter(len(look.bystanders) for look in drawn if look)
+    assert set(count) == {0, 2, 3} and 80 <= count[0] <= 120
+
+
+def test_released_records_look_as_their_draws_say_and_differ() -> None:
+    tallies = load_tallies(RELEASED)
+    looks = list[Look]()
+    for spec in load_released().values():
+        family = get_family(spec.family)
+        look = look_of_draw(tallies[spec.family].seed, spec.family, spec.seed, tallies[spec.family].look)
+        assert look == family.params_from(spec.params).look, spec.scenario_id
+        looks += [look] if look else []
+    assert len(looks) == 702 - 15  # drop_split and ramp_deflect are as the pocket model was trained on
+    assert 0.45 < np.mean([bool(look.bystanders) for look in looks]) < 0.55
+    assert len({look.panel for look in looks}) == len(PANELS)
+    assert {look.material for look in looks} == {*MATERIALS}
+    assert len({(look.light_turn_deg, look.light) for look in looks}) > 600
+    assert len({(look.floor_pattern, look.floor_tones) for look in looks}) > 60
 
 
 def test_a_look_changes_no_trajectory() -> None:

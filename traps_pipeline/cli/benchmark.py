@@ -11,6 +11,7 @@ from traps_pipeline.errors import TrapsError
 
 LOOKS = (
     "floor",
+    "pale-floor",
     "light",
     "panel",
     "bystanders",
@@ -51,7 +52,7 @@ def add(commands: Commands) -> None:
         choices=LOOKS,
         default=[],
         metavar="PART",
-        help=f"vary how scenes look, too: {', '.join(LOOKS)} (default: the floor under dice and seesaws)",
+        help=f"vary how scenes look, too: {', '.join(LOOKS)} (default: what varies in the released benchmark)",
     )
     parser.add_argument("--workers", type=whole(1, 1024), help="processes (default: one per core)")
 

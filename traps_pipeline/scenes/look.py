@@ -16,28 +16,30 @@ import numpy as np
 
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.kit import COLOURS, READ, Scene, uniform
-from traps_pipeline.scenes.parts.floor import TEXELS, TONES, floors, lay
+from traps_pipeline.scenes.parts.floor import PALE, TEXELS, TONES, floors, lay
 from traps_pipeline.scenes.render import SUPERSAMPLE
 
 if TYPE_CHECKING:
     import mujoco
 
 # What may vary, as `traps sample --look` names it.
-PARTS = ("floor", "light", "panel", "bystanders", "camera", "material", "size")
-# Colours of the panel (sRGB): dark or dull, and none that a question names.
+PARTS = ("floor", "pale-floor", "light", "panel", "bystanders", "camera", "material", "size")
+OF_OCCLUSION = ("bystanders", "camera", "light", "material", "pale-floor", "panel")  # of a family that says nothing
+# Colours of the panel (sRGB): dark, dull, and none that a question names or that is taken for one in another light.
 PANELS: Mapping[str, tuple[float, float, float]] = {
     "navy": COLOURS["navy"],
-    "maroon": (0.33, 0.10, 0.14),
-    "olive": (0.32, 0.32, 0.14),
-    "petrol": (0.05, 0.26, 0.28),
-    "umber": (0.30, 0.21, 0.14),
+    "maroon": (0.30, 0.16, 0.18),
+    "olive": (0.29, 0.29, 0.18),
+    "petrol": (0.13, 0.22, 0.24),
+    "umber": (0.27, 0.22, 0.18),
 }
 # What the panel is of, besides its colour: thin lines, paler by so much, at so many to the metre and so wide.
 MATERIALS = ("plain", "slats", "tiles")
 LINE_TONE, LINES_PER_M, LINE_SHARE = 1.6, 8.0, 0.08
 SIZES = {"360p": 1, "720p": 2}  # of a frame: how many times as fine as 480x360
-_FLOOR = floors()
+_FLOORS = {"pale-floor": floors(PALE), "floor": floors()}  # the first that is named counts
 _FLOOR_FIELDS = ("floor_pattern", "floor_tones", "floor_repeat_m", "floor_turn_deg", "floor_shift_m")
+BYSTANDERS = (0, 0, 2, 3)  # how many stand there: none in half of the scenes
 BEHIND_M = (0.25, 0.9)  # so far behind all that is shown a bystander stands: it hides nothing and shades nothing
 
 
@@ -93,8 +95,9 @@ def draw_look(rng: np.random.Generator, parts: Collection[str]) -> Look | None:
     if not parts:
         return None
     drawn: dict[str, Any] = {}
-    if "floor" in parts:
-        drawn |= dict(zip(_FLOOR_FIELDS, _FLOOR.draw(rng, {}, len(_FLOOR_FIELDS)), strict=True))
+    floor = next((floor for part, floor in _FLOORS.items() if part in parts), None)
+    if floor is not None:
+        drawn |= dict(zip(_FLOOR_FIELDS, floor.draw(rng, {}, len(_FLOOR_FIELDS)), strict=True))
     if "light" in parts:
         bright, warm = uniform(rng, 0.8, 1.1), uniform(rng, -0.06, 0.06)
         drawn["light_turn_deg"] = uniform(rng, -15, 15)
@@ -104,7 +107,7 @@ def draw_look(rng: np.random.Generator, parts: Collection[str]) -> Look | None:
     if "bystanders" in parts:
         places = [
             (uniform(rng, -0.9, 0.9), uniform(rng, *BEHIND_M), uniform(rng, 0.04, 0.12), uniform(rng, 0.04, 0.2))
-            for _ in range(int(rng.integers(1, 4)))
+            for _ in range(int(rng.choice(BYSTANDERS)))
         ]
         drawn["bystanders"] = tuple(places)
         drawn["bystander_tones"] = tuple(str(tone) for tone in rng.choice(list(TONES), len(places)))

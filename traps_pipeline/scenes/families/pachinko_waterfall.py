@@ -285,5 +285,5 @@ FAMILY = scene_family(
     observe=observe,
     min_margin_m=0.01,
     perturbation=1e-5,
-    looks=("floor",),
+    looks=("bystanders", "floor", "light", "material", "panel"),
 )

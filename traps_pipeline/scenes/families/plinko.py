@@ -229,5 +229,5 @@ FAMILY = scene_family(
     observe=observe,
     min_margin_m=0.01,
     perturbation=1e-6,
-    looks=("floor",),
+    looks=("bystanders", "floor", "light", "material", "panel"),
 )

@@ -341,5 +341,5 @@ FAMILY = scene_family(
     observe=observe,
     min_margin_m=0.01,
     perturbation=6e-4,
-    looks=("floor",),
+    looks=("bystanders", "floor", "light", "material", "panel"),
 )

@@ -165,4 +165,5 @@ FAMILY = scene_family(
     ],
     observe=observe,
     min_margin_m=0.03,
+    looks=(),
 )

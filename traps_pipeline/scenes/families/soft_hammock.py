@@ -137,4 +137,5 @@ FAMILY = scene_family(
     ],
     observe=observe,
     min_margin_m=0.05,
+    looks=(),
 )

@@ -179,4 +179,5 @@ FAMILY = scene_family(
     observe=observe,
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.03,
+    looks=("bystanders", "camera", "material", "pale-floor", "panel"),
 )

@@ -380,5 +380,5 @@ FAMILY = scene_family(
     physics=Physics(timestep_s=0.001, gravity_m_s2=4.4),
     min_margin_m=0.03,
     perturbation=1e-6,
-    looks=("floor",),
+    looks=("bystanders", "floor", "light", "material", "panel"),
 )

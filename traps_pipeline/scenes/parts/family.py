@@ -10,7 +10,7 @@ import numpy as np
 
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.scenes.kit import Family, Motion, Physics, Reading, Scene
-from traps_pipeline.scenes.look import dressed, look_of, with_look
+from traps_pipeline.scenes.look import OF_OCCLUSION, dressed, look_of, with_look
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
@@ -35,13 +35,14 @@ def scene_family(
     legible: Callable[[Motion, Any], Sequence[tuple[tuple[str, ...], float]]] | None = None,
     twins: Callable[[Any], Sequence[Any]] | None = None,
     perturbation: float = 1e-4,
-    looks: tuple[str, ...] = (),
+    looks: tuple[str, ...] | None = None,
 ) -> Family:
     """A family from its parts; `kit.Family` says what the other fields mean.
 
     Parameters with a hidden element make an occlusion family, whose twins follow from it; parameters without one make a
     chaotic family. twins: other worlds than those, for a hidden element that is more than one field. sub_scenario: the
-    family's name unless it is given.
+    family's name unless it is given. looks: parts of the look that vary; unless they are given, all but the size in an
+    occlusion family, and none in a chaotic one.
     """
     if twins is None and vary.hidden_field(params) is not None:
         twins = vary.twins
@@ -74,6 +75,6 @@ def scene_family(
         min_margin_m=min_margin_m,
         twins=twins,
         perturbation=perturbation,
-        looks=looks,
+        looks=(() if twins is None else OF_OCCLUSION) if looks is None else looks,
         check=vary.check,
     )

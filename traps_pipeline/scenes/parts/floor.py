@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,21 +22,22 @@ TONES: Mapping[str, tuple[float, float, float]] = {
     "slate": (0.33, 0.36, 0.39),
     "coal": (0.21, 0.21, 0.20),
 }
+PALE = ("chalk", "sand", "clay", "stone", "moss")  # on which what is black, and the masts of flags, show
 PATTERNS = ("checks", "stripes", "planks")
 PLAIN_SHARE = 0.08  # of floors that have no pattern: two of a family would look alike
 TEXELS = 256  # of a side of the texture, which shows one repeat of the pattern
 
 
-def floors() -> Group:
-    """The fields `floor_pattern`, `floor_tones` (two), `floor_repeat_m` (from one repeat to the next),
+def floors(tones: Sequence[str] = tuple(TONES)) -> Group:
+    """Of some tones, the fields `floor_pattern`, `floor_tones` (two), `floor_repeat_m` (from one repeat to the next),
     `floor_turn_deg` and `floor_shift_m` (along both sides of the pattern)."""
 
     def draw(rng: np.random.Generator, so_far: Drawn) -> tuple[str, tuple[str, ...], float, float, tuple[float, ...]]:
         pattern = PATTERNS[int(rng.integers(len(PATTERNS)))] if rng.random() > PLAIN_SHARE else "plain"
-        tones = tuple(str(tone) for tone in rng.permutation(list(TONES))[:2])
+        chosen = tuple(str(tone) for tone in rng.permutation(list(tones))[:2])
         repeat = round(float(rng.uniform(0.5, 1.5)), 2)
         turn = round(float(rng.uniform(-45, 45)), 1)
-        return pattern, tones, repeat, turn, tuple(round(float(x), 2) for x in rng.uniform(0, repeat, 2))
+        return pattern, chosen, repeat, turn, tuple(round(float(x), 2) for x in rng.uniform(0, repeat, 2))
 
     return together(draw)
 
