@@ -18,7 +18,7 @@ from traps_pipeline.models.reference import phrase
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.partitions import dataset_of
 
-# Pixels of navy in one piece. Panels of released voids have 18,000 and more; shade in a control never had above 100.
+# Pixels of a board in one piece. Released voids have 7,700 and more; shade in a control never had above 300.
 PANEL_PX = 1000
 CUT_FRAMES = 24  # the shortest control has so many, and each cut clip has fewer (docs/spec.md 2.5)
 

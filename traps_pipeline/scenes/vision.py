@@ -94,7 +94,7 @@ def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
         colour = np.array(named, np.float32)
         bright = pixels @ colour / (colour @ colour)
         off = np.linalg.norm(pixels - bright[..., None] * colour, axis=2) / np.linalg.norm(colour)
-        found |= (bright > 0.5) & (bright < 1.3) & (off < 0.08 * bright)
+        found |= (bright > 0.5) & (bright < 1.1) & (off < 0.06 * bright)
     lines = np.ones((9, 9), np.uint8)  # are no wider
     return next(iter(blobs(cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, lines), min_area)), None)
 
