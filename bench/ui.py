@@ -1,7 +1,10 @@
 """Seconds until pages of Dagster's UI show what was asked for, in a study of many cells: the graph and the partitions
 of `responses`, beside a stock project with one asset of as many partitions.
 
-python bench/ui.py [--cells 576 10000]
+python bench/ui.py [--cells 576 10000] [--database]
+
+--database: Dagster's history in PostgreSQL, and the study in an object store (moto's server), as on a cluster; there
+is no cluster, since nothing is launched.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import tempfile
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,7 @@ import yaml
 from playwright.sync_api import Page, sync_playwright
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
 CHROMIUM, TOKEN = "/usr/bin/chromium", "a-token-of-the-benchmark"
 DATASETS, REGIMES, RUNS = 4, 3, 3
 VIEWS = 3  # of each page; the fastest counts, so that the first one fills caches
@@ -38,6 +42,7 @@ keys = dg.MultiPartitionsDefinition({{
 def responses(): ...
 defs = dg.Definitions([responses])
 """
+SHARED = "storage: {{postgres: {{postgres_url: {address!r}}}}}\n"
 # Every cell is told to be made, as the stage tells it.
 FILL = """
 import dagster as dg
@@ -52,8 +57,9 @@ with dg.DagsterInstance.get() as history:
 """
 
 
-def study(folder: Path, cells: int) -> dict[str, str]:
-    """A workspace whose study names so many cells, of models in a registry of its own; its environment."""
+def study(folder: Path, cells: int, shared: dict[str, str] | None) -> dict[str, str]:
+    """A workspace whose study names so many cells, of models in a registry of its own; its environment. shared: the
+    variables of a study in an object store."""
     models = -(-cells // (DATASETS * REGIMES * RUNS))
     entries = [  # each of its own: a dictionary that is written twice would become an alias, which the reader refuses
         {"id": f"m{n:04d}", "backend": "reference", "params": {"strategy": "oracle"}, "runs": RUNS}
@@ -72,22 +78,25 @@ def study(folder: Path, cells: int) -> dict[str, str]:
         "per_family": 1,
     }
     (folder / "many.yaml").write_text(yaml.safe_dump(experiment))
-    workspace = folder / "study"
-    environment = os.environ | {
+    plain = {name: value for name, value in os.environ.items() if name != "DAGSTER_HOME"}
+    environment = plain | {
         "TRAPS_MODELS": str(folder / "models.yaml"),
-        "TRAPS_WORKSPACE": str(workspace),
-        "DAGSTER_HOME": str(workspace / "dagster"),
+        "TRAPS_WORKSPACE": str(folder / "study"),
+        "TRAPS_SCRATCH": str(folder / "scratch"),
         "PYTHONPATH": str(ROOT),
-    }
+    } | (shared or {})  # fmt: skip
     command = [sys.executable, "-m", "traps_pipeline.cli", "init", str(folder / "many.yaml")]
-    subprocess.run(command, cwd=ROOT, env=environment, check=True, stdout=subprocess.DEVNULL)
-    return environment
+    said = subprocess.run(command, cwd=ROOT, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
+    return environment | {"DAGSTER_HOME": said.partition("DAGSTER_HOME=")[2].strip()}
 
 
-def stock(folder: Path, cells: int) -> dict[str, str]:
-    """A folder with the stock project; its environment."""
+def stock(folder: Path, cells: int, shared: dict[str, str] | None) -> dict[str, str]:
+    """A folder with the stock project; its environment. shared: with the address of a database for its history."""
     home = folder / "home"
     home.mkdir()
+    if shared:
+        address = shared["TRAPS_DATABASE"].replace("postgresql:", "postgresql+psycopg2:")
+        (home / "dagster.yaml").write_text(SHARED.format(address=address))
     (folder / "stock.py").write_text(STOCK.format(datasets=DATASETS, evaluations=cells // DATASETS))
     return os.environ | {"DAGSTER_HOME": str(home), "PYTHONPATH": str(folder)}
 
@@ -128,14 +137,23 @@ def seconds(page: Page, address: str, text: str) -> float:
     return min(found)
 
 
-def measure(kind: str, cells: int, browser: Any) -> dict[str, float]:
+def measure(kind: str, cells: int, browser: Any, *, in_database: bool) -> dict[str, float]:
     """Seconds of each page for one project."""
-    with socket.socket() as probe, tempfile.TemporaryDirectory() as name:
+    from tests.objectstore import S3
+    from tests.postgres import Postgres
+
+    with socket.socket() as probe, tempfile.TemporaryDirectory() as name, ExitStack() as opened:
         probe.bind(("127.0.0.1", 0))
         port, folder = probe.getsockname()[1], Path(name)
         probe.close()
-        ours = kind == "study"
-        environment = (study if ours else stock)(folder, cells)
+        ours, shared = kind == "study", None
+        if in_database:
+            database = opened.enter_context(Postgres.running(durable=True))
+            shared = opened.enter_context(S3.running()).environment | {
+                "TRAPS_DATABASE": database.address(), "TRAPS_WORKSPACE": "s3://lab/pages",
+                "TRAPS_RAY": f"http://127.0.0.1:{port}",
+            }  # fmt: skip
+        environment = (study if ours else stock)(folder, cells, shared)
         module = "traps_pipeline.definitions" if ours else "stock"
         begun = time.monotonic()
         filled = subprocess.run(
@@ -170,10 +188,13 @@ def main() -> None:
     """Print a table for each number of cells."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cells", type=int, nargs="+", default=[576, 10_000])
+    parser.add_argument("--database", action="store_true", help="Dagster's history in PostgreSQL")
+    arguments = parser.parse_args()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        for cells in parser.parse_args().cells:
-            ours, other = (measure(kind, cells, browser) for kind in ("study", "stock"))
+        for cells in arguments.cells:
+            kinds = ("study", "stock")
+            ours, other = (measure(kind, cells, browser, in_database=arguments.database) for kind in kinds)
             print(f"{cells} cells: seconds, in a stock project, ratio")
             for (what, mine), theirs in zip(ours.items(), other.values(), strict=True):
                 print(f"  {what:44} {mine:7.2f} {theirs:7.2f} {mine / theirs:7.2f}", flush=True)
