@@ -75,13 +75,13 @@ class Bucket:
         except (BaseError, FileNotFoundError) as error:
             raise self.error(error) from None
 
-    def names(self) -> Iterator[tuple[str, int, datetime]]:
-        """Name, size in bytes and time of writing of all objects. Raises TrapsError."""
+    def names(self, below: str = "") -> Iterator[tuple[str, int, datetime]]:
+        """Name, size in bytes and time of writing of all objects (below a name). Raises TrapsError."""
         import obstore
         from obstore.exceptions import BaseError
 
         try:
-            for page in obstore.list(self._store):
+            for page in obstore.list(self._store, below or None):
                 yield from ((one["path"], one["size"], one["last_modified"]) for one in page)
         except (BaseError, FileNotFoundError) as error:
             raise self.error(error) from None
