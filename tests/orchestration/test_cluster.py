@@ -75,14 +75,16 @@ def test_a_study_in_a_folder_and_a_missing_head_are_refused_with_the_remedy(
     for name in ("ray", "dagster_ray", "dagster_postgres"):
         pytest.importorskip(name, reason="the extra `cluster` is not installed")
     instance = dg.DagsterInstance.ephemeral()
-    with pytest.raises(TrapsError, match=r"other hosts do not see this folder.*s3://BUCKET/STUDY"):
+    with pytest.raises(TrapsError, match=r"^the host .* of the study lab: other hosts do not see .*s3://BUCKET/STUDY"):
         require_cluster(workspace, instance)
     remote = Workspace(workspace.root, workspace.study, "s3://lab/study")
     monkeypatch.delenv(RAY, raising=False)
-    with pytest.raises(TrapsError, match=r"TRAPS_RAY is not set"):
+    with pytest.raises(TrapsError, match=r"^the host .* of the study lab: TRAPS_RAY is not set"):
         require_cluster(remote, instance)
     monkeypatch.setenv(RAY, "http://127.0.0.1:1")
-    with pytest.raises(TrapsError, match=r"nobody takes runs of the study lab.*`traps ui` on the head"):
+    with pytest.raises(
+        TrapsError, match=r"^the host .* submits no runs of the study lab: nobody.*`traps ui` on the head"
+    ):
         require_cluster(remote, instance)
 
 

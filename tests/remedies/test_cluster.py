@@ -163,7 +163,7 @@ def head(workspace: Workspace) -> Iterator[subprocess.Popen[bytes]]:
 @carries_out(
     "runs on other hosts need {} here and there: install the extra `cluster`",
     "{} is not set: export {}=http://HEAD:8265, the address of Ray's head for the study",
-    "nobody takes runs of the study {} from the queue; run `traps ui` on the head, with the same variables, and then",
+    "nobody takes runs from its queue; run `traps ui` on the head, with the same variables, and then",
 )
 def test_runs_are_submitted_once_the_extra_the_address_and_the_head_are_there(
     address: str, monkeypatch: pytest.MonkeyPatch
@@ -185,7 +185,9 @@ def test_runs_are_submitted_once_the_extra_the_address_and_the_head_are_there(
     with pytest.raises(TrapsError, match=r"TRAPS_RAY is not set: export TRAPS_RAY=http://HEAD:8265"):
         required()
     monkeypatch.setenv(RAY, "http://127.0.0.1:1")
-    with pytest.raises(TrapsError, match=r"nobody takes runs of the study .*run `traps ui` on the head"):
+    with pytest.raises(
+        TrapsError, match=r"runs of the study .*: nobody takes runs from its queue; run `traps ui` on the head"
+    ):
         required()
     with head(workspace) as process:
         until = time.monotonic() + BEAT_S
@@ -286,7 +288,7 @@ def test_a_host_that_exports_the_database_opens_the_history(
     monkeypatch.delenv(DATABASE, raising=False)
     history: Any = remedied(
         lambda: SharedHistory.from_config_value(None, {"variable": DATABASE}),
-        "{} is not set on the host {}; export the address of the study's database",
+        "{} is not set on the host {}; export the address of the database of the study {}",
         lambda: monkeypatch.setenv(DATABASE, postgres.address()),
     )
     assert history.run_storage.get_runs_count() >= 0

@@ -278,6 +278,7 @@ def test_an_address_that_leads_nowhere_names_variable_host_study_and_remedy(
         session_of(VARIABLE, "my-study")
     told = str(raised.value)
     assert told.startswith(f"{VARIABLE}: ") and said in told and "study my-study" in told
+    assert f"host {socket.gethostname()}" in told
     assert "wrong" not in told and "0123" not in told
     assert "127.0.0.1" in told or "postgresql://USER" in told
 

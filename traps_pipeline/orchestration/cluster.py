@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -22,7 +23,7 @@ from traps_pipeline.extras import missing
 from traps_pipeline.models.registry import LOCAL, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Stage
-from traps_pipeline.orchestration.runs import Ran, Range, Runs, batches, broke_off, problems_of, range_tags
+from traps_pipeline.orchestration.runs import Ran, Range, Runs, batches, broke_off, problems_of, range_tags, reason
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
 from traps_pipeline.orchestration.schemes import Scheme
 from traps_pipeline.orchestration.shared_history import unusable
@@ -36,7 +37,8 @@ if TYPE_CHECKING:
 STUDY_TAG = "traps/study"
 AT_ONCE = 40  # runs; Ray keeps a process of some 85 MB for each on the head
 POLL_S = 1.0
-MONITOR_S, START_S, RESUMES = 15, 90, 3
+MONITOR_S, RESUMES = 15, 3
+START_S = 24 * 3600  # a run may wait so long for a host; one that waits for nothing ends sooner (`lost_runs.py`)
 ALIVE_S = 120  # a daemon that has been silent for longer is dead
 QUEUE = "QUEUED_RUN_COORDINATOR"
 OnInterrupt = Literal["leave", "cancel"]
@@ -48,7 +50,7 @@ _WAITING = (
     dg.DagsterRunStatus.CANCELING,
 )
 _MADE, _FAILED = dg.DagsterEventType.ASSET_MATERIALIZATION, dg.DagsterEventType.STEP_FAILURE
-_ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED}
+_ENDED = {dg.DagsterEventType.RUN_FAILURE, dg.DagsterEventType.RUN_CANCELED, dg.DagsterEventType.ENGINE_EVENT}
 
 
 def dagster_yaml(variable: str, place: str) -> dict[str, Any]:
@@ -69,10 +71,10 @@ def dagster_yaml(variable: str, place: str) -> dict[str, Any]:
             "class": "QuotingRayRunLauncher",
             "config": {"ray": {"address": os.environ[RAY], "num_cpus": 1, "runtime_env": _works_in(place)}},
         },
-        # Ray keeps what a job prints; Dagster would write it below a path of the host that submitted the run.
         "compute_logs": {
-            "module": "dagster._core.storage.noop_compute_log_manager",
-            "class": "NoOpComputeLogManager",
+            "module": "traps_pipeline.orchestration.shared_logs",
+            "class": "SharedLogs",
+            "config": {"place": place},
         },
         "run_monitoring": {
             "enabled": True,
@@ -87,24 +89,27 @@ def dagster_yaml(variable: str, place: str) -> dict[str, Any]:
 def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
     """Raises TrapsError unless runs can be submitted from here: the study is one that other hosts see, Ray's address is
     known, and a daemon takes runs from the queue."""
+    where = f"the host {socket.gethostname()} submits no runs of the study {workspace.study.name}: "
     if absent := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
         raise TrapsError(
-            f"runs on other hosts need {' and '.join(absent)} here and there: install the extra `cluster`, in a "
+            f"{where}runs on other hosts need {' and '.join(absent)} here and there: install the extra `cluster`, in a "
             "checkout `python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"
         )
     if not isinstance(workspace.place, str):
         raise TrapsError(
-            f"{workspace.root}: other hosts do not see this folder; a study for --cluster lies in an object store: "
+            f"{where}other hosts do not see {workspace.root}; a study for --cluster lies in an object store: "
             f"{VARIABLE}=s3://BUCKET/STUDY (docs/cluster.md)"
         )
     if not os.environ.get(RAY):
-        raise TrapsError(f"{RAY} is not set: export {RAY}=http://HEAD:8265, the address of Ray's head for the study")
+        raise TrapsError(
+            f"{where}{RAY} is not set: export {RAY}=http://HEAD:8265, the address of Ray's head for the study"
+        )
     beats = instance.get_daemon_heartbeats()
     last = beats[QUEUE].timestamp if QUEUE in beats else 0.0
     if time.time() - last > ALIVE_S:
         raise TrapsError(
-            f"nobody takes runs of the study {workspace.study.name} from the queue; run `traps ui` on the head, with "
-            "the same variables, and then the same command again"
+            f"{where}nobody takes runs from its queue; run `traps ui` on the head, with the same variables, and then "
+            "the same command again"
         )
 
 
@@ -272,10 +277,19 @@ class RayRuns(Runs):
         if run.status == dg.DagsterRunStatus.SUCCESS:
             return Ran([], over_budget=False)
         if not ran.problems:
-            said = [entry.message for entry in self._instance.all_logs(run_id, of_type=_ENDED)]
-            why = " ".join(" ".join(said[-1:]).split())[:300] or "no reason is known"
+            why = " ".join(self._last_word(run_id).split())[:400]
             ran.problems.append(f"{name} ended as {run.status.value.lower()} ({why}); see its log in `traps ui`")
         return ran
+
+    def _last_word(self, run_id: str) -> str:
+        """Why a run ended whose steps do not say it: an error of those who were to start it, or what was told last."""
+        logged = [entry.dagster_event for entry in self._instance.all_logs(run_id, of_type=_ENDED)]
+        events = [event for event in logged if event is not None]
+        for event in events[-2:]:  # that a run could not be started is told right before its end
+            if event.is_engine_event and event.engine_event_data.error:
+                return reason(event.engine_event_data.error)
+        said = [event.message for event in events if not event.is_engine_event and event.message]
+        return said[-1] if said else "no reason is known"
 
     def _interrupted(self, left: Sequence[str]) -> None:
         if self._on_interrupt == "leave":

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import shlex
+import socket
 from typing import Any
 
 from dagster_ray import RayRunLauncher  # pyright: ignore[reportMissingImports] - of the extra `cluster`
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.orchestration.cluster import STUDY_TAG
+from traps_pipeline.storage.workspace import RAY
 
 
 class QuotingRayRunLauncher(RayRunLauncher):
@@ -14,4 +19,11 @@ class QuotingRayRunLauncher(RayRunLauncher):
 
     def _launch_ray_job(self, submission_id: str, entrypoint: str, run: Any) -> None:
         command, _, quoted = entrypoint.partition(" '")
-        super()._launch_ray_job(submission_id, f"{command} {shlex.quote(quoted.removesuffix(chr(39)))}", run)
+        try:
+            super()._launch_ray_job(submission_id, f"{command} {shlex.quote(quoted.removesuffix(chr(39)))}", run)
+        except OSError as error:
+            raise TrapsError(
+                f"{self.address}: Ray's head does not answer the host {socket.gethostname()}, which starts the runs of "
+                f"the study {run.tags.get(STUDY_TAG, '')} ({' '.join(str(error).split())[:200]}). See that the head "
+                f"runs (`ray status`) and that {RAY} is its address; then run the same command again"
+            ) from error

@@ -133,7 +133,7 @@ def _execute(
     finally:
         close_dropped()
     failures = [event for event in result.all_events if event.is_step_failure]
-    if any(error.cls_name in _INTERRUPTS for event in failures for error in _chain(event)):
+    if any(error.cls_name in _INTERRUPTS for event in failures for error in _causes(event)):
         raise KeyboardInterrupt
     ran = problems_of(failures)
     if not result.success and not ran.problems:
@@ -145,33 +145,37 @@ def _execute(
 
 def problems_of(failures: Sequence[dg.DagsterEvent]) -> Ran:
     """What failed steps say."""
-    problems = [line for event in failures for line in _reason(event).splitlines()]
-    over = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _chain(event))
+    problems = [line for event in failures for line in reason(event.step_failure_data.error).splitlines()]
+    over = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _causes(event))
     return Ran(problems, over)
 
 
 def broke_off(run: dg.DagsterRun, failures: Sequence[dg.DagsterEvent]) -> bool:
     """Whether a run, or a step of it that others wait for, ended for no reason that it could tell: its host, the
     network or the database failed."""
-    named = [{error.cls_name for error in _chain(event)} for event in failures]
+    named = [{error.cls_name for error in _causes(event)} for event in failures]
     is_interrupted = any(names & {*_INTERRUPTS} for names in named)
     unnamed = not failures or any(not names & {*_SENTENCES} for names in named)
     return run.status == dg.DagsterRunStatus.FAILURE and unnamed and not is_interrupted
 
 
-def _chain(event: dg.DagsterEvent) -> list[Any]:
+def _causes(event: dg.DagsterEvent) -> list[Any]:
     """The error of a failed step and its causes, outermost first."""
-    chain, error = [], event.step_failure_data.error
+    return _chain(event.step_failure_data.error)
+
+
+def _chain(error: Any) -> list[Any]:
+    chain = []
     while error is not None:
         chain.append(error)
         error = error.cause
     return chain
 
 
-def _reason(event: dg.DagsterEvent) -> str:
-    """The error of a failed step: our own sentences where there are some, else the innermost exception."""
-    chain = _chain(event)
-    readable = [error for error in chain if error.cls_name in _SENTENCES]
+def reason(error: Any) -> str:
+    """What an error that Dagster wrote down says: our own sentences where there are some, else its innermost cause."""
+    chain = _chain(error)
+    readable = [one for one in chain if one.cls_name in _SENTENCES]
     if not readable:
         return chain[-1].message.strip() if chain else "the step failed"
     return re.sub(rf"^\S*\b{readable[0].cls_name}: ", "", readable[0].message.strip())

@@ -13,6 +13,7 @@ from dagster._core.storage.base_storage import DagsterStorage
 from dagster._serdes import ConfigurableClassData
 
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.workspace import VARIABLE
 
 
 def unusable() -> tuple[type[Exception], ...]:
@@ -40,7 +41,8 @@ class SharedHistory(DagsterStorage):
         address = os.environ.get(variable)
         if not address:
             raise TrapsError(
-                f"{variable} is not set on the host {socket.gethostname()}; export the address of the study's database"
+                f"{variable} is not set on the host {socket.gethostname()}; export the address of the database of the "
+                f"study {os.environ.get(VARIABLE, 'whose history is opened')}"
             )
         # SQLAlchemy 2.1 takes psycopg 3 for a plain postgresql://, and dagster-postgres's NOTIFY fails with it.
         url = "postgresql+psycopg2://" + address.partition("://")[2]

@@ -158,7 +158,8 @@ class Session:
             except psycopg.ProgrammingError:
                 raise TrapsError(
                     f"{self._variable}: is no address of a PostgreSQL database; write it as "
-                    f"postgresql://USER:PASSWORD@HOST:5432/DATABASE (study {self.study})"
+                    "postgresql://USER:PASSWORD@HOST:5432/DATABASE "
+                    f"(study {self.study}, host {socket.gethostname()})"
                 ) from None
             self._enter(self._connection)
         return self._connection

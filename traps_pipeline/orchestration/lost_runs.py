@@ -1,0 +1,60 @@
+"""Runs that wait for a host, and those that wait for nothing.
+
+A run that left the queue is STARTING until its process says that it has begun. On a cluster that takes as long as all
+hosts are busy, or as a new one needs to come up, so Dagster's own limit on it (`start_timeout_seconds`) would end runs
+that nothing is wrong with. Ray knows whether a run waits for a host; Dagster asks it of runs that have begun alone. A
+sensor asks it of the others.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import dagster as dg
+from dagster._core.launcher import WorkerStatus
+
+LOST_S = 90  # after so long a run that Ray knows nothing of was never submitted, or Ray's head lost it
+INTERVAL_S = 15
+_BEFORE = [dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.NOT_STARTED]
+
+
+def fail_lost_runs(instance: dg.DagsterInstance, lost_s: float = LOST_S) -> list[str]:
+    """Mark runs as failed that will never begin; their ids. Raises OSError while Ray's head does not answer."""
+    failed = list[str]()
+    for run, why in _lost(instance, lost_s):
+        now = instance.get_run_by_id(run.run_id)
+        if now is not None and now.status == run.status:  # it may have begun since
+            instance.report_run_failed(now, f"the run will not begin: {why}")
+            failed.append(run.run_id)
+    return failed
+
+
+def _lost(instance: dg.DagsterInstance, lost_s: float) -> Iterator[tuple[dg.DagsterRun, str]]:
+    """Runs that will never begin, and why."""
+    for record in instance.get_run_records(dg.RunsFilter(statuses=_BEFORE)):
+        run, is_old = record.dagster_run, time.time() - record.update_timestamp.timestamp() > lost_s
+        if run.status == dg.DagsterRunStatus.NOT_STARTED:
+            if is_old:
+                yield run, "the command that made it ended before it was in the queue"
+            continue
+        found = instance.run_launcher.check_run_worker_health(run)
+        if found.status == WorkerStatus.UNKNOWN and is_old:
+            yield run, f"Ray knows nothing of its job ({found.msg})"
+        elif found.status in (WorkerStatus.FAILED, WorkerStatus.SUCCESS):
+            yield run, f"its job on Ray has ended ({found.msg})"
+
+
+@dg.sensor(
+    minimum_interval_seconds=INTERVAL_S,
+    default_status=dg.DefaultSensorStatus.RUNNING,
+    description="Marks runs as failed that wait for no host any more, since Ray's head lost them or their job ended "
+    "before they began. Those that wait for a host go on waiting.",
+)
+def lost_runs(context: dg.SensorEvaluationContext) -> dg.SkipReason:
+    """For studies whose runs go to a cluster."""
+    try:
+        failed = fail_lost_runs(context.instance)
+    except OSError as error:
+        return dg.SkipReason(f"Ray's head does not answer: {error}")
+    return dg.SkipReason(f"{len(failed)} runs were lost: {', '.join(failed)}" if failed else "no run was lost")
