@@ -3,7 +3,7 @@ loop, on the same server (50 ms latency), in one run; with `--inspect PYTHON` al
 also with the ledger in a PostgreSQL that syncs to the disk. Ours are laid out as a study is: cells of 1,000 items (500
 pairs), each finished before the next.
 
-python bench/calls.py [--answers 2000] [--memory] [--database] [--inspect /path/to/python]
+python bench/calls.py [--answers 2000] [--times 1] [--memory] [--database] [--inspect /path/to/python]
 """
 
 from __future__ import annotations
@@ -149,6 +149,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--answers", type=int, default=2000)
+    parser.add_argument("--times", type=int, default=1, help="each is measured so often, in turn; the best counts")
     parser.add_argument("--memory", action="store_true", help="peak memory after 4,000 and after 20,000 calls")
     parser.add_argument("--database", action="store_true", help="the ledger in PostgreSQL, too")
     parser.add_argument("--inspect", metavar="PYTHON", help="a Python that has inspect_ai and openai")
@@ -157,11 +158,15 @@ def main() -> None:
         provider = opened.enter_context(Provider.start({"latency_s": 0.05}, keeps_records=False))
         database = opened.enter_context(Postgres.running(durable=True)) if arguments.database else None
         print(f"{'connections':>11} {'':<18} {'answers/s':>10} {'CPU ms each':>12}")
+        kinds: dict[str, tuple[str, dict[str, str]]] = {"ours": ("ours", {}), "bare": ("bare", {})}
+        if database:
+            kinds["ours, PostgreSQL"] = "ours", {DATABASE: database.address()}
         for connections in CONNECTIONS:
-            found = {name: _worker(name, provider.url, connections, arguments.answers) for name in ("ours", "bare")}
-            if database:
-                where = {DATABASE: database.address()}
-                found["ours, PostgreSQL"] = _worker("ours", provider.url, connections, arguments.answers, **where)
+            found = dict[str, dict[str, float]]()
+            for _ in range(arguments.times):  # in turn, so that what else the machine does meets all of them
+                for name, (worker, where) in kinds.items():
+                    new = _worker(worker, provider.url, connections, arguments.answers, **where)
+                    found[name] = max(found.get(name, new), new, key=lambda one: one["rate"])
             if arguments.inspect:
                 few = max(200, arguments.answers // 5)
                 found["inspect_ai"] = _inspect(arguments.inspect, provider.url, connections, few)

@@ -46,7 +46,7 @@ panel: rules
 scenarios: [{", ".join(f"{family}-{n:04d}" for family in FAMILIES for n in range(1, SCENARIOS + 1))}]
 """
 OTHERS = {
-    "calls": ["bench/calls.py", "--database"],
+    "calls": ["bench/calls.py", "--database", "--times", "3"],
     "ledger": ["bench/ledger.py", "--database"],
     "first-call": ["bench/first_call.py", "--rows", "1000000", "--store"],
     "pages": ["bench/ui.py", "--database", "--cells", "10000", "50000"],
@@ -84,7 +84,10 @@ def rendering() -> None:
                 "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
             }  # fmt: skip
             cluster = Cluster(folder, shared)
-            own = {"TRAPS_RAY": f"http://127.0.0.1:{cluster.dashboard}", "TRAPS_WORKSPACE": "s3://lab/rendering"}
+            own = {
+                "TRAPS_RAY": f"http://127.0.0.1:{cluster.dashboard}",
+                "TRAPS_WORKSPACE": f"s3://lab/rendering-{count}",
+            }
             environment = shared | own | {"TRAPS_SCRATCH": str(folder / "here")}
             study = Study(folder, environment, folder / "rendering.yaml", until="videos")
             try:
