@@ -20,6 +20,7 @@ ROOMS = (
     "files",
     "digests",
     "paths",
+    "cores",
     "extras",
     "terminal",
     "yamlfile",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import threading
@@ -15,12 +16,16 @@ import yaml
 from dagster._daemon.monitoring.run_monitoring import RESUME_RUN_LOG_MESSAGE
 
 from tests.postgres import Postgres
+from traps_pipeline.cores import cores
+from traps_pipeline.defs import benchmark
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.cluster import RayRuns, dagster_yaml, require_cluster
+from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.runs import batches, broke_off
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, require_same_code
 from traps_pipeline.orchestration.schemes import CELL, DATASET, Scheme
 from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, end_if_resumed
+from traps_pipeline.progress import Progress, reporting
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 
@@ -60,6 +65,56 @@ def test_cells_of_one_model_stay_together(workspace: Workspace) -> None:
     assert len([*batches(CELL, keys)]) == 1  # which one process makes in one
 
 
+def test_what_a_stage_takes_is_what_ray_sets_aside_and_what_the_run_uses(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    remote = Workspace(workspace.root, workspace.study, "s3://lab/study")
+    submits = RayRuns(dg.DagsterInstance.ephemeral(), remote, 1, 0.0, "leave", cpus=4)
+    works = {"TRAPS_WORKSPACE": "s3://lab/study", "TRAPS_CORES": "4"}
+    assert json.loads(submits._resources([the_graph()[benchmark.VIDEOS.name]], (None, None))) == {
+        "num_cpus": 4, "memory": int(2.2 * 2**30), "runtime_env": {"env_vars": works}
+    }  # fmt: skip
+    assert json.loads(submits._resources([the_graph()[benchmark.ITEMS.name]], (None, None))) == {
+        "num_cpus": 1, "runtime_env": {"env_vars": works | {"TRAPS_CORES": "1"}}
+    }  # fmt: skip
+    here = len(os.sched_getaffinity(0))
+    for given, used in (("1", 1), ("100000", here), ("", here)):
+        monkeypatch.setenv("TRAPS_CORES", given)
+        assert cores() == used
+
+
+def test_a_person_is_told_once_that_no_host_takes_any_run(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("traps_pipeline.orchestration.cluster.IDLE_S", 0.0)
+    shown = Shown()
+    with dg.DagsterInstance.ephemeral() as instance, reporting(shown):
+        run = instance.create_run_for_job(_nothing, tags={"dagster-ray/config": '{"num_cpus": 16}'})
+        starting = dg.DagsterEvent(event_type_value=dg.DagsterEventType.PIPELINE_STARTING.value, job_name="_nothing")
+        instance.report_dagster_event(starting, run.run_id)
+        watching, left = RayRuns(instance, workspace, 1, 0.0, "leave"), [run.run_id]
+        for _ in range(3):
+            watching._look_at(left, [])
+            time.sleep(0.01)
+        assert [note for note in shown.notes if "for a host that is free and has num_cpus 16" in note] == shown.notes
+        assert len(shown.notes) == 1
+        instance.report_run_failed(run, "it was ended")
+        watching._look_at(left, [])
+        assert not left
+
+
+class Shown(Progress):
+    """Keeps what is told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.notes = list[str]()
+
+    def note(self, text: str) -> None:
+        """See `Progress`."""
+        self.notes.append(text)
+
+
 def test_a_host_with_other_code_refuses_a_run_and_names_both(workspace: Workspace) -> None:
     require_same_code({CODE_TAG: code_here()}, "lab")
     require_same_code({}, "lab")  # a run of this host's own
@@ -94,7 +149,9 @@ def test_what_dagster_is_told_holds_no_address_of_the_database(monkeypatch: pyte
     said = dagster_yaml("TRAPS_DATABASE", "s3://lab/study")
     assert "secret" not in str(said) and said["concurrency"]["runs"]["max_concurrent_runs"] == 40
     assert said["run_launcher"]["config"]["ray"] == {
-        "address": "http://head:8265", "num_cpus": 1, "runtime_env": {"env_vars": {"TRAPS_WORKSPACE": "s3://lab/study"}},
+        "address": "http://head:8265", "num_cpus": 1, "runtime_env": {
+            "env_vars": {"TRAPS_WORKSPACE": "s3://lab/study", "TRAPS_CORES": "1"}
+        },
     }  # fmt: skip
 
 

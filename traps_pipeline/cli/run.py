@@ -67,6 +67,12 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--gpus", type=number(0, 1000), default=0.0, help="GPUs of a run of --cluster that loads a local model"
     )
+    parser.add_argument(
+        "--cpus",
+        type=whole(1, 1000),
+        default=1,
+        help="cores of a run of --cluster that renders clips or fits probes, which works on all of them (default: 1)",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -141,7 +147,8 @@ def _runs(arguments: argparse.Namespace, instance: DagsterInstance, workspace: W
     from traps_pipeline.orchestration.cluster import RayRuns, require_cluster
 
     require_cluster(workspace, instance)
-    with RayRuns(instance, workspace, arguments.runs, arguments.gpus, arguments.on_interrupt) as runs:
+    given = arguments.runs, arguments.gpus, arguments.on_interrupt, arguments.cpus
+    with RayRuns(instance, workspace, *given) as runs:
         yield runs
 
 

@@ -28,7 +28,7 @@ from traps_pipeline.mechanism.versions import (
     steering_version,
 )
 from traps_pipeline.models.registry import local_models
-from traps_pipeline.orchestration.graph import Check, Need
+from traps_pipeline.orchestration.graph import Check, Need, Takes
 from traps_pipeline.orchestration.schemes import (
     CATEGORY,
     CELL,
@@ -184,6 +184,7 @@ probes = stage(
     scheme=EXTRACTION,
     kinds=["parquet", "scikitlearn"],
     needs={"hidden_states": "some", "verdicts": "none"},
+    takes=Takes(memory_gb=1.0, each_gb=0.5),
     wants=lambda wanted, key: Extraction.parse(key).prompt == PROBE_PROMPT,
     checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
 )

@@ -5,7 +5,6 @@ Layers are read one at a time: at the 8B size one layer of all items takes 46 MB
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.cores import cores
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.paths import CURVES, LOOK_ALIKES, TRANSFER_PAIRS, Path, probed_taxonomy
 from traps_pipeline.mechanism.probes import (
@@ -281,7 +281,7 @@ def each_layer(work: Callable[[int], Result], n_layers: int) -> Iterator[Result]
     """
     from threadpoolctl import threadpool_limits
 
-    workers = min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+    workers = min(cores(), MOST_WORKERS)
     with threadpool_limits(1), ThreadPoolExecutor(workers) as pool:
         yield from pool.map(work, range(n_layers))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Any
 
 from traps_pipeline import progress
 from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.cores import cores
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.framing import framed
@@ -77,7 +77,7 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
         workspace.bring(item["clip"] for item in items)
         for item in items:
             jobs[item["media_digest"], repr(spec)] = (workspace.root / item["clip"], item["media_digest"], spec)
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for done, _ in enumerate(pool.map(lambda job: workspace.media.prepare(*job), jobs.values()), start=1):
             progress.current().tick("responses", "media to send", done, len(jobs))
 

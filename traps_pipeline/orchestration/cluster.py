@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import dagster as dg
 
 from traps_pipeline import progress
+from traps_pipeline.cores import CORES
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.extras import missing
 from traps_pipeline.models.registry import LOCAL, get_model
@@ -39,6 +40,7 @@ AT_ONCE = 40  # runs; Ray keeps a process of some 85 MB for each on the head
 POLL_S = 1.0
 MONITOR_S, RESUMES = 15, 3
 START_S = 24 * 3600  # a run may wait so long for a host; one that waits for nothing ends sooner (`lost_runs.py`)
+IDLE_S = 60.0  # after so long a person is told that runs wait for a host
 ALIVE_S = 120  # a daemon that has been silent for longer is dead
 QUEUE = "QUEUED_RUN_COORDINATOR"
 OnInterrupt = Literal["leave", "cancel"]
@@ -115,13 +117,21 @@ def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
 
 class RayRuns(Runs):
     """Runs of a study in Dagster's queue. most: into which a group of stages is cut, besides what cannot stand in one
-    rectangle of cells. gpus: of each run that loads a local model."""
+    rectangle of cells. gpus: of each run that loads a local model. cpus: of each run that works on as many as it is
+    given."""
 
     def __init__(
-        self, instance: dg.DagsterInstance, workspace: Workspace, most: int, gpus: float, on_interrupt: OnInterrupt
+        self,
+        instance: dg.DagsterInstance,
+        workspace: Workspace,
+        most: int,
+        gpus: float,
+        on_interrupt: OnInterrupt,
+        cpus: int = 1,
     ) -> None:
         self._instance, self._workspace, self._on_interrupt = instance, workspace, on_interrupt
-        self._most, self._gpus = most, gpus
+        self._most, self._gpus, self._cpus = most, gpus, cpus
+        self._idle_since, self._told_idle = float("inf"), False  # while all runs wait for a host
         self._stack, self._n_keys = ExitStack(), 0
         self._cursors: dict[str, str | None] = {}
         self._retries: dict[str, tuple[Sequence[Stage], Range, Mapping[str, str]]] = {}  # once, what broke off
@@ -210,15 +220,16 @@ class RayRuns(Runs):
 
     def _resources(self, stages: Sequence[Stage], of: Range) -> str:
         """What Ray sets aside for a run, and which study it works in. No secrets: tags can be read by everybody."""
-        takes = {"num_cpus": max(stage.takes.cpus for stage in stages), "num_gpus": 0.0, "memory": None}
-        memory = max(stage.takes.memory_gb for stage in stages)
+        cpus = self._cpus if any(stage.takes.each_gb for stage in stages) else 1
+        takes = {"num_cpus": cpus, "num_gpus": 0.0, "memory": None}
+        memory = max(stage.takes.memory_gb + cpus * stage.takes.each_gb for stage in stages)
         asks = RESPONSES.name in {stage.name for stage in stages} and any(map(_is_local, self._chunks.get(of, ())))
         if asks or any(stage.cost == "machine" for stage in stages):
             takes["num_gpus"] = self._gpus
         if memory:
             takes["memory"] = int(memory * 2**30)
         given = {name: value for name, value in takes.items() if value}
-        return json.dumps(given | {"runtime_env": _works_in(str(self._workspace.place))})
+        return json.dumps(given | {"runtime_env": _works_in(str(self._workspace.place), cpus)})
 
     def _watch(self, run_ids: Sequence[str]) -> list[Ran]:
         """Tell what runs do until all have ended. While the database is away, for as long as runs themselves wait for
@@ -242,6 +253,7 @@ class RayRuns(Runs):
     def _look_at(self, left: list[str], done: list[Ran]) -> None:
         """Tell what these runs have done since the last time. What came of those that have ended is added to `done`."""
         runs = {run.run_id: run for run in self._instance.get_runs(dg.RunsFilter(run_ids=left))}
+        self._tell_waiting([*runs.values()])
         for run_id in [*left]:
             run = runs.get(run_id)
             self._tell(run_id)
@@ -253,6 +265,22 @@ class RayRuns(Runs):
             elif run is None or run.is_finished:
                 done.append(self._ended(run_id, run, self._failures.get(run_id, [])))
                 left.remove(run_id)
+
+    def _tell_waiting(self, runs: Sequence[dg.DagsterRun]) -> None:
+        """Say once that no run has begun for a while, since no host has what one takes: nothing else would."""
+        waiting = [run for run in runs if run.status == dg.DagsterRunStatus.STARTING]
+        if not waiting or any(run.status == dg.DagsterRunStatus.STARTED for run in runs):
+            self._idle_since = float("inf")
+            return
+        self._idle_since = min(self._idle_since, time.monotonic())
+        if time.monotonic() - self._idle_since > IDLE_S and not self._told_idle:
+            self._told_idle = True
+            takes = json.loads(waiting[0].tags.get("dagster-ray/config", "{}"))
+            wanted = ", ".join(f"{name} {value}" for name, value in takes.items() if name != "runtime_env")
+            progress.current().note(
+                f"{len(waiting)} runs have waited {IDLE_S:.0f} s for a host that is free and has {wanted or 'a CPU'}; "
+                "`ray status` on the head shows what there is"
+            )
 
     def _tell(self, run_id: str) -> None:
         """Tell of partitions that a run has made since the last time, and remember steps that failed."""
@@ -303,8 +331,8 @@ class RayRuns(Runs):
         progress.current().note(f"{len(left)} runs were told to end; what they asked and made is kept")
 
 
-def _works_in(place: str) -> dict[str, Any]:
-    return {"env_vars": {VARIABLE: place}}
+def _works_in(place: str, cpus: int = 1) -> dict[str, Any]:
+    return {"env_vars": {VARIABLE: place, CORES: str(cpus)}}
 
 
 def _is_local(cell: str | None) -> bool:

@@ -63,11 +63,12 @@ class Source:
 
 @dataclass(frozen=True)
 class Takes:
-    """What a run of a stage takes of a host, for a cluster to set aside. memory_gb: 0 where it does not matter. A stage
-    whose cost is `machine` takes a GPU besides, where `traps run --gpus` says so."""
+    """What a run of a stage takes of a host, for a cluster to set aside. memory_gb: 0 where it does not matter.
+    each_gb: of a stage that works on all cores that it is given (`traps run --cpus`), the memory of each besides; 0: it
+    works on one. A stage whose cost is `machine` takes a GPU besides, where `traps run --gpus` says so."""
 
-    cpus: float = 1.0
     memory_gb: float = 0.0
+    each_gb: float = 0.0
 
 
 @dataclass(frozen=True)

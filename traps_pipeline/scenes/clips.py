@@ -7,13 +7,13 @@ control that closes has a panel in its last frames; the twin's clip never has on
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
+from traps_pipeline.cores import cores
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.files import write_text
 from traps_pipeline.scenes import checks
@@ -170,4 +170,4 @@ def render_pairs(jobs: Sequence[Job], workers: int | None = None) -> Iterator[tu
     """Render pairs with one process a core; yields each job with its frames drawn as it is done."""
     todo = [job for job in jobs if any(read_clip(path) is None for path in job.clips)]
     yield from ((job, 0) for job in jobs if job not in todo)
-    yield from run_in_order(render_pair, todo, min(workers or len(os.sched_getaffinity(0)), max(1, len(todo))))
+    yield from run_in_order(render_pair, todo, min(workers or cores(), max(1, len(todo))))

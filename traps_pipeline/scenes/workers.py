@@ -13,6 +13,8 @@ from itertools import islice
 from multiprocessing import get_context
 from typing import TypeVar
 
+from traps_pipeline.cores import cores
+
 JOBS_A_WORKER = 100  # GL drivers leak: a worker does so many jobs, then another takes over
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -25,7 +27,7 @@ def run_in_order(
 
     A GL context belongs to a process, so each worker keeps its own. Closing the iterator cancels what has not begun.
     """
-    workers = workers or len(os.sched_getaffinity(0))
+    workers = workers or cores()
     source = iter(jobs)
     more = True
     while more:  # a fresh pool for each round: recycling inside a pool can deadlock (CPython 3.11)

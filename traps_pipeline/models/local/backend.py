@@ -7,12 +7,12 @@ running and nothing else.
 from __future__ import annotations
 
 import asyncio
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from threading import Event
 
+from traps_pipeline.cores import cores
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.framing import framed
 from traps_pipeline.models.local.checkpoint import find_checkpoint
@@ -84,7 +84,7 @@ class LocalBackend:
         from traps_pipeline.models.local.sampling import Sampling
 
         model = load_local_model(self._entry)
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        with ThreadPoolExecutor(cores()) as pool:
             clips = list(pool.map(lambda request: _frames(request, self._spec), batch.requests))
         prompts = [
             model.prompt(request.system, request.user, shown.frames, shown.times_s)

@@ -1,0 +1,13 @@
+"""How many cores work may use: those of this process, or those that a cluster has set aside for its run."""
+
+from __future__ import annotations
+
+import os
+
+CORES = "TRAPS_CORES"  # of a run on a cluster; set by who submits it
+
+
+def cores() -> int:
+    """At least one."""
+    here, given = len(os.sched_getaffinity(0)), os.environ.get(CORES)
+    return min(here, max(1, int(given))) if given else here
