@@ -86,7 +86,7 @@ def test_a_run_that_waits_for_a_host_goes_on_waiting_and_one_that_waits_for_noth
         opened.callback(lambda: cluster.signal("head", signal.SIGKILL))
         instance = opened.enter_context(history(tmp_path / "history", f"http://127.0.0.1:{cluster.dashboard}"))
         launcher: Any = instance.run_launcher
-        waiting, stopped, unknown, left = (launched(instance) for _ in range(4))
+        waiting, ended, unknown, left = (launched(instance) for _ in range(4))
         never_queued = instance.create_run_for_job(study)
 
         def launch() -> None:
@@ -99,14 +99,13 @@ def test_a_run_that_waits_for_a_host_goes_on_waiting_and_one_that_waits_for_noth
             cluster.start_head,
         )
         client = launcher.client
-        client.submit_job(submission_id=f"dagster-run-{stopped.run_id}", entrypoint="true", entrypoint_num_cpus=1)
-        client.stop_job(f"dagster-run-{stopped.run_id}")
+        client.submit_job(submission_id=f"dagster-run-{ended.run_id}", entrypoint="false")  # takes no CPU
         until = time.monotonic() + CAN_END_S
-        while not client.get_job_status(f"dagster-run-{stopped.run_id}").is_terminal():
+        while not client.get_job_status(f"dagster-run-{ended.run_id}").is_terminal():
             assert time.monotonic() < until
             time.sleep(0.5)
         instance.report_run_canceled(left)
-        assert fail_lost_runs(instance, lost_s=3600) == [stopped.run_id]  # the others may be submitted yet
+        assert fail_lost_runs(instance, lost_s=3600) == [ended.run_id]  # the others may be submitted yet
         assert {*fail_lost_runs(instance, lost_s=0)} == {unknown.run_id, never_queued.run_id}
         assert [state(instance, run) for run in (waiting, left)] == ["STARTING", "CANCELED"]
         assert "the run will not begin: Ray knows nothing of its job" in told(instance, unknown)
