@@ -324,6 +324,7 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     said = study.traps("run", str(study.experiment), "--until", "items")
     study.require(" 0 frames rendered" in said.stdout, "clips that are there are not rendered again")
     study.start_daemon()
+    scene.opens.counts.clear()  # what nodes open for this study, not for the one before
     provider.reset()
     orphans = Orphans(scene.database.address())
     orphans.start()

@@ -31,6 +31,7 @@ from dagster import DagsterInstance
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.cluster import require_cluster
+from traps_pipeline.storage.place import name_of
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -271,7 +272,8 @@ def nodes_are_apart(study: Study, opens: Opened, *, least: int = len(NODES)) -> 
         path for folder in folders.values() for path in folder.rglob("*")
         if path.is_symlink() or not path.resolve().is_relative_to(folder)
     ]  # fmt: skip
-    made = {node: len([*folder.rglob("*.parquet")]) for node, folder in folders.items()}
+    mine = name_of(study.environment["TRAPS_WORKSPACE"])  # nodes may have made other studies before
+    made = {node: len([*(folder / mine).rglob("*.parquet")]) for node, folder in folders.items()}
     enough = sum(count > 0 for count in made.values()) >= least
     study.require(not strays and enough, f"at least {least} nodes have tables in their own folders: {made}")
     if not opens.is_on:
