@@ -57,7 +57,7 @@ def test_what_a_run_prints_on_one_host_is_read_on_another(
     @dg.op
     def speaks(context: dg.OpExecutionContext) -> None:
         print("made on this host", flush=True)
-        context.instance.compute_log_manager.on_progress(keys_of(here.instance, context.run_id)[0])
+        here.logs.on_progress(keys_of(here.instance, context.run_id)[0])
         seen.append(there.read(keys_of(here.instance, context.run_id)[0])[0])
         print("and ended", flush=True)
 
@@ -87,7 +87,7 @@ def test_a_run_ends_well_where_the_store_does_not_take_what_it_prints(
     @dg.op
     def speaks(context: dg.OpExecutionContext) -> None:
         print("made on this host", flush=True)
-        context.instance.compute_log_manager.on_progress(keys_of(host.instance, context.run_id)[0])
+        host.logs.on_progress(keys_of(host.instance, context.run_id)[0])
 
     @dg.job
     def study() -> None:
