@@ -377,6 +377,10 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     tables_are_equal(study, alone, fetch(study, study.folder / f"fetched-{kind}"))
     # With eight calls one node may make all that is left, where the other's run was killed before it wrote a table.
     nodes_are_apart(study, scene.opens, least=1 if scene.size is SMALL else len(NODES))
+    with study.opened() as workspace:
+        assert isinstance(workspace.store, ObjectStore)
+        logged = {name.split("/")[1] for name, size, _ in workspace.store.bucket.names("logs") if size}
+    study.require(bool(logged), f"the store has what {len(logged)} runs printed")
     import psycopg
 
     with psycopg.connect(scene.database.address(), autocommit=True) as connection:
