@@ -169,8 +169,8 @@ def look_inside(folder: Path, experiment: Path) -> dict[str, str]:
 
 
 def watch(run: subprocess.Popen[str], kill: object) -> tuple[int, int]:
-    """Print what a run says, and kill a node once it renders; its exit code, and how many calls failed that may be asked
-    again: some of `flaky` always do."""
+    """Print what a run says, and kill a node once it renders; its exit code, and how many calls failed: some of `flaky`
+    always do."""
     began, killed, failed = time.monotonic(), kill is None, 0
     assert run.stdout is not None
     for line in run.stdout:
