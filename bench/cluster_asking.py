@@ -45,6 +45,7 @@ panel: rules
 judged_by_rules: true
 scenarios: {[f"{family}-0001" for family in FAMILIES]}
 """.replace("'", "")
+MORE = f"prices: {{input: 1.0, output: 10.0, as_of: 2026-11-01}}\n    runs: {len(RUNS)}"  # of an entry
 BUDGET = ("--no-preflight", "--budget-usd", "100000")
 
 
@@ -84,7 +85,9 @@ def main() -> None:
         folder = Path(name)
         checkout = Checkout(make_checkout(folder / "checkout"), folder / "clips")
         limits = f"limits: {{concurrency: {CONNECTIONS}, timeout_s: 36, backoff_s: 0.05}}"
-        entries = [entry(one, "images").replace("limits: {timeout_s: 36, backoff_s: 0.05}", limits) for one in MODELS]
+        entries = [
+            entry(one, "images", MORE).replace("limits: {timeout_s: 36, backoff_s: 0.05}", limits) for one in MODELS
+        ]
         register(checkout, provider, *entries)
         experiment = checkout.root / "asking.yaml"
         experiment.write_text(EXPERIMENT)

@@ -45,7 +45,8 @@ def free_port() -> int:
 
 
 class Cluster:
-    """A Ray head and two nodes of this machine, each recognised by a variable in the environment of its processes."""
+    """A Ray head and two nodes of this machine, each recognised by its scratch folder in the environment of its
+    processes: a machine may have several clusters."""
 
     def __init__(self, folder: Path, environment: dict[str, str], own: dict[str, dict[str, str]] | None = None) -> None:
         self.folder, self.environment, self.own = folder, environment, own or {}
@@ -82,7 +83,7 @@ class Cluster:
 
     def processes(self, name: str) -> list[int]:
         """The processes of a node, and those that they started."""
-        mark, found = f"\0TRAPS_NODE={name}\0".encode(), list[int]()
+        mark, found = f"\0TRAPS_SCRATCH={self.folder / name}\0".encode(), list[int]()
         for entry in Path("/proc").iterdir():
             if entry.name.isdigit() and int(entry.name) != os.getpid():
                 try:

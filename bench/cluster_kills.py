@@ -88,7 +88,8 @@ class Scene:
 
     def busy(self) -> tuple[str, list[int]]:
         """A node that executes a run, and the processes that do."""
-        found = executing()
+        here = {pid for node in NODES for pid in self.cluster.processes(node)}
+        found = {pid: told for pid, told in executing().items() if pid in here}
         node = next(node for _, node in found.values() if node)
         return node, [pid for pid, (_, where) in found.items() if where == node]
 
