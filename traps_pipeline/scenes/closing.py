@@ -24,6 +24,7 @@ from traps_pipeline.scenes.outcome import Rejected
 from traps_pipeline.scenes.parts.outcome import still_from
 from traps_pipeline.scenes.policies import last_of_all
 from traps_pipeline.scenes.simulate import swept_points
+from traps_pipeline.scenes.world import World
 
 READ_BY_DRAW_S = 1.0  # so long the outcome is in view where there is time for it
 REST_BY_DRAW_S = 0.6  # so long it has been at rest by then: three frames of five a second
@@ -36,10 +37,10 @@ def closed(pair: Pair, seed: int, so_far: Mapping[str, Any]) -> tuple[Pair, dict
     """A pair whose control closes, at a moment that follows from the seed, with the evidence of it; the pair as it is
     if its control can be closed at no moment that is tried. so_far: the evidence of all other certificates. Raises
     Rejected if not even that can be certified."""
-    closings = (Closing(frame, _panel(pair, frame)) for frame in _moments(pair, seed))
-    for closing in closings:
+    worlds = pair.control, pair.other_world
+    for frame in moments(pair.control, seed):
         try:
-            return _certified(pair, closing, so_far)
+            return _certified(pair, Closing(frame, panel_from(frame, *worlds)), so_far)
         except Rejected:
             continue  # another moment may do
     return _certified(pair, None, so_far)
@@ -61,35 +62,34 @@ def record_of(pair: Pair) -> dict[str, Any] | None:
     return {"closes_frame": closing.frame, **own}
 
 
-def _moments(pair: Pair, seed: int) -> Iterator[int]:
-    """Frames at which the control may close: when the outcome has been in view, and at rest, for long enough; where
-    there is no time for that, and after all others, the last frame that is possible."""
-    control = pair.control
+def moments(control: World, seed: int) -> Iterator[int]:
+    """Frames at which a control may close: when the outcome has been in view, and at rest, for long enough; where there
+    is no time for that, and after all others, the last frame that is possible. None where no frame is."""
     fps, commit = control.physics.fps, control.outcome.commit_frame
     last = last_of_all(len(control.qpos), fps)
     if last - commit < round(READ_S * fps):
         return
-    rests = _at_rest_from(pair) + round(REST_BY_DRAW_S * fps)
+    rests = _at_rest_from(control) + round(REST_BY_DRAW_S * fps)
     first = min(max(commit + round(READ_BY_DRAW_S * fps), rests), last)
     rng = np.random.default_rng([seed, *control.family.name.encode(), *b"closing"])
     drawn = [int(frame) for frame in rng.permutation(np.arange(first, last + 1))]
     yield from dict.fromkeys([*drawn[: TRIES - 1], last])
 
 
-def _at_rest_from(pair: Pair) -> int:
+def _at_rest_from(control: World) -> int:
     """The frame from which every decisive body stays as it lies at the end: its middle, and three points around it."""
-    motion = pair.control.motion
-    paths = [motion.places(body, BESIDE_M) for body in pair.control.scene.decisive]
+    motion = control.motion
+    paths = [motion.places(body, BESIDE_M) for body in control.scene.decisive]
     return still_from(*paths, within_m=STILL_M)
 
 
-def _panel(pair: Pair, frame: int) -> Panel:
-    """The panel of the void, or one in front of where all outcomes lie and of all that moves from a frame on."""
-    control = pair.control
+def panel_from(frame: int, control: World, *others: World) -> Panel:
+    """The panel that closes a control at a frame: that of its void, or one in front of where all outcomes lie and of all
+    that moves from then on, in the control and in other worlds that it must not be told from."""
     if control.panel is not None:
         return control.panel
     zone = control.scene.stage if control.scene.rest is None else (control.scene.rest,)
-    moving = [swept_points(world.model, world.qpos[frame:]) for world in (control, pair.other_world)]
+    moving = [swept_points(world.model, world.qpos[frame:]) for world in (control, *others)]
     hidden = np.concatenate([*moving, *(box.corners() for box in zone)])
     return fit_panel(control.camera, Box(_corner(hidden.min(axis=0)), _corner(hidden.max(axis=0))))
 
