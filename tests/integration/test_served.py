@@ -24,7 +24,7 @@ def test_the_pocket_model_behind_transformers_serve_gets_a_row(
     with transformers_serve(WEIGHTS, tmp_path) as url:
         path.write_text(
             f"name: served\nmodels:\n  - id: served\n    base_url: {url}\n    served_name: {WEIGHTS}\n"
-            "    media: {profile: images, uniform: 2}\n    waivers: {media: it was trained with two frames}\n"
+            "    media: {profile: images, uniform: 8}\n    waivers: {media: it was trained with eight frames}\n"
             f"judges:\n{judges}panels: {{three: [judge-a, judge-b, judge-c]}}\n"
             f"regimes: [standard]\ndatasets: [occlusion]\n{SMALL.read_text()[SMALL.read_text().index('scenarios:') :]}"
         )

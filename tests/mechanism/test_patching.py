@@ -3,20 +3,30 @@ the positions of a prompt's parts; and an independent re-implementation in plain
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pytest
 import torch
 
-from tests.local_models import QUESTIONS, SYSTEM, Family, ask, model
+from tests.local_models import QUESTIONS, SYSTEM, Family, ask, clip, model
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching import SITES, Patch, Recorded, patched_changes, record, require_patchable
-from traps_pipeline.models.local.adapter import LocalModel, Prompt
+from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.spans import PARTS, spans
+from traps_pipeline.models.registry import get_model
+from traps_pipeline.storage.media import MediaSpec, sample
 
 pytestmark = pytest.mark.slow
-FAMILIES: tuple[Family, ...] = ("qwen3-vl", "llava-next-video")
+POCKET = "pocket"  # the shipped weights, whose states mean something, beside tiny random ones
+PATCHABLE = ("qwen3-vl", "llava-next-video", POCKET)
+
+
+def subject(name: str) -> LocalModel:
+    """The pocket model, or the tiny random one of a family."""
+    return load_local_model(get_model(POCKET), inside=True) if name == POCKET else model(cast(Family, name))
 
 
 def other(prompt: Prompt, seed: int = 0) -> Prompt:
@@ -31,16 +41,20 @@ def other(prompt: Prompt, seed: int = 0) -> Prompt:
     return Prompt(prompt.text, inputs | {"input_ids": ids})
 
 
-def pair(family: Family) -> tuple[LocalModel, Recorded, Recorded, list[int], Prompt, Prompt]:
-    of = model(family)
-    target = ask(of)
+def pair(name: str) -> tuple[LocalModel, Recorded, Recorded, list[int], Prompt, Prompt]:
+    of = subject(name)
+    if name == POCKET:
+        shown = sample(clip(), cast(MediaSpec, get_model(POCKET).media))
+        target = of.prompt(SYSTEM, QUESTIONS[0], shown.frames, shown.times_s.tolist())
+    else:
+        target = ask(of)
     source, tokens = other(target), abstention_tokens(of)
     return of, record(of, target, tokens), record(of, source, tokens), tokens, target, source
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_all_positions_give_the_source_and_a_patch_with_itself_nothing(family: Family) -> None:
-    of, target, source, tokens, *_ = pair(family)
+@pytest.mark.parametrize("name", PATCHABLE)
+def test_all_positions_give_the_source_and_a_patch_with_itself_nothing(name: str) -> None:
+    of, target, source, tokens, *_ = pair(name)
     whole = np.ones(target.length, bool)
     assert abs(source.margin - target.margin) > 1e-3
     everywhere = [Patch("residual", layer, whole) for layer in range(of.n_layers + 1)]
@@ -74,13 +88,13 @@ def test_without_the_deepstack_features_all_positions_do_not_give_the_source() -
         model("qwen3-vl").clips = ClipMemory()
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_a_patch_is_what_a_plain_hook_on_the_whole_model_does(family: Family) -> None:
+@pytest.mark.parametrize("name", PATCHABLE)
+def test_a_patch_is_what_a_plain_hook_on_the_whole_model_does(name: str) -> None:
     """Independent: the library's own forward pass from pixels to logits, one hook, one prompt at a time."""
-    of, target, source, tokens, prompt, donor = pair(family)
+    of, target, source, tokens, prompt, donor = pair(name)
     chosen = torch.zeros(target.length, dtype=torch.bool)
     chosen[-9:-2] = True  # text behind the clip, so that no deepstack feature is concerned
-    for name, layer, get in (
+    for site, layer, get in (
         ("residual", 3, lambda block: block), ("attention", 2, lambda block: block.self_attn),
         ("mlp", 4, lambda block: block.mlp),
     ):  # fmt: skip
@@ -107,7 +121,7 @@ def test_a_patch_is_what_a_plain_hook_on_the_whole_model_does(family: Family) ->
         never = of.network.generation_config.suppress_tokens or []
         rest = [t for t in range(len(logits)) if t not in tokens and t not in never]
         expected = (torch.logsumexp(logits[tokens], 0) - torch.logsumexp(logits[rest], 0)).item()
-        change = patched_changes(of, target, source, [Patch(name, layer, chosen.numpy())], tokens)[0]
+        change = patched_changes(of, target, source, [Patch(site, layer, chosen.numpy())], tokens)[0]
         assert target.margin + change == pytest.approx(expected, abs=1e-5)
 
 

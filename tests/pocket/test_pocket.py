@@ -44,6 +44,7 @@ from traps_pipeline.storage.workspace import Workspace
 pytestmark = pytest.mark.slow
 
 FEW = 2  # scenes
+SHOWN_S = [0.0, 0.7, 1.4, 2.1, 2.8, 3.5, 4.2, 4.9]  # eight frames of a clip of 50 at 10 a second
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -75,9 +76,9 @@ def data(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _guided(recipe: Recipe) -> float:
-    """The share of voids labelled with an abstention under the guided prompt that is decided at each look; 0 where the
-    scene's record has it."""
-    return (recipe.abstain_shares or {}).get("guided", 0.0)
+    """The share of voids labelled with an abstention under the guided prompt."""
+    assert recipe.abstain_shares is not None, "the shipped recipe has shares by prompt"
+    return recipe.abstain_shares["guided"]
 
 
 def _records(job: ShardJob) -> list[SceneRecord]:
@@ -108,13 +109,13 @@ def test_frames_for_training_are_those_that_a_clip_gives(
     """The same scenes written as clips and read through the media path of every model: only H.264 lies between."""
     (job,) = shard_jobs(recipe, "train", data)
     rendered = np.load(job.pixels)
-    assert rendered.shape == (FEW, 3 if recipe.decoys else 2, 2, 96, 128, 3)  # control, void, and perhaps a decoy
+    assert rendered.shape == (FEW, 3, 8, 96, 128, 3)  # control, void and decoy
     monkeypatch.setitem(STREAM, "held-out", STREAM["train"])
     as_clips = dataclasses.replace(job, split="held-out", folder=tmp_path, count=1)
     draw_shard(as_clips)
     for side, name in enumerate(("control", "void")):
         shown = sample(as_clips.clip(0, name), recipe.media)
-        assert shown.times_s.tolist() == [0.0, 4.9]
+        assert shown.times_s.tolist() == pytest.approx(SHOWN_S)
         off = np.abs(shown.frames.astype(int) - rendered[0, side])
         assert off.mean() < 3 and (off > 40).mean() < 0.005  # of 255: colours are halved in resolution
 
@@ -133,7 +134,7 @@ def test_a_folder_of_another_recipe_is_refused(recipe: Recipe, tmp_path: Path) -
     none = recipe.model_copy(update={"scenes": {"drop_split": 0}})
     render(none, "train", tmp_path)
     with pytest.raises(TrapsError, match="another recipe"):
-        render(none.model_copy(update={"abstain_share": 0.4}), "train", tmp_path)
+        render(none.model_copy(update={"decoys": 0.4}), "train", tmp_path)
 
 
 def test_other_numbers_of_scenes_draw_what_is_missing_and_read_what_is_wanted(
@@ -193,7 +194,8 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
         ]
         text = processor.apply_chat_template(turns, add_generation_prompt=True)
         said = say(question.label(_guided(recipe)), "guided") + processor.tokenizer.eos_token
-        clock = {"fps": 1000.0, "frames_indices": [0, 4900], "total_num_frames": 4901}
+        indices = [round(1000 * time) for time in SHOWN_S]
+        clock = {"fps": 1000.0, "frames_indices": indices, "total_num_frames": 4901}
         inputs = processor(
             text=[text + said], videos=[np.array(frames)], video_metadata=[clock], do_sample_frames=False,
             return_tensors="pt",

@@ -18,7 +18,7 @@ from traps_pipeline.scenes.vision import colour_mask
 
 pytestmark = pytest.mark.slow
 SHARES = {"standard": 0.1, "guided": 0.9, "json": 0.5, "vqa_standard": 0.1, "vqa_guided": 0.9}
-FEW = 6
+FEW, FPS = 6, 10
 
 
 def recipe(**settings: object) -> Recipe:
@@ -53,25 +53,52 @@ def test_lengths_of_chaotic_clips_overlap(planted: tuple[Recipe, Path, dict[str,
         if record.family != "plinko":
             continue
         for side in (0, 1):
-            last = (record.length(side, n_frames) - 1) / get_family("plinko").physics.fps
-            assert scenes.times(number, side) == [0.0, pytest.approx(last)]
+            times, last = scenes.times(number, side), (record.length(side, n_frames) - 1) / FPS
+            assert len(times) == 8 and times[0] == 0.0 and times[-1] == pytest.approx(last)
         assert record.cut_frame is not None
         if record.void_length:
             assert record.cut_frame < record.void_length == n_frames
 
 
-def test_a_jittered_control_still_ends_with_its_outcome(
+def test_a_short_control_ends_with_its_outcome_in_view(
     planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
 ) -> None:
-    """The last frame of a control is the simulation's last one, whenever the clip begins."""
+    """It ends with the last frame before a panel would come, as those of the arm length_matched do."""
     made, folder, _ = planted
     scenes = Scenes(made, folder)
-    late = [n for n, record in enumerate(scenes.records) if record.control_from]
-    assert late
-    for number in late:
+    short = [n for n, record in enumerate(scenes.records) if record.control_from]
+    assert short
+    for number in short:
+        assert scenes.records[number].control_until == scenes.records[number].closes_frame
         record, last = scenes.records[number], scenes.frames(number, 0)[-1]
         x, y = (round(share * size) for share, size in zip(record.places["last"], (128, 96), strict=True))
         assert colour_mask(last[max(0, y - 6) : y + 6, max(0, x - 6) : x + 6], record.ball).any()
+
+
+def test_a_panel_closes_controls_and_held_voids_alike(
+    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
+) -> None:
+    """Behind it a control of an occlusion scene is its void, frame by frame, and before it the two differ; nothing of a
+    chaotic scene moves any more."""
+    made, folder, _ = planted
+    scenes, seen = Scenes(made, folder), {"plinko": 0, "drop_split": 0}
+    for number, record in enumerate(scenes.records):
+        if record.closes_frame is None or record.control_until is not None:
+            continue
+        assert 0.8 <= record.closes_frame / FPS <= 4.5
+        closed = np.array(scenes.times(number, 0)) >= record.closes_frame / FPS - 1e-6
+        assert closed[-1] and not closed[0]
+        control, void = (scenes.frames(number, side).astype(int) for side in (0, 1))
+        if record.cut_frame is None:
+            assert (control[closed] == void[closed]).all()
+            assert all((a != b).any() for a, b in zip(control[~closed], void[~closed], strict=True))
+        else:
+            assert (np.diff(control[closed], axis=0) == 0).all()
+            if record.void_length:
+                arrives = np.abs(np.diff(void, axis=0)).max(axis=(1, 2, 3)) > 40
+                assert arrives[closed.argmax() - 1]  # the panel, over a still picture
+        seen[record.family] += 1
+    assert all(seen.values())
 
 
 def test_a_decoy_shows_a_panel_and_the_outcome(planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]]) -> None:
@@ -109,7 +136,10 @@ def test_settings_that_are_not_used_leave_the_data_as_they_were(tmp_path: Path) 
     (job,) = shard_jobs(plain, "train", tmp_path)
     draw_shard(job)
     line = json.loads(job.lines.read_text())
-    assert not {"control_from", "void_length", "decoy"} & set(line) and set(line["visual"]) == {"question", "answer"}
+    assert not {"control_from", "control_until", "void_length", "decoy"} & set(line) and set(line["visual"]) == {
+        "question",
+        "answer",
+    }
     assert np.load(job.pixels).shape[1] == 2
 
 

@@ -29,9 +29,9 @@ models:
   - id: served
     base_url: {url}
     served_name: {weights}
-    media: {{profile: images, uniform: 2}}
+    media: {{profile: images, uniform: 8}}
     params: {{temperature: 0.0, max_tokens: 32}}
-    waivers: {{media: trained with two frames, temperature: greedy, max_tokens: its answers are short}}
+    waivers: {{media: trained with eight frames, temperature: greedy, max_tokens: its answers are short}}
     runs: 1
 panel: rules
 judged_by_rules: true
@@ -66,7 +66,7 @@ def served(demo: Checkout, released: Path, tmp_path_factory: pytest.TempPathFact
     folder = tmp_path_factory.mktemp("served")
     shutil.copytree(demo.workspace / "clips", folder / "study" / "clips")
     study = Checkout(ROOT, folder / "study")
-    write_harness(released, folder / "harness", shown("images", 2))
+    write_harness(released, folder / "harness", shown("images", 8))
     with transformers_serve(WEIGHTS, folder) as url:
         experiment = EXPERIMENT.format(url=url, weights=WEIGHTS) + DEMO[DEMO.index("scenarios:") :]
         (folder / "served.yaml").write_text(experiment)

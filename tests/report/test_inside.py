@@ -14,9 +14,13 @@ from traps_pipeline.mechanism.effects import own_effects
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS
 from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report.catalogue import FIGURES, INSIDE
+from traps_pipeline.report.page import Card, picture_block, report_html
 from traps_pipeline.report.results import Makers, Results
 from traps_pipeline.report.tables import inside
+from traps_pipeline.report.tables.mechanism import why
 from traps_pipeline.report.writing import PrintedTable
+from traps_pipeline.scoring.tables import LEADERBOARD
+from traps_pipeline.storage.study import Layers, MechanismSettings
 from traps_pipeline.storage.tables import Table
 
 ABOUT = {"model": "m", "prompt": "standard", "epoch": "e"}
@@ -168,7 +172,7 @@ def test_doses_are_in_units_of_the_class_gap() -> None:
 def test_a_figure_is_drawn_from_them(name: str) -> None:
     report = next(report for report in FIGURES if report.name == name)
     axes = report.make(Made()).axes
-    assert axes and any(ax.has_data() for ax in axes)
+    assert axes and all(ax.has_data() for ax in axes)  # no panel for a dataset that was not asked
 
 
 def test_a_gate_moves_a_model_in_the_plane_of_j_and_accuracy() -> None:
@@ -177,3 +181,18 @@ def test_a_gate_moves_a_model_in_the_plane_of_j_and_accuracy() -> None:
     points = {(round(x, 6), round(y, 6)) for marks in plane.collections for x, y in np.asarray(marks.get_offsets())}
     assert points >= {(0.5, 0.9), (0.8, 0.8)}  # J = 0.5 - 0 before the gate, 0.9 - 0.1 behind it
     assert (0.9, 0.5) not in points
+
+
+def test_the_page_says_below_a_figures_title_what_it_shows() -> None:
+    report = next(report for report in FIGURES if report.name == "patching")
+    card = Card("figure-patching", report.title, [picture_block("made up", b"\x89PNG" + bytes(20))], report.doc)
+    page = report_html(frame(LEADERBOARD), chapters=[("Figures", [card])])
+    assert f'<p class="shows">{report.doc}</p>' in page and "1 is the whole difference of the outcome" in report.doc
+
+
+def test_only_a_study_without_a_mechanism_section_is_told_so() -> None:
+    made = Results()
+    made.is_study = True
+    assert "no `mechanism` section" in why(made)
+    made.mechanism = MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)})
+    assert why(made) == "this study has no such results yet"

@@ -42,6 +42,7 @@ class Scenes:
         self._frames: list[np.ndarray] = []
         self._place: list[tuple[int, int]] = []
         self._spec, self._decoys, self.shares = recipe.media, recipe.decoys, recipe.abstain_shares or {}
+        self._names: dict[tuple[int, int], np.ndarray] = {}  # of clips that were looked at: a tenth of a step otherwise
         for shard, (job, records) in enumerate(read_shards(recipe, "train", folder)):
             self._frames.append(np.load(job.pixels, mmap_mode="r", allow_pickle=False))
             self._place += [(shard, i) for i in range(len(records))]
@@ -51,6 +52,13 @@ class Scenes:
         """Frames of a clip, uint8 (N, H, W, 3)."""
         shard, place = self._place[scene]
         return self._frames[shard][place, side]
+
+    def names(self, scene: int, side: int) -> np.ndarray:
+        """The words that name every token of a clip, as in `names_of`, uint8 (tokens, words)."""
+        known = (scene, side)
+        if known not in self._names:
+            self._names[known] = names_of(self.frames(scene, side))
+        return self._names[known]
 
     def times(self, scene: int, side: int) -> list[float]:
         """Seconds into the clip of each frame."""
@@ -84,7 +92,7 @@ class Batch:
 
     A row is a clip followed by its questions with their answers; the attention mask hides the questions from each
     other. ids, labels (B, S), with IGNORED outside the answers; sees (B, 1, S, P + S) bool, the attention mask;
-    positions (3, B, P + S). names: the words that name every token of the clips, as in `names_of`.
+    positions (3, B, P + S). names: the words that name every token of the clips, as in `names_of`, float32.
     """
 
     head: torch.Tensor
@@ -130,7 +138,7 @@ class Batches:
             *rows,
             pixels=patches(values.permute(0, 1, 4, 2, 3)),
             grid=grids,
-            names=names_of(frames),
+            names=torch.from_numpy(np.concatenate([self._scenes.names(at.scene, at.side) for at in looks])).float(),
         )
 
     def _pieces(
@@ -206,17 +214,14 @@ def patches(frames: torch.Tensor) -> torch.Tensor:
     return split.reshape(batch * count // 2 * rows * columns, channels * 2 * PATCH * PATCH)
 
 
-def names_of(frames: np.ndarray) -> torch.Tensor:
-    """For every token of the clips (B, N, H, W, 3), in their order, the words that name its square in the later of its
-    two frames: the colours that have a few pixels there, its column and its row. Shape (tokens, words), float32, 0 or
-    1."""
-    import torch
-
+def names_of(frames: np.ndarray) -> np.ndarray:
+    """For every token of a clip (N, H, W, 3), in their order, the words that name its square in the later of its two
+    frames: the colours that have a few pixels there, its column and its row. Shape (tokens, words), uint8, 0 or 1."""
     from traps_pipeline.scenes.vision import colour_mask
 
-    later, square = frames[:, 1::2], 2 * PATCH
-    slots, rows, columns = len(frames) * later.shape[1], frames.shape[2] // square, frames.shape[3] // square
-    tall = later.reshape(-1, frames.shape[3], 3)
+    later, square = frames[1::2], 2 * PATCH
+    slots, rows, columns = len(later), frames.shape[1] // square, frames.shape[2] // square
+    tall = later.reshape(-1, frames.shape[2], 3)
     cells = (slots * rows, square, columns, square)
     seen = [colour_mask(tall, colour).reshape(cells).sum(axis=(1, 3)) >= SEEN_PX for colour in NAMED]
     colours = np.stack(seen, axis=-1).reshape(slots, rows, columns, len(NAMED))
@@ -227,7 +232,7 @@ def names_of(frames: np.ndarray) -> torch.Tensor:
         np.broadcast_to(row[:, None], (slots, rows, columns, len(ROWS))),
     ]
     named = np.concatenate([colours, *places], axis=-1)
-    return torch.from_numpy(named.reshape(-1, named.shape[-1]).astype(np.float32))
+    return named.reshape(-1, named.shape[-1]).astype(np.uint8)
 
 
 def name_tokens(tokenizer: Any) -> torch.Tensor:

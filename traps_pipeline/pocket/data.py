@@ -62,11 +62,13 @@ class SceneRecord:
 
     cut_frame: number of frames of the void (None for occlusion: as many as the control). asked: the control's question;
     visual: the same question about the void clip; ill_posed: about the control clip; answerable: a question that both
-    clips answer. ball: the colour of the ball in the question. places: the ball's place in the control's `first` and
-    `last` frame and in the last one before the cut (`cut`; chaotic), as shares of the picture's width and height from
-    its upper left corner. control_from: first frame of the control's clip; void_length: frames of the void's clip, of
-    which those from cut_frame on repeat the one before (None: as many as cut_frame says). decoy: whether there is a
-    third clip, the control with a panel that hides nothing.
+    clips answer. ball: the colour of the ball in the question. places: the ball's place in the `first` frame of the
+    control's clip, in the `last` one before a panel closes it, and in the last one before the cut (`cut`; chaotic), as
+    shares of the picture's width and height from its upper left corner. closes_frame: the simulation's frame from which
+    on a panel closes the control, and a void that is held so long (None: nothing closes it). control_from,
+    control_until: first frame of the control's clip, and the one behind its last (None: to the end); void_length:
+    frames of the void's clip, of which those from cut_frame on repeat the one before (None: as many as cut_frame says).
+    decoy: whether there is a third clip, the control with a panel that hides nothing, which nothing closes.
     """
 
     family: str
@@ -81,7 +83,9 @@ class SceneRecord:
     answerable: Question
     ball: str
     places: dict[str, tuple[float, float]]
+    closes_frame: int | None
     control_from: int = 0
+    control_until: int | None = None
     void_length: int | None = None
     decoy: bool = False
 
@@ -89,7 +93,7 @@ class SceneRecord:
         """Frames of the clip of a side (0 control, 1 void, 2 decoy), where the simulation has n_frames."""
         if side == 1 and self.cut_frame is not None:
             return self.void_length or self.cut_frame
-        return n_frames - self.control_from
+        return (self.control_until or n_frames) - self.control_from
 
     @property
     def line(self) -> str:
@@ -98,7 +102,7 @@ class SceneRecord:
         values = asdict(self)
         for name in ("asked", "visual", "ill_posed", "answerable"):
             values[name] = {key: value for key, value in values[name].items() if key != "draw" or value is not None}
-        unused = {"control_from": 0, "void_length": None, "decoy": False}
+        unused = {"control_from": 0, "control_until": None, "void_length": None, "decoy": False}
         kept = {name: value for name, value in values.items() if name not in unused or value != unused[name]}
         return canonical_json(kept) + "\n"
 
@@ -174,20 +178,24 @@ def _record(shot: Shot, recipe: Recipe, decoy: bool, rng: np.random.Generator) -
         return Question(question, None if draw < recipe.abstain_share else guessed)
 
     wording, both = shot.wording, shot.wording.answerable_question
+    family, params, closing = shot.control.family, shot.control.params, shot.control.closing
+    first, end = shot.control_span
     return SceneRecord(
-        family=shot.family.name,
-        params_digest=params_digest(shot.family.name, params_to_dict(shot.params)),
+        family=family.name,
+        params_digest=params_digest(family.name, params_to_dict(params)),
         labels=tuple(wording.labels),
         aliases=dict(wording.aliases),
-        answer_type=shot.family.answer_type,
+        answer_type=family.answer_type,
         cut_frame=shot.cut_frame,
         asked=Question(wording.question, shot.outcome.answer),
         visual=void(wording.question, wording.labels),
         ill_posed=void(shot.ill_posed_question, ()),
         answerable=Question(both.question, both.answer),
-        ball=shot.params.ball_colours[0] if hasattr(shot.params, "ball_colours") else shot.params.ball_colour,
+        ball=params.ball_colours[0] if hasattr(params, "ball_colours") else params.ball_colour,
         places=shot.places,
-        control_from=shot.control_from,
+        closes_frame=None if closing is None else closing.frame,
+        control_from=first,
+        control_until=end if end < len(shot.control.qpos) else None,
         void_length=shot.void_length,
         decoy=decoy,
     )
@@ -215,11 +223,11 @@ def draw_shard(job: ShardJob) -> int:
         if record.params_digest in job.banned:
             continue
         if job.split == "train":
-            if job.recipe.decoys and shot.panel is not None:
+            if job.recipe.decoys and shot.control.panel is not None:
                 sides.append(decoy or sides[0])  # an array has one shape; without a decoy its place is never looked at
             frames.append(np.stack([resized(np.stack(side), job.recipe.media.size) for side in sides]))
         else:
-            _write_clips(job, len(records), shot, sides)
+            _write_clips(job, record, len(records), sides)
         records.append(record)
     if len(records) < job.count:
         raise TrapsError(f"{job.family}: {len(records)} of {job.count} scenes after {_MOST_DRAWS * job.count} draws")
@@ -230,16 +238,14 @@ def draw_shard(job: ShardJob) -> int:
     return len(records)
 
 
-def _write_clips(job: ShardJob, place: int, shot: Shot, sides: Sequence[list[np.ndarray]]) -> None:
+def _write_clips(job: ShardJob, record: SceneRecord, place: int, sides: Sequence[list[np.ndarray]]) -> None:
     """Write the clips with the benchmark's length, rate, size and codec. Frames that the model is not shown are copies
     of the frame before, which need no drawing."""
-    fps = shot.family.physics.fps
-    whole = len(shot.qpos) - shot.control_from
-    lengths = whole, shot.void_length or shot.cut_frame or whole
-    for side, drawn, length in zip(("control", "void"), sides, lengths, strict=True):
-        shown = pick(np.arange(length) / fps, job.recipe.media)
-        latest = np.searchsorted(shown, np.arange(length), side="right") - 1
-        encode([drawn[i] for i in latest], job.clip(place, side), fps)
+    physics = get_family(job.family).physics
+    for side, (name, drawn) in enumerate(zip(("control", "void"), sides, strict=True)):
+        times = np.arange(record.length(side, physics.n_frames)) / physics.fps
+        latest = np.searchsorted(pick(times, job.recipe.media), np.arange(len(times)), side="right") - 1
+        encode([drawn[i] for i in latest], job.clip(place, name), physics.fps)
 
 
 def shard_jobs(recipe: Recipe, split: Split, folder: Path) -> list[ShardJob]:

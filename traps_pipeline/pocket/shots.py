@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from traps_pipeline.pocket.recipe import Jitter
 from traps_pipeline.scenes import checks
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera, Panel, View, fit_camera, fit_shot, in_frame
+from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Closing, View, fit_camera, fit_shot, in_frame
 from traps_pipeline.scenes.certificates import EARLIEST_CUT_S, settled_outcome, shown_points
+from traps_pipeline.scenes.closing import moments, panel_from
 from traps_pipeline.scenes.kit import Family, Wording
 from traps_pipeline.scenes.outcome import Outcome, Rejected, compile_scene, decisive_geoms, simulated
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.simulate import replay
 from traps_pipeline.scenes.wording import draw_ill_posed
+from traps_pipeline.scenes.world import World
 from traps_pipeline.storage.media import MediaSpec, pick
 
 LATEST_CUT_S = 2.0  # released cuts lie between 1.1 and 2.0 s
@@ -23,22 +25,23 @@ CUT_BEFORE_COMMIT_S = 0.5
 DECOY_BEHIND_M, DECOY_PX = 0.1, 2000.0  # a decoy stands so far behind all that is shown, and has so many pixels
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shot:
-    """A simulated scene that was accepted as a pair."""
+    """A simulated scene that was accepted as a pair. control: as in a released pair, with how it closes. control_span:
+    the first frame of the control's clip and the one behind its last; void_length, places: as in `data.SceneRecord`."""
 
-    family: Family
-    params: Any
+    control: World
     wording: Wording
-    qpos: np.ndarray
     outcome: Outcome
-    camera: Camera
-    panel: Panel | None
     cut_frame: int | None
     ill_posed_question: str
     places: dict[str, tuple[float, float]]
-    control_from: int = 0
-    void_length: int | None = None
+    control_span: tuple[int, int]
+    void_length: int | None
+
+    def shown(self, first: int, length: int, spec: MediaSpec) -> np.ndarray:
+        """The simulation's frames that the model is shown of a clip with so many frames, from one of them on."""
+        return first + pick(np.arange(length) / self.control.physics.fps, spec)
 
 
 def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = None) -> Shot:
@@ -56,11 +59,25 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
         raise Rejected("something decisive leaves the frame")
     cut = None if panel is not None else _draw_cut(outcome, physics.fps, rng)
     ill_posed = draw_ill_posed(family.taxonomy, scene.inventory, rng)
-    start, held = (0, None) if cut is None or jitter is None else _jittered(jitter, len(qpos), cut, physics.fps, rng)
-    frames = {"first": start, "last": len(qpos) - 1} | ({} if cut is None else {"cut": cut - 1})
+    control = _closed(World(family, params, physics, qpos, camera, panel), int(rng.integers(2**31)))
+    span, held = (0, len(qpos)), None
+    if cut is not None and jitter is not None:
+        span, held = _jittered(jitter, control, rng)
+    frames = {"first": span[0], "last": control.open_frames - 1} | ({} if cut is None else {"cut": cut - 1})
     pixels = camera.project(motion.pos(scene.decisive[0])[list(frames.values())]) / (WIDTH, HEIGHT)
     places = {name: (round(float(x), 4), round(float(y), 4)) for name, (x, y) in zip(frames, pixels, strict=True)}
-    return Shot(family, params, wording, qpos, outcome, camera, panel, cut, ill_posed, places, start, held)
+    return Shot(control, wording, outcome, cut, ill_posed, places, span, held)
+
+
+def _closed(control: World, seed: int) -> World:
+    """The control as those of released scenarios end (`scenes.closing`), but without a certificate: only the first and
+    the last frame behind the panel are looked at. The control as it is if no panel can close it."""
+    for frame in moments(control, seed):
+        closing = replace(control, closing=Closing(frame, panel_from(frame, control)))
+        with closing.closed_renderer() as renderer:
+            if not renderer.visible_pixels(control.qpos[[frame, -1]], closing.closed_off, panel=True).any():
+                return closing
+    return control
 
 
 def _draw_cut(outcome: Outcome, fps: int, rng: np.random.Generator) -> int:
@@ -71,51 +88,64 @@ def _draw_cut(outcome: Outcome, fps: int, rng: np.random.Generator) -> int:
     return int(rng.integers(first, last + 1))
 
 
-def _jittered(jitter: Jitter, n: int, cut: int, fps: int, rng: np.random.Generator) -> tuple[int, int | None]:
-    """The first frame of a chaotic control, and the length of its void; (0, None) for clips as they are."""
-    late, held = rng.random(2) < (jitter.control, jitter.void)
-    short = int(rng.integers(round(EARLIEST_CUT_S * fps) + 1, round(LATEST_CUT_S * fps) + 1))
-    # Held to the very end: of lengths in between there are no controls, so that they alone would tell a void.
-    return (max(0, n - short) if late else 0), (n if held else None)
+def _jittered(jitter: Jitter, control: World, rng: np.random.Generator) -> tuple[tuple[int, int], int | None]:
+    """The frames of a chaotic control's clip, and the length of its void; the whole control and None for clips as they
+    are."""
+    fps, n = control.physics.fps, len(control.qpos)
+    short, held = rng.random(2) < (jitter.control, jitter.void)
+    length = int(rng.integers(round(EARLIEST_CUT_S * fps) + 1, round(LATEST_CUT_S * fps) + 1))
+    # A short control ends where the panel would come, as in the arm length_matched. A void is held to the very end: of
+    # lengths in between there are no controls, so that they alone would tell a void.
+    return (control.open_frames - length, control.open_frames) if short else (0, n), (n if held else None)
 
 
 def render_shot(shot: Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The frames of control and void that the model is shown, each (N, 360, 480, 3) as two lists. Raises Rejected."""
-    fps = shot.family.physics.fps
-    shown = shot.control_from + pick(np.arange(len(shot.qpos) - shot.control_from) / fps, spec)
-    model, scene = compile_scene(shot.family, shot.params, shot.family.physics, shot.panel)
-    with Renderer(model, shot.camera) as renderer:
-        control = list(renderer.frames(shot.qpos[shown]))
+    """The frames of control and void that the model is shown, each (N, 360, 480, 3) as two lists. Raises Rejected.
+
+    A void that is held closes when its control does: else the panel alone would tell the sides of a chaotic pair.
+    """
+    control = shot.control
+    qpos, until = control.qpos, control.open_frames
+    first, end = shot.control_span
+    shown = shot.shown(first, end - first, spec)
+    with control.closed_renderer() as renderer:
         if shot.cut_frame is not None:
-            before = pick(np.arange(shot.void_length or shot.cut_frame) / fps, spec)
-            return control, list(renderer.frames(shot.qpos[np.minimum(before, shot.cut_frame - 1)]))
-        last = shot.qpos[-1:]
-        decisive = decisive_geoms(model, scene.decisive)
-        if checks.past_panel(renderer, last, decisive, scene.hidden).leaked(0):
+            before = shot.shown(0, shot.void_length or shot.cut_frame, spec)
+            void = checks.control_frames(
+                renderer, qpos[np.minimum(before, shot.cut_frame - 1)], int((before < until).sum())
+            )
+            return list(checks.control_frames(renderer, qpos[shown], int((shown < until).sum()))), list(void)
+        if checks.past_panel(
+            renderer, qpos[-1:], decisive_geoms(control.model, control.scene.decisive), control.scene.hidden
+        ).leaked(0):
             raise Rejected("the panel does not hide the outcome")
-        return control, list(renderer.frames(shot.qpos[shown], panel=True))
+        hidden = list(renderer.frames(qpos[shown], panel=True))
+        drawn = int((shown < until).sum())
+        return [*renderer.frames(qpos[shown[:drawn]]), *hidden[drawn:]], hidden
 
 
 def render_decoy(shot: Shot, spec: MediaSpec) -> list[np.ndarray] | None:
-    """The frames of the control with the void's panel behind everything, seen by a camera that holds both; None if it
-    hides anything decisive all the same, or is not seen itself."""
-    if shot.panel is None:
+    """The frames of the control, which no panel closes, with the void's panel behind everything, seen by a camera that
+    holds both; None if it hides anything decisive all the same, or is not seen itself."""
+    control = shot.control
+    if control.panel is None:
         return None
-    model, scene = compile_scene(shot.family, shot.params, shot.family.physics)
-    points = shown_points(model, scene, shot.qpos)
-    azimuth = np.radians(shot.camera.azimuth_deg)
+    points = shown_points(control.model, control.scene, control.qpos)
+    azimuth = np.radians(control.camera.azimuth_deg)
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    behind = float((points @ ahead).max()) - float(np.array(shot.panel.centre) @ ahead) + DECOY_BEHIND_M
-    x, y, z = (float(value) for value in np.array(shot.panel.centre) + ahead * behind)
-    panel = replace(shot.panel, centre=(x, y, z))
-    view = View(shot.camera.azimuth_deg, shot.camera.elevation_deg, shot.camera.fovy_deg)
+    centre = np.array(control.panel.centre)
+    behind = float((points @ ahead).max()) - float(centre @ ahead) + DECOY_BEHIND_M
+    x, y, z = (float(value) for value in centre + ahead * behind)
+    panel = replace(control.panel, centre=(x, y, z))
+    view = View(control.camera.azimuth_deg, control.camera.elevation_deg, control.camera.fovy_deg)
     camera = fit_camera(view, np.concatenate([points, panel.corners()]))
-    model, scene = compile_scene(shot.family, shot.params, shot.family.physics, panel)
-    geoms = [*decisive_geoms(model, scene.decisive), *scene.hidden]
-    shown = shot.qpos[pick(np.arange(len(shot.qpos)) / shot.family.physics.fps, spec)]
+    model, scene = compile_scene(control.family, control.params, control.physics, panel)
+    geoms: Sequence[str] = [*decisive_geoms(model, scene.decisive), *scene.hidden]
+    shown = control.qpos[shot.shown(0, len(control.qpos), spec)]
     with Renderer(model, camera) as renderer:
         seen = float(renderer.visible_pixels(shown[:1], ["cover_panel"], panel=True)[0, 0])
-        without, beside = (renderer.visible_pixels(shown, geoms, panel=there) for there in (False, True))
+        ends = shown[[0, -1]]
+        without, beside = (renderer.visible_pixels(ends, geoms, panel=there) for there in (False, True))
         if seen < DECOY_PX or not np.array_equal(without, beside):
             return None
         return list(renderer.frames(shown, panel=True))

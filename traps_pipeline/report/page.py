@@ -26,11 +26,12 @@ class Block:
 
 @dataclass(frozen=True)
 class Card:
-    """A figure, or tables, of the study beside the paper's."""
+    """A figure, or tables, of the study beside the paper's. note: what it shows."""
 
     name: str
     title: str
     blocks: Sequence[Block]
+    note: str = ""
 
 
 def report_html(

@@ -84,8 +84,8 @@ def _at_rest_from(control: World) -> int:
 
 
 def panel_from(frame: int, control: World, *others: World) -> Panel:
-    """The panel that closes a control at a frame: that of its void, or one in front of where all outcomes lie and of all
-    that moves from then on, in the control and in other worlds that it must not be told from."""
+    """The panel that closes a control at a frame: that of its void, or one in front of where all outcomes lie and of
+    all that moves from then on, in the control and in other worlds that it must not be told from."""
     if control.panel is not None:
         return control.panel
     zone = control.scene.stage if control.scene.rest is None else (control.scene.rest,)

@@ -10,8 +10,9 @@ import numpy as np
 from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.partitions import DATASETS, SHORT
 from traps_pipeline.report.figures.looks import arrow, frame_plane
-from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.inside import SHORTCUTS, beside, why
+from traps_pipeline.report.results import Results, datasets_of
+from traps_pipeline.report.tables.inside import SHORTCUTS, beside
+from traps_pipeline.report.tables.mechanism import why
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import (
     COLOURS,
@@ -38,10 +39,12 @@ GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
 
 def probe_baselines(results: Results) -> Figure:
     """AUROC of each dataset's probe on itself and on the other datasets (black, with its interval) beside probes on raw
-    inputs and on the output margin; grey is what noise gives under the same split, mean ± 2 deviations."""
+    inputs and on the output margin; grey is what noise gives under the same split, mean ± 2 deviations. oc and ch are
+    occlusion and chaotic, and with _ip their ill-posed questions; oc→ch is fitted on oc and scored on ch. A probe shows
+    what the states add only as far as it is above all coloured marks."""
     rows = beside(results)
     if not len(rows):
-        return not_run_figure("Probes and their baselines", why(results, rows), PAGE_IN)
+        return not_run_figure("Probes and their baselines", why(results), PAGE_IN)
     from matplotlib.lines import Line2D
 
     models = list(dict.fromkeys(rows["model"]))
@@ -84,12 +87,14 @@ def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
 
 def gate_arrows(results: Results) -> Figure:
     """Each model's answers before the gate (hollow) and after it (filled) in the plane of Acc and J, for gates on
-    states and their controls (from other datasets, mid threshold, all datasets); and risk against coverage."""
+    states and their controls (from other datasets, mid threshold, all datasets); and risk against coverage. J is
+    AbsRec less FalseAbs: an arrow upwards tells voids from controls better, an arrow to the left pays for it with right
+    answers."""
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
     rows = rows.loc[rows["features"].isin(_FEATURES)]
     if not len(rows):
-        absent = why(results, rows) if results.is_study else "the paper gates nothing"
+        absent = why(results) if results.is_study else "the paper gates nothing"
         return not_run_figure("Probe-gated abstention", absent, PAGE_IN)
     from matplotlib.lines import Line2D
 
@@ -142,7 +147,8 @@ def _risk(ax: Axes, rows: pd.DataFrame, regime: str, colour: dict[str, str]) -> 
 
 def patching(results: Results) -> Figure:
     """Indirect effect of each group of positions at each layer of the residual stream, for patches from the void into
-    the control and back; 1 is the whole difference of the outcome."""
+    the control and back; 1 is the whole difference of the outcome. stamps are the time stamps, changed and unchanged
+    the visual tokens whose pixels differ between the sides and those whose pixels do not; last is the last token."""
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
     if not len(rows):
@@ -187,21 +193,22 @@ def _effects(ax: Axes, part: pd.DataFrame) -> Any:
 def doses_among_nulls(results: Results) -> Figure:
     """Abstention of each dataset's controls (+) and voids (−) along its own direction, by dose in units of the class
     gap. Right of the line: the nulls, which are orthogonal to the direction, at the largest dose, added on controls (+)
-    and subtracted on voids (−); a larger dot stands for more draws."""
+    and subtracted on voids (−); a larger dot stands for more draws. The direction does something of its own where its
+    line ends away from the dots. oc and ch are occlusion and chaotic, and with _ip their ill-posed questions."""
     rows = results.own_effects
     if not len(rows):
-        absent = why(results, rows) if results.is_study else "the paper has no such nulls"
+        absent = why(results) if results.is_study else "the paper has no such nulls"
         return not_run_figure("Doses among nulls", absent, PAGE_IN)
     from matplotlib.lines import Line2D
 
     cells = list(dict.fromkeys(zip(rows["model"], rows["directions"], rows["regime"], strict=True)))
-    colour = _colours(NULLS)
+    datasets, colour = datasets_of(rows.assign(dataset=rows["target"])), _colours(NULLS)
     with figure_style():
         figure = new_figure(PAGE_IN, 0.7 + 1.7 * len(cells))
-        axes = figure.subplots(len(cells), 4, squeeze=False, sharey=True, sharex=True)
+        axes = figure.subplots(len(cells), len(datasets), squeeze=False, sharey=True, sharex=True)
         for line, (model, directions, regime) in zip(axes, cells, strict=True):
             of = rows.loc[(rows["model"] == model) & (rows["directions"] == directions) & (rows["regime"] == regime)]
-            for ax, dataset in zip(line, DATASETS, strict=True):
+            for ax, dataset in zip(line, datasets, strict=True):
                 _dose(ax, of.loc[of["target"] == dataset], colour)
                 ax.set_title(f"{SHORT[dataset]}, {directions}→{regime}", size=7)
             line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")

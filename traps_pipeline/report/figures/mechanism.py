@@ -11,7 +11,7 @@ from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
 from traps_pipeline.partitions import DATASETS, SHORT, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.mechanism import NO_MECHANISM, best_layers
+from traps_pipeline.report.tables.mechanism import best_layers, why
 from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, figure_style, new_figure, not_run_figure, plain
 
 if TYPE_CHECKING:
@@ -30,10 +30,6 @@ KEY_PATHS = [(s, t) for s, t in TRANSFER if taxonomy_of(s) != taxonomy_of(t) and
 COSINE_SCALE = 0.6  # of the paper's heatmaps
 CROSSING = TRANSFER_TYPES[:3]
 SETS = {"transfer": "transfer", "within_domain": "within"}
-
-
-def _why(results: Results, frame: pd.DataFrame) -> str:
-    return NO_MECHANISM if results.is_study and not len(frame) else results.why("probes")
 
 
 def _legend(figure: Figure, *more: Line2D, colours: Mapping[str, str] = COLOUR) -> None:
@@ -75,7 +71,7 @@ def probe_curves(results: Results) -> Figure:
     rows = results.probes
     curves = rows.loc[(rows["analysis"] == "transfer") & rows["value"].notna()]
     if not len(curves):
-        return not_run_figure("Probe transfer by layer", _why(results, rows), PAGE_IN)
+        return not_run_figure("Probe transfer by layer", why(results), PAGE_IN)
     models = list(dict.fromkeys(curves["model"]))
     with figure_style():
         figure = new_figure(PAGE_IN, 0.65 + 1.75 * len(models))
@@ -126,8 +122,8 @@ def confabulated_strip(results: Results) -> Figure:
     at the best layer of all samples; the bar is the median of the model's filled markers, the dashed line is chance."""
     rows = best_layers(results.probes)
     if not len(rows) or rows.loc[:, "cf_value"].isna().all():
-        why = "no dataset has confabulated voids" if len(rows) else _why(results, rows)
-        return not_run_figure("Cf→Cf probes", why, PAGE_IN)
+        absent = "no dataset has confabulated voids" if len(rows) else why(results)
+        return not_run_figure("Cf→Cf probes", absent, PAGE_IN)
     models = list(dict.fromkeys(rows["model"]))
     with figure_style():
         figure = new_figure(PAGE_IN, 2.5)
@@ -167,7 +163,7 @@ def dose_response(results: Results) -> Figure:
     rows = rows.loc[rows["kind"] == "void"]
     panels = _panels(rows)
     if not panels:
-        return not_run_figure("Dose and response", _why(results, rows), PAGE_IN)
+        return not_run_figure("Dose and response", why(results), PAGE_IN)
     across = 2 if len(panels) > 1 else 1
     lines = -(-len(panels) // across)
     with figure_style():
@@ -236,7 +232,7 @@ def cosine_heatmaps(results: Results) -> Figure:
     rows = results.cosines
     rows = rows.loc[rows["prompt"] == rows["other_prompt"]]
     if not len(rows):
-        return not_run_figure("Cosines of void directions", _why(results, rows), PAGE_IN)
+        return not_run_figure("Cosines of void directions", why(results), PAGE_IN)
     panels = [(str(key[0]), str(key[1]), part) for key, part in rows.groupby(["model", "prompt"], sort=False)]  # pyright: ignore[reportIndexIssue]
     several = len({prompt for _, prompt, _ in panels}) > 1
     columns = min(3, len(panels))

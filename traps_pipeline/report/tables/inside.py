@@ -8,7 +8,7 @@ from traps_pipeline.mechanism.paths import path_name, probed_taxonomy
 from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT
 from traps_pipeline.partitions import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.mechanism import DIRECTIONS, INFERENCE, NO_MECHANISM
+from traps_pipeline.report.tables.mechanism import DIRECTIONS, INFERENCE, why
 from traps_pipeline.report.tables.shared import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
@@ -20,12 +20,6 @@ FEW_NOTE = f"† fewer than {FEW} controls or voids: the value says little"
 LAYER = Column("layer", "Layer", "count")
 DOSE = Column("step", "Dose")
 SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "− everywhere"}
-
-
-def why(results: Results, frame: pd.DataFrame) -> str:
-    """The reason why a frame of a study has no rows."""
-    asked = len(results.probes) or not results.is_study
-    return results.why("probes") if asked or len(frame) else NO_MECHANISM
 
 
 def few(rows: pd.DataFrame, *counts: str) -> list[str]:
@@ -120,7 +114,7 @@ def _beside(results: Results) -> PrintedTable:
         "pairs within a taxonomy and a dataset on itself: fitted without the scored scenario, controls included",
         *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
     ]
-    absent = why(results, rows) if results.is_study else "the paper has no such baselines"
+    absent = why(results) if results.is_study else "the paper has no such baselines"
     return PrintedTable("probe_baselines", "Probes beside their baselines", rows, columns, notes, absent)
 
 
@@ -141,7 +135,7 @@ def _look_alikes(results: Results) -> PrintedTable:
         "frame times of the other side: 1 for a probe that reads the frames, 0 for one that reads the time stamps",
         *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
     ]
-    absent = why(results, rows) if results.is_study else "the paper has no such items"
+    absent = why(results) if results.is_study else "the paper has no such items"
     return PrintedTable("probe_look_alikes", "What only looks like a void", named, columns, notes, absent)
 
 
@@ -181,7 +175,7 @@ def _nulls(results: Results) -> PrintedTable:
         *_ahead(rows),
         *([FEW_NOTE] if "†" in set(named["mark"]) else []),
     ]
-    absent = why(results, rows) if results.is_study else "the paper has no such nulls"
+    absent = why(results) if results.is_study else "the paper has no such nulls"
     return PrintedTable("steering_nulls", "Void directions among their nulls", named, columns, notes, absent)
 
 
@@ -217,7 +211,7 @@ def _pecs(results: Results) -> PrintedTable:
         "degenerate: cut off, a phrase four times in a row, or another script than the unsteered answer",
         *([FEW_NOTE] if "†" in set(named["mark"]) else []),
     ]
-    absent = why(results, rows) if results.is_study else "the paper prints no correctness of steered answers"
+    absent = why(results) if results.is_study else "the paper prints no correctness of steered answers"
     return PrintedTable("steering_pecs", "PECS of the steered model", named, columns, notes, absent)
 
 
@@ -269,7 +263,7 @@ def _gate_sources(results: Results) -> PrintedTable:
         "conformal: at most 5 % of new source controls in expectation, or as the experiment says",
         *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
     ]
-    absent = why(results, rows) if results.is_study else "the paper gates nothing"
+    absent = why(results) if results.is_study else "the paper gates nothing"
     return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, absent)
 
 
@@ -283,7 +277,7 @@ def _gate_controls(results: Results) -> PrintedTable:
         "a gate on states shows what states add only as far as it is above gates on raw inputs, on the output margin "
         "and on an untrained model’s states",
     ]
-    absent = why(results, rows) if results.is_study else "the paper gates nothing"
+    absent = why(results) if results.is_study else "the paper gates nothing"
     return PrintedTable("gate_controls", "The gate beside its controls", rows, columns, notes, absent)
 
 
@@ -299,7 +293,7 @@ def _gate_answerable(results: Results) -> PrintedTable:
         Column("n_controls", "n", "count"),
     ]  # fmt: skip
     notes = ["all of these items can be answered, so that every abstention of a gate is a false one"]
-    absent = why(results, rows) if results.is_study else "the paper gates nothing"
+    absent = why(results) if results.is_study else "the paper gates nothing"
     return PrintedTable("gate_answerable", "The gate on items that can be answered", rows, columns, notes, absent)
 
 
@@ -341,7 +335,7 @@ def _prompts(results: Results) -> PrintedTable:
         "what the prompt changes: the answers (AbsRec), or what is represented (AUROC of voids against controls, "
         "states under the VQA prompt of that name, fitted without the scored scenario)",
     ]
-    absent = why(results, rows) if results.is_study else "the paper prints no such figures"
+    absent = why(results) if results.is_study else "the paper prints no such figures"
     return PrintedTable(
         "prompt_gate", "What the prompt changes, in answers and in states", rows, columns, notes, absent
     )

@@ -25,8 +25,9 @@ NO_MECHANISM = "the experiment has no `mechanism` section, so no local model's s
 SETS = {"transfer": "transfer", "within_domain": "within domain"}
 
 
-def _why(results: Results, frame: pd.DataFrame) -> str:
-    return NO_MECHANISM if results.is_study and not len(frame) else results.why("probes")
+def why(results: Results) -> str:
+    """The reason why a frame of what is found inside models has no rows."""
+    return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
 
 
 # --- probes -----------------------------------------------------------------------------------------------------------
@@ -87,9 +88,7 @@ def _transfer(results: Results) -> PrintedTable:
         "from, to: 95 % interval from resampled scenarios of the target, with the probe held fixed",
         *([] if not len(rows) else sorted({note for note in rows["note"] if note})),
     ]
-    return PrintedTable(
-        "probe_transfer", "Probe transfer: AUROC by ordered pair", rows, columns, notes, _why(results, rows)
-    )
+    return PrintedTable("probe_transfer", "Probe transfer: AUROC by ordered pair", rows, columns, notes, why(results))
 
 
 def _means(results: Results) -> PrintedTable:
@@ -105,7 +104,7 @@ def _means(results: Results) -> PrintedTable:
         Column("cf_own_value", "Cf→Cf, own layer", "fraction"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
     notes = _shared_controls(results)
-    return PrintedTable("probe_means", "Probe transfer: means over paths", rows, columns, notes, _why(results, rows))
+    return PrintedTable("probe_means", "Probe transfer: means over paths", rows, columns, notes, why(results))
 
 
 def _held_out(results: Results) -> list[Column]:
@@ -132,7 +131,7 @@ def _within(results: Results) -> PrintedTable:
         Column("value", "AUROC", "fraction"), Column("shuffled", "Shuffled labels", "fraction", spread="spread"),
     ]  # fmt: skip
     notes = ["cross-validated, folds by scenario; shuffled: mean over shuffles and layers ± deviation over shuffles"]
-    return PrintedTable("probe_within", "Probes within a dataset", table, columns, notes, _why(results, table))
+    return PrintedTable("probe_within", "Probes within a dataset", table, columns, notes, why(results))
 
 
 def _catch(results: Results) -> PrintedTable:
@@ -152,9 +151,7 @@ def _catch(results: Results) -> PrintedTable:
         Column("n", "n", "count"),
     ]  # fmt: skip
     notes = ["voids that the source’s nearest centroid assigns to void, mean over the other datasets as sources"]
-    return PrintedTable(
-        "probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, _why(results, table)
-    )
+    return PrintedTable("probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, why(results))
 
 
 def _answerable(results: Results) -> PrintedTable:
@@ -174,8 +171,8 @@ def _answerable(results: Results) -> PrintedTable:
         "answerable: void clips of occlusion with a question that they answer. First column: the same clips with both "
         "questions; 0.5 if a probe detects a hidden object, 1 if it detects an unknowable answer. Second: the reverse"
     ]
-    why = _why(results, wide) if results.is_study else "the paper has no such control"
-    return PrintedTable("probe_answerable", "Hidden, or unknowable", wide, columns, notes, why)
+    absent = why(results) if results.is_study else "the paper has no such control"
+    return PrintedTable("probe_answerable", "Hidden, or unknowable", wide, columns, notes, absent)
 
 
 # --- directions -------------------------------------------------------------------------------------------------------
@@ -204,11 +201,13 @@ def cosines(results: Results) -> list[PrintedTable]:
         Column("name", "Direction"),
         Column("cosine", "Cosine", "fraction", 2),
     ]
-    why = _why(results, rows)
+    absent = why(results)
     printed = "" if results.is_study else "the paper’s text has 0.94 to 0.97 for qwen3-vl-8b"
     return [
-        PrintedTable("cosines", "Cosines of void directions", wide, matrix, [], why),
-        PrintedTable("cosines_standard_guided", "Standard against guided directions", across, pair, [], printed or why),
+        PrintedTable("cosines", "Cosines of void directions", wide, matrix, [], absent),
+        PrintedTable(
+            "cosines_standard_guided", "Standard against guided directions", across, pair, [], printed or absent
+        ),
     ]
 
 
@@ -258,8 +257,8 @@ def _shares(results: Results) -> PrintedTable:
         "mean over all paths and regimes; answers: distinct answers, each of which may belong to several paths",
         "from, to: 95 % interval from resampled scenarios, not answers; its width is 0 where all scenarios agree",
     ]
-    why = _why(results, wide) if results.is_study else "the paper prints no answers to resample"
-    return PrintedTable("steering_shares", "Steering in all, with intervals by scenario", wide, columns, notes, why)
+    absent = why(results) if results.is_study else "the paper prints no answers to resample"
+    return PrintedTable("steering_shares", "Steering in all, with intervals by scenario", wide, columns, notes, absent)
 
 
 def _regimes(results: Results, name: str, title: str) -> PrintedTable:
@@ -272,7 +271,7 @@ def _regimes(results: Results, name: str, title: str) -> PrintedTable:
         Column("void_top", "Void, α, %", "percent"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
     notes = ["mean over the paths of a set; +α on controls, −α on voids"]
-    return PrintedTable(name, title, rows, columns, notes, _why(results, rows))
+    return PrintedTable(name, title, rows, columns, notes, why(results))
 
 
 def _domains(results: Results) -> PrintedTable:
@@ -289,7 +288,7 @@ def _domains(results: Results) -> PrintedTable:
             "judged by the panel; the paper judged its two same-domain figures by keywords, which it does not print: "
             "no keyword judge here would be its own"
         )
-    return PrintedTable("steering_domains", "Same against cross domain", rows, columns, notes, _why(results, rows))
+    return PrintedTable("steering_domains", "Same against cross domain", rows, columns, notes, why(results))
 
 
 def _top(results: Results) -> PrintedTable:
@@ -297,7 +296,7 @@ def _top(results: Results) -> PrintedTable:
     rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
     rows = _named(rows)
     columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, Column("alpha", "α", "count"), *_SIDES]
-    return PrintedTable("steering_top", "Steering at the largest α", rows, columns, [], _why(results, rows))
+    return PrintedTable("steering_top", "Steering at the largest α", rows, columns, [], why(results))
 
 
 def _dose(results: Results) -> PrintedTable:
@@ -316,9 +315,7 @@ def _dose(results: Results) -> PrintedTable:
         f"n = {counts.max():.0f} answers per cell at most, one per scenario" if len(counts) else "",
         "from, to: 95 % Wilson interval" if results.is_study else "",
     ]
-    return PrintedTable(
-        "steering_dose", "Dose and response", rows, columns, [n for n in notes if n], _why(results, rows)
-    )
+    return PrintedTable("steering_dose", "Dose and response", rows, columns, [n for n in notes if n], why(results))
 
 
 def _layers(results: Results) -> PrintedTable:
@@ -328,8 +325,8 @@ def _layers(results: Results) -> PrintedTable:
         Column("control", "Controls abstained on %", "percent"), Column("n_splits", "Splits", "count"),
     ]  # fmt: skip
     notes = ["each dataset’s direction on its own controls, mean over the four splits"]
-    why = "only one layer was steered" if len(results.effects) else _why(results, rows)
-    table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, why)
+    absent = "only one layer was steered" if len(results.effects) else why(results)
+    table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, absent)
     return rightly_empty(table, results.is_study and bool(len(results.effects)))
 
 
