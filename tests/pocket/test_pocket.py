@@ -44,7 +44,6 @@ from traps_pipeline.storage.workspace import Workspace
 pytestmark = pytest.mark.slow
 
 FEW = 2  # scenes
-SHOWN_S = [0.0, 0.7, 1.4, 2.1, 2.8, 3.5, 4.2, 4.9]  # eight frames of a clip of 50 at 10 a second
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -107,6 +106,8 @@ def test_frames_for_training_are_those_that_a_clip_gives(
     recipe: Recipe, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same scenes written as clips and read through the media path of every model: only H.264 lies between."""
+    from traps_pipeline.pocket.batches import Scenes
+
     (job,) = shard_jobs(recipe, "train", data)
     rendered = np.load(job.pixels)
     assert rendered.shape == (FEW, 3, 8, 96, 128, 3)  # control, void and decoy
@@ -115,7 +116,7 @@ def test_frames_for_training_are_those_that_a_clip_gives(
     draw_shard(as_clips)
     for side, name in enumerate(("control", "void")):
         shown = sample(as_clips.clip(0, name), recipe.media)
-        assert shown.times_s.tolist() == pytest.approx(SHOWN_S)
+        assert shown.times_s.tolist() == pytest.approx(Scenes(recipe, data).times(0, side))
         off = np.abs(shown.frames.astype(int) - rendered[0, side])
         assert off.mean() < 3 and (off > 40).mean() < 0.005  # of 255: colours are halved in resolution
 
@@ -194,8 +195,8 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
         ]
         text = processor.apply_chat_template(turns, add_generation_prompt=True)
         said = say(question.label(_guided(recipe)), "guided") + processor.tokenizer.eos_token
-        indices = [round(1000 * time) for time in SHOWN_S]
-        clock = {"fps": 1000.0, "frames_indices": indices, "total_num_frames": 4901}
+        indices = [round(1000 * time) for time in scenes.times(1, 0)]
+        clock = {"fps": 1000.0, "frames_indices": indices, "total_num_frames": indices[-1] + 1}
         inputs = processor(
             text=[text + said], videos=[np.array(frames)], video_metadata=[clock], do_sample_frames=False,
             return_tensors="pt",

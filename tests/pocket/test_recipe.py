@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from traps_pipeline.pocket.batches import Scenes
+from traps_pipeline.pocket.batches import Scenes, names_of
 from traps_pipeline.pocket.data import Question, SceneRecord, draw_shard, shard_jobs
 from traps_pipeline.pocket.recipe import Jitter, Recipe, load_recipe
 from traps_pipeline.pocket.words import PROMPTS
-from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.vision import colour_mask
 
 pytestmark = pytest.mark.slow
@@ -44,8 +43,8 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recipe, Path, dic
 
 def test_lengths_of_chaotic_clips_overlap(planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]]) -> None:
     made, folder, records = planted
-    scenes, n_frames = Scenes(made, folder), get_family("plinko").physics.n_frames
-    lengths = {side: [record.length(side, n_frames) for record in records["plinko"]] for side in (0, 1)}
+    scenes = Scenes(made, folder)
+    lengths = {side: [record.length(side) for record in records["plinko"]] for side in (0, 1)}
     assert any(record.control_from for record in records["plinko"])
     assert any(record.void_length for record in records["plinko"])
     assert min(lengths[0]) < max(lengths[1])  # neither side is always the longer one
@@ -53,11 +52,11 @@ def test_lengths_of_chaotic_clips_overlap(planted: tuple[Recipe, Path, dict[str,
         if record.family != "plinko":
             continue
         for side in (0, 1):
-            times, last = scenes.times(number, side), (record.length(side, n_frames) - 1) / FPS
+            times, last = scenes.times(number, side), (record.length(side) - 1) / FPS
             assert len(times) == 8 and times[0] == 0.0 and times[-1] == pytest.approx(last)
         assert record.cut_frame is not None
         if record.void_length:
-            assert record.cut_frame < record.void_length == n_frames
+            assert record.cut_frame < record.void_length == record.n_frames
 
 
 def test_a_short_control_ends_with_its_outcome_in_view(
@@ -99,6 +98,22 @@ def test_a_panel_closes_controls_and_held_voids_alike(
                 assert arrives[closed.argmax() - 1]  # the panel, over a still picture
         seen[record.family] += 1
     assert all(seen.values())
+
+
+def test_a_glance_shows_the_end_before_the_panel_and_no_time_that_tells_the_side(
+    planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
+) -> None:
+    made, folder, _ = planted
+    scenes = Scenes(made, folder)
+    for number, record in enumerate(scenes.records):
+        closes_s = (record.closes_frame or record.n_frames) / FPS - record.control_from / FPS
+        seen = [time for time in scenes.times(number, 0) if time < closes_s - 1e-6]
+        assert scenes.times(number, 0, glance=True) == seen[-2:]
+        place = scenes.times(number, 0).index(seen[-1])
+        assert (scenes.frames(number, 0, glance=True)[-1] == scenes.frames(number, 0)[place]).all()
+        assert (scenes.names(number, 0, glance=True) == names_of(scenes.frames(number, 0)[place - 1 : place + 1])).all()
+        if record.cut_frame is None:
+            assert scenes.times(number, 1, glance=True) == seen[-2:]
 
 
 def test_a_decoy_shows_a_panel_and_the_outcome(planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]]) -> None:

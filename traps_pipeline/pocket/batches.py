@@ -42,30 +42,42 @@ class Scenes:
         self._frames: list[np.ndarray] = []
         self._place: list[tuple[int, int]] = []
         self._spec, self._decoys, self.shares = recipe.media, recipe.decoys, recipe.abstain_shares or {}
-        self._names: dict[tuple[int, int], np.ndarray] = {}  # of clips that were looked at: a tenth of a step otherwise
+        self._names: dict[tuple[int, int, bool], np.ndarray] = {}  # of what was looked at: a tenth of a step otherwise
         for shard, (job, records) in enumerate(read_shards(recipe, "train", folder)):
             self._frames.append(np.load(job.pixels, mmap_mode="r", allow_pickle=False))
             self._place += [(shard, i) for i in range(len(records))]
             self.records += records
 
-    def frames(self, scene: int, side: int) -> np.ndarray:
-        """Frames of a clip, uint8 (N, H, W, 3)."""
+    def frames(self, scene: int, side: int, glance: bool = False) -> np.ndarray:
+        """Frames of a clip, uint8 (N, H, W, 3). glance: the last two before a panel closes it."""
         shard, place = self._place[scene]
-        return self._frames[shard][place, side]
+        frames = self._frames[shard][place, side]
+        return frames[self._last_two(scene, side)] if glance else frames
 
-    def names(self, scene: int, side: int) -> np.ndarray:
-        """The words that name every token of a clip, as in `names_of`, uint8 (tokens, words)."""
-        known = (scene, side)
+    def names(self, scene: int, side: int, glance: bool = False) -> np.ndarray:
+        """The words that name every token of a clip or glance, as in `names_of`, uint8 (tokens, words)."""
+        known = (scene, side, glance)
         if known not in self._names:
-            self._names[known] = names_of(self.frames(scene, side))
+            self._names[known] = names_of(self.frames(*known))
         return self._names[known]
 
-    def times(self, scene: int, side: int) -> list[float]:
+    def times(self, scene: int, side: int, glance: bool = False) -> list[float]:
         """Seconds into the clip of each frame."""
         record = self.records[scene]
-        physics = get_family(record.family).physics
-        every = np.arange(record.length(side, physics.n_frames)) / physics.fps
-        return every[pick(every, self._spec)].tolist()
+        every = np.arange(record.length(side)) / get_family(record.family).physics.fps
+        shown = every[pick(every, self._spec)].tolist()
+        return shown[self._last_two(scene, side)] if glance else shown
+
+    def _last_two(self, scene: int, side: int) -> slice:
+        """The last two frames shown before a panel closes a clip; nothing closes a decoy. Those of a void that a panel
+        hides from its beginning are at the same times as its control's, which else would tell the side."""
+        record, times = self.records[scene], self.times(scene, side)
+        closes = None if side == 2 else record.closes_frame
+        if closes is None:
+            return slice(len(times) - 2, len(times))
+        closes_s = (closes - (record.control_from if side == 0 else 0)) / get_family(record.family).physics.fps
+        seen = sum(time < closes_s - 1e-6 for time in times)
+        return slice(seen - 2, seen)
 
     def look(self, rng: np.random.Generator, void_share: float) -> Look:
         """A random clip with its question, another one (answerable or ill-posed), and two for the place of its ball."""
@@ -118,19 +130,21 @@ class Batches:
         rng = np.random.default_rng([self._seed, step])
         prompt_name = PROMPTS[int(rng.integers(len(PROMPTS)))]
         looks = [self._scenes.look(rng, self._training.void_share) for _ in range(self._training.batch)]
-        frames = np.stack([self._scenes.frames(look.scene, look.side) for look in looks])
-        return self.make(looks, prompt_name, augmented(frames, self._training.brightness, rng))
+        glance = step < self._training.glance_steps
+        frames = np.stack([self._scenes.frames(look.scene, look.side, glance) for look in looks])
+        return self.make(looks, prompt_name, augmented(frames, self._training.brightness, rng), glance)
 
-    def make(self, looks: Sequence[Look], prompt_name: str, frames: np.ndarray) -> Batch:
-        """The batch of some clips, frames (B, N, H, W, 3) uint8, under one of PROMPTS."""
+    def make(self, looks: Sequence[Look], prompt_name: str, frames: np.ndarray, glance: bool = False) -> Batch:
+        """The batch of some clips, or of glances at them, frames (B, N, H, W, 3) uint8, under one of PROMPTS."""
         import torch
 
         grid = (frames.shape[1] // 2, frames.shape[2] // PATCH, frames.shape[3] // PATCH)
-        pieces = [self._pieces(look, prompt_name, grid) for look in looks]
+        pieces = [self._pieces(look, prompt_name, grid, glance) for look in looks]
         head = self._ids(pieces[0][0])
         clips = [self._ids(clip) for _, clip, _ in pieces]
         talks = [[(self._ids(text), self._ids(answer)) for text, answer in questions] for _, _, questions in pieces]
         grids = torch.tensor([grid] * len(looks))
+        names = [self._scenes.names(look.scene, look.side, glance) for look in looks]
         values = (torch.from_numpy(frames).float() / 255 - torch.from_numpy(self._mean)) / torch.from_numpy(self._std)
         rows = self._rows(head, clips, talks, grids)
         return Batch(
@@ -138,16 +152,16 @@ class Batches:
             *rows,
             pixels=patches(values.permute(0, 1, 4, 2, 3)),
             grid=grids,
-            names=torch.from_numpy(np.concatenate([self._scenes.names(at.scene, at.side) for at in looks])).float(),
+            names=torch.from_numpy(np.concatenate(names)).float(),
         )
 
     def _pieces(
-        self, look: Look, prompt_name: str, grid: tuple[int, int, int]
+        self, look: Look, prompt_name: str, grid: tuple[int, int, int], glance: bool
     ) -> tuple[str, str, list[tuple[str, str]]]:
         """The chat as the processor writes it, cut into pieces: the system's part; the clip with its time stamps and
         placeholders for its tokens; and for each question its text with the beginning of the answer, and the answer."""
         processor, token = self._processor, self._processor.video_token
-        times = self._scenes.times(look.scene, look.side)
+        times = self._scenes.times(look.scene, look.side, glance)
         clip = "".join(
             f"<{(first + last) / 2:.1f} seconds>{processor.vision_start_token}"
             f"{token * (grid[1] * grid[2] // 4)}{processor.vision_end_token}"

@@ -64,11 +64,12 @@ class SceneRecord:
     visual: the same question about the void clip; ill_posed: about the control clip; answerable: a question that both
     clips answer. ball: the colour of the ball in the question. places: the ball's place in the `first` frame of the
     control's clip, in the `last` one before a panel closes it, and in the last one before the cut (`cut`; chaotic), as
-    shares of the picture's width and height from its upper left corner. closes_frame: the simulation's frame from which
-    on a panel closes the control, and a void that is held so long (None: nothing closes it). control_from,
-    control_until: first frame of the control's clip, and the one behind its last (None: to the end); void_length:
-    frames of the void's clip, of which those from cut_frame on repeat the one before (None: as many as cut_frame says).
-    decoy: whether there is a third clip, the control with a panel that hides nothing, which nothing closes.
+    shares of the picture's width and height from its upper left corner. n_frames: of the control, of which its clip may
+    be a part. closes_frame: the frame of the control from which on a panel closes it, and a void that is held so long
+    (None: nothing closes it). control_from, control_until: first frame of the control's clip, and the one behind its
+    last (None: to the end); void_length: frames of the void's clip, of which those from cut_frame on repeat the one
+    before (None: as many as cut_frame says). decoy: whether there is a third clip, the control with a panel that hides
+    nothing, which nothing closes.
     """
 
     family: str
@@ -83,17 +84,18 @@ class SceneRecord:
     answerable: Question
     ball: str
     places: dict[str, tuple[float, float]]
+    n_frames: int
     closes_frame: int | None
     control_from: int = 0
     control_until: int | None = None
     void_length: int | None = None
     decoy: bool = False
 
-    def length(self, side: int, n_frames: int) -> int:
-        """Frames of the clip of a side (0 control, 1 void, 2 decoy), where the simulation has n_frames."""
+    def length(self, side: int) -> int:
+        """Frames of the clip of a side (0 control, 1 void, 2 decoy)."""
         if side == 1 and self.cut_frame is not None:
             return self.void_length or self.cut_frame
-        return (self.control_until or n_frames) - self.control_from
+        return (self.control_until or self.n_frames) - self.control_from
 
     @property
     def line(self) -> str:
@@ -193,6 +195,7 @@ def _record(shot: Shot, recipe: Recipe, decoy: bool, rng: np.random.Generator) -
         answerable=Question(both.question, both.answer),
         ball=params.ball_colours[0] if hasattr(params, "ball_colours") else params.ball_colour,
         places=shot.places,
+        n_frames=len(shot.control.qpos),
         closes_frame=None if closing is None else closing.frame,
         control_from=first,
         control_until=end if end < len(shot.control.qpos) else None,
@@ -241,11 +244,11 @@ def draw_shard(job: ShardJob) -> int:
 def _write_clips(job: ShardJob, record: SceneRecord, place: int, sides: Sequence[list[np.ndarray]]) -> None:
     """Write the clips with the benchmark's length, rate, size and codec. Frames that the model is not shown are copies
     of the frame before, which need no drawing."""
-    physics = get_family(job.family).physics
+    fps = get_family(job.family).physics.fps
     for side, (name, drawn) in enumerate(zip(("control", "void"), sides, strict=True)):
-        times = np.arange(record.length(side, physics.n_frames)) / physics.fps
+        times = np.arange(record.length(side)) / fps
         latest = np.searchsorted(pick(times, job.recipe.media), np.arange(len(times)), side="right") - 1
-        encode([drawn[i] for i in latest], job.clip(place, name), physics.fps)
+        encode([drawn[i] for i in latest], job.clip(place, name), fps)
 
 
 def shard_jobs(recipe: Recipe, split: Split, folder: Path) -> list[ShardJob]:

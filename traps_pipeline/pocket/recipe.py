@@ -20,7 +20,8 @@ Split = Literal["train", "held-out"]
 
 class Training(BaseModel):
     """How the weights are fitted. void_share: share of void clips in a batch; brightness: augmentation; naming: weight
-    of the naming loss; naming_steps: number of first steps with the naming loss alone."""
+    of the naming loss; naming_steps: number of first steps with the naming loss alone; glance_steps: number of first
+    steps that show of each clip the last two frames before a panel closes it, and nothing else."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     steps: int = Field(ge=1)
@@ -32,6 +33,7 @@ class Training(BaseModel):
     brightness: float = Field(ge=0, lt=1)
     naming: float = Field(ge=0)
     naming_steps: int = Field(ge=0)
+    glance_steps: int = Field(default=0, ge=0)
 
 
 class Jitter(BaseModel):
@@ -69,6 +71,8 @@ class Recipe(BaseModel):
         made before it keeps its digest."""
         unused = {"abstain_share", "abstain_shares", "jitter", "decoys"} - self.model_fields_set
         made = self.model_dump(mode="json", include={*only} or None, exclude=unused)
+        if "training" in made and not self.training.glance_steps:
+            del made["training"]["glance_steps"]
         return made | ({"media": self.media.content()} if "media" in made else {})
 
     @field_validator("scenes")

@@ -14,6 +14,7 @@ from traps_pipeline.scenes.certificates import EARLIEST_CUT_S, settled_outcome, 
 from traps_pipeline.scenes.closing import moments, panel_from
 from traps_pipeline.scenes.kit import Family, Wording
 from traps_pipeline.scenes.outcome import Outcome, Rejected, compile_scene, decisive_geoms, simulated
+from traps_pipeline.scenes.pace import cut_to, lengths
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.simulate import replay
 from traps_pipeline.scenes.wording import draw_ill_posed
@@ -59,8 +60,12 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
         raise Rejected("something decisive leaves the frame")
     cut = None if panel is not None else _draw_cut(outcome, physics.fps, rng)
     ill_posed = draw_ill_posed(family.taxonomy, scene.inventory, rng)
-    control = _closed(World(family, params, physics, qpos, camera, panel), int(rng.integers(2**31)))
-    span, held = (0, len(qpos)), None
+    # A draw has one length: to try another one would take a certificate that says so.
+    whole, seed = World(family, params, physics, qpos, camera, panel), int(rng.integers(2**31))
+    control = _closed(cut_to(whole, lengths(whole, seed)[0]), seed)
+    if control.outcome.label != outcome.label:
+        raise Rejected("the clip ends before its outcome")
+    span, held = (0, len(control.qpos)), None
     if cut is not None and jitter is not None:
         span, held = _jittered(jitter, control, rng)
     frames = {"first": span[0], "last": control.open_frames - 1} | ({} if cut is None else {"cut": cut - 1})
@@ -115,9 +120,7 @@ def render_shot(shot: Shot, spec: MediaSpec) -> tuple[list[np.ndarray], list[np.
                 renderer, qpos[np.minimum(before, shot.cut_frame - 1)], int((before < until).sum())
             )
             return list(checks.control_frames(renderer, qpos[shown], int((shown < until).sum()))), list(void)
-        if checks.past_panel(
-            renderer, qpos[-1:], decisive_geoms(control.model, control.scene.decisive), control.scene.hidden
-        ).leaked(0):
+        if control.closing is None and renderer.visible_pixels(qpos[-1:], control.concealed, panel=True).any():
             raise Rejected("the panel does not hide the outcome")
         hidden = list(renderer.frames(qpos[shown], panel=True))
         drawn = int((shown < until).sum())
