@@ -209,6 +209,33 @@ def test_a_batch_gives_the_loss_of_plain_prompts_one_by_one(recipe: Recipe, data
     assert found == pytest.approx(expected, rel=1e-5)
 
 
+def test_a_part_of_a_clip_is_the_clip_with_the_rest_hidden(recipe: Recipe, data: Path) -> None:
+    """The same loss as of the whole clip where the attention mask hides all other pairs of frames from every token."""
+    import torch
+
+    from traps_pipeline.pocket.batches import Batches, Look, Scenes
+    from traps_pipeline.pocket.model import make_model, train_tokenizer
+    from traps_pipeline.pocket.train import answer_loss, look_at
+
+    scenes = Scenes(recipe, data)
+    model, processor = make_model(train_tokenizer(scenes.records), seed=1)
+    model.eval()
+    batches, asked = Batches(scenes, model, processor, recipe.training, 1), (scenes.records[0].asked,)
+    whole = batches.make([Look(0, 0, asked)], "standard", np.array(scenes.frames(0, 0))[None])
+    part = batches.make([Look(0, 0, asked, (1, 2))], "standard", np.array(scenes.frames(0, 0, (1, 2)))[None])
+    first = whole.ids[0].tolist().index(processor.vision_start_token_id)  # of the chat; each pair has one of its own
+    pair = (whole.ids.shape[1] - part.ids.shape[1]) // 2
+    gone = [*range(first + 1, first + 1 + pair), *range(first + 1 + 3 * pair, first + 1 + 4 * pair)]
+    left = [i for i in range(whole.ids.shape[1]) if i not in gone]
+    assert (whole.ids[:, left] == part.ids).all()
+    length = len(whole.head)
+    assert (whole.positions[:, :, [*range(length), *(length + i for i in left)]] == part.positions).all()
+    whole.sees[..., [length + i for i in gone]] = False
+    with torch.no_grad():
+        losses = [answer_loss(model, look_at(model, batch), batch).item() for batch in (whole, part)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+
+
 def test_training_that_was_stopped_goes_on_bit_for_bit(recipe: Recipe, data: Path, tmp_path: Path) -> None:
     from traps_pipeline.pocket.train import train
 

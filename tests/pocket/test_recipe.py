@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from traps_pipeline.pocket.batches import Scenes, names_of
+from traps_pipeline.pocket.batches import NAMED, Scenes, names_of
 from traps_pipeline.pocket.data import Question, SceneRecord, draw_shard, shard_jobs
 from traps_pipeline.pocket.recipe import Jitter, Recipe, load_recipe
 from traps_pipeline.pocket.words import PROMPTS
@@ -100,20 +100,38 @@ def test_a_panel_closes_controls_and_held_voids_alike(
     assert all(seen.values())
 
 
-def test_a_glance_shows_the_end_before_the_panel_and_no_time_that_tells_the_side(
+def test_the_pair_of_frames_that_is_always_shown_is_the_last_before_the_panel_and_tells_no_side(
     planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]],
 ) -> None:
     made, folder, _ = planted
-    scenes = Scenes(made, folder)
+    scenes, rng = Scenes(made, folder), np.random.default_rng(0)
     for number, record in enumerate(scenes.records):
         closes_s = (record.closes_frame or record.n_frames) / FPS - record.control_from / FPS
-        seen = [time for time in scenes.times(number, 0) if time < closes_s - 1e-6]
-        assert scenes.times(number, 0, glance=True) == seen[-2:]
-        place = scenes.times(number, 0).index(seen[-1])
-        assert (scenes.frames(number, 0, glance=True)[-1] == scenes.frames(number, 0)[place]).all()
-        assert (scenes.names(number, 0, glance=True) == names_of(scenes.frames(number, 0)[place - 1 : place + 1])).all()
+        before = [i for i, time in enumerate(scenes.times(number, 0)) if time < closes_s - 1e-6]
+        assert scenes.pairs(number, 0, 1, rng) == (before[-1] // 2,)
+        assert scenes.pairs(number, 0, 4, rng) is scenes.pairs(number, 0, None, rng) is None
+        two = scenes.pairs(number, 0, 2, rng)
+        assert two is not None and before[-1] // 2 in two and two[0] < two[1] <= 3
+        assert (
+            scenes.frames(number, 0, two) == scenes.frames(number, 0)[[2 * p + i for p in two for i in (0, 1)]]
+        ).all()
+        assert (
+            scenes.names(number, 0, two) == scenes.names(number, 0).reshape(4, 48, -1)[[*two]].reshape(96, -1)
+        ).all()
         if record.cut_frame is None:
-            assert scenes.times(number, 1, glance=True) == seen[-2:]
+            assert scenes.pairs(number, 1, 1, rng) == (before[-1] // 2,)
+
+
+def test_a_token_is_named_for_what_was_seen_there_before_a_panel_came_between_two_frames() -> None:
+    """Red in the first square of the earlier frame, blue in the second of the later one."""
+    frames = np.full((4, 32, 32, 3), 128, np.uint8)
+    frames[2, :16, :16], frames[3, :16, 16:] = (220, 40, 40), (40, 70, 220)
+    red, blue = NAMED.index("red"), NAMED.index("blue")
+    plain, across = names_of(frames), names_of(frames, 1)
+    assert plain.shape == (8, len(NAMED) + 8 + 6) and not plain[:4, : len(NAMED)].any()
+    assert [*plain[4:6, red]] == [0, 0] and [*across[4:6, red]] == [1, 0]
+    assert [*plain[4:6, blue]] == [*across[4:6, blue]] == [0, 1]
+    assert (across[:4] == plain[:4]).all() and (across[6:] == plain[6:]).all()
 
 
 def test_a_decoy_shows_a_panel_and_the_outcome(planted: tuple[Recipe, Path, dict[str, list[SceneRecord]]]) -> None:

@@ -20,8 +20,8 @@ Split = Literal["train", "held-out"]
 
 class Training(BaseModel):
     """How the weights are fitted. void_share: share of void clips in a batch; brightness: augmentation; naming: weight
-    of the naming loss; naming_steps: number of first steps with the naming loss alone; glance_steps: number of first
-    steps that show of each clip the last two frames before a panel closes it, and nothing else."""
+    of the naming loss; naming_steps: number of first steps with the naming loss alone; pairs: from a step on, how many
+    pairs of frames of each clip are shown (`batches.Scenes.pairs`); all where there is none."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     steps: int = Field(ge=1)
@@ -33,7 +33,12 @@ class Training(BaseModel):
     brightness: float = Field(ge=0, lt=1)
     naming: float = Field(ge=0)
     naming_steps: int = Field(ge=0)
-    glance_steps: int = Field(default=0, ge=0)
+    pairs: dict[int, int] = Field(default_factory=dict)
+
+    def pairs_at(self, step: int) -> int | None:
+        """How many pairs of frames are shown at a step; None for all."""
+        begun = [first for first in self.pairs if first <= step]
+        return self.pairs[max(begun)] if begun else None
 
 
 class Jitter(BaseModel):
@@ -71,8 +76,8 @@ class Recipe(BaseModel):
         made before it keeps its digest."""
         unused = {"abstain_share", "abstain_shares", "jitter", "decoys"} - self.model_fields_set
         made = self.model_dump(mode="json", include={*only} or None, exclude=unused)
-        if "training" in made and not self.training.glance_steps:
-            del made["training"]["glance_steps"]
+        if "training" in made and not self.training.pairs:
+            del made["training"]["pairs"]
         return made | ({"media": self.media.content()} if "media" in made else {})
 
     @field_validator("scenes")

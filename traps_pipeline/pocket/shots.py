@@ -13,6 +13,7 @@ from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Closing, View, fit_camer
 from traps_pipeline.scenes.certificates import EARLIEST_CUT_S, settled_outcome, shown_points
 from traps_pipeline.scenes.closing import moments, panel_from
 from traps_pipeline.scenes.kit import Family, Wording
+from traps_pipeline.scenes.look import draw_look
 from traps_pipeline.scenes.outcome import Outcome, Rejected, compile_scene, decisive_geoms, simulated
 from traps_pipeline.scenes.pace import cut_to, lengths
 from traps_pipeline.scenes.render import Renderer
@@ -49,6 +50,8 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
     """A random scene. Raises Rejected, as `scenes.resolve` does, when it gives no valid pair."""
     params = family.draw(rng)
     wording = family.word(params, rng)
+    if family.looks:  # as released scenes of the family look; others draw nothing here
+        params = replace(params, look=draw_look(rng, family.looks))
     physics = family.physics
     model, scene = compile_scene(family, params, physics)
     qpos = simulated(model, scene, physics)
