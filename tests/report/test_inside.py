@@ -186,7 +186,7 @@ def test_a_gate_moves_a_model_in_the_plane_of_j_and_accuracy() -> None:
 def test_the_page_says_below_a_figures_title_what_it_shows() -> None:
     report = next(report for report in FIGURES if report.name == "patching")
     card = Card("figure-patching", report.title, [picture_block("made up", b"\x89PNG" + bytes(20))], report.doc)
-    page = report_html(frame(LEADERBOARD), chapters=[("Figures", [card])])
+    page = report_html(frame(LEADERBOARD).astype(object), chapters=[("Figures", [card])])
     assert f'<p class="shows">{report.doc}</p>' in page and "1 is the whole difference of the outcome" in report.doc
 
 
