@@ -37,7 +37,7 @@ def other(prompt: Prompt, seed: int = 0) -> Prompt:
         if value.is_floating_point():
             inputs[name] = value + torch.randn(value.shape, generator=generator)
     ids = inputs["input_ids"].clone()
-    ids[0, -12:-9] = ids[0, -20:-17]
+    ids[0, -12:-9] = ids[0, -12:-9].flip(0)  # of the question, in all families
     return Prompt(prompt.text, inputs | {"input_ids": ids})
 
 
