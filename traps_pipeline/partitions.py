@@ -53,6 +53,7 @@ TIME_SWAPPED = "chaotic_time_swapped"  # of the mechanistic stages alone: each s
 PROBED_ARMS = ("decoy", "length_matched")  # arms that probes are applied to where an experiment asks them
 PROBED_DATASETS = (*DATASETS, ANSWERABLE, TIME_SWAPPED, *PROBED_ARMS)
 VQA_PROMPTS = ("standard", "guided")
+PROBE_PROMPT = "standard"  # probes are of this VQA prompt, the other one serves directions (docs/spec.md 7.1)
 SIDES = ("control", "void")
 
 _SLUG = re.compile(r"[a-z0-9.-]+")

@@ -37,7 +37,8 @@ def probes() -> pd.DataFrame:
         for s, t, a in (("chaotic", "chaotic", "held_out"), ("chaotic", "occlusion", "transfer"),
                         ("chaotic", "chaotic_time_swapped", "time_swapped"))
     ]  # fmt: skip
-    return frame(PROBES, *rows, rows[0] | {"layer": 1, "source_best": False, "value": 0.2})
+    guided = rows[0] | {"prompt": "guided", "value": 0.96}
+    return frame(PROBES, *rows, rows[0] | {"layer": 1, "source_best": False, "value": 0.2}, guided)
 
 
 def baselines() -> pd.DataFrame:
@@ -95,8 +96,8 @@ class Made(Results):
 
     source, is_study = "made up", True
     makers: ClassVar[Makers] = {
-        "probes": lambda _: probes(),
-        "baselines": lambda _: baselines(),
+        "prompted_probes": lambda _: probes(),
+        "prompted_baselines": lambda _: baselines(),
         "gate": lambda _: gate(),
         "risk_coverage": lambda _: curves(),
         "patching": lambda _: patching(),
@@ -133,10 +134,10 @@ def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
 
 def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
     table = inside.gate(Made())[-1]
-    (row,) = cells(table)  # chaotic alone has answers, under guided; probes were fitted under standard
+    (row,) = cells(table)  # chaotic alone has answers, under guided; the output margin was read under standard
     assert (row["Dataset"], row["guided"], row["guided − standard"]) == ("ch", "50.0", "–")
     assert (row["Probe, standard"], row["Output margin, standard"]) == ("0.980", "0.900")
-    assert row["Probe, guided"] == row["AbsRec %, standard"] == "–"
+    assert row["Probe, guided"] == "0.960" and row["Output margin, guided"] == row["AbsRec %, standard"] == "–"
 
 
 def test_nulls_say_in_how_many_rows_a_direction_is_ahead() -> None:
@@ -173,6 +174,27 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
     report = next(report for report in FIGURES if report.name == name)
     axes = report.make(Made()).axes
     assert axes and all(ax.has_data() for ax in axes)  # no panel for a dataset that was not asked
+
+
+def test_doses_in_alpha_do_not_set_the_scale_of_the_figure_of_class_gaps() -> None:
+    """Of a dataset whose sides nearly coincide, alpha 10 is twenty gaps."""
+    made = Made()
+    made.made["own_effects"] = own_effects(effects().assign(alpha=lambda rows: rows["alpha"].replace(200.0, 0.5)))
+    assert max(made.own_effects["gaps"]) == pytest.approx(20.0)
+    (axes,) = next(report for report in FIGURES if report.name == "doses_among_nulls").make(made).axes
+    assert axes.get_xlim()[1] < 2.5
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0", "0.5", "1", "+", "−"]
+
+
+@pytest.mark.parametrize("name", ["gate_arrows", "doses_among_nulls"])
+def test_that_figures_are_not_comparable_is_said_beside_the_legend(name: str) -> None:
+    made = Made()
+    made.judged_by = "Judged by rules, not comparable: pocket."
+    figure = next(report for report in FIGURES if report.name == name)._figure(made)
+    figure.draw_without_rendering()
+    (said,) = [text for text in figure.texts if "not comparable" in text.get_text()]
+    others = [figure.legends[0].get_window_extent(), *(axes.get_tightbbox() for axes in figure.axes)]
+    assert not any(said.get_window_extent().overlaps(box) for box in others if box is not None)
 
 
 def test_a_gate_moves_a_model_in_the_plane_of_j_and_accuracy() -> None:

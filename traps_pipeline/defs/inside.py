@@ -29,8 +29,8 @@ from traps_pipeline.models.registry import ModelEntry, local_models
 from traps_pipeline.orchestration.graph import Need
 from traps_pipeline.orchestration.schemes import CELL, EXTRACTION, by_extraction, these_keys
 from traps_pipeline.orchestration.stage import source, stage
-from traps_pipeline.orchestration.wanted import PROBE_PROMPT, Wanted
-from traps_pipeline.partitions import DATASETS, PROBED_ARMS, Cell, Evaluation, Extraction
+from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.partitions import DATASETS, PROBE_PROMPT, PROBED_ARMS, Cell, Evaluation, Extraction
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -76,7 +76,7 @@ probe_baselines = stage(
     needs={"hidden_states": "some"},
     kinds=["parquet", "scikitlearn"],
     cost="machine",  # the output margin needs the model's head
-    wants=lambda wanted, key: Extraction.parse(key).prompt == PROBE_PROMPT,
+    wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
 )
 
 

@@ -45,7 +45,7 @@ from traps_pipeline.orchestration.schemes import (
     to_keys,
 )
 from traps_pipeline.orchestration.stage import source, stage
-from traps_pipeline.orchestration.wanted import PROBE_PROMPT, Wanted
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import (
     ANSWERABLE,
     DATASETS,
@@ -185,7 +185,7 @@ probes = stage(
     kinds=["parquet", "scikitlearn"],
     needs={"hidden_states": "some", "verdicts": "none"},
     takes=Takes(memory_gb=1.0, each_gb=0.5),
-    wants=lambda wanted, key: Extraction.parse(key).prompt == PROBE_PROMPT,
+    wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,
     checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
 )
 

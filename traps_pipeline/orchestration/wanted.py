@@ -21,6 +21,7 @@ from traps_pipeline.partitions import (
     DATASETS,
     PROBED_ARMS,
     PROBED_DATASETS,
+    PROBE_PROMPT,
     REGIMES,
     TIME_SWAPPED,
     VQA_PROMPTS,
@@ -34,7 +35,6 @@ from traps_pipeline.partitions import (
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
 
-PROBE_PROMPT = "standard"  # probes are of this VQA prompt, the other one serves directions (docs/spec.md 7.1)
 
 
 class Wanted:
@@ -150,6 +150,12 @@ class Wanted:
         """Keys of hidden_states: what is no dataset of pairs serves probes alone."""
         cells = [StatesCell(d, e) for d, e in product(self.probed, self.extractions)]
         return [c.key for c in cells if c.dataset in DATASETS or c.extraction.prompt == PROBE_PROMPT]
+
+    @cached_property
+    def probed_prompts(self) -> tuple[str, ...]:
+        """VQA prompts with whose states probes are fitted."""
+        settings = self._inside[1] if self._inside else None
+        return settings.probes.prompts if settings else (PROBE_PROMPT,)
 
     @cached_property
     def steered(self) -> list[str]:

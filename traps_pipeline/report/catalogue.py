@@ -34,6 +34,7 @@ from traps_pipeline.report.writing import SOFT, PrintedTable, figure_bytes, figu
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+RIGHT_EDGE_IN = 0.14  # for a line of text along the right edge of a figure
 PAPER = "published"  # folder below tables/ and figures/
 RECOMPUTED = "recomputed"  # folder below tables/, of what follows from the paper's tables
 # Stages whose tables hold figures that the panel decided: what reads one of them says who judged. Tests hold this
@@ -229,7 +230,7 @@ TABLES: tuple[TableReport, ...] = (
     TableReport(
         "probe_baselines", inside.probe_baselines, ("probes", "probe_baselines"), title="Probes and their baselines"
     ),
-    TableReport("gate", inside.gate, ("gate",), title="Probe-gated abstention"),
+    TableReport("gate", inside.gate, ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
     TableReport("patching", inside.patching, ("patching",)),
     TableReport(
         "cosines", tables_of_mechanism.cosines, ("cosines",), printed_mechanism.cosines, title="Void directions"
@@ -321,13 +322,17 @@ def workspace_files(report: Report, results: Results) -> dict[str, bytes]:
 
 
 def _say_below(figure: Figure, text: str) -> None:
-    """Write a line at the foot of a figure, or along its right edge where its layout is frozen and the foot is full."""
+    """Write a line at the foot of a figure, or along its right edge where its layout is frozen or a legend is at the
+    foot, for which the layout leaves no second line."""
     look: dict[str, Any] = {"fontsize": 6, "color": SOFT, "parse_math": False}
+    engine = figure.get_layout_engine()
     with figure_style():
-        if figure.get_layout_engine() is not None:
+        if engine is not None and not figure.legends:
             figure.supxlabel(text, x=0.99, ha="right", **look)
-        else:
-            figure.text(0.995, 0.5, text, rotation=90, ha="right", va="center", **look)
+            return
+        if engine is not None:
+            engine.set(rect=(0, 0, 1 - RIGHT_EDGE_IN / figure.get_figwidth(), 1))
+        figure.text(0.995, 0.5, text, rotation=90, ha="right", va="center", **look)
 
 
 def _is_judged(reads: Sequence[str]) -> bool:

@@ -22,7 +22,7 @@ from traps_pipeline.mechanism.control_tables import (
     STEERING_PECS,
 )
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_SHARES
-from traps_pipeline.partitions import DATASETS
+from traps_pipeline.partitions import DATASETS, PROBE_PROMPT
 from traps_pipeline.scoring.people_tables import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.scoring.tables import (
     CONFABULATION_PREVALENCE,
@@ -122,10 +122,17 @@ class Results:
     panel_errors = Made(table=PANEL_ERRORS)
     corrected = Made(table=CORRECTED)
     composition = Made("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
-    probes = Made("PROBES rows; the paper has only transfer, confabulated, shuffled, centroid_void.", table=PROBES)
+    prompted_probes = Made("PROBES rows under every prompt.", table=PROBES)
+    prompted_baselines = Made("PROBE_BASELINES rows under every prompt.", table=PROBE_BASELINES)
+    probes = Made(
+        "PROBES rows under PROBE_PROMPT; the paper has only transfer, confabulated, shuffled, centroid_void.",
+        derive=lambda results: _of_probe_prompt(results.prompted_probes),
+    )
     cosines = Made("COSINES rows at the steered layer of each model.")
     effects = Made("STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label.")
-    baselines = Made(table=PROBE_BASELINES)
+    baselines = Made(
+        "PROBE_BASELINES rows under PROBE_PROMPT.", derive=lambda results: _of_probe_prompt(results.prompted_baselines)
+    )
     gate = Made(table=GATE)
     risk_coverage = Made(table=RISK_COVERAGE)
     patching = Made(table=PATCHING)
@@ -176,6 +183,10 @@ class Results:
         return "; ".join(self.refused.get(what, [])) or (
             "this study has no such results yet" if self.is_study else "the paper prints no such table"
         )
+
+
+def _of_probe_prompt(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows.loc[rows["prompt"] == PROBE_PROMPT]
 
 
 def datasets_of(cells: pd.DataFrame) -> list[str]:

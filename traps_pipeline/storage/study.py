@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from traps_pipeline.partitions import VQA_PROMPTS, check_slug
+from traps_pipeline.partitions import PROBE_PROMPT, VQA_PROMPTS, check_slug
 
 FORMAT = 1  # of a workspace
 Regime = Literal["standard", "guided"]
@@ -32,6 +32,9 @@ class ProbeSettings(BaseModel):
     folds: int = Field(default=5, ge=2)
     shuffles: int = Field(default=20, ge=20, description="with fewer the mean says little")
     resamples: int = Field(default=1000, ge=100)
+    prompts: tuple[Regime, ...] = Field(
+        default=(PROBE_PROMPT,), description="VQA prompts; others than standard are for what a prompt changes alone"
+    )
     others: tuple[str, ...] = Field(
         default=(), description="further probes, at the steered layer: mean difference, or classifiers of scikit-learn"
     )
@@ -125,10 +128,13 @@ class MechanismSettings(BaseModel):
     seed: int = 20260101
 
     @model_validator(mode="after")
-    def _directions_are_extracted(self) -> MechanismSettings:
+    def _prompts_are_extracted(self) -> MechanismSettings:
         missing = set(self.steering.direction_regimes if self.steering else ()) - set(self.prompts)
         if missing:
             raise ValueError(f"steering.direction_regimes: {sorted(missing)} are not among the prompts {self.prompts}")
+        unread = {*self.probes.prompts} - {*self.prompts, PROBE_PROMPT}
+        if unread:
+            raise ValueError(f"probes.prompts: {sorted(unread)} are not among the prompts {self.prompts}")
         return self
 
     @field_validator("models")

@@ -88,8 +88,8 @@ def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
 def gate_arrows(results: Results) -> Figure:
     """Each model's answers before the gate (hollow) and after it (filled) in the plane of Acc and J, for gates on
     states and their controls (from other datasets, mid threshold, all datasets); and risk against coverage. J is
-    AbsRec less FalseAbs: an arrow upwards tells voids from controls better, an arrow to the left pays for it with right
-    answers."""
+    AbsRec less FalseAbs: an arrow to the right tells voids from controls better, an arrow downwards pays for it with
+    right answers."""
     rows = results.gate
     rows = rows.loc[(rows["source"] == "other datasets") & (rows["threshold"] == "mid") & (rows["target"] == "all")]
     rows = rows.loc[rows["features"].isin(_FEATURES)]
@@ -226,6 +226,8 @@ def doses_among_nulls(results: Results) -> Figure:
 
 
 def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:
+    # Doses in alpha have a figure of their own; a gap may be so small that they would set the scale of this one.
+    rows = rows.loc[rows["unit"] == "gap"]
     for side, line, marker, ink in (("control", "-", "o", INK), ("void", "--", "s", SOFT)):
         of = rows.loc[rows["side"] == side]
         void = of.loc[of["kind"] == "void"].sort_values("gaps").drop_duplicates("gaps")

@@ -309,8 +309,8 @@ def prompts(results: Results) -> pd.DataFrame:
     table = plain.pivot_table(index=keys, columns="regime", values="plain_abs_rec", observed=True)
     table = table.reindex(columns=pd.Index(PROMPTED)).add_prefix("said_")
     table["change"] = table["said_guided"] - table["said_standard"]
-    own = [results.probes.loc[results.probes["source_best"].eq(True)]]
-    own += [results.baselines.loc[results.baselines["features"] == "output margin"]]
+    own = [results.prompted_probes.loc[results.prompted_probes["source_best"].eq(True)]]
+    own += [results.prompted_baselines.loc[results.prompted_baselines["features"] == "output margin"]]
     for name, rows in zip(("probe", "margin"), own, strict=True):
         rows = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"])]
         rows = rows.rename(columns={"target": "dataset"}).astype({"prompt": object, "dataset": object})
