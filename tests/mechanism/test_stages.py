@@ -34,10 +34,12 @@ from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES, STEERING, STEERING_VOTES
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import WITH_TEXT
+from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.partitions import ANSWERABLE, DATASETS, TIME_SWAPPED, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.parquet import Made
-from traps_pipeline.storage.study import MechanismSettings
+from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
@@ -231,6 +233,27 @@ def test_probes_take_confabulated_items_from_the_verdicts_and_are_fitted_once(
     assert set(pd.DataFrame(stages.probe_rows(own, STANDARD))["made_of"]) != set(rows["made_of"])
 
 
+def test_probes_of_another_prompt_are_fitted_where_they_are_asked_for(own: Workspace, entry: ModelEntry) -> None:
+    """Under the guided prompt there are states of the four datasets alone, so that nothing scores look-alikes."""
+    asked = Asked(datasets=DATASETS, models=("tiny",), regimes=("standard",), runs=(1,), mechanism=True)
+    own = own.allow(experiments={"inside": asked}, scenarios=["plinko-0001", "drop_split-0001"])
+    for prompts in (("standard",), ("standard", "guided")):
+        probes = own.mechanism.probes.model_copy(update={"prompts": prompts})
+        own = own.allow(mechanism=own.mechanism.model_copy(update={"probes": probes}))
+        for name in ("probes", "probe_baselines"):
+            assert the_graph()[name].wanted(Wanted(own)) == [f"tiny__{prompt}" for prompt in prompts]
+    guided = Extraction("tiny", "guided")
+    for dataset in DATASETS:
+        cell = StatesCell(dataset, guided)
+        own.tables.write(HIDDEN_STATES, cell.partition, stages.extract_states(own, cell)[0], {})
+    of = {each.prompt: pd.DataFrame(stages.probe_rows(own, each)) for each in (STANDARD, guided)}
+    found, here = ({*of[prompt]["analysis"]} for prompt in ("standard", "guided"))
+    assert found - here == {"answerable_void", "answerable_control", "time_swapped"} and here < found
+    assert {*of["guided"]["prompt"]} == {"guided"}
+    both = of["guided"].merge(of["standard"], on=["analysis", "source", "target", "layer", "scope"])
+    assert not np.allclose(both["value_x"].astype(float), both["value_y"].astype(float), equal_nan=True)
+
+
 def test_a_model_that_is_not_local_or_not_asked_for_is_told(study: Workspace, entry: ModelEntry) -> None:
     with pytest.raises(TrapsError, match="oracle: is asked through backend reference, and only local models"):
         stages.examined_model(study, "oracle")
@@ -416,6 +439,10 @@ def test_settings_that_cannot_be_are_refused() -> None:
         ({"models": {}}, "at least 1"),
         ({"models": layers, "probes": {"shuffles": 5}}, "greater than or equal to 20"),
         ({"models": layers, "prompts": ["standard"]}, "are not among the prompts"),
+        (
+            {"models": layers, "prompts": ["standard"], "steering": None, "probes": {"prompts": ["guided"]}},
+            "probes.prompts: .'guided'. are not among the prompts",
+        ),
         ({"models": layers, "steering": {"alphas": [5, 2]}}, "must ascend"),
         ({"models": {"a__b": layers["tiny"]}}, "must match"),
     ):

@@ -19,9 +19,9 @@ from traps_pipeline.partitions import (
     BESIDE,
     CATEGORIES,
     DATASETS,
+    PROBE_PROMPT,
     PROBED_ARMS,
     PROBED_DATASETS,
-    PROBE_PROMPT,
     REGIMES,
     TIME_SWAPPED,
     VQA_PROMPTS,
@@ -34,7 +34,6 @@ from traps_pipeline.partitions import (
 )
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
-
 
 
 class Wanted:

@@ -246,12 +246,8 @@ class Batches:
         kinds = (whole == self._processor.video_token_id).int() * 2  # 2: video, as the library counts modalities
         every = range(len(clip) - 2)
         placed, _ = self._rope_index(whole, kinds, video_grid_thw=torch.tensor([[len(every), *grid]]))
-        pieces = [
-            None,
-            None,
-            *every,
-            None,
-        ]  # of which pair of frames; the first two are the system's part and the opening
+        # The pair of frames of each piece; the first two are the system's part and the clip's opening.
+        pieces = [None, None, *every, None]
         lengths = [len(head), *map(len, clip)]
         kept = [pair is None or shown is None or pair in shown for pair in pieces]
         mask = torch.tensor(kept).repeat_interleave(torch.tensor(lengths))
