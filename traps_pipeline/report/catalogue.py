@@ -324,13 +324,15 @@ def workspace_files(report: Report, results: Results) -> dict[str, bytes]:
 def _say_below(figure: Figure, text: str) -> None:
     """Write a line at the foot of a figure, or along its right edge where its layout is frozen or a legend is at the
     foot, for which the layout leaves no second line."""
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
     look: dict[str, Any] = {"fontsize": 6, "color": SOFT, "parse_math": False}
     engine = figure.get_layout_engine()
     with figure_style():
         if engine is not None and not figure.legends:
             figure.supxlabel(text, x=0.99, ha="right", **look)
             return
-        if engine is not None:
+        if isinstance(engine, ConstrainedLayoutEngine):
             engine.set(rect=(0, 0, 1 - RIGHT_EDGE_IN / figure.get_figwidth(), 1))
         figure.text(0.995, 0.5, text, rotation=90, ha="right", va="center", **look)
 
