@@ -24,6 +24,7 @@ from traps_pipeline.storage.media import MediaSpec, pick
 
 LATEST_CUT_S = 2.0  # released cuts lie between 1.1 and 2.0 s
 CUT_BEFORE_COMMIT_S = 0.5
+LOOKS = frozenset({"floor"})  # of what may vary in a family, what varies in released scenes of the pocket's families
 DECOY_BEHIND_M, DECOY_PX = 0.1, 2000.0  # a decoy stands so far behind all that is shown, and has so many pixels
 
 
@@ -50,8 +51,8 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
     """A random scene. Raises Rejected, as `scenes.resolve` does, when it gives no valid pair."""
     params = family.draw(rng)
     wording = family.word(params, rng)
-    if family.looks:  # as released scenes of the family look; others draw nothing here
-        params = replace(params, look=draw_look(rng, family.looks))
+    if parts := LOOKS.intersection(family.looks):
+        params = replace(params, look=draw_look(rng, parts))
     physics = family.physics
     model, scene = compile_scene(family, params, physics)
     qpos = simulated(model, scene, physics)
