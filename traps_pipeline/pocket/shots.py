@@ -24,7 +24,7 @@ from traps_pipeline.storage.media import MediaSpec, pick
 
 LATEST_CUT_S = 2.0  # released cuts lie between 1.1 and 2.0 s
 CUT_BEFORE_COMMIT_S = 0.5
-LOOKS = frozenset({"floor"})  # of what may vary in a family, what varies in released scenes of the pocket's families
+LOOKS = frozenset({"floor"})  # of what may vary in a family, what varies here, so that a family's list changes no scene
 DECOY_BEHIND_M, DECOY_PX = 0.1, 2000.0  # a decoy stands so far behind all that is shown, and has so many pixels
 
 
