@@ -54,7 +54,7 @@ def start_the_twin_elsewhere(record: Record) -> None:
 ALTERED: dict[str, tuple[Callable[[Record], None], str]] = {
     "hidden_race-0001": (lower_panel, "hidden"),
     "domino_chain-0001": (close_the_gap, "physics"),
-    "chain-0001": (raise_panel, "referents: something that the question names has 12 pixels"),
+    "chain-0001": (raise_panel, "referents: something that the question names has 0 pixels"),
     "head_on-0001": (change_answer, "outcome"),
     "plinko-0001": (cut_later, "open"),
     "pachinko_waterfall-0001": (start_the_twin_elsewhere, "twin: the twin's trajectory begins"),
