@@ -24,7 +24,7 @@ panel: rules
 epoch: small
 scenarios: [hidden_race-0001, plinko-0001]
 datasets:
-  [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, removed, held_void, twin_control, choices_swapped,
+  [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, decoy, held_void, twin_control, choices_swapped,
    labels_two, labels_six, panel_grey, schema_abstain, frames_few]
 """
 
@@ -38,10 +38,10 @@ def test_arms_are_asked_with_the_pairs_and_take_the_shortcuts_gain_away(study: C
     until = ("--until", "leaderboard,robust,hypotheses")
     run = other.traps("run", path, *until)
     assert run.code == 0, run.err
-    # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: removed 1, held_void 1, twin_control 2, choices_swapped 2 x 2.
+    # Pairs: 2 scenarios x 2 datasets x 2 sides. Arms: decoy 1, held_void 1, twin_control 2, choices_swapped 2 x 2.
     # Variations: 2 x 2 of the race, whose answers are colours, panel 1, schema and frames 2 x 2 each.
     assert run.counts()["answers"] == 3 * (8 + (1 + 1 + 2 + 4) + (4 + 1 + 4 + 4))
-    assert run.counts()["frames"] == 50 + 50 + 50  # removed, held and grey; the others show the pair's own clips
+    assert run.counts()["frames"] == 50 + 50 + 50  # decoy, held and grey; the others show the pair's own clips
     tables = Workspace.open(other.workspace).tables
     arms = tables.read_all(ARMS)
     (refused,) = arms.dropna(subset=["refused"])["scenario_id"].unique()

@@ -95,6 +95,8 @@ def test_panels_of_arms_come_stand_and_go_as_they_say():
     control, void = bounce.control_frames, bounce.void_frames
     removed = arms.ARMS["removed"].film(bounce)
     assert all(np.array_equal(a, b) for a, b in zip(removed.frames, [*void[:40], *control[40:]], strict=True))
+    with pytest.raises(Rejected, match="first of the two events that are asked about happens behind the panel"):
+        arms.ARMS["removed"].film(scenario("hidden_race-0001"))
     late = arms.ARMS["late_panel"].film(bounce)
     at = round(late.evidence["covered_from_s"] * bounce.fps)
     assert at == bounce.control.outcome.commit_frame - 1  # never so late that the outcome was seen

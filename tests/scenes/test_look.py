@@ -203,8 +203,8 @@ def test_a_panel_of_tiles_hides_the_worlds_at_720_lines_as_well() -> None:
 
 @pytest.mark.slow
 def test_a_scene_is_drawn_and_certified_under_a_look(tmp_path: Path) -> None:
-    parts = ("floor", "material", "panel")
-    tally = sample_family("bounce", 1, 3, tmp_path, look=parts, workers=1)
+    parts = tuple(sorted({*get_family("bounce").looks, "floor"}))
+    tally = sample_family("bounce", 1, 3, tmp_path, look=["floor"], workers=1)
     assert load_tallies(tmp_path)["bounce"].look == tally.look == [*parts]
     found = try_draw(Draw("bounce", 3, tally.draws - 1, frozenset(), parts))
     assert isinstance(found, Resolved)

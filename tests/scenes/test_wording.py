@@ -34,6 +34,9 @@ SCENE = Inventory(
         ("In which year was the ramp made?", "age"),
         ("Does the red ball pass the black line, yes or no?", None),
         ("What colour is the ramp?", None),
+        ("What colour is the inside of the red block?", "inside"),
+        ("What colour is the inside of the red tray?", None),  # it is open
+        ("Is the tray of the red block hollow or solid?", None),
     ],
 )
 def test_a_question_beyond_the_video_names_a_listed_property(question: str, property_: str | None) -> None:

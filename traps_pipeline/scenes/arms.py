@@ -197,6 +197,9 @@ def _removed(scenario: Scenario) -> Take:
     last_seen = checks.last_sampled(len(scenario.control.qpos), scenario.fps)[0]
     if spec.void["hidden_from_frame"] >= at or commit > last_seen or last_seen < at:
         raise Rejected("the outcome is not both hidden before the panel goes and settled after it")
+    order = scenario.control.outcome.in_order
+    if order is not None and order[0] < at:
+        raise Rejected("the first of the two events that are asked about happens behind the panel")
     frames = [*scenario.void_frames[:at], *scenario.control_frames[at:]]
     return Take(frames, {"hidden_until_s": at / scenario.fps, "settled_s": commit / scenario.fps})
 
@@ -381,7 +384,7 @@ ARMS: Mapping[str, Arm] = {
             "removed",
             "a panel in the first frames means: abstain",
             f"the panel stands as in the void until {SHOWN_AGAIN_S} s before the end; the last three sampled frames "
-            "are the control's, with the outcome settled",
+            "are the control's, with the outcome settled; which of two events was first is not asked",
             must_answer,
             _removed,
         ),

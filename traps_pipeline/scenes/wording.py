@@ -72,7 +72,8 @@ BEYOND_VIDEO: Mapping[str, tuple[str, tuple[str, ...]]] = {
     ),
     "smell or taste": (r"\b(smells?|taste)\b", ("What does the {thing} smell of?",)),
     "inside": (
-        r"\b(hollow|inside of the)\b",
+        # What is open shows its inside.
+        r"^(?!.*\b(tray|bin|basket|pen|lane|box|bucket|tunnel|funnel|bridge)s?\b).*\b(hollow|inside of the)\b",
         ("Is the {thing} hollow or solid?", "What colour is the inside of the {thing}?"),
     ),
     "later": (
