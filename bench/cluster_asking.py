@@ -1,5 +1,6 @@
 """What it costs calls that a study is made on a cluster: the same cells asked by one process with a folder, and by one
-run on one node, with the study in PostgreSQL and an object store; 2,160 calls of 50 ms over 25 connections.
+run on one node, with the study in PostgreSQL and an object store; 2,016 calls of 50 ms over 24 connections, in cells of
+48 calls.
 
 python bench/cluster_asking.py [--times 2]
 (needs the packages of the extra `cluster`, and moto)
@@ -30,20 +31,20 @@ from tests.postgres import Postgres
 from tests.providers.server import Provider
 from traps_pipeline.storage.place import scratch_of
 
-MODELS, CONNECTIONS, LATENCY_S = [f"seer-{letter}" for letter in "abcde"], 5, 0.05
-REGIMES, RUNS = ["standard", "guided", "json"], list(range(1, 10))
-FAMILIES = ("plinko", "tumbling_dice", "domino_chain", "hidden_race")
-ITEMS = len(FAMILIES) * 2 * 2  # two datasets, two sides
-CALLS = ITEMS * len(REGIMES) * len(RUNS) * len(MODELS)
+MODELS, CONNECTIONS, LATENCY_S = [f"seer-{letter}" for letter in "abc"], 8, 0.05
+RUNS = list(range(1, 8))
+SCENARIOS = [f"{family}-{number:04d}" for family in ("slide", "bounce", "launch") for number in range(1, 9)]
+ITEMS = len(SCENARIOS) * 2 * 2  # two datasets, two sides
+CALLS = ITEMS * len(RUNS) * len(MODELS)
 EXPERIMENT = f"""
 name: asking
 description: Models at a provider.
 models: {MODELS}
-regimes: {REGIMES}
+regimes: [standard]
 runs: {RUNS}
 panel: rules
 judged_by_rules: true
-scenarios: {[f"{family}-0001" for family in FAMILIES]}
+scenarios: {SCENARIOS}
 """.replace("'", "")
 MORE = f"prices: {{input: 1.0, output: 10.0, as_of: 2026-11-01}}\n    runs: {len(RUNS)}"  # of an entry
 BUDGET = ("--no-preflight", "--budget-usd", "100000")

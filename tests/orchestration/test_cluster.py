@@ -249,6 +249,30 @@ def test_a_process_whose_run_was_resumed_elsewhere_ends_without_a_word(tmp_path:
         assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == RESUMED_ELSEWHERE
 
 
+def test_a_shared_history_keeps_its_connection_and_survives_a_restart_of_the_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
+    import psycopg
+
+    with Postgres.running() as server:
+        with psycopg.connect(server.address(), autocommit=True) as connection:
+            connection.execute("alter system set log_connections to on")
+            connection.execute("select pg_reload_conf()")
+        monkeypatch.setenv("LAB_DATABASE", server.address())
+        (tmp_path / "dagster.yaml").write_text(yaml.safe_dump(dagster_yaml_of_history("LAB_DATABASE")))
+        with dg.DagsterInstance.from_config(str(tmp_path)) as instance:
+            said = server.folder / "log"
+            opened = said.read_text().count("connection authorized")
+            for number in range(20):
+                instance.report_runless_asset_event(dg.AssetMaterialization("clips", partition=f"{number}"))
+            assert said.read_text().count("connection authorized") - opened < 5  # by itself it makes two for each
+            server.stop()
+            server.start()
+            instance.report_runless_asset_event(dg.AssetMaterialization("clips", partition="20"))
+            assert len(instance.get_materialized_partitions(dg.AssetKey("clips"))) == 21
+
+
 def dagster_yaml_of_history(variable: str) -> dict[str, Any]:
     """Of what a study's Dagster is told, where its history lies."""
     with pytest.MonkeyPatch.context() as patched:

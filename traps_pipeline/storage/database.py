@@ -38,7 +38,7 @@ GRACE_S = 10  # after the server was started, those who held a lock before have 
 RETRY_S = 0.2
 SKEW_S = 60  # Dagster compares times of several hosts to tell a run that never began; stores refuse 15 minutes
 FORMAT = 2  # of the tables; those of format 1 have no segments, and are given them
-_KEEPALIVE: dict[str, Any] = {
+KEEPALIVE: dict[str, Any] = {
     "keepalives_idle": 5,
     "keepalives_interval": 5,
     "keepalives_count": 3,
@@ -153,7 +153,7 @@ class Session:
             try:
                 self._connection = psycopg.connect(
                     self._address, autocommit=True, connect_timeout=10, application_name=f"traps {self.id}",
-                    **_KEEPALIVE,
+                    **KEEPALIVE,
                 )  # fmt: skip
             except psycopg.ProgrammingError:
                 raise TrapsError(
