@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -21,10 +22,10 @@ from traps_pipeline.scenes.look import MATERIALS, PANELS, PARTS, Look, frame_siz
 from traps_pipeline.scenes.outcome import compile_scene, simulated
 from traps_pipeline.scenes.parts.floor import PALE
 from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.relook import with_look
+from traps_pipeline.scenes.relook import relook_family, with_look
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.resolve import Resolved
-from traps_pipeline.scenes.sample import Draw, load_tallies, sample_family, try_draw
+from traps_pipeline.scenes.sample import Draw, load_tallies, record_line, sample_family, save_tallies, try_draw
 from traps_pipeline.scenes.spec import SceneSpec
 from traps_pipeline.scenes.world import World
 
@@ -169,6 +170,26 @@ def test_a_frame_of_720_lines_shows_the_same_scene_twice_as_fine_and_counts_the_
     assert case.family.observe(frames, case.spec.question) == case.family.observe(
         np.stack([cv2.resize(large, (480, 360), interpolation=cv2.INTER_AREA)] * 2), case.spec.question
     )
+
+
+def test_the_first_picture_that_a_renderer_draws_of_a_scene_with_textures_is_as_later_ones() -> None:
+    case = load("behind_wall-0001")
+    world = World.of_record(case.spec, case.qpos)
+    with world.renderer() as renderer:
+        first, again = (next(renderer.frames(case.qpos[:1])).copy() for _ in range(2))
+    assert np.array_equal(first, again)
+
+
+def test_a_record_without_its_look_is_given_the_look_of_its_draw(tmp_path: Path) -> None:
+    (tmp_path / "trajectories").mkdir()
+    shutil.copy(RELEASED / "trajectories" / "plinko-0001.npz", tmp_path / "trajectories")
+    spec = load("plinko-0001").spec
+    bare = spec.model_copy(update={"params": {k: v for k, v in spec.params.items() if k != "look"}})
+    (tmp_path / "plinko.jsonl").write_text(record_line(bare), encoding="utf-8")
+    save_tallies(tmp_path, {"plinko": replace(load_tallies(RELEASED)["plinko"], look=[])})
+    assert relook_family(tmp_path, "plinko", workers=1) == {}
+    assert SceneSpec.model_validate_json((tmp_path / "plinko.jsonl").read_text(encoding="utf-8")) == spec
+    assert load_tallies(tmp_path)["plinko"].look == sorted(get_family("plinko").looks)
 
 
 @pytest.mark.slow

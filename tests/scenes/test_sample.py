@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,15 @@ from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.relook import draw_again
-from traps_pipeline.scenes.sample import answer_quota, kind_of, load_tallies, sample_family, take_out
+from traps_pipeline.scenes.sample import (
+    _choices,
+    _closed,
+    answer_quota,
+    kind_of,
+    load_tallies,
+    sample_family,
+    take_out,
+)
 from traps_pipeline.scenes.spec import load_trajectory
 
 
@@ -32,6 +41,16 @@ from traps_pipeline.scenes.spec import load_trajectory
 def test_the_quota_of_an_answer(count: int, labels: int, quota: int) -> None:
     assert answer_quota(count, labels) == quota
     assert answer_quota(count, labels) * labels >= count  # the quotas can be filled
+
+
+def test_an_answer_that_few_questions_offer_has_its_quota_sooner() -> None:
+    plinko = get_family("plinko")  # boards of five, six or seven buckets, a third each
+    shares = {bucket: 1 / choices for bucket, choices in _choices(plinko).items()}
+    assert sum(shares.values()) == pytest.approx(1)
+    assert shares["1"] == pytest.approx((1 / 5 + 1 / 6 + 1 / 7) / 3, abs=0.01)
+    assert shares["7"] == pytest.approx(1 / 7 / 3, abs=0.01)
+    counts = Counter({"1": 20, "7": 20})
+    assert _closed(counts, 125, plinko) == {"7"}  # 125 x 1.5 x .17 = 31 and 125 x 1.5 x .047 = 8 are allowed
 
 
 @pytest.fixture(scope="module")

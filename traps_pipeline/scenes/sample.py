@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -34,6 +34,7 @@ from traps_pipeline.scenes.workers import run_in_order
 MOST_DRAWS = 40  # for each scenario wanted; a family that needs more is not worth its time
 DRAWS = "draws.json"  # beside the records: how each family was drawn
 _MEASURED = re.compile(r"\d[\d.]*|'\w+'(?=\s)")  # numbers and answers in a reason, which differ from draw to draw
+_WORDED = 128  # questions by which the share of an answer is known
 _UNASKED = "?"  # stands for the ill-posed question until the scenario has its place
 
 
@@ -225,15 +226,22 @@ def record_line(spec: SceneSpec) -> str:
 
 
 def _closed(answers: Counter[str], count: int, family: Family) -> frozenset[str]:
-    labels = _label_count(family)
-    return frozenset(answer for answer, n in answers.items() if n >= answer_quota(count, labels))
+    choices = _choices(family)
+    return frozenset(answer for answer, n in answers.items() if n >= answer_quota(count, choices[answer]))
 
 
 @cache
-def _label_count(family: Family) -> float:
-    """Choices of a question of the family, on average over draws (plinko has boards of five to seven buckets)."""
+def _choices(family: Family) -> Mapping[str, float]:
+    """Answer to the number of choices of which it would be one as often as chance gives it, over many draws: that of
+    the questions, where each offers the same ones, and more for an answer that not all of them offer."""
     rng = np.random.default_rng(0)
-    return float(np.mean([len(family.word(family.draw(rng), rng).labels) for _ in range(32)]))
+    drawn = [family.word(family.draw(rng), rng).labels for _ in range(_WORDED)]
+    shares = defaultdict[str, float](float)
+    for labels in drawn:
+        for label in labels:
+            shares[label] += 1 / len(labels) / len(drawn)
+    rare = float(len(drawn))  # an answer that none of them offers
+    return defaultdict(lambda: rare, {label: 1 / share for label, share in shares.items()})
 
 
 def try_draw(draw: Draw) -> Resolved | str:
