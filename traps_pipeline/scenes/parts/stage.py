@@ -358,13 +358,14 @@ class Stage:
         across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
         seen = np.concatenate([box.corners() for box in (*in_view, cover)])
         upright = np.array([0.0, 0.0, np.cos(down)]) + ahead * np.sin(down)
-        scale = max(np.ptp(seen @ across), np.ptp(seen @ upright) * 4 / 3)
+        scale = max(np.ptp(_along(seen, across)), np.ptp(_along(seen, upright)) * 4 / 3)
         wide, high = FLAG * scale, FLAG_SHAPE * FLAG * scale / float(np.cos(down))
         corners, flown, boxes = cover.corners(), [], []
-        for phrase, (foot, colour) in sorted(self._marks.items(), key=lambda item: float(np.dot(item[1][0], across))):
+        for phrase, (foot, colour) in sorted(self._marks.items(), key=lambda mark: float(_along(mark[1][0], across))):
             place = np.array(foot)
-            over = float((corners[:, 2] + (corners - place) @ ahead * np.tan(down)).max()) + FLAG_CLEAR_M + high / 2
-            at = float(place @ across)
+            over = float((corners[:, 2] + _along(corners - place, ahead) * np.tan(down)).max())
+            over += FLAG_CLEAR_M + high / 2
+            at = float(_along(place, across))
             over += high * 1.2 * max((n + 1 for n, other in flown if abs(at - other) < 1.15 * wide), default=0)
             flown.append((int(any(abs(at - other) < 1.15 * wide for _, other in flown)), at))
             centre = place + across * wide / 2 + np.array([0, 0, over - place[2]])
@@ -456,3 +457,9 @@ def coloured(p: Any) -> dict[str, str]:
     """Part -> its colour, from the fields `<part>_colour` of the parameters."""
     names = [each.name for each in fields(p) if each.name.endswith("_colour")]
     return {name.removesuffix("_colour"): getattr(p, name) for name in names}
+
+
+def _along(points: Any, axis: np.ndarray) -> np.ndarray:
+    """How far points (..., 3) lie along an axis (3,). These numbers go into the model as they are, so they are added in
+    one order: the last bit of a product of matrices is another one on another CPU."""
+    return (np.asarray(points) * axis).sum(axis=-1)
