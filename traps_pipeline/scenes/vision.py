@@ -120,10 +120,12 @@ def before_panel(frames: np.ndarray) -> np.ndarray:
         sizes[0] = 0
         region = names == sizes.argmax()
         around = cv2.dilate(region.astype(np.uint8), np.ones((17, 17), np.uint8)).astype(bool) & ~region
-        colour = np.median(frames[at][region], axis=0).astype(np.uint8)
+        before, colour = (np.median(frame[region], axis=0).astype(np.uint8) for frame in (frames[at - 1], frames[at]))
         even, beside = ((_apart(frames[at][part], colour) <= ALIKE).mean() for part in (region, around))
+        was_even = (_apart(frames[at - 1][region], before) <= ALIKE).mean()
         stays = (_apart(frames[-1][region], frames[at][region]) <= ALIKE).mean()
-        if sizes.max() >= PANEL_PX and even > 0.7 and beside < 0.3 and stays > 0.9:
+        stands_out = beside < 0.3 or (beside < 0.75 and was_even < even)  # some of what is around it may be as dark
+        if sizes.max() >= PANEL_PX and even > 0.6 and stands_out and stays > 0.9:
             return frames[:at]
     return frames
 
@@ -150,7 +152,8 @@ def without_flags(frames: np.ndarray) -> np.ndarray:
             x, y, wide, high = patch
             box = np.s_[y : y + high, x : x + wide]
             changes = np.abs(np.stack([frames[0][box], frames[-1][box]]).astype(int) - still[box])
-            if min(abs(y - top), abs(y + high - top)) > 6 or changes.mean() > 12:
+            rests = (changes[1] > 40).any(axis=-1).mean()  # a thing that lies before the patch is smaller than it
+            if min(abs(y - top), abs(y + high - top)) > 6 or changes.mean() > 12 or rests > 0.03:
                 continue  # neither flies at the end of the mast, or it moves
             above = max(0, min(top, y) - 4)
             beside = shown[:, above, max(0, left - 4)]

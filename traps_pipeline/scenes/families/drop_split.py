@@ -169,5 +169,5 @@ FAMILY = scene_family(
     observe=observe,
     min_margin_m=0.08,
     twins=twins,
-    looks=(),
+    looks=("bystanders", "camera", "light", "material", "panel"),
 )

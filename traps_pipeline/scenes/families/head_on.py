@@ -46,8 +46,8 @@ class Params:
     slowed: float = between(0.40, 0.48)  # share of its speed that a ball keeps on the rough board
     radius_m: float = between(0.050, 0.058)
     half_deck_m: float = between(0.46, 0.52)
-    ramp_m: float = between(0.40, 0.46)
-    slope_deg: float = between(8.0, 10.0)
+    ramp_m: float = between(0.64, 0.70)
+    slope_deg: float = between(5.4, 6.6)
     azimuth_deg: float = in_front(-18, 18)
     elevation_deg: float = between(-38, -24)
 

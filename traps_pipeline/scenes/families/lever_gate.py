@@ -40,7 +40,7 @@ class Params:
     held_open: bool = hidden(False, True)  # whether the counterweight sits far out
     radius_m: float = between(0.043, 0.050)
     speed_m_s: float = between(0.55, 0.72)
-    run_m: float = between(0.50, 0.62)  # visible lane
+    run_m: float = between(0.92, 1.04)  # visible lane
     gate_at_m: float = between(0.30, 0.36)
     arm_m: float = between(0.24, 0.28)  # from the gate to the pivot, and from there to the other end of the lever
     drop_m: float = between(0.22, 0.25)  # length of the gate below the lever

@@ -134,5 +134,4 @@ FAMILY = scene_family(
     ],
     observe=nearer_side("ball", "red", "blue", find=compact, least=100),
     min_margin_m=0.03,
-    looks=(),
 )

@@ -49,8 +49,8 @@ class Params:
         lambda rng, so_far: (uniform(rng, 0.048, 0.060), uniform(rng, 0.045, 0.055), uniform(rng, 0.026, 0.034))
     )
     rough: bool = hidden(False, True)  # whether the board stands out of the deck
-    slope_deg: float = between(19, 25)
-    incline_m: float = between(0.48, 0.56)  # length of the incline's surface
+    slope_deg: float = between(12, 14.5)
+    incline_m: float = between(0.82, 0.90)  # length of the incline's surface
     start_m: float = between(0.08, 0.14)  # from the incline's top to the middle of the block
     deck_friction: float = between(0.03, 0.06)
     rough_friction: float = between(0.75, 0.95)

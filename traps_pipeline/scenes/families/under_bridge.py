@@ -40,7 +40,7 @@ class Params:
     radius_m: float = between(0.048, 0.056)
     slope_deg: float = between(10, 15)
     ramp_m: float = between(0.34, 0.42)  # length of the ramp along the ground
-    flat_m: float = between(0.10, 0.16)  # road from the ramp to the bridge
+    flat_m: float = between(0.38, 0.46)  # road from the ramp to the bridge
     bridge_m: float = between(0.40, 0.46)  # width of the bridge, along the road
     span_m: float = between(0.42, 0.50)  # length of the bridge, across the road
     height_m: float = between(0.22, 0.25)  # of the bridge's lower side
