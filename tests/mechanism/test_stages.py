@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import shutil
+import subprocess
+import sys
+import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -11,6 +15,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.conftest import ROOT
+from tests.mechanism.steer_cell import CELL
 from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write_items, write_verdicts
 from traps_pipeline import inside
 from traps_pipeline.benchmark.tables import ITEMS, ItemRow
@@ -307,6 +313,46 @@ def steered(study: Workspace, entry: ModelEntry) -> Workspace:
     ]  # controls are judged for correctness too
     assert [len(made.rows(STEERING_VOTES)) for _, made in votes] == [3 * n for n in tasks]
     return study
+
+
+def test_who_may_not_write_a_cell_makes_its_answers_and_a_killed_process_gives_its_chunk_back(
+    own: Workspace, entry: ModelEntry, tmp_path: Path
+) -> None:
+    """While this process holds the ledger, one helper is killed behind its first chunk and another one makes the rest;
+    when it may write it generates nothing twice, and its texts are those of one process alone."""
+    few = entry.model_copy(update={"limits": entry.limits.model_copy(update={"concurrency": 8})})
+    described, made = tmp_path / "entry.json", own.ledger_folder / "made" / "tiny"
+    described.write_text(few.model_dump_json(), "utf-8")
+    alone = shutil.copytree(own.root, tmp_path / "alone", symlinks=True)
+
+    def start(root: Path) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "tests.mechanism.steer_cell", str(root), str(described)]
+        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+
+    def wait_for(files: int, process: subprocess.Popen[str]) -> int:
+        while len(done := list(made.glob("*.json"))) < files:
+            assert process.poll() is None
+            time.sleep(0.02)
+        return sum(len(json.loads(path.read_text("utf-8"))) for path in done)
+
+    async def helped() -> tuple[int, subprocess.Popen[str]]:
+        async with own.answers.writing(CELL.evaluation.key, print):
+            first = start(own.root)
+            wait_for(1, first)
+            first.kill()
+            first.wait()
+            known = wait_for(1, second := start(own.root))
+            assert wait_for(9, second) == 70  # 70 answers in chunks of 8
+            return known, second
+
+    known, process = asyncio.run(helped())
+    output, _ = process.communicate()
+    said, alone_said = json.loads(output.splitlines()[-1]), None
+    assert process.returncode == 0 and known >= 6 and said["generated"] == 70 - known
+    process = start(alone)
+    alone_said = json.loads(process.communicate()[0].splitlines()[-1])
+    assert alone_said["generated"] == 70 and said["texts"] == alone_said["texts"]
+    assert not made.exists() and len(own.answers.read(CELL.evaluation.key).rows) == 70
 
 
 def test_what_two_cells_share_is_one_answer(steered: Workspace, entry: ModelEntry) -> None:

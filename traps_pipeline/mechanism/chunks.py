@@ -53,9 +53,16 @@ def end_leases(folder: Path) -> None:
     shutil.rmtree(folder / LEASES, ignore_errors=True)
 
 
-def _file(path: Path) -> IO[str]:
+@contextmanager
+def writable(folder: Path) -> Iterator[None]:
+    """Raises TrapsError where nothing can be written in a folder."""
     try:
+        yield
+    except OSError as error:
+        raise TrapsError(f"{folder}: cannot be written ({error.strerror or error}); {remedy(error)}") from error
+
+
+def _file(path: Path) -> IO[str]:
+    with writable(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
         return path.open("w")
-    except OSError as error:
-        raise TrapsError(f"{path.parent}: cannot be written ({error.strerror or error}); {remedy(error)}") from error

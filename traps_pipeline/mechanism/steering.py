@@ -13,7 +13,7 @@ none in another. Nulls are steered at the largest dose, along the direction of t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import product
@@ -21,11 +21,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from traps_pipeline import progress
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
 from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
+from traps_pipeline.mechanism.made_answers import MadeAnswers, is_written, make_meanwhile
 from traps_pipeline.mechanism.paths import sources_of
 from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT, STEERING, SteeringRow, SteeringVoteRow
 from traps_pipeline.mechanism.versions import loaded_params
@@ -260,24 +262,28 @@ class SteeredBackend(LocalBackend):
     """A local model that answers with a direction added to one block, each row with a direction and an alpha of its
     own."""
 
-    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray]) -> None:
+    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], made: MadeAnswers) -> None:
         super().__init__(entry)
-        self._vectors = vectors
+        self._vectors, self._made = vectors, made
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
 
     def _answers(self, batch: _Batch) -> list[Outcome]:
-        """Answer a batch, in the worker thread; all rows of one layer are generated together, resumed at that layer,
-        and unsteered rows apart."""
+        """Answer a batch, in the worker thread, but for what another process has made of it."""
+        return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
+
+    def generate(self, wanted: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
+        """Answer requests; all rows of one layer are generated together, resumed at that layer, and unsteered rows
+        apart. stopped: asked at every token, ends early."""
         from traps_pipeline.mechanism.hook import Steering
 
         groups: dict[int | None, list[int]] = {}
-        for number, request in enumerate(batch.requests):
+        for number, request in enumerate(wanted):
             steering = request.params["steering"]
             groups.setdefault(steering["layer"] if steering else None, []).append(number)
         outcomes: dict[int, Outcome] = {}
         model = self._model()
         for group, numbers in groups.items():
-            requests = [batch.requests[number] for number in numbers]
+            requests = [wanted[number] for number in numbers]
             prompts = [self._prompt(r.media, r.media_digest, r.system, r.user) for r in requests]
             hook = None
             if group is not None:
@@ -288,11 +294,11 @@ class SteeredBackend(LocalBackend):
                 hook = Steering(vectors, group, alphas, removed)
             most = requests[0].params["max_new_tokens"]
             with model.remembering_clips(), model.resuming():
-                made = model.generate(prompts, most, None, hook, stopped=batch.abandoned.is_set)
+                made = model.generate(prompts, most, None, hook, stopped=stopped)
             for number, one in zip(numbers, made, strict=True):
                 counts = (one.prompt_tokens, one.completion_tokens)
                 outcomes[number] = outcome(one.text, one.finish_reason, *counts, model.served_model)
-        return [outcomes[number] for number in range(len(batch.requests))]
+        return [outcomes[number] for number in range(len(wanted))]
 
     def _model(self) -> Any:
         from traps_pipeline.models.local.adapter import load_local_model
@@ -312,7 +318,11 @@ def collect_steered(
     directions: Mapping[str, Mapping[str, Directions]],
 ) -> Iterator[tuple[SteeringCell, Made]]:
     """Generate the missing answers; yields the STEERING rows of each finished cell. directions: by VQA prompt, then by
-    source."""
+    source.
+
+    Several processes may do so at once, on one machine: one writes the answers of an evaluation, and whoever waits for
+    it makes answers in the meantime (`made_answers`).
+    """
     vectors = {
         vector_digest(vector): vector
         for of_prompt in directions.values()
@@ -322,18 +332,42 @@ def collect_steered(
         for vector in draw
     }
 
+    made = MadeAnswers(workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
+
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
-        return wanted_steered(workspace, entry, cell, directions[cell.directions])
+        wanted = wanted_steered(workspace, entry, cell, directions[cell.directions])
+        made.chunks([each.request for each in wanted])
+        return wanted
 
     def finish(settled: Settled[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, Made]:
+        made.forget([each.request for each in settled.calls])
         answered = settled.answered()
         plain = {q.item["item_id"]: row["text"] for q, row in answered if q.strength.kind == UNSTEERED}
         return settled.made(partial(_steering_row, plain))
 
     def make(entry: Entry) -> SteeredBackend:
-        return SteeredBackend(entry, vectors)
+        return SteeredBackend(entry, vectors, made)
 
+    for cell in cells:
+        if is_written(workspace.answers, cell.evaluation.key):
+            _make_meanwhile(workspace, cell, calls(cell), made, make(entry))
     yield from collect(workspace, "steering", workspace.answers, [entry], cells, calls, finish, make)
+
+
+def _make_meanwhile(
+    workspace: Workspace,
+    cell: SteeringCell,
+    wanted: Sequence[SteeredQuestion],
+    made: MadeAnswers,
+    backend: SteeredBackend,
+) -> None:
+    """Make answers of a cell while another process writes those of its evaluation."""
+    report = progress.current()
+    report.note(f"{cell.key}: another process writes the answers; some are made here, from the last one on")
+    requests = [each.request for each in wanted]
+    tick = partial(report.tick, "steering", f"chunks of answers of {cell.key}")
+    count = make_meanwhile(made, workspace.answers, cell.evaluation.key, requests, backend.generate, tick)
+    report.note(f"{cell.key}: {count} answers were made for the process that writes them")
 
 
 def _steering_row(

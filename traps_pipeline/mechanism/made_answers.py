@@ -1,0 +1,146 @@
+"""Answers that several processes make for one evaluation, of which one alone may write the ledger.
+
+Who may not write makes answers in the meantime, chunk by chunk of its calls and from their end, and leaves them in a
+folder; who writes takes what is there and makes the rest. A chunk is leased as it is made, so nobody makes it twice,
+and a process that dies gives it back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from traps_pipeline.digests import digest
+from traps_pipeline.files import try_lock, write_text
+from traps_pipeline.mechanism.chunks import writable
+from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.storage.ledger import Ledger, LockGivenUp
+
+POLL_S = 0.2
+
+Make = Callable[[Sequence[Request], Callable[[], bool]], list[Outcome]]  # calls; whether to stop; their outcomes
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Calls that one process makes together, by key; another process has the same ones in a chunk of the same name."""
+
+    name: str
+    calls: Mapping[str, Request]
+
+
+class MadeAnswers:
+    """The answers in a folder, and the chunks of the calls that are wanted here."""
+
+    def __init__(self, folder: Path, size: int) -> None:
+        self._folder, self._size = folder, size
+        self._of: dict[str, Chunk] = {}
+
+    def chunks(self, wanted: Sequence[Request]) -> list[Chunk]:
+        """The calls of a cell in chunks, which are known from now on."""
+        calls = list({request.key: request for request in wanted}.values())
+        parts = [calls[first : first + self._size] for first in range(0, len(calls), self._size)]
+        found = [Chunk(digest([each.key for each in part])[:16], {each.key: each for each in part}) for part in parts]
+        for chunk in found:
+            self._of |= dict.fromkeys(chunk.calls, chunk)
+        return found
+
+    def outcomes(self, requests: Sequence[Request], make: Make, stopped: Callable[[], bool]) -> list[Outcome]:
+        """What came of calls, which are of known chunks: as another process made them, or made here. Waits while
+        another process makes some of them, unless it is stopped."""
+        chunks = {chunk.name: chunk for request in requests if (chunk := self._of.get(request.key))}
+        with ExitStack() as leases:
+            found: dict[str, Outcome] = {}
+            for chunk in chunks.values():
+                while not leases.enter_context(self._lease(chunk)) and not stopped():
+                    time.sleep(POLL_S)
+                found |= self._read(chunk)
+            missing = [request for request in requests if request.key not in found]
+            if missing:
+                found |= zip([each.key for each in missing], make(missing, stopped), strict=True)
+        return [found[request.key] for request in requests]
+
+    def fill(self, chunk: Chunk, known: Callable[[Sequence[str]], set[str]], make: Make) -> int | None:
+        """Make the answers of a chunk that are not known, unless another process is at it (None); their number."""
+        with self._lease(chunk) as mine:
+            if not mine:
+                return None
+            made = self._read(chunk)
+            settled = known(list(chunk.calls)) | {*made}
+            missing = [request for key, request in chunk.calls.items() if key not in settled]
+            if missing:
+                outcomes = make(missing, lambda: False)
+                made |= zip([each.key for each in missing], outcomes, strict=True)
+                with writable(self._folder):
+                    write_text(self._path(chunk), json.dumps({key: asdict(each) for key, each in made.items()}))
+            return len(missing)
+
+    def forget(self, wanted: Sequence[Request]) -> None:
+        """Remove the answers to calls that the ledger holds now."""
+        for name in {chunk.name for request in wanted if (chunk := self._of.get(request.key))}:
+            for path in (self._folder / f"{name}.json", self._folder / f"{name}.lock"):
+                path.unlink(missing_ok=True)
+        if self._folder.is_dir() and not any(self._folder.iterdir()):
+            shutil.rmtree(self._folder, ignore_errors=True)  # another process may do so at the same time
+
+    def _path(self, chunk: Chunk) -> Path:
+        return self._folder / f"{chunk.name}.json"
+
+    def _read(self, chunk: Chunk) -> dict[str, Outcome]:
+        try:
+            rows = json.loads(self._path(chunk).read_text(encoding="utf-8"))
+            return {key: Outcome(**row) for key, row in rows.items() if key in chunk.calls}
+        except FileNotFoundError:
+            return {}
+        except (ValueError, TypeError, AttributeError):  # not what was written: made again
+            return {}
+
+    @contextmanager
+    def _lease(self, chunk: Chunk) -> Iterator[bool]:
+        """Whether the chunk is this process's until the end of the block."""
+        with writable(self._folder):
+            held = try_lock(self._folder / f"{chunk.name}.lock")
+        try:
+            yield held is not None
+        finally:
+            if held is not None:
+                os.close(held)
+
+
+def is_written(ledger: Ledger, evaluation: str) -> bool:
+    """Whether another process writes an evaluation now."""
+
+    async def try_it() -> bool:
+        try:
+            async with ledger.writing(evaluation, lambda _: None, lambda: True):
+                return False
+        except LockGivenUp:
+            return True
+
+    return asyncio.run(try_it())
+
+
+def make_meanwhile(
+    made: MadeAnswers,
+    ledger: Ledger,
+    evaluation: str,
+    wanted: Sequence[Request],
+    make: Make,
+    tick: Callable[[int, int], None],
+) -> int:
+    """Make answers to these calls from their end, for as long as another process writes their evaluation; returns how
+    many were made. tick: gets the chunks done and their number."""
+    chunks, count = made.chunks(wanted), 0
+    for done, chunk in enumerate(reversed(chunks), start=1):
+        count += made.fill(chunk, lambda keys: {*ledger.read(evaluation, keys).settled}, make) or 0
+        tick(done, len(chunks))
+        if not is_written(ledger, evaluation):
+            break
+    return count
