@@ -1,11 +1,13 @@
 """What a benchmark can be passed by, other than by seeing: measured on its records, and on a study of its arms.
 
-From the records (two frames of each are drawn, about a minute and a half on two cores): how many controls the family's
-own observer answers from the last shown frame alone, and how many nobody can, since a panel hides the outcome there
-(certificate `closing`); when outcomes settle, and until when they are in view; how many records of a family have a
-neighbour whose first frame looks like theirs; how far each seesaw turns; how well the state at the cut predicts the
-outcome of a chaotic record, beside always saying the commonest outcome. From a study that asked the arms (`traps run
-arms`): PECS, PECS-R and the gap of the shortcut rules and of the observer.
+From the records (two frames of each are drawn, about three minutes on two cores): how many controls the family's own
+observer answers from the last shown frame alone, and how many nobody can, since a panel hides the outcome there
+(certificate `closing`); what of a void's pixels over which anything moves its panel covers, and whether all that the
+question names shows there (certificate `referents`); when outcomes settle, and until when they are in view; how many
+records of a family have a neighbour whose first frame looks like theirs; how far each seesaw turns; how well the state
+at the cut predicts the outcome of a chaotic record, beside always saying the commonest outcome. With --observer also
+what the observer reads of each whole control, encoded and decoded (eight minutes more). From a study that asked the
+arms (`traps run arms`): PECS, PECS-R and the gap of the shortcut rules and of the observer.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 os.environ.setdefault("MUJOCO_GL", "osmesa")
 
@@ -29,8 +32,11 @@ import pandas as pd
 
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.paths import RELEASED
-from traps_pipeline.scenes.certificates import CLOSING, stored_evidence
+from traps_pipeline.scenes.certificates import CLOSING, REFERENTS, Certificate, stored_evidence
+from traps_pipeline.scenes.checks import control_frames
+from traps_pipeline.scenes.encode import encode
 from traps_pipeline.scenes.evidence import Claim
+from traps_pipeline.scenes.observe import observe
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
 from traps_pipeline.scenes.world import World
 from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
@@ -58,6 +64,9 @@ class Measured:
     looks: int
     turned_deg: float | None
     at_cut: np.ndarray | None
+    covers: float | None
+    referents: bool | None
+    whole_clip_answer: str | None = None
 
 
 def main() -> None:
@@ -65,14 +74,18 @@ def main() -> None:
     parser.add_argument("--per-family", type=int, help="the first so many records of each family; default: all")
     parser.add_argument("--specs", type=Path, default=RELEASED, help="folder of the released records")
     parser.add_argument("--workspace", type=Path, help="a study that asked the arms; without one they are not reported")
+    parser.add_argument("--observer", action="store_true", help="let the observer read each whole control, too")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
     chosen = first_of_each(load_released(arguments.specs), arguments.per_family)
     with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
-        found = list(pool.map(partial(measure, folder=arguments.specs), chosen, chunksize=4))
+        found = list(pool.map(partial(measure, folder=arguments.specs, whole=arguments.observer), chosen, chunksize=4))
     print(f"{len(found)} records of {len({one.family for one in found})} families")
     print_last_frame(found)
+    if arguments.observer:
+        print_observer(found)
     print_hidden(found)
+    print_voids(found)
     print_times(found)
     print_looks(found)
     print_seesaws(found)
@@ -90,16 +103,17 @@ def first_of_each(specs: dict[str, SceneSpec], most: int | None) -> list[SceneSp
     return [specs[scenario_id] for scenario_id in ids]
 
 
-def measure(spec: SceneSpec, folder: Path) -> Measured:
-    """Draw the first frame and the last shown one, of which the observer sees a still clip; read the trajectory."""
+def measure(spec: SceneSpec, folder: Path, whole: bool = False) -> Measured:
+    """Draw the first frame and the last shown one, of which the observer sees a still clip; read the trajectory. whole:
+    show the observer the whole control, too."""
     qpos = load_trajectory(folder / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
     world = World.of_record(spec, qpos)
     shown = range(0, len(qpos), STEP)
     with world.closed_renderer() as renderer:
         (first,) = renderer.frames(qpos[:1])
         (last,) = renderer.frames(qpos[[shown[-1]]], panel=world.open_frames <= shown[-1])
-    observe = world.family.observe
-    answer = observe(np.stack([last] * len(shown)), spec.question) if observe is not None else None
+    see = world.family.observe
+    answer = see(np.stack([last] * len(shown)), spec.question) if see is not None else None
     return Measured(
         scenario_id=spec.scenario_id,
         family=spec.family,
@@ -107,18 +121,28 @@ def measure(spec: SceneSpec, folder: Path) -> Measured:
         truth=spec.ground_truth,
         settled=spec.evidence["commit_s"] * world.physics.fps / len(qpos),
         in_view_until=world.open_frames / len(qpos),
-        hidden_at_end=spec.control is not None
-        and CLOSING.failure(stored_evidence(spec), Claim.of_record(spec)) is None,
+        hidden_at_end=spec.control is not None and given(CLOSING, spec),
         last_frame_answer=answer,
         looks=perceptual_hash(first),
         turned_deg=turned_deg(world.model, qpos) if spec.family == "seesaw_sorter" else None,
         at_cut=state_at_cut(qpos, spec.void["cut_frame"]) if spec.void_kind == "truncation" else None,
+        covers=spec.evidence.get("panel_covers"),
+        referents=given(REFERENTS, spec) if spec.void_kind == "occluder" else None,
+        whole_clip_answer=read_whole(world, spec, qpos) if whole else None,
     )
 
 
-def hidden_at_end(spec: SceneSpec) -> bool:
-    """Whether the record's own evidence certifies that its last shown frame hides the outcome."""
-    return spec.control is not None and CLOSING.failure(stored_evidence(spec), Claim.of_record(spec)) is None
+def given(certificate: Certificate, spec: SceneSpec) -> bool:
+    """Whether the record's own evidence carries a certificate; `traps certify` measures that evidence again."""
+    return certificate.failure(stored_evidence(spec), Claim.of_record(spec)) is None
+
+
+def read_whole(world: World, spec: SceneSpec, qpos: np.ndarray) -> str | None:
+    """What the observer answers from the control's clip, as a model is shown it."""
+    with world.closed_renderer() as renderer, TemporaryDirectory() as folder:
+        clip = Path(folder) / "control.mp4"
+        encode(list(control_frames(renderer, qpos, world.open_frames)), clip, world.physics.fps)
+        return observe(clip, spec.question)
 
 
 def perceptual_hash(frame: np.ndarray) -> int:
@@ -156,6 +180,28 @@ def print_last_frame(found: Sequence[Measured]) -> None:
         print(f"  {family:20} {right / n:6.3f} {any_answer / n:6.3f} {n:4d}")
     right, any_answer, n = np.sum(list(rows.values()), axis=0)
     print(f"  {'all':20} {right / n:6.3f} {any_answer / n:6.3f} {n:4d}")
+
+
+def print_observer(found: Sequence[Measured]) -> None:
+    """The ceiling of what classical vision reads; a control that it reads wrongly is named."""
+    print("\nControls answered rightly from the whole clip (right, answered at all, of)")
+    for name, ones in [*by_taxonomy(found).items(), ("all", found)]:
+        right = np.mean([one.whole_clip_answer == one.truth for one in ones])
+        some = np.mean([one.whole_clip_answer is not None for one in ones])
+        print(f"  {name:20} {right:6.3f} {some:6.3f} {len(ones):4d}")
+    wrong = [one for one in found if one.whole_clip_answer != one.truth]
+    print("  not right:", ", ".join(f"{one.scenario_id} ({one.whole_clip_answer})" for one in wrong) or "none")
+
+
+def print_voids(found: Sequence[Measured]) -> None:
+    covers = [one.covers for one in found if one.covers is not None]
+    shown = [one.referents for one in found if one.referents is not None]
+    if covers:
+        spread = " ".join(f"{value:5.2f}" for value in np.quantile(covers, (0, 0.25, 0.5, 0.75, 1)))
+        print(f"\nPixels over which anything moves that the panel covers, as shares (least, quartiles, most): {spread}")
+        print(
+            f"Occlusion voids in which all that the question names shows, or was seen moving: {sum(shown)} of {len(shown)}"
+        )
 
 
 def print_hidden(found: Sequence[Measured]) -> None:
