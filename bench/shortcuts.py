@@ -199,9 +199,7 @@ def print_voids(found: Sequence[Measured]) -> None:
     if covers:
         spread = " ".join(f"{value:5.2f}" for value in np.quantile(covers, (0, 0.25, 0.5, 0.75, 1)))
         print(f"\nPixels over which anything moves that the panel covers, as shares (least, quartiles, most): {spread}")
-        print(
-            f"Occlusion voids in which all that the question names shows, or was seen moving: {sum(shown)} of {len(shown)}"
-        )
+        print(f"Voids in which all that the question names shows, or was seen moving: {sum(shown)} of {len(shown)}")
 
 
 def print_hidden(found: Sequence[Measured]) -> None:
