@@ -68,7 +68,9 @@ def test_a_question_gives_its_template_and_values_back() -> None:
     templates = ("Does the {ball} ball pass the {line} line, yes or no?", "Where is the {ball} ball: left or right?")
     assert asked(templates, "Does the red ball pass the blue line, yes or no?") == {"ball": "red", "line": "blue"}
     assert asked(templates, "Where is the red ball: left or right?") == {"ball": "red"}
-    assert asked(templates, "Where is the red ball?") is None
+    assert asked(templates, "Where is the red ball?") == {"ball": "red"}  # the arm choices_swapped asks so
+    assert asked(("Which ball is first: {choices}?",), "Which ball is first?") is None  # offered nothing
+    assert asked(templates, "Where is the red ball: up or down?") is None
     assert asked(("{a} or {a}?",), "x or y?") is None  # the same placeholder, two values
 
 

@@ -13,6 +13,9 @@ from functools import cache
 import numpy as np
 
 from traps_pipeline.scenes.kit import COLOURS, Inventory, Taxonomy
+from traps_pipeline.scenes.offers import without_choices
+
+YES_OR_NO, LEFT_OR_RIGHT = ("yes", "no"), ("left", "right")
 
 # --- well-posed questions ---------------------------------------------------------------------------------------------
 
@@ -32,12 +35,21 @@ def _pattern(template: str) -> re.Pattern[str]:
 
 
 def asked(templates: Sequence[str], question: str) -> dict[str, str] | None:
-    """The values that a question fills its template's placeholders with; None if it fits none of the templates."""
-    for template in templates:
+    """The values that a question fills its template's placeholders with, also without the choices that the template
+    itself spells out ('yes or no'); None if it fits none of the templates."""
+    for template in (*templates, *_open_forms(tuple(templates))):
         match = _pattern(template).fullmatch(question)
         if match:
             return match.groupdict()
     return None
+
+
+@cache
+def _open_forms(templates: tuple[str, ...]) -> list[str]:
+    """Templates without their choices, of those that offer the same ones to every scenario."""
+    fixed = [template for template in templates if "{choices}" not in template]
+    forms = [without_choices(template, labels) for template in fixed for labels in (YES_OR_NO, LEFT_OR_RIGHT)]
+    return [form for form in forms if form is not None]
 
 
 def choices_in(text: str) -> tuple[str, ...]:
