@@ -207,6 +207,16 @@ def test_a_record_under_another_floor_has_the_same_worlds_and_is_certified() -> 
 
 
 @pytest.mark.slow
+def test_under_another_look_a_record_loses_every_certificate_that_it_does_not_pass() -> None:
+    """Also those whose numbers would be the same: one record once took a light in which its panel no longer hid all."""
+    case = load("tumbling_dice-0005")
+    assert case.spec.control is not None and isinstance(with_look(case.spec, None, case.qpos, case.twin), SceneSpec)
+    soon = round(case.spec.evidence["commit_s"] * case.physics.fps) + 4  # 0.6 s are wanted
+    early = case.spec.model_copy(update={"control": {**case.spec.control, "closes_frame": soon}})
+    assert str(with_look(early, None, case.qpos, case.twin)).startswith("closing: the panel comes at")
+
+
+@pytest.mark.slow
 def test_a_panel_of_tiles_hides_the_worlds_at_720_lines_as_well() -> None:
     case = load("bounce-0001")
     pair = pair_of(case.spec, case.qpos, case.twin, frame_step=10)

@@ -103,8 +103,8 @@ def _relooked(job: _Job) -> Resolved | str:
 
 
 def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.ndarray) -> SceneSpec | str:
-    """A record under a look that moves neither camera nor panel, or which of the certificates that another picture may
-    change it loses. qpos, twin: its trajectories, (F, nq) each."""
+    """A record under a look that moves neither camera nor panel, or which certificate it loses; those of rollouts stay.
+    qpos, twin: its trajectories, (F, nq) each."""
     family = get_family(spec.family)
     dressed = plain(params_to_dict(replace(family.params_from(spec.params), look=look)))
     other = spec.twin.params
@@ -113,8 +113,8 @@ def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.nda
     seen = spec.model_copy(update={"params": dressed, "twin": spec.twin.model_copy(update={"params": other})})
     pair, evidence = pair_of(seen, qpos, twin), dict(spec.evidence)
     for certificate in certificates_for(spec.void_kind):
-        if not any(number.kept and not number.compared for number in certificate.numbers):
-            continue
+        if any(number.of_futures for number in certificate.numbers):
+            continue  # thousands of rollouts, of which no picture is drawn
         try:
             measured = certificate.measured(pair)
         except Rejected as rejected:
