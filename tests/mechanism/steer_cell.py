@@ -14,7 +14,8 @@ import pytest
 
 from tests.mechanism.study import register
 from traps_pipeline.mechanism import stages
-from traps_pipeline.mechanism.steering import SteeredBackend, collect_steered
+from traps_pipeline.mechanism.steered_backend import SteeredBackend
+from traps_pipeline.mechanism.steering import collect_steered
 from traps_pipeline.mechanism.tables import STEERING
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.models.request import Outcome, Request

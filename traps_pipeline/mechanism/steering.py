@@ -13,13 +13,11 @@ none in another. Nulls are steered at the largest dose, along the direction of t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from itertools import product
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from traps_pipeline import progress
 from traps_pipeline.benchmark.tables import ITEMS
@@ -29,29 +27,23 @@ from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.made_answers import MadeAnswers, is_written, make_meanwhile
 from traps_pipeline.mechanism.paths import sources_of
+from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT, STEERING, SteeringRow, SteeringVoteRow
 from traps_pipeline.mechanism.versions import loaded_params
 from traps_pipeline.models.answers import Question
 from traps_pipeline.models.ask import Settled, collect
 from traps_pipeline.models.judges import JudgeEntry, load_panel
-from traps_pipeline.models.local.backend import LocalBackend, outcome
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import Entry, ModelEntry
-from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.models.request import Request
 from traps_pipeline.partitions import SIDES, SteeringCell, taxonomy_of
-from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace
 
-if TYPE_CHECKING:
-    from traps_pipeline.models.local.adapter import Prompt
-    from traps_pipeline.models.local.backend import _Batch
-
 UNSTEERED = "none"  # source and kind where alpha is 0
 BY_LABEL = "label"  # the paper's sign policy, which knows the side of each item
-PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every direction and strength
 
 
 @dataclass(frozen=True)
@@ -256,59 +248,6 @@ def shared_item(item: Mapping[str, Any]) -> str:
 
 
 # --- generating them --------------------------------------------------------------------------------------------------
-
-
-class SteeredBackend(LocalBackend):
-    """A local model that answers with a direction added to one block, each row with a direction and an alpha of its
-    own."""
-
-    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], made: MadeAnswers) -> None:
-        super().__init__(entry)
-        self._vectors, self._made = vectors, made
-        self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
-
-    def _answers(self, batch: _Batch) -> list[Outcome]:
-        """Answer a batch, in the worker thread, but for what another process has made of it."""
-        return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
-
-    def generate(self, wanted: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
-        """Answer requests; all rows of one layer are generated together, resumed at that layer, and unsteered rows
-        apart. stopped: asked at every token, ends early."""
-        from traps_pipeline.mechanism.hook import Steering
-
-        groups: dict[int | None, list[int]] = {}
-        for number, request in enumerate(wanted):
-            steering = request.params["steering"]
-            groups.setdefault(steering["layer"] if steering else None, []).append(number)
-        outcomes: dict[int, Outcome] = {}
-        model = self._model()
-        for group, numbers in groups.items():
-            requests = [wanted[number] for number in numbers]
-            prompts = [self._prompt(r.media, r.media_digest, r.system, r.user) for r in requests]
-            hook = None
-            if group is not None:
-                along = [request.params["steering"] for request in requests]
-                vectors = np.stack([self._vectors[steering["direction"]] for steering in along])
-                alphas = tuple(float(steering["alpha"]) for steering in along)
-                removed = tuple(float(steering.get("removed", 0.0)) for steering in along)
-                hook = Steering(vectors, group, alphas, removed)
-            most = requests[0].params["max_new_tokens"]
-            with model.remembering_clips(), model.resuming():
-                made = model.generate(prompts, most, None, hook, stopped=stopped)
-            for number, one in zip(numbers, made, strict=True):
-                counts = (one.prompt_tokens, one.completion_tokens)
-                outcomes[number] = outcome(one.text, one.finish_reason, *counts, model.served_model)
-        return [outcomes[number] for number in range(len(wanted))]
-
-    def _model(self) -> Any:
-        from traps_pipeline.models.local.adapter import load_local_model
-
-        return load_local_model(self._entry, inside=True)
-
-    def _make_prompt(self, clip: Any, digest: str, system: str, user: str) -> Prompt:
-        """A processed prompt, kept in memory; `digest` identifies the frames, so a re-rendered clip is a new prompt."""
-        shown = sample(clip, self._spec)
-        return self._model().prompt(system, user, shown.frames, shown.times_s.tolist())
 
 
 def collect_steered(
