@@ -7,6 +7,7 @@ import os
 import shlex
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,20 @@ from tests.postgres import Postgres
 from traps_pipeline.cores import cores
 from traps_pipeline.defs import benchmark
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.orchestration.cluster import RayRuns, dagster_yaml, require_cluster
+from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.orchestration.cluster import (
+    RESOURCES_TAG,
+    STUDY_TAG,
+    RayRuns,
+    dagster_yaml,
+    own_tags,
+    require_cluster,
+)
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.runs import batches, broke_off
-from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, require_same_code
+from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, installed, require_same_code
 from traps_pipeline.orchestration.schemes import CELL, DATASET, Scheme
+from traps_pipeline.orchestration.shared_history import SharedHistory
 from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, end_if_resumed
 from traps_pipeline.progress import Progress, reporting
 from traps_pipeline.storage.study import Study
@@ -53,6 +63,32 @@ def test_ranges_hold_each_key_once(workspace: Workspace, most: int) -> None:
     assert len(ranges) >= min(most, len(keys))
 
 
+@pytest.mark.parametrize(("n_datasets", "n_evaluations"), [(28, 195), (28, 30), (12, 100), (4, 195), (28, 1), (4, 3)])
+def test_a_study_of_whole_models_is_cut_into_as_many_runs_as_asked_and_no_more(
+    n_datasets: int, n_evaluations: int
+) -> None:
+    datasets = [f"d{n:02d}" for n in range(n_datasets)]
+    evaluations = [f"model-{n // 9}__standard__run{n % 9}" for n in range(n_evaluations)]
+    definition = dg.MultiPartitionsDefinition(
+        {"dataset": dg.StaticPartitionsDefinition(datasets), "evaluation": dg.StaticPartitionsDefinition(evaluations)}
+    )
+    grid = Scheme(definition, lambda _: {}, lambda _: [])
+    keys = [f"{dataset}|{evaluation}" for evaluation in evaluations for dataset in datasets]
+    ranges = [*batches(grid, keys, 40)]
+    assert sorted(keys_of(grid, ranges)) == sorted(keys)
+    assert min(40, len(keys)) * 0.7 <= len(ranges) <= 40
+    sizes = [len(keys_of(grid, [one])) for one in ranges]
+    assert max(sizes) <= 2 * min(sizes)
+
+
+def test_fewer_runs_than_models_load_each_model_once() -> None:
+    evaluations = [f"model-{n // 9}__standard__run{n % 9}" for n in range(90)]
+    scheme = Scheme(dg.StaticPartitionsDefinition(evaluations), lambda _: {}, lambda _: [])
+    parts = [keys_of(scheme, [one]) for one in batches(scheme, evaluations, 7)]
+    models = [model for part in parts for model in {key.partition("__")[0] for key in part}]
+    assert len(parts) == 7 and sorted(models) == sorted({*models})
+
+
 def test_cells_of_one_model_stay_together(workspace: Workspace) -> None:
     datasets = [str(key) for key in DATASET.definition.get_partition_keys()][:4]
     every = [str(key) for key in CELL.definition.get_partition_keys()]
@@ -66,17 +102,24 @@ def test_cells_of_one_model_stay_together(workspace: Workspace) -> None:
 
 
 def test_what_a_stage_takes_is_what_ray_sets_aside_and_what_the_run_uses(
-    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    remote = Workspace(workspace.root, workspace.study, "s3://lab/study")
-    submits = RayRuns(dg.DagsterInstance.ephemeral(), remote, 1, 0.0, "leave", cpus=4)
     works = {"TRAPS_WORKSPACE": "s3://lab/study", "TRAPS_CORES": "4"}
-    assert json.loads(submits._resources([the_graph()[benchmark.VIDEOS.name]], (None, None))) == {
+
+    def taken(stage: str, keys: Sequence[str] = (), gpus: float = 0.0) -> dict[str, Any]:
+        tags = own_tags("lab", "s3://lab/study", [the_graph()[stage]], keys, 4, gpus)
+        assert tags[STUDY_TAG] == "lab" and tags[CODE_TAG] == code_here()
+        return json.loads(tags[RESOURCES_TAG])
+
+    one = {"num_cpus": 1, "runtime_env": {"env_vars": works | {"TRAPS_CORES": "1"}}}
+    assert taken(benchmark.VIDEOS.name) == {
         "num_cpus": 4, "memory": int(2.2 * 2**30), "runtime_env": {"env_vars": works}
     }  # fmt: skip
-    assert json.loads(submits._resources([the_graph()[benchmark.ITEMS.name]], (None, None))) == {
-        "num_cpus": 1, "runtime_env": {"env_vars": works | {"TRAPS_CORES": "1"}}
-    }  # fmt: skip
+    assert taken(benchmark.ITEMS.name, gpus=1.0) == one
+    reference, local = "occlusion|oracle__standard__run1", "occlusion|pocket__standard__run1"
+    assert taken(RESPONSES.name, [reference], gpus=1.0) == one
+    assert taken(RESPONSES.name, [reference, local], gpus=1.0) == one | {"num_gpus": 1.0}
+    assert taken(RESPONSES.name, [local]) == one
     here = len(os.sched_getaffinity(0))
     for given, used in (("1", 1), ("100000", here), ("", here)):
         monkeypatch.setenv("TRAPS_CORES", given)
@@ -118,10 +161,16 @@ class Shown(Progress):
 def test_a_host_with_other_code_refuses_a_run_and_names_both(workspace: Workspace) -> None:
     require_same_code({CODE_TAG: code_here()}, "lab")
     require_same_code({}, "lab")  # a run of this host's own
+    theirs = json.loads(code_here())
+    theirs["files"]["assets"], theirs["versions"]["numpy"], theirs["versions"]["numba"] = "0123", "1.0", "9"
+    del theirs["versions"]["mujoco"]  # which it does not have: what only one of them has is not compared
     with pytest.raises(
-        TrapsError, match=r"the host .* has other code .* study lab \(.* here, 0\.1\.9, files x, packages y there"
-    ):
-        require_same_code({CODE_TAG: "0.1.9, files x, packages y"}, "lab")
+        TrapsError, match=rf"^the host .* has other code .* of the study lab: files of assets \w+ here and 0123 there, "
+        rf"numpy {installed()['numpy']} here and 1\.0 there\. Install",
+    ):  # fmt: skip
+        require_same_code({CODE_TAG: json.dumps(theirs)}, "lab")
+    with pytest.raises(TrapsError, match=r"traps-pipeline 0\.2\.0 here and 0\.1\.9, files x there"):
+        require_same_code({CODE_TAG: "0.1.9, files x"}, "lab")  # of a version that said it in other words
 
 
 def test_a_study_in_a_folder_and_a_missing_head_are_refused_with_the_remedy(
@@ -163,8 +212,53 @@ def test_the_command_line_of_a_run_survives_a_shell(monkeypatch: pytest.MonkeyPa
     base = launcher.QuotingRayRunLauncher.__mro__[1]
     monkeypatch.setattr(base, "_launch_ray_job", lambda self, id_, entrypoint, run: sent.append(entrypoint))
     told = """{"config_yaml": "'variable: X'", "a": 1}"""
-    launcher.QuotingRayRunLauncher("http://head:8265")._launch_ray_job("1", f"dagster api execute_run '{told}'", None)
+    run = dg.DagsterRun("a job", tags={CODE_TAG: code_here()})
+    launcher.QuotingRayRunLauncher("http://head:8265")._launch_ray_job("1", f"dagster api execute_run '{told}'", run)
     assert shlex.split(sent[0]) == ["dagster", "api", "execute_run", told]
+
+
+def test_a_run_that_dagsters_pages_launch_takes_and_says_what_one_of_the_command_line_does(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    launcher = pytest.importorskip(
+        "traps_pipeline.orchestration.ray_launcher", reason="the extra `cluster` is not installed"
+    )
+    monkeypatch.setenv("TRAPS_WORKSPACE", str(Workspace.create(tmp_path / "study", Study(name="lab")).root))
+    monkeypatch.setenv("TRAPS_RUN_CPUS", "4")
+    monkeypatch.setenv("TRAPS_RUN_GPUS", "1")
+    sent = list[dict[str, str]]()
+    base = launcher.QuotingRayRunLauncher.__mro__[1]
+    monkeypatch.setattr(base, "_launch_ray_job", lambda self, id_, entrypoint, run: sent.append(run.tags))
+    with dg.DagsterInstance.ephemeral() as instance:
+        starts = launcher.QuotingRayRunLauncher("http://head:8265")
+        starts.register_instance(instance)
+        for stage, key in ((benchmark.VIDEOS.name, "dominoes"), (RESPONSES.name, "chaotic|pocket__standard__run1")):
+            selected = {the_graph()[stage].spec.key}
+            tags = {"dagster/partition": key}
+            run = dg.DagsterRun("__ASSET_JOB", asset_selection=frozenset(selected), tags=tags)
+            instance.add_run(run)
+            starts._launch_ray_job("1", "dagster api execute_run '{}'", run)
+            kept = instance.get_run_by_id(run.run_id)
+            assert kept is not None and kept.tags.items() >= sent[-1].items()
+    assert [tags[CODE_TAG] for tags in sent] == [code_here()] * 2 and {tags[STUDY_TAG] for tags in sent} == {"lab"}
+    rendering, asking = (json.loads(tags[RESOURCES_TAG]) for tags in sent)
+    assert (rendering["num_cpus"], rendering.get("num_gpus")) == (4, None) and rendering["memory"]
+    assert (asking["num_cpus"], asking["num_gpus"]) == (1, 1.0)
+
+
+def test_a_worker_with_a_wrong_password_names_itself_the_study_and_the_variable(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
+    with Postgres.running() as server:
+        monkeypatch.setenv("TRAPS_WORKSPACE", "s3://lab/study")
+        monkeypatch.setenv("TRAPS_DATABASE", f"postgresql://traps:a-wrong-word@127.0.0.1:{server.port}/traps")
+        with pytest.raises(
+            TrapsError,
+            match=r"^the host .* cannot open the history of the study s3://lab/study with TRAPS_DATABASE \(.*\)",
+        ) as raised:
+            SharedHistory.from_config_value(None, {"variable": "TRAPS_DATABASE"})
+        assert "a-wrong-word" not in str(raised.value) and raised.value.__cause__ is None
 
 
 def test_a_command_that_watches_runs_outlives_a_database_that_is_stopped_and_started(

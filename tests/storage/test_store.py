@@ -191,14 +191,16 @@ def test_an_object_that_was_altered_is_named_and_nothing_is_read_from_it(bucket_
     assert other.here(there).read_bytes() == b"whole"
 
 
-def test_a_scratch_folder_may_be_lost_or_altered_at_any_time(bucket_hosts: Hosts) -> None:
+@pytest.mark.parametrize("in_place", [False, True])  # in place also under the path, which is a link to the content
+def test_a_scratch_folder_may_be_lost_or_altered_at_any_time(bucket_hosts: Hosts, in_place: bool) -> None:
     one, other = bucket_hosts.open("one"), bucket_hosts.open("other")
     put(one, "clips/a.mp4", b"frames")
     there = other.root / "clips/a.mp4"
     other.look()
     other.bring([there])
     for cached in (path for path in (other.root / OBJECTS).rglob("*") if path.is_file()):
-        cached.unlink()
+        if not in_place:
+            cached.unlink()
         cached.write_bytes(b"rotten")
     later = bucket_hosts.open("other")
     later.bring([there])

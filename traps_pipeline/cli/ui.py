@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import os
 
-from traps_pipeline.cli.command import OK, Commands, open_workspace, whole
+from traps_pipeline.cli.command import OK, Commands, number, open_workspace, whole
 from traps_pipeline.extras import require
+
+CLUSTER = "of a study on a cluster"
 
 
 def add(commands: Commands) -> None:
@@ -14,16 +16,26 @@ def add(commands: Commands) -> None:
     parser = commands.add("ui", ui, "Dagster's web server and daemon; prints the address to open, with its token")
     parser.add_argument("--port", type=whole(1, 65535), default=3000, help="of the web server (default: 3000)")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine alone)")
+    parser.add_argument(
+        "--cpus", type=whole(1, 1000), help=f"as of `traps run`, for runs launched in the pages {CLUSTER}"
+    )
+    parser.add_argument(
+        "--gpus", type=number(0, 1000), help=f"as of `traps run`, for runs launched in the pages {CLUSTER}"
+    )
     parser.add_argument("--token", help="of the address, instead of a fresh one (default: $TRAPS_UI_TOKEN)")
 
 
 def ui(arguments: argparse.Namespace) -> int:
     """See `traps ui --help`."""
     require("ui")
+    from traps_pipeline.orchestration.cluster import RUN_CPUS, RUN_GPUS
     from traps_pipeline.orchestration.run import dagster_history
     from traps_pipeline.orchestration.webserver import DANGER, TOKEN_VARIABLE, serve_with_dagster
     from traps_pipeline.webguard import token_for
 
+    for variable, value in ((RUN_CPUS, arguments.cpus), (RUN_GPUS, arguments.gpus)):
+        if value is not None:
+            os.environ[variable] = str(value)  # for the daemon, which starts such runs
     given = arguments.token or os.environ.get(TOKEN_VARIABLE)
     token = token_for(arguments.host, given, danger=DANGER, variable=TOKEN_VARIABLE)
     workspace = open_workspace(arguments)

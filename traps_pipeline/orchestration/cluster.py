@@ -10,7 +10,7 @@ import json
 import os
 import socket
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -23,8 +23,18 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.extras import missing
 from traps_pipeline.models.registry import LOCAL, get_model
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.orchestration.graph import Stage
-from traps_pipeline.orchestration.runs import Ran, Range, Runs, batches, broke_off, problems_of, range_tags, reason
+from traps_pipeline.orchestration.graph import Stage, the_graph
+from traps_pipeline.orchestration.runs import (
+    Ran,
+    Range,
+    Runs,
+    batches,
+    broke_off,
+    problems_of,
+    range_of,
+    range_tags,
+    reason,
+)
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
 from traps_pipeline.orchestration.schemes import Scheme
 from traps_pipeline.orchestration.shared_history import unusable
@@ -36,6 +46,8 @@ if TYPE_CHECKING:
     from dagster._core.workspace.context import WorkspaceRequestContext
 
 STUDY_TAG = "traps/study"
+RUN_CPUS, RUN_GPUS = "TRAPS_RUN_CPUS", "TRAPS_RUN_GPUS"  # of runs that are launched in Dagster's pages
+RESOURCES_TAG = "dagster-ray/config"  # dagster-ray's own name
 AT_ONCE = 40  # runs; Ray keeps a process of some 85 MB for each on the head
 POLL_S = 1.0
 MONITOR_S, RESUMES = 15, 3
@@ -43,6 +55,7 @@ START_S = 24 * 3600  # a run may wait so long for a host; one that waits for not
 IDLE_S = 60.0  # after so long a person is told that runs wait for a host
 ALIVE_S = 120  # a daemon that has been silent for longer is dead
 QUEUE = "QUEUED_RUN_COORDINATOR"
+SAID = 300  # letters of the beginning and of the end of what a lost run said
 OnInterrupt = Literal["leave", "cancel"]
 _WAITING = (
     dg.DagsterRunStatus.QUEUED,
@@ -136,14 +149,14 @@ class RayRuns(Runs):
         self._cursors: dict[str, str | None] = {}
         self._retries: dict[str, tuple[Sequence[Stage], Range, Mapping[str, str]]] = {}  # once, what broke off
         self._failures: dict[str, list[dg.DagsterEvent]] = {}  # steps of runs that failed
-        self._chunks: dict[Range, Sequence[str | None]] = {}  # what a range is a part of
 
     def __enter__(self) -> RayRuns:
         """Wait for runs that were left."""
         ours = dg.RunsFilter(statuses=[*_WAITING], tags={STUDY_TAG: self._workspace.study.name})
-        if left := [run.run_id for run in self._instance.get_runs(ours)]:
+        if left := [*self._instance.get_runs(ours)]:
             progress.current().note(f"{len(left)} runs of this study go on that were left; waiting for them first")
-            self._watch(left)
+            progress.current().stage("runs that were left", sum(map(_partitions, left)))
+            self._watch([run.run_id for run in left])
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -164,16 +177,9 @@ class RayRuns(Runs):
 
     def ranges(self, scheme: Scheme | None, keys: Sequence[str | None]) -> list[Range]:
         """Ranges for several hosts: so many that all have work, and so few that starting them costs little. What one
-        model is asked stays together, so that it is loaded once."""
+        model is asked stays together, so that it is loaded in few runs."""
         self._n_keys = len(keys)
-        if scheme is None:
-            return [(key, key) for key in keys]
-        by_model = sorted(keys, key=lambda key: str(key).partition("|")[::-1])
-        size = -(-len(by_model) // self._most) if by_model else 1
-        chunks = [by_model[first : first + size] for first in range(0, len(by_model), size)]
-        found = {one: chunk for chunk in chunks for one in batches(scheme, chunk)}
-        self._chunks |= found
-        return [*found]
+        return [*batches(scheme, keys, self._most)]
 
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
         """See `Runs`."""
@@ -191,11 +197,8 @@ class RayRuns(Runs):
         selector = JobSubsetSelector(location.name, repository.name, "__ASSET_JOB", None, selected)
         job = location.get_job(selector)
         plan = location.get_execution_plan(job, {}, None, None, instance=self._instance)
-        own = {
-            STUDY_TAG: self._workspace.study.name,
-            CODE_TAG: code_here(),
-            "dagster-ray/config": self._resources(stages, of),
-        }
+        place = str(self._workspace.place)
+        own = own_tags(self._workspace.study.name, place, stages, keys_in(stages, of), self._cpus, self._gpus)
         run = self._instance.create_run(
             job_name=job.name,
             run_id=None,
@@ -217,19 +220,6 @@ class RayRuns(Runs):
             asset_graph=repository.asset_graph,
         )
         return self._instance.submit_run(run.run_id, self._context).run_id
-
-    def _resources(self, stages: Sequence[Stage], of: Range) -> str:
-        """What Ray sets aside for a run, and which study it works in. No secrets: tags can be read by everybody."""
-        cpus = self._cpus if any(stage.takes.each_gb for stage in stages) else 1
-        takes = {"num_cpus": cpus, "num_gpus": 0.0, "memory": None}
-        memory = max(stage.takes.memory_gb + cpus * stage.takes.each_gb for stage in stages)
-        asks = RESPONSES.name in {stage.name for stage in stages} and any(map(_is_local, self._chunks.get(of, ())))
-        if asks or any(stage.cost == "machine" for stage in stages):
-            takes["num_gpus"] = self._gpus
-        if memory:
-            takes["memory"] = int(memory * 2**30)
-        given = {name: value for name, value in takes.items() if value}
-        return json.dumps(given | {"runtime_env": _works_in(str(self._workspace.place), cpus)})
 
     def _watch(self, run_ids: Sequence[str]) -> list[Ran]:
         """Tell what runs do until all have ended. While the database is away, for as long as runs themselves wait for
@@ -275,7 +265,7 @@ class RayRuns(Runs):
         self._idle_since = min(self._idle_since, time.monotonic())
         if time.monotonic() - self._idle_since > IDLE_S and not self._told_idle:
             self._told_idle = True
-            takes = json.loads(waiting[0].tags.get("dagster-ray/config", "{}"))
+            takes = json.loads(waiting[0].tags.get(RESOURCES_TAG, "{}"))
             wanted = ", ".join(f"{name} {value}" for name, value in takes.items() if name != "runtime_env")
             progress.current().note(
                 f"{len(waiting)} runs have waited {IDLE_S:.0f} s for a host that is free and has {wanted or 'a CPU'}; "
@@ -305,7 +295,7 @@ class RayRuns(Runs):
         if run.status == dg.DagsterRunStatus.SUCCESS:
             return Ran([], over_budget=False)
         if not ran.problems:
-            why = " ".join(self._last_word(run_id).split())[:400]
+            why = _shortened(" ".join(self._last_word(run_id).split()))
             ran.problems.append(f"{name} ended as {run.status.value.lower()} ({why}); see its log in `traps ui`")
         return ran
 
@@ -331,9 +321,44 @@ class RayRuns(Runs):
         progress.current().note(f"{len(left)} runs were told to end; what they asked and made is kept")
 
 
+def own_tags(
+    study: str, place: str, stages: Collection[Stage], keys: Iterable[str], cpus: int, gpus: float
+) -> dict[str, str]:
+    """What a run on another host must say of itself: its study, the code that submitted it, and what Ray sets aside.
+    No secrets: tags can be read by everybody. keys: the partitions that it is to make."""
+    takes: dict[str, Any] = {"num_cpus": cpus if any(stage.takes.each_gb for stage in stages) else 1}
+    asks = RESPONSES.name in {stage.name for stage in stages} and any(map(_is_local, keys))
+    if gpus and (asks or any(stage.cost == "machine" for stage in stages)):
+        takes["num_gpus"] = gpus
+    if memory := max(stage.takes.memory_gb + takes["num_cpus"] * stage.takes.each_gb for stage in stages):
+        takes["memory"] = int(memory * 2**30)
+    takes["runtime_env"] = _works_in(place, takes["num_cpus"])
+    return {STUDY_TAG: study, CODE_TAG: code_here(), RESOURCES_TAG: json.dumps(takes)}
+
+
+def keys_in(stages: Sequence[Stage], of: Range) -> Sequence[str]:
+    """The partitions of a range; none where the stages have none."""
+    scheme, (first, last) = stages[0].scheme if stages else None, of
+    if scheme is None or first is None:
+        return []
+    return [*scheme.definition.get_partition_keys_in_range(dg.PartitionKeyRange(first, str(last)))]
+
+
+def _partitions(run: dg.DagsterRun) -> int:
+    """How many partitions a run is to make, those of all its stages."""
+    graph = the_graph()
+    selected = [graph[key.path[-1]] for key in run.asset_selection or ()]
+    return sum(len(keys_in([stage], range_of(run.tags))) or 1 for stage in selected)
+
+
+def _shortened(said: str) -> str:
+    """The beginning, which names what failed, and the end, where a log has the cause."""
+    return said if len(said) <= 2 * SAID else f"{said[:SAID]} ... {said[-SAID:]}"
+
+
 def _works_in(place: str, cpus: int = 1) -> dict[str, Any]:
     return {"env_vars": {VARIABLE: place, CORES: str(cpus)}}
 
 
-def _is_local(cell: str | None) -> bool:
-    return get_model(Cell.parse(str(cell)).evaluation.model).backend == LOCAL
+def _is_local(cell: str) -> bool:
+    return get_model(Cell.parse(cell).evaluation.model).backend == LOCAL

@@ -8,7 +8,7 @@ import socket
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -73,32 +73,84 @@ def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
     return {_RANGE[0]: str(first), _RANGE[1]: str(last)}
 
 
+def range_of(tags: Mapping[str, str]) -> Range:
+    """The partitions of a run, by its tags: those of `range_tags`, or Dagster's own of a single key."""
+    single = tags.get("dagster/partition")
+    return tags.get(_RANGE[0], single), tags.get(_RANGE[1], single)
+
+
 def this_host() -> str:
     """Where process numbers mean what they mean here: the machine and its namespace of processes."""
     namespace = Path("/proc/self/ns/pid")
     return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
 
 
-def batches(scheme: Scheme | None, keys: Sequence[str | None]) -> Iterator[tuple[str | None, str | None]]:
+def batches(
+    scheme: Scheme | None, keys: Sequence[str | None], at_least: int = 1
+) -> Iterator[tuple[str | None, str | None]]:
     """Ranges (first key, last key) that together are exactly the keys: one run each. Of two dimensions a range is a
-    rectangle of neighbours."""
+    rectangle of neighbours. at_least: into about how many of equal size they are cut, where there are so many keys."""
     if scheme is None or not keys:
         yield from ((key, key) for key in keys)
         return
-    if not isinstance(scheme.definition, dg.MultiPartitionsDefinition):
-        every = [str(key) for key in scheme.definition.get_partition_keys()]
-        yield from ((every[first], every[last]) for first, last in _spans([every.index(str(key)) for key in keys]))
-        return
-    rows, columns = ([str(k) for k in d.partitions_def.get_partition_keys()] for d in scheme.definition.partitions_defs)
-    places = {key: number for number, key in enumerate(columns)}
+    if isinstance(scheme.definition, dg.MultiPartitionsDefinition):
+        rows, columns = (
+            [str(k) for k in d.partitions_def.get_partition_keys()] for d in scheme.definition.partitions_defs
+        )
+        pairs = [str(key).partition("|")[::2] for key in keys]
+    else:
+        rows, columns = [""], [str(key) for key in scheme.definition.get_partition_keys()]
+        pairs = [("", str(key)) for key in keys]
+    fewest = _rectangles(rows, columns, pairs)
+    for whole in fewest:
+        share = round(at_least * whole.size / len(keys)) if len(fewest) < at_least else 1
+        for part in _parts(whole, max(1, share), columns):
+            first, last = (rows[part.top], columns[part.left]), (rows[part.bottom], columns[part.right])
+            yield "|".join(filter(None, first)), "|".join(filter(None, last))
+
+
+@dataclass(frozen=True, order=True)
+class _Rectangle:
+    """Cells of two dimensions, by their numbers; both ends belong to it."""
+
+    left: int
+    right: int
+    top: int
+    bottom: int
+
+    @property
+    def size(self) -> int:
+        return (self.right - self.left + 1) * (self.bottom - self.top + 1)
+
+
+def _rectangles(rows: Sequence[str], columns: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[_Rectangle]:
+    """Cells (row, column) in rectangles: neighbours of a row, of as many rows as have the same ones."""
+    row_of, column_of = ({name: number for number, name in enumerate(names)} for names in (rows, columns))
     by_row: dict[int, list[int]] = {}
-    for key in keys:
-        row, _, column = str(key).partition("|")
-        by_row.setdefault(rows.index(row), []).append(places[column])
+    for row, column in pairs:
+        by_row.setdefault(row_of[row], []).append(column_of[column])
     spans = sorted((span, row) for row, numbers in by_row.items() for span in _spans(numbers))
-    for span, group in groupby(spans, key=lambda pair: pair[0]):
-        for first, last in _spans([row for _, row in group]):
-            yield f"{rows[first]}|{columns[span[0]]}", f"{rows[last]}|{columns[span[1]]}"
+    return [
+        _Rectangle(*span, top, bottom)
+        for span, group in groupby(spans, key=lambda pair: pair[0])
+        for top, bottom in _spans([row for _, row in group])
+    ]
+
+
+def _parts(whole: _Rectangle, count: int, columns: Sequence[str]) -> Iterator[_Rectangle]:
+    """A rectangle in about so many of one size: whole columns as far as there are enough, and between models where
+    there are fewer parts than models, since each run loads its models anew."""
+    width, height = whole.right - whole.left + 1, whole.bottom - whole.top + 1
+    heads = [name.partition("__")[0] for name in columns[whole.left : whole.right + 1]]
+    models = [0, *(n for n in range(1, width) if heads[n] != heads[n - 1]), width]
+    across, down = min(count, width), min(max(1, round(count / width)), height)
+    cuts = {width * n // across for n in range(across + 1)}
+    if across < len(models):
+        cuts = {min(models, key=lambda model, cut=cut: abs(model - cut)) for cut in cuts}
+    lines = [height * n // down for n in range(down + 1)]
+    for left, right in pairwise(sorted(cuts)):
+        for top, bottom in pairwise(lines):
+            yield _Rectangle(whole.left + left, whole.left + right - 1, whole.top + top, whole.top + bottom - 1)
 
 
 def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:

@@ -2,48 +2,79 @@
 
 from __future__ import annotations
 
+import json
+import re
 import socket
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from functools import cache
+from pathlib import Path
 
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.paths import PACKAGE
+from traps_pipeline.paths import ASSETS, PACKAGE, SCENE_SPECS, SHIPPED
 
 CODE_TAG = "traps/code"  # of runs: the code of the host that submitted them
-# What decides the bytes of clips, tables and calls; the lock pins these.
-DECISIVE = ("av", "dagster", "mujoco", "numpy", "opencv-python-headless", "pandas", "pyarrow", "scikit-learn", "scipy")
+DISTRIBUTION = "traps-pipeline"
+_NAME, _NOT_FOR_RUNS = re.compile(r"[\w.-]+"), re.compile(r"extra == ['\"](dev|docs|sign)['\"]")
 
 
 @cache
 def code_here() -> str:
-    """This host's code in one word: the package's version, a digest of its files, and one of the installed versions
-    of the packages that results depend on."""
-    files = {path.relative_to(PACKAGE).as_posix(): file_digest(path) for path in sorted(PACKAGE.rglob("*.py"))}
-    return f"{_version('traps-pipeline')}, files {digest(files)[:8]}, packages {digest(installed())[:8]}"
+    """This host's code, as JSON: digests of the package's own files and of those that people edit (`assets/`,
+    `scene_specs/`), and the versions of Python and of every package that `pyproject.toml` names and that is here."""
+    folders = {"the package": PACKAGE, "assets": ASSETS, "scene_specs": SCENE_SPECS}
+    files = {name: _digest_of(folder) for name, folder in folders.items()}
+    return json.dumps({"files": files, "versions": installed()}, sort_keys=True)
 
 
 def installed() -> dict[str, str]:
-    """The installed versions of the packages that results depend on."""
-    return {name: _version(name) for name in DECISIVE}
+    """Versions of Python, of this package, and of what it names, by name; what is not installed is left out. Builds for
+    other hardware (`+cpu`, `+cu128`) are the same version."""
+    from importlib.metadata import PackageNotFoundError, requires, version
 
-
-def _version(name: str) -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "none"
+    wanted = [line for line in requires(DISTRIBUTION) or () if not _NOT_FOR_RUNS.search(line)]
+    found = {"python": ".".join(map(str, sys.version_info[:2]))}
+    for name in sorted({DISTRIBUTION, *(match[0] for line in wanted if (match := _NAME.match(line)))}):
+        try:
+            found[name] = version(name).partition("+")[0]
+        except PackageNotFoundError:
+            continue
+    return found
 
 
 def require_same_code(tags: Mapping[str, str], study: str) -> None:
-    """Raises TrapsError where a run was submitted by a host with other code than this one's."""
-    theirs = tags.get(CODE_TAG)
-    if theirs is not None and theirs != code_here():
-        here = ", ".join(f"{name} {found}" for name, found in installed().items())
+    """Raises TrapsError where a run was submitted by a host with other code than this one's. What only one of the two
+    has installed is not compared: a host without a GPU need not have what a GPU wants."""
+    if CODE_TAG not in tags:
+        return
+    here, there = _flat(code_here()), _flat(tags[CODE_TAG])
+    differ = [name for name in sorted(here.keys() & there.keys()) if here[name] != there[name]]
+    if differ:
+        told = ", ".join(f"{name} {here[name]} here and {there[name]} there" for name in differ)
         raise TrapsError(
             f"the host {socket.gethostname()} has other code than the host that submitted this run of the study "
-            f"{study} ({code_here()} here, {theirs} there; here are {here}). Install the same version of the package "
-            "from the same lock on both, and run the same command again"
+            f"{study}: {told}. Install the same version of the package from the same lock on both, and run the same "
+            "command again"
         )
+
+
+def _flat(said: str) -> dict[str, str]:
+    """What is compared, by name. Something that no host of this version says is one thing that differs."""
+    try:
+        parsed = json.loads(said)
+        return {f"files of {name}": str(one) for name, one in parsed["files"].items()} | {
+            str(name): str(one) for name, one in parsed["versions"].items()
+        }
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return {DISTRIBUTION: said[:80]}
+
+
+def _digest_of(folder: Path) -> str:
+    return digest({path.relative_to(folder).as_posix(): file_digest(path) for path in _files(folder)})[:12]
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts and not path.is_relative_to(SHIPPED):
+            yield path

@@ -7,6 +7,7 @@ import socket
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
+from urllib.parse import urlsplit
 
 from dagster import StringSource
 from dagster._core.storage.base_storage import DagsterStorage
@@ -48,7 +49,23 @@ class SharedHistory(DagsterStorage):
         # SQLAlchemy 2.1 takes psycopg 3 for a plain postgresql://, and dagster-postgres's NOTIFY fails with it.
         url = "postgresql+psycopg2://" + address.partition("://")[2]
         storage = import_module("dagster_postgres").DagsterPostgresStorage
-        return _connected(storage(url, should_autocreate_tables=True, inst_data=inst_data), url)
+        try:
+            return _connected(storage(url, should_autocreate_tables=True, inst_data=inst_data), url)
+        except unusable() as error:
+            raise TrapsError(
+                f"the host {socket.gethostname()} cannot open the history of the study "
+                f"{os.environ.get(VARIABLE, 'that it was told of')} with {variable} ({_cause(error, address)}); see "
+                "that the address, its user and its password are right on this host, and run the same command again"
+            ) from None  # the cause names the address
+
+
+def _cause(error: BaseException, address: str) -> str:
+    """The innermost reason in one line, without the password."""
+    while error.__cause__ is not None or error.__context__ is not None:
+        error = error.__cause__ or error.__context__ or error
+    secret = urlsplit(address).password
+    said = " ".join(str(error).split())[:300]
+    return said.replace(secret, "***") if secret else said
 
 
 def _connected(storage: Any, url: str) -> DagsterStorage:

@@ -227,7 +227,7 @@ class ObjectStore(Store):
 
         def one(path: Path) -> None:
             row = self._current(path)
-            if row is None or _is_same_file(path, self._cached(row.digest)):
+            if row is None or (_is_same_file(path, self._cached(row.digest)) and self._is_cached(row.digest)):
                 return
             if not self._is_cached(row.digest) and path.is_file() and sha256(path.read_bytes()).digest() == row.digest:
                 _link(path, self._cached(row.digest))
