@@ -85,6 +85,7 @@ class Scene:
     study: Study
     size: Size
     opens: Opened
+    provider: Provider
 
     def busy(self) -> tuple[str, list[int]]:
         """A node that executes a run, and the processes that do."""
@@ -149,6 +150,15 @@ def cut_network(scene: Scene) -> None:
     scene.proxies[node].mend()
 
 
+def silence_network(scene: Scene) -> None:
+    """Nothing passes between a node and PostgreSQL for longer than a session may be silent, though no connection
+    breaks; then it passes again."""
+    node = scene.busy()[0]
+    scene.proxies[node].fall_silent()
+    time.sleep(CUT_S)
+    scene.proxies[node].mend()
+
+
 def empty_store(scene: Scene) -> None:
     """After the study was made: every clip is removed from the store; the next run makes them again."""
 
@@ -171,6 +181,8 @@ def want_together(scene: Scene) -> None:
         second = other.start_run("--no-preflight", "--budget-usd", f"{BUDGET_USD}")
         said = _launched(port, name_of(study))
         print(f"  {time.monotonic() - began:6.1f} s  the page says {said}", flush=True)
+        asked_by_now = scene.provider.stats()["answered_in_full"]
+        study.require(asked_by_now < scene.size.wanted, f"all three want them at once: {asked_by_now} calls by now")
         lines = _shown(second, began)
         study.require(second.wait() == 0 and "LaunchBackfillSuccess" in said, "both others end well")
         print(f"  the other command: {lines[-2].strip()}", flush=True)
@@ -200,7 +212,7 @@ def _launched(port: int, study: str) -> str:
 
 KILLS: dict[str, Callable[[Scene], None]] = {
     "run": kill_run, "node": kill_node, "head": kill_head, "postgres": kill_postgres, "stopped": stop_node,
-    "network": cut_network, "store": empty_store, "together": want_together,
+    "network": cut_network, "silent": silence_network, "store": empty_store, "together": want_together,
 }  # fmt: skip
 SEGMENTS = """
 select count(distinct s.id), coalesce(sum(s.rows), 0),
@@ -290,7 +302,7 @@ def kill_each(
                     "TRAPS_WORKSPACE": f"s3://lab/{kind}", "TRAPS_SCRATCH": str(folder / f"here-{kind}")
                 }  # fmt: skip
                 study = Study(folder, environment, experiment, checkout.root, size.until)
-                scene = Scene(cluster, database, store, proxies, study, size, opens)
+                scene = Scene(cluster, database, store, proxies, study, size, opens, provider)
                 try:
                     _one(kind, scene, provider, checkout.workspace)
                 except Exception as error:  # noqa: BLE001 - the other kinds are tried all the same

@@ -2,10 +2,11 @@
 two nodes, each with a scratch folder of its own; the study lies on s3:// alone. Then what a cluster must not change is
 compared with a run of one process in a folder.
 
-python bench/cluster_study.py [--kill] [--interrupt leave|cancel] [--experiment FILE | --mechanism]
+python bench/cluster_study.py [--kill [--at STAGE]] [--interrupt leave|cancel] [--experiment FILE | --mechanism]
 (needs the packages of the extra `cluster`, and moto)
 
---kill: every process of a node is killed (-9) while it renders, and the node is started again. --interrupt: Ctrl-C
+--kill: every process of a node is killed (-9) while it renders (or 3 s after the first partition of STAGE), and the
+node is started again. --interrupt: Ctrl-C
 after the first partition, which leaves or cancels the runs; then the same command once more. --mechanism: hidden
 states, probes and steering of a tiny random checkpoint, too, on four scenarios of one family. What else may be killed,
 while models are asked: `bench/cluster_kills.py`.
@@ -168,15 +169,15 @@ def look_inside(folder: Path, experiment: Path) -> dict[str, str]:
     return {"TRAPS_MODELS": str(registry)}
 
 
-def watch(run: subprocess.Popen[str], kill: object) -> tuple[int, int]:
-    """Print what a run says, and kill a node once it renders; its exit code, and how many calls failed: some of `flaky`
-    always do."""
+def watch(run: subprocess.Popen[str], kill: object, at: str = "scene_specs") -> tuple[int, int]:
+    """Print what a run says, and kill a node once it tells of a stage; its exit code, and how many calls failed: some
+    of `flaky` always do."""
     began, killed, failed = time.monotonic(), kill is None, 0
     assert run.stdout is not None
     for line in run.stdout:
         print(f"  {time.monotonic() - began:6.1f} s  {line.rstrip()}", flush=True)
         failed += sum(int(found) for found in re.findall(r"(\d+) calls failed and can be asked again", line))
-        if not killed and "scene_specs" in line and "[" in line:
+        if not killed and at in line and "[" in line:
             killed = True
             time.sleep(3)
             kill()  # type: ignore[operator]
@@ -191,12 +192,13 @@ def asked(said: str) -> int:
 
 def main() -> None:
     from bench.cluster_gate import Cluster
-    from bench.cluster_watch import Opened
+    from bench.cluster_watch import Opened, executing
     from tests.objectstore import S3
     from tests.postgres import Postgres
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kill", action="store_true")
+    parser.add_argument("--at", default="scene_specs", help="a stage: a node is killed 3 s after its first partition")
     parser.add_argument("--log", type=Path, help="a file for the log of Dagster's daemon")
     parser.add_argument("--interrupt", choices=("leave", "cancel"))
     what = parser.add_mutually_exclusive_group()
@@ -230,7 +232,8 @@ def main() -> None:
             study.start_daemon()
 
             def kill() -> None:
-                busy = [node for node in NODES if list((folder / node).glob("*/clips/*"))] or ["one"]
+                here = {pid for node in NODES for pid in cluster.processes(node)}
+                busy = [node for pid, (_, node) in executing().items() if pid in here] or ["one"]
                 print(f"  {cluster.signal(busy[0], signal.SIGKILL)} processes of {busy[0]} killed", flush=True)
                 cluster.start_node(busy[0])
 
@@ -244,7 +247,7 @@ def main() -> None:
                 print(f"  runs: {states}", flush=True)
                 is_left = not ({"CANCELED", "CANCELING", "FAILURE"} & {*states})
                 study.require(is_left == (arguments.interrupt == "leave"), f"their runs: {arguments.interrupt}")
-            code, failed = watch(study.start_run(), kill if arguments.kill else None)
+            code, failed = watch(study.start_run(), kill if arguments.kill else None, arguments.at)
             print(f"  the study took {time.monotonic() - began:.0f} s on two nodes")
             study.require(code == (1 if failed else 0), f"the run ends well but for {failed} calls (exit code {code})")
             again = study.run_to_end()
@@ -286,6 +289,8 @@ def nodes_are_apart(study: Study, opens: Opened, *, least: int = len(NODES)) -> 
     enough = sum(count > 0 for count in made.values()) >= least
     study.require(not strays and enough, f"at least {least} nodes have tables in their own folders: {made}")
     if not opens.is_on:
+        if least == len(NODES):
+            study.require(os.geteuid() != 0, "root sees which files nodes open")
         print("  not looked at: which files nodes open (that needs root, and mounts)", flush=True)
         return
     own = {node: opens.counts.get((node, node), 0) for node in NODES}

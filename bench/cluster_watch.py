@@ -19,10 +19,11 @@ NODE = b"TRAPS_NODE"  # in the environment of the processes of a node
 
 
 class Proxy:
-    """A way to a port of this machine that can be cut: connections break, and new ones are refused."""
+    """A way to a port of this machine that can be cut: connections break, and new ones are refused. Or it falls silent:
+    connections stand, and nothing passes."""
 
     def __init__(self, port: int) -> None:
-        self._to, self._open, self.is_cut = port, set[asyncio.StreamWriter](), False
+        self._to, self._open, self.is_cut, self.is_silent = port, set[asyncio.StreamWriter](), False, False
         self._loop = asyncio.new_event_loop()
         threading.Thread(target=self._loop.run_forever, daemon=True).start()
         server = asyncio.run_coroutine_threadsafe(asyncio.start_server(self._serve, "127.0.0.1", 0), self._loop)
@@ -42,10 +43,11 @@ class Proxy:
         await asyncio.gather(self._copy(reader, onward), self._copy(there, writer))
         self._open -= both
 
-    @staticmethod
-    async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _copy(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with suppress(OSError):
             while some := await reader.read(65536):
+                while self.is_silent:
+                    await asyncio.sleep(0.2)
                 writer.write(some)
                 await writer.drain()
         writer.close()
@@ -55,9 +57,13 @@ class Proxy:
         self.is_cut = True
         self._loop.call_soon_threadsafe(lambda: [writer.transport.abort() for writer in self._open])
 
+    def fall_silent(self) -> None:
+        """Let nothing pass, and break nothing: what is sent arrives once it is mended."""
+        self.is_silent = True
+
     def mend(self) -> None:
-        """Take connections again."""
-        self.is_cut = False
+        """Take connections again, and let pass what was sent."""
+        self.is_cut = self.is_silent = False
 
 
 def node_of(pid: int) -> str:

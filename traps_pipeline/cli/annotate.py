@@ -42,7 +42,7 @@ def annotate(arguments: argparse.Namespace) -> int:
         arguments, "annotate", TOKEN_VARIABLE, danger="label in other people's names", people=people
     )
     workspace = open_workspace(arguments)
-    if isinstance(workspace.place, str):
+    if workspace.is_shared:
         raise TrapsError(
             f"{workspace.place}: labels are kept in a folder, and this study lies in an object store, where no other "
             "host would see them; label a study in a folder (docs/people.md)"

@@ -103,7 +103,7 @@ def _shared_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[st
     entries: list[Entry] = [*load_models().values(), *load_judges().values()]
     for account, folder in study.account_budgets.items():
         through = [entry.id for entry in entries if entry.account == account]
-        if isinstance(workspace.place, str) and not Path(folder).is_absolute():
+        if workspace.is_shared and not Path(folder).is_absolute():
             raise TrapsError(
                 f"{workspace.place}/study.yaml: account_budgets names the folder {folder}, which other hosts do not "
                 "see; give the path of a folder that all hosts of this study share"

@@ -110,7 +110,7 @@ def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
             f"{where}runs on other hosts need {' and '.join(absent)} here and there: install the extra `cluster`, in a "
             "checkout `python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"
         )
-    if not isinstance(workspace.place, str):
+    if not workspace.is_shared:
         raise TrapsError(
             f"{where}other hosts do not see {workspace.root}; a study for --cluster lies in an object store: "
             f"{VARIABLE}=s3://BUCKET/STUDY (docs/cluster.md)"

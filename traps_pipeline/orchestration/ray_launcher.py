@@ -25,7 +25,7 @@ class QuotingRayRunLauncher(RayRunLauncher):
 
     def _launch_ray_job(self, submission_id: str, entrypoint: str, run: Any) -> None:
         command, _, quoted = entrypoint.partition(" '")
-        if CODE_TAG not in run.tags:
+        if CODE_TAG not in run.tags and run.asset_selection:
             tags = tags_of_page_run(run)
             self._instance.add_run_tags(run.run_id, tags)
             run = run.with_tags({**run.tags, **tags})

@@ -112,7 +112,7 @@ class TableStore:
         version = content_version(data)
         state = State(version, dict(inputs), len(data), failed, code)
         footer, path = json.dumps(asdict(state)), self.path(table, partition)
-        note = json.dumps({"state": footer, "columns": data.schema.names})
+        note = _note(footer, data.schema.names)
         self._store.write({path: sealed(data, {_FOOTER: footer.encode()})}, note=note, durable=True)
         return version
 
@@ -289,6 +289,23 @@ def read_sealed(path: Path) -> pa.Table:
     import pyarrow.parquet as pq
 
     return pq.ParquetFile(_sound_bytes(path)).read()
+
+
+def note_of(path: Path) -> str:
+    """What a store notes of a partition: its footer, and its columns. Raises TrapsError where it is not what was
+    written."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        schema = pq.ParquetFile(_sound_bytes(path)).schema_arrow
+        return _note((schema.metadata or {})[_FOOTER].decode(), schema.names)
+    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+        raise TrapsError(f"{path}: is not a table as it was written ({error})") from error
+
+
+def _note(footer: str, names: Sequence[str]) -> str:
+    return json.dumps({"state": footer, "columns": [*names]})
 
 
 def _sum_of(content: bytes) -> bytes:

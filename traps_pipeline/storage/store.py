@@ -1,4 +1,5 @@
-"""Where a study's files lie: one interface with two implementations, which nothing above this room tells apart.
+"""Where a study's files lie: one interface with two implementations, which what reads and writes files does not tell
+apart (`Workspace.is_shared` does, for what several hosts cannot share).
 
 In a folder of one machine (`FolderStore`), or in an object store that several hosts share (`storage/objects.py`). Code
 names a file by its path below the workspace's folder on this machine, makes it there, and hands it over with `keep`;

@@ -48,6 +48,11 @@ class Workspace:
         """What a person names to get it: its folder, or its address in an object store."""
         return self._address or self.root
 
+    @property
+    def is_shared(self) -> bool:
+        """Whether its files lie in an object store, where several hosts see them."""
+        return bool(self._address)
+
     @staticmethod
     def default_place() -> Place:
         """`$TRAPS_WORKSPACE`, else `.workspaces/default` in the checkout, or, without one, in the current folder."""

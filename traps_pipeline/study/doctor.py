@@ -103,7 +103,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
 
     workspace = Workspace.open(place)
     store, lost = workspace.store, list[str]()
-    remote = [store.below(workspace.root / folder) for folder in FOLDERS] if isinstance(workspace.place, str) else []
+    remote = [store.below(workspace.root / folder) for folder in FOLDERS] if workspace.is_shared else []
     for path in (path for below in remote for path in below):  # fetched, and held against their digests
         try:
             store.here(path)
@@ -111,7 +111,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
             lost.append(str(error))
     for folder in FOLDERS:
         workspace.bring_folder(workspace.root / folder)
-    if isinstance(workspace.place, str):
+    if workspace.is_shared:
         yield Finding(not lost, "store", "; ".join(lost[:SHOWN]) or "every object is what was written")
     for what, files, damage_of in (
         ("tables", sorted((workspace.root / "tables").rglob("*.parquet")), _damaged_table),

@@ -10,7 +10,7 @@ import asyncio
 import re
 import secrets
 import time
-from collections.abc import AsyncIterator, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass
 from itertools import islice
@@ -59,10 +59,17 @@ def move_to_database(workspace: Workspace, variable: str) -> Moved:
             "--to: give the name of a variable of the environment, in capitals (LAB_DATABASE), that holds the address; "
             "study.yaml holds the name, and never the address"
         )
-    return asyncio.run(_move_in(workspace, session_of(variable, workspace.study.name), variable))
+    session = session_of(variable, workspace.study.name)
+    return move_rows(workspace, session, lambda: workspace.allow(database=variable))
 
 
-async def _move_in(workspace: Workspace, session: Session, variable: str) -> Moved:
+def move_rows(workspace: Workspace, session: Session, settle: Callable[[], object]) -> Moved:
+    """Put the ledger of a study's folder into a database. settle: makes it count there, once all is there. Raises
+    TrapsError, also while anybody asks."""
+    return asyncio.run(_move_in(workspace, session, settle))
+
+
+async def _move_in(workspace: Workspace, session: Session, settle: Callable[[], object]) -> Moved:
     ledgers = [SegmentLedger(workspace.ledger_folder, kind) for kind in KINDS]
     async with _nobody_asks(ledgers):
         with alone(workspace), closing(Journal(workspace.ledger_folder / JOURNAL)) as journal:
@@ -70,7 +77,7 @@ async def _move_in(workspace: Workspace, session: Session, variable: str) -> Mov
             for place in (note for ledger in ledgers for note in ledger.damage()):
                 progress.current().note(f"{place}; it is not moved, and what it cost counts as spent")
             rows = session.run(lambda connection: _fill(connection, session, ledgers, spent))
-            workspace.allow(database=variable)
+            settle()
         session.run(lambda c: c.execute("update traps.studies set is_here = true where id = %s", [session.study_id]))
         return Moved(rows, session.host, _put_aside(workspace))
 
@@ -132,7 +139,7 @@ def move_back(workspace: Workspace) -> Moved:
     session = workspace.session
     if session is None:
         raise TrapsError(f"{workspace.root}/study.yaml: the ledger lies in {workspace.ledger_folder} already")
-    if isinstance(workspace.place, str):
+    if workspace.is_shared:
         raise TrapsError(
             f"{workspace.place}: a study in an object store keeps its ledger in its database, where the names of its "
             "files lie, too"

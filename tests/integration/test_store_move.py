@@ -1,0 +1,57 @@
+"""A finished study of one machine goes into an object store: it is the same study there, and nothing is paid again."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from bench.equality import main as compare
+from tests.conftest import SMALL, Checkout, copied
+from tests.objectstore import S3
+from tests.postgres import Postgres
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.workspace import DATABASE, Workspace
+from traps_pipeline.study.store_move import LEFT, move_to_store
+
+pytestmark = pytest.mark.slow
+EXPERIMENT, ADDRESS = SMALL.with_name("one_regime.yaml"), "s3://lab/moved"
+NOTHING = {"answers": 0, "votes": 0, "frames": 0}
+
+
+def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_again(
+    one_regime: Checkout, s3: S3, postgres: Postgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(DATABASE, postgres.address())
+    monkeypatch.setenv("TRAPS_SCRATCH", str(tmp_path / "scratch"))
+    study = copied(one_regime, tmp_path)
+    with monkeypatch.context() as patched:  # killed once all is there, before it counts
+
+        def killed(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        patched.setattr("traps_pipeline.study.store_move.write_anchor", killed)
+        with pytest.raises(KeyboardInterrupt):
+            move_to_store(Workspace.open(study.workspace), ADDRESS)
+    assert not Workspace.is_there(ADDRESS) and Workspace.open(study.workspace).answers.evaluations()
+
+    moved = study.traps("ledger", "move", "--store", ADDRESS)
+    assert moved.code == 0 and f"the study lies at {ADDRESS} now" in moved.out, moved.out + moved.err
+    shutil.rmtree(tmp_path / "scratch")  # another host has none of it
+    monkeypatch.setenv("TRAPS_WORKSPACE", ADDRESS)
+    command = [sys.executable, "-m", "traps_pipeline.cli", "run", EXPERIMENT, "--until", "leaderboard"]
+    again = study.run("env", "-u", "DAGSTER_HOME", *command, "--workspace", ADDRESS)
+    assert (again.code, again.counts()) == (0, NOTHING), again.out + again.err
+    workspace = Workspace.open(ADDRESS)
+    workspace.bring_folder(workspace.tables.root)
+    assert compare(one_regime.workspace, workspace.root) == 0
+
+    left = study.traps("status")
+    assert left.code == 1 and "no such workspace" in left.err and (study.workspace / LEFT).is_file()
+    with pytest.raises(TrapsError, match=rf"^{ADDRESS}: the study's ledger lies in {ADDRESS}, and not in a folder"):
+        move_to_store(workspace, "s3://lab/elsewhere")
+    other = copied(one_regime, tmp_path / "other")
+    with pytest.raises(TrapsError, match=rf"^{ADDRESS}: a study lies there already; name another address"):
+        move_to_store(Workspace.open(other.workspace), ADDRESS)

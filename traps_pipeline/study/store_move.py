@@ -1,0 +1,76 @@
+"""A study of one machine, moved into an object store: its answers, votes and spending into the database, and its files
+under their digests. Nothing of it is asked, rendered or extracted again.
+
+Until all is there, nothing lies at the address, and the folder is the study; a move that is killed is done again. Then
+the folder is a study no more, so that nobody pays twice; its files stay where they are.
+"""
+
+from __future__ import annotations
+
+import shutil
+from itertools import islice
+from pathlib import Path
+
+from traps_pipeline import progress
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.storage.anchor import write_anchor
+from traps_pipeline.storage.database import session_of
+from traps_pipeline.storage.parquet import note_of
+from traps_pipeline.storage.place import STUDY, Place, scratch_of
+from traps_pipeline.storage.workspace import DATABASE, Workspace
+from traps_pipeline.study.ledger_move import Moved, move_rows
+
+# Dagster's history, lock files, reports and labels belong to a machine, and the ledger is moved by itself.
+STAYS = ("dagster", "ledger", "reports", "labels", STUDY)
+AT_ONCE = 500  # files of one change
+LEFT = "study.moved.yaml"  # what study.yaml of the folder is called then
+
+
+def move_to_store(workspace: Workspace, address: Place) -> Moved:
+    """Move a study from its folder to an address (s3://BUCKET/STUDY). Raises TrapsError, also while anybody asks."""
+    if not isinstance(address, str):
+        raise TrapsError(f"{address}: is a folder; --store names an address in an object store, s3://BUCKET/STUDY")
+    if workspace.is_shared or workspace.study.database:
+        where = workspace.place if workspace.is_shared else "a database"
+        raise TrapsError(
+            f"{workspace.place}: the study's ledger lies in {where}, and not in a folder; a study whose files lie in a "
+            "folder moves its ledger back first (`traps ledger move --back`)"
+        )
+    if Workspace.is_there(address):
+        raise TrapsError(
+            f"{address}: a study lies there already; name another address. If it is this one, and a move was stopped "
+            f"at its very end, rename {workspace.root / STUDY}: what it holds was moved"
+        )
+    study = workspace.study.model_copy(update={"database": DATABASE})
+    target = Workspace(scratch_of(address), study, address)
+
+    def settle() -> None:
+        _move_files(workspace, target)
+        target.save_study()
+        write_anchor(address, study)
+        (workspace.root / STUDY).rename(workspace.root / LEFT)
+
+    return move_rows(workspace, session_of(DATABASE, study.name), settle)
+
+
+def _move_files(workspace: Workspace, target: Workspace) -> None:
+    files = iter(
+        [p for p in workspace.store.below(workspace.root) if p.relative_to(workspace.root).parts[0] not in STAYS]
+    )
+    count = 0
+    while some := list(islice(files, AT_ONCE)):
+        kept = list[Path]()
+        for path in some:
+            there = target.root / path.relative_to(workspace.root)
+            if path.is_relative_to(workspace.tables.root):
+                try:
+                    target.store.write({there: path.read_bytes()}, note=note_of(path))
+                except TrapsError as error:
+                    progress.current().note(f"{error}; it is left, and made anew")
+                continue
+            there.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, there)
+            kept.append(there)
+        target.store.keep(kept)
+        count += len(some)
+        progress.current().note(f"{count} files lie in {target.place}")
