@@ -30,9 +30,9 @@ from traps_pipeline.orchestration.cluster import (
     require_cluster,
 )
 from traps_pipeline.orchestration.graph import the_graph
-from traps_pipeline.orchestration.runs import batches, broke_off
+from traps_pipeline.orchestration.runs import broke_off, range_tags
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, installed, require_same_code
-from traps_pipeline.orchestration.schemes import CELL, DATASET, Scheme
+from traps_pipeline.orchestration.schemes import DATASET
 from traps_pipeline.orchestration.shared_history import SharedHistory
 from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, end_if_resumed
 from traps_pipeline.progress import Progress, reporting
@@ -40,65 +40,9 @@ from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 
 
-def runs(most: int, workspace: Workspace) -> RayRuns:
-    return RayRuns(dg.DagsterInstance.ephemeral(), workspace, most, 0.0, "leave")
-
-
 @pytest.fixture
 def workspace(tmp_path: Path) -> Workspace:
     return Workspace(tmp_path, Study(name="lab"))
-
-
-def keys_of(scheme: Scheme, ranges: list[Any]) -> list[str]:
-    """Every key of every range, as Dagster reads it."""
-    return [key for first, last in ranges for key in scheme.definition.get_partition_keys_in_range(
-        dg.PartitionKeyRange(str(first), str(last)))]  # fmt: skip
-
-
-@pytest.mark.parametrize("most", [1, 3, 40])
-def test_ranges_hold_each_key_once(workspace: Workspace, most: int) -> None:
-    keys = [str(key) for key in CELL.definition.get_partition_keys()][::2][:60]
-    ranges = runs(most, workspace).ranges(CELL, keys)
-    assert sorted(keys_of(CELL, ranges)) == sorted(keys)
-    assert len(ranges) >= min(most, len(keys))
-
-
-@pytest.mark.parametrize(("n_datasets", "n_evaluations"), [(28, 195), (28, 30), (12, 100), (4, 195), (28, 1), (4, 3)])
-def test_a_study_of_whole_models_is_cut_into_as_many_runs_as_asked_and_no_more(
-    n_datasets: int, n_evaluations: int
-) -> None:
-    datasets = [f"d{n:02d}" for n in range(n_datasets)]
-    evaluations = [f"model-{n // 9}__standard__run{n % 9}" for n in range(n_evaluations)]
-    definition = dg.MultiPartitionsDefinition(
-        {"dataset": dg.StaticPartitionsDefinition(datasets), "evaluation": dg.StaticPartitionsDefinition(evaluations)}
-    )
-    grid = Scheme(definition, lambda _: {}, lambda _: [])
-    keys = [f"{dataset}|{evaluation}" for evaluation in evaluations for dataset in datasets]
-    ranges = [*batches(grid, keys, 40)]
-    assert sorted(keys_of(grid, ranges)) == sorted(keys)
-    assert min(40, len(keys)) * 0.7 <= len(ranges) <= 40
-    sizes = [len(keys_of(grid, [one])) for one in ranges]
-    assert max(sizes) <= 2 * min(sizes)
-
-
-def test_fewer_runs_than_models_load_each_model_once() -> None:
-    evaluations = [f"model-{n // 9}__standard__run{n % 9}" for n in range(90)]
-    scheme = Scheme(dg.StaticPartitionsDefinition(evaluations), lambda _: {}, lambda _: [])
-    parts = [keys_of(scheme, [one]) for one in batches(scheme, evaluations, 7)]
-    models = [model for part in parts for model in {key.partition("__")[0] for key in part}]
-    assert len(parts) == 7 and sorted(models) == sorted({*models})
-
-
-def test_cells_of_one_model_stay_together(workspace: Workspace) -> None:
-    datasets = [str(key) for key in DATASET.definition.get_partition_keys()][:4]
-    every = [str(key) for key in CELL.definition.get_partition_keys()]
-    evaluations = [*dict.fromkeys(key.partition("|")[2] for key in every)][:4]
-    keys = [f"{dataset}|{evaluation}" for dataset in datasets for evaluation in evaluations]
-    ranges = runs(4, workspace).ranges(CELL, keys)  # 16 cells in 4 runs: one of each model, all its datasets
-    assert len(ranges) == 4
-    for one in ranges:
-        assert len({key.partition("|")[2] for key in keys_of(CELL, [one])}) == 1
-    assert len([*batches(CELL, keys)]) == 1  # which one process makes in one
 
 
 def test_what_a_stage_takes_is_what_ray_sets_aside_and_what_the_run_uses(
@@ -151,7 +95,11 @@ class Shown(Progress):
 
     def __init__(self) -> None:
         super().__init__()
-        self.notes = list[str]()
+        self.notes, self.stages = list[str](), list[tuple[str, int]]()
+
+    def stage(self, name: str, n: int) -> None:
+        """See `Progress`."""
+        self.stages.append((name, n))
 
     def note(self, text: str) -> None:
         """See `Progress`."""
@@ -381,3 +329,39 @@ def _nothing_op() -> None: ...
 @dg.job
 def _nothing() -> None:
     _nothing_op()
+
+
+@pytest.mark.parametrize("on_interrupt", ["leave", "cancel"])
+def test_an_interrupted_command_leaves_its_runs_or_ends_them_and_the_next_one_counts_what_was_left(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, on_interrupt: Any
+) -> None:
+    shown = Shown()
+    stages = [the_graph()[name] for name in (RESPONSES.name, "votes")]
+    selected = frozenset(stage.spec.key for stage in stages)
+    cells = range_tags(("occlusion|oracle__standard__run1", "chaotic|oracle__standard__run1"))
+    with dg.DagsterInstance.ephemeral() as instance, reporting(shown):
+        run = dg.DagsterRun("a job", asset_selection=selected, tags={**cells, STUDY_TAG: "lab"})
+        instance.add_run(run)
+        ended = list[str]()
+        monkeypatch.setattr(type(instance.run_coordinator), "cancel_run", lambda _, run_id: ended.append(run_id))
+        asking = RayRuns(instance, workspace, 1, 0.0, on_interrupt)
+
+        def interrupt(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(asking, "_look_at", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            asking._watch([run.run_id])
+        assert ended == ([run.run_id] if on_interrupt == "cancel" else [])
+        instance.report_run_failed(run, "it was ended")
+        instance.add_run(dg.DagsterRun("a job", asset_selection=selected, tags={**cells, STUDY_TAG: "another"}))
+        again = dg.DagsterRun("a job", asset_selection=selected, tags={**cells, STUDY_TAG: "lab"})
+        instance.add_run(again)
+        next_one = RayRuns(instance, workspace, 1, 0.0, on_interrupt)
+        monkeypatch.setattr(next_one, "_watch", lambda run_ids: watched.extend(run_ids))
+        watched = list[str]()
+        with next_one:
+            assert watched == [again.run_id]
+    datasets = [str(key) for key in DATASET.definition.get_partition_keys()]
+    between = abs(datasets.index("occlusion") - datasets.index("chaotic")) + 1
+    assert shown.stages == [("runs that were left", 2 * between)]

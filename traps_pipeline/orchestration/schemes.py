@@ -5,6 +5,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from typing import Any
 
 import dagster as dg
@@ -26,6 +28,14 @@ class Scheme:
     definition: dg.PartitionsDefinition
     columns: Callable[[str], Mapping[str, Any]]
     wanted: Callable[[Wanted], Sequence[str]]
+
+    @cached_property
+    def keys(self) -> frozenset[str]:
+        """Every key. (Dagster makes an object of each key of two dimensions, every time that it is asked.)"""
+        if isinstance(self.definition, dg.MultiPartitionsDefinition):
+            dimensions = (one.partitions_def.get_partition_keys() for one in self.definition.partitions_defs)
+            return frozenset(map("|".join, product(*dimensions)))
+        return frozenset(map(str, self.definition.get_partition_keys()))
 
 
 def study_here() -> Workspace | None:
@@ -87,12 +97,10 @@ by_steering = dg.MultiToSingleDimensionPartitionMapping("steering")
 
 def to_keys(above: Scheme, below: Scheme, mapping: Callable[[str], Iterable[str]]) -> dg.StaticPartitionMapping:
     """What partitions below are made from each above, of the keys that the study has."""
-    there = {*below.definition.get_partition_keys()}
-    pairs = {str(key): sorted(there & {*mapping(str(key))}) for key in above.definition.get_partition_keys()}
+    pairs = {key: sorted(below.keys & {*mapping(key)}) for key in sorted(above.keys)}
     return dg.StaticPartitionMapping({key: found for key, found in pairs.items() if found})
 
 
 def these_keys(above: Scheme, keys: Iterable[str]) -> dg.SpecificPartitionsPartitionMapping:
     """Of all partitions above these, as far as the study has them."""
-    there = {str(key) for key in above.definition.get_partition_keys()}
-    return dg.SpecificPartitionsPartitionMapping([key for key in keys if key in there])
+    return dg.SpecificPartitionsPartitionMapping([key for key in keys if key in above.keys])
