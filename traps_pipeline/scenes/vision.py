@@ -16,6 +16,7 @@ from traps_pipeline.scenes.look import PANELS
 
 FLAG_PX = (60, 50)  # a flag is no wider and no higher
 PANEL_PX = 8000  # a panel that comes before a scene is larger, whatever moves is smaller
+MOVED_PX = 24  # what moves changes more pixels from frame to frame
 CHANGED, ALIKE = 16, 12  # levels of 255: by more than these a pixel changes, by no more two are of one colour
 # Hue (degrees), least saturation and value (0-1) of the saturated colours. Shade lowers the value, not the hue.
 _HUES: Mapping[str, tuple[float, float, float, float]] = {
@@ -128,6 +129,21 @@ def before_panel(frames: np.ndarray) -> np.ndarray:
         if sizes.max() >= PANEL_PX and even > 0.6 and stands_out and stays > 0.9:
             return frames[:at]
     return frames
+
+
+def after_panel(frames: np.ndarray) -> np.ndarray:
+    """The frames after a panel goes that stands from the first one on; all of them if none goes."""
+    return before_panel(frames[::-1])[::-1]
+
+
+def moved(frames: np.ndarray) -> np.ndarray:
+    """Where the last frame differs from the one before, bool (360, 480)."""
+    return _apart(frames[-1], frames[-2]) > CHANGED if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
+
+
+def still(frames: np.ndarray) -> bool:
+    """Whether nothing moves in the last two steps that are shown."""
+    return moved(frames).sum() < MOVED_PX and moved(frames[:-1]).sum() < MOVED_PX
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from traps_pipeline.scenes.kit import COLOURS, Inventory, Taxonomy
 from traps_pipeline.scenes.offers import without_choices
 
-YES_OR_NO, LEFT_OR_RIGHT = ("yes", "no"), ("left", "right")
+YES_OR_NO, LEFT_OR_RIGHT, ANY_TWO = ("yes", "no"), ("left", "right"), ("this", "that")
 
 # --- well-posed questions ---------------------------------------------------------------------------------------------
 
@@ -35,8 +35,8 @@ def _pattern(template: str) -> re.Pattern[str]:
 
 
 def asked(templates: Sequence[str], question: str) -> dict[str, str] | None:
-    """The values that a question fills its template's placeholders with, also without the choices that the template
-    itself spells out ('yes or no'); None if it fits none of the templates."""
+    """The values that a question fills its template's placeholders with, also without the choices that it may offer;
+    None if it fits none of the templates."""
     for template in (*templates, *_open_forms(tuple(templates))):
         match = _pattern(template).fullmatch(question)
         if match:
@@ -46,9 +46,11 @@ def asked(templates: Sequence[str], question: str) -> dict[str, str] | None:
 
 @cache
 def _open_forms(templates: tuple[str, ...]) -> list[str]:
-    """Templates without their choices, of those that offer the same ones to every scenario."""
-    fixed = [template for template in templates if "{choices}" not in template]
-    forms = [without_choices(template, labels) for template in fixed for labels in (YES_OR_NO, LEFT_OR_RIGHT)]
+    """Templates without their choices: those that they spell out ('yes or no'), or those of the scenario."""
+    forms = []
+    for template in templates:
+        filled = template.replace("{choices}", " or ".join(ANY_TWO))
+        forms += [without_choices(filled, labels) for labels in (YES_OR_NO, LEFT_OR_RIGHT, ANY_TWO)]
     return [form for form in forms if form is not None]
 
 

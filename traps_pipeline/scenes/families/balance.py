@@ -15,6 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box
 from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import AHEAD
 from traps_pipeline.scenes.parts.outcome import Reading, lasting_from
 from traps_pipeline.scenes.parts.questions import Filled, Question, colour_of, comes_from
 from traps_pipeline.scenes.parts.stage import DEAD, Stage, Surface
@@ -28,6 +29,7 @@ BALL_DENSITY = 1000.0
 STIFFNESS = 1.6  # of the spring that pulls the beam level, in torques of the ball per radian
 LEVEL_M = 0.06  # the ends of a balanced beam differ less in height
 TIPPED_DEG = 5.0  # in the picture
+OVER = 0.75  # of the tilt that it starts with: a beam that turns so far does not come back
 PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", "grey")
 
 
@@ -152,6 +154,19 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return "balanced" if abs(tilt) < TIPPED_DEG else "right" if tilt > 0 else "left"
 
 
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """A beam that turns as far over as it leaned at first, or does not turn at all, stays at that end; one that slows
+    down in between comes to rest level."""
+    slopes = [(_slope_deg(frame, named["beam"], 200), _slope_deg(frame, "black", 100)) for frame in frames]
+    tilts = [beam - base for beam, base in slopes if beam is not None and base is not None]
+    if len(tilts) < 3 or abs(tilts[0]) < TIPPED_DEG:
+        return None
+    then = tilts[-1] + AHEAD * (tilts[-1] - tilts[-2])
+    if min(abs(then), abs(tilts[-1])) < OVER * abs(tilts[0]):
+        return "balanced"
+    return "right" if then > 0 else "left"
+
+
 def _slope_deg(frame: np.ndarray, colour: str, min_area: int) -> float | None:
     """Slope of the largest region of a colour, positive if it falls to the right; None unless it is a long strip."""
     blob = largest(frame, colour, min_area)
@@ -188,6 +203,7 @@ FAMILY = scene_family(
         comes_from("From which side does the ball roll along the shelf, left or right?"),
     ],
     observe=observe,
+    foresee=foresee,
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.02,
 )

@@ -13,7 +13,7 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import past_far_edge
+from traps_pipeline.scenes.parts.observers import AHEAD, past_far_edge
 from traps_pipeline.scenes.parts.outcome import Reading, came_through
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import Span, Stage, Surface
@@ -142,5 +142,6 @@ FAMILY = scene_family(
         colour_from("wall", "What colour is the wall: {choices}?", BALL_COLOURS, unlike=("ball", "wall")),
     ],
     observe=past_far_edge("ball", "wall"),
+    foresee=past_far_edge("ball", "wall", ahead=AHEAD),
     min_margin_m=0.02,
 )

@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import beyond
+from traps_pipeline.scenes.parts.observers import AHEAD, beyond
 from traps_pipeline.scenes.parts.outcome import Reading, crossed
 from traps_pipeline.scenes.parts.questions import colour_of, goes_to, yes_no
 from traps_pipeline.scenes.parts.stage import DEAD, Stage, Surface
@@ -110,6 +110,7 @@ FAMILY = scene_family(
         goes_to("Towards which side does the ball roll along the table, left or right?"),
     ],
     observe=beyond("ball", "wall"),
+    foresee=beyond("ball", "wall", ahead=AHEAD),
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.03,
 )

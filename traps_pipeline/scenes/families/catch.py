@@ -7,6 +7,7 @@ either way, and the walls of the pen keep the ball behind the panel.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -14,12 +15,12 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import rounded
+from traps_pipeline.scenes.parts.observers import end_of, rounded
 from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, SOFT, Span, Stage, Surface
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, hidden, one_of
-from traps_pipeline.scenes.vision import at_rest, blobs, colour_mask
+from traps_pipeline.scenes.vision import blobs, colour_mask
 
 GRAVITY = 9.81
 FLOOR_M = 0.02  # thickness of the pen's floor and of the basket's
@@ -140,13 +141,38 @@ def outcome(motion: Motion, p: Params) -> Reading:
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     """Whether the resting ball is between the sides of the basket in the picture."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    parts = blobs(colour_mask(frames[-1], named["basket"]), 40)
-    ball = path[-1]
-    if ball is None or not at_rest(path) or not parts:
+    sides, ball = _sides(frames[-1], named["basket"]), end_of(path)
+    if ball is None or sides is None:
         return None
-    left = min(part.box[0] for part in parts)
-    right = max(part.box[0] + part.box[2] for part in parts)
-    return "yes" if abs(ball.x - (left + right) / 2) < 0.45 * (right - left) else "no"
+    return "yes" if _between(ball.x, sides) else "no"
+
+
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """Whether the flying ball is between the sides of the basket when it has fallen to the middle of their height."""
+    path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
+    sides, flight = _sides(frames[-1], named["basket"]), [ball for ball in path if ball is not None]
+    if sides is None or len(flight) < 3:
+        return None
+    a, b, c = flight
+    falls, faster = c.y - b.y, c.y - 2 * b.y + a.y  # in a frame, and by how much more in the next
+    down = (sides[2] + sides[3]) / 2 - c.y
+    speed = falls + faster / 2
+    frames_on = (math.sqrt(max(speed**2 + 2 * faster * down, 0.0)) - speed) / faster if faster > 0 else 0.0
+    return "yes" if _between(c.x + max(frames_on, 0.0) * (c.x - b.x), sides) else "no"
+
+
+def _sides(frame: np.ndarray, colour: str) -> tuple[float, float, float, float] | None:
+    """The left and the right end, the top and the bottom (px) of all that has the basket's colour."""
+    boxes = [part.box for part in blobs(colour_mask(frame, colour), 40)]
+    if not boxes:
+        return None
+    right, bottom = max(x + width for x, _, width, _ in boxes), max(y + height for _, y, _, height in boxes)
+    return min(box[0] for box in boxes), right, min(box[1] for box in boxes), bottom
+
+
+def _between(x: float, sides: tuple[float, float, float, float]) -> bool:
+    left, right = sides[:2]
+    return abs(x - (left + right) / 2) < 0.45 * (right - left)
 
 
 FAMILY = scene_family(
@@ -168,5 +194,6 @@ FAMILY = scene_family(
         colour_of("pedestal", "What colour is the pedestal that the ball is thrown from: {choices}?", SEEN),
     ],
     observe=observe,
+    foresee=foresee,
     min_margin_m=0.03,
 )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import reaches
+from traps_pipeline.scenes.parts.observers import has_begun, lies_on, reaches
 from traps_pipeline.scenes.parts.outcome import Reading, clear_m, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.ramp import SteppedRamp
@@ -143,5 +143,7 @@ FAMILY = scene_family(
         comes_from("On which side does the ball on the ramp start, left or right?"),
     ],
     observe=reaches("last", "box"),
+    foresee=has_begun("last", reach=0.25),
+    look=lies_on("last", "box"),
     min_margin_m=0.03,
 )

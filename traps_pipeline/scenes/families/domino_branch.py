@@ -17,16 +17,17 @@ import numpy as np
 from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, listed
 from traps_pipeline.scenes.parts.dominoes import BALL, BALL_AT, PLANK, STILL_M
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import upper_half_stays
+from traps_pipeline.scenes.parts.observers import end_of, struck, upper_half_stays
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.questions import left_or_right
 from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Stage
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, several_between
-from traps_pipeline.scenes.vision import is_panel, largest
+from traps_pipeline.scenes.vision import blobs, colour_mask, is_panel, largest, track
 
 STOP_AT = 2.9  # where the post stops the kicked ball's centre: behind the panel, out of the domino's reach
 PUSH = 0.10  # how far the stopped ball has pushed into either branch
 SIDES = ("left", "right")
+FLATTER = 1.3  # times as high for its width, at least, is a domino that stands beside one that lies
 PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
 
@@ -149,6 +150,24 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return "right" if stands[0] else "left"
 
 
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """The side whose end domino alone has left its place or is about to; a flag of its colour does neither."""
+    falls = []
+    for colour in (named["left"], named["right"]):
+        seen = blobs(colour_mask(frames[0], colour), 60)
+        falls.append(any(not upper_half_stays(frames, colour, one) or struck(frames, one, 0.0) for one in seen))
+    return None if falls[0] == falls[1] else "left" if falls[0] else "right"
+
+
+def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """The side whose end domino rests and is the flatter of the two."""
+    ends = [end_of(track(frames, named[side], 60)) for side in SIDES]
+    upright = [end.box[3] / end.box[2] for end in ends if end is not None]
+    if len(upright) < 2 or max(upright) < FLATTER * min(upright):
+        return None
+    return SIDES[int(np.argmin(upright))]
+
+
 def _stands(frames: np.ndarray, colour: str) -> bool | None:
     """Whether the upper half of the thing of that colour is where it was; None if it is not to be seen at the end."""
     first, last = largest(frames[0], colour, 60), largest(frames[-1], colour, 60)
@@ -173,6 +192,8 @@ FAMILY = scene_family(
     ),
     asides=[_aside],
     observe=observe,
+    foresee=foresee,
+    look=look,
     physics=Physics(timestep_s=0.001, tolerance=0.0),  # a solver that stops early makes rounding visible in the twin
     min_margin_m=0.03,
 )

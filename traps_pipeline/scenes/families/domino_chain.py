@@ -16,7 +16,7 @@ from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.dominoes import Size, Standing
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import has_fallen
+from traps_pipeline.scenes.parts.observers import has_begun, has_fallen, lies_flat
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import Stage
@@ -126,6 +126,8 @@ FAMILY = scene_family(
         colour_of("ball", "What colour is the ball that rolls into the dominoes: {choices}?", ("first", "row", "ball")),
     ],
     observe=has_fallen("last"),
+    foresee=has_begun("last", reach=0.25),
+    look=lies_flat("last"),
     physics=Physics(timestep_s=0.001, tolerance=0.0),  # a solver that stops early makes rounding visible in the twin
     min_margin_m=0.03,
 )

@@ -9,7 +9,7 @@ struck the second row: nothing that the gap changes can push back on what is see
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,16 +18,18 @@ from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts import dominoes
 from traps_pipeline.scenes.parts.dominoes import Size, Standing
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import upper_half_stays
+from traps_pipeline.scenes.parts.observers import around, upper_half_stays
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, either, how_many, range_of
 from traps_pipeline.scenes.parts.stage import Stage
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, facing, one_of
-from traps_pipeline.scenes.vision import blobs, colour_mask
+from traps_pipeline.scenes.vision import blobs, colour_mask, moved
 from traps_pipeline.scenes.wording import choices_in
 
 Ranges = tuple[tuple[int, int], ...]  # the choices: least and most dominoes of each
 RANGES: tuple[Ranges, ...] = (((1, 2), (3, 4), (5, 6)), ((1, 2), (3, 5), (6, 7)))
+UPRIGHT = 1.8  # times as high as wide is a domino that stands
+GIVES = 0.2  # of a domino's picture: so much of one changes that falls
 FALLEN = 0.6  # of a domino's height: a top below it belongs to a fallen domino
 PLAY = apart("red", "green", "blue", "yellow", "cyan", "purple")
 
@@ -125,12 +127,44 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     """All dominoes of the second row less those that still stand where they stood at first."""
-    colour, ranges = named["second"], [[int(n) for n in one.split("-")] for one in choices_in(named["choices"])]
+    colour = named["second"]
     before, close, after = (colour_mask(frames[i], colour) for i in (0, -3, -1))
     standing = blobs(before, min_area=60)
-    if len(standing) != ranges[-1][1] or after.sum() < 0.3 * before.sum() or (after != close).sum() > 0.1 * after.sum():
+    ranges = _choices(named, len(standing))
+    if ranges is None or after.sum() < 0.3 * before.sum() or (after != close).sum() > 0.1 * after.sum():
         return None
     return range_of(ranges, sum(not upper_half_stays(frames, colour, domino) for domino in standing))
+
+
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """The dominoes of the second row that no longer stand where they stood, or that something moves at."""
+    standing, change = blobs(colour_mask(frames[0], named["second"]), min_area=60), moved(frames)
+    ranges = _choices(named, len(standing))
+    if ranges is None:
+        return None
+    falls = [
+        not upper_half_stays(frames, named["second"], each) or change[around(each, 0.0)].mean() > GIVES
+        for each in standing
+    ]
+    return range_of(ranges, sum(falls))
+
+
+def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """The dominoes of the second row, of which the choices tell the number, less those that stand at the end."""
+    close, after = (colour_mask(frames[i], named["second"]) for i in (-3, -1))
+    if "choices" not in named or not after.any() or (after != close).sum() > 0.1 * after.sum():
+        return None
+    ranges = [[int(n) for n in one.split("-")] for one in choices_in(named["choices"])]
+    stand = sum(domino.box[3] > UPRIGHT * domino.box[2] for domino in blobs(after, min_area=60))
+    return range_of(ranges, ranges[-1][1] - stand)
+
+
+def _choices(named: Mapping[str, str], dominoes_seen: int) -> Sequence[Sequence[int]] | None:
+    """The ranges that are offered, or those that are for so many dominoes; None if these are not all of the row."""
+    if "choices" in named:
+        offered: Sequence[Sequence[int]] = [[int(n) for n in one.split("-")] for one in choices_in(named["choices"])]
+        return offered if offered[-1][1] == dominoes_seen else None
+    return next((ranges for ranges in RANGES if ranges[-1][1] == dominoes_seen), None)
 
 
 FAMILY = scene_family(
@@ -155,6 +189,8 @@ FAMILY = scene_family(
         ),
     ],
     observe=observe,
+    foresee=foresee,
+    look=look,
     physics=Physics(timestep_s=0.001, tolerance=0.0),  # a solver that stops early makes rounding visible in the twin
     min_margin_m=0.03,
     twins=twins,

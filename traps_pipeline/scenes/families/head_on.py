@@ -10,17 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, Vec3, listed
 from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import AHEAD, colours_of_balls, end_of
 from traps_pipeline.scenes.parts.outcome import Reading, held_from, still_from, undecided
 from traps_pipeline.scenes.parts.questions import which_colour
 from traps_pipeline.scenes.parts.stage import Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, several_between, shuffled
-from traps_pipeline.scenes.vision import at_rest, is_panel, largest, track
-from traps_pipeline.scenes.wording import choices_in
+from traps_pipeline.scenes.vision import is_panel, largest, track
 
 DECK_M = 0.035
 STEP_M = 0.018  # the ramps end this high over the deck
@@ -31,7 +32,8 @@ STILL_M = 0.003  # a ball that moves less than this any more is at rest
 FELT = Surface(8e-4, priority=2)
 LIVELY = Surface(2e-5, sliding=0.05, solref=(-20000.0, -60.0))  # of the balls
 SIDES = ("left", "right")
-PLAY, PLAIN = apart("red", "green", "blue", "yellow", "cyan", "purple"), shuffled("grey", "white")
+BALL_COLOURS = "red", "green", "blue", "yellow", "cyan", "purple"
+PLAY, PLAIN = apart(*BALL_COLOURS), shuffled("grey", "white")
 
 
 @dataclass(frozen=True)
@@ -130,13 +132,13 @@ def _aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
     return AnswerableQuestion(question, choices, p.colours[i])
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
     """The ball that ends on its own side of the black line, if both are at rest on that side."""
     line, kept = largest(frames[0], "black"), []
-    for colour in choices_in(named["choices"]):
+    for colour in colours_of_balls(frames, named, BALL_COLOURS):
         path = track(frames, colour, 60)
-        start, end = path[0], path[-1]
-        if line is None or start is None or end is None or is_panel(start) or is_panel(end) or not at_rest(path):
+        start, end = path[0], end_of(path, ahead)
+        if line is None or start is None or end is None or is_panel(start) or is_panel(end):
             return None
         if (start.x - line.x) * (end.x - line.x) > 0:
             kept.append(colour)
@@ -158,5 +160,6 @@ FAMILY = scene_family(
     ),
     asides=[_aside],
     observe=observe,
+    foresee=partial(observe, ahead=AHEAD),
     min_margin_m=0.05,
 )

@@ -7,25 +7,26 @@ Which lanes the balls enter by does not tell: balls of one lane may be parted, b
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import small
+from traps_pipeline.scenes.parts.observers import carried_on, small
 from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import yes_no
 from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, hidden, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest
+from traps_pipeline.scenes.vision import Blob, at_rest
 
 DECK_M = 0.03
 WALL_M = 0.012
 # In ball radii:
 HALF_PITCH = 1.4  # from the middle of the track to a lane's centre
 SWITCH = (2.6, 4.5)  # across and along the lanes, when it is turned
+ASIDE = 0.5  # of a ball's height in the picture: balls of different lanes are farther apart
 PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 PLAIN = shuffled("wood", "grey", "white", "black")
 
@@ -149,6 +150,33 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return "yes" if resting else None
 
 
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """Whether the balls, if they go on as they do, are in one lane when they are side by side: then they collide."""
+    paths = [[small(frame, named[name]) for frame in frames] for name in ("first", "second")]
+    a, b = (carried_on(path, 0.0) for path in paths)
+    a_next, b_next = (carried_on(path, 1.0) for path in paths)
+    if a is None or b is None or a_next is None or b_next is None:
+        return None
+    gap, closing = np.array([b.x - a.x, b.y - a.y]), np.array([b_next.x - a_next.x, b_next.y - a_next.y])
+    way = _along(paths)
+    if way is None:
+        return None
+    aside = np.array([-way[1], way[0]])
+    if (gap @ way) * (closing @ way) < 0:  # they will have passed in the next frame
+        share = (gap @ way) / ((gap - closing) @ way)
+        gap = gap + share * (closing - gap)
+    return "yes" if abs(gap @ aside) < ASIDE * max(a.box[3], b.box[3]) else "no"
+
+
+def _along(paths: Sequence[Sequence[Blob | None]]) -> np.ndarray | None:
+    """Which way the track runs in the picture: the balls start at its ends."""
+    first, second = (next((blob for blob in path if blob), None) for path in paths)
+    if first is None or second is None:
+        return None
+    way = np.array([second.x - first.x, second.y - first.y])
+    return way / np.linalg.norm(way)
+
+
 FAMILY = scene_family(
     "hidden_collision",
     category="hidden",
@@ -165,5 +193,6 @@ FAMILY = scene_family(
     ),
     asides=[_aside],
     observe=observe,
+    foresee=foresee,
     min_margin_m=0.06,
 )

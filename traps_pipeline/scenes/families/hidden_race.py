@@ -14,6 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import colours_of_balls
 from traps_pipeline.scenes.parts.outcome import Reading, first_past
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, either, which_colour
 from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, Stage, Surface, brake
@@ -28,14 +29,14 @@ from traps_pipeline.scenes.parts.vary import (
     shuffled,
 )
 from traps_pipeline.scenes.vision import blobs, colour_mask
-from traps_pipeline.scenes.wording import choices_in
 
 DECK_M = 0.045  # height of the lanes; the tray lies lower, so that no ball rolls back into the tunnel
 TRAY_M = 0.015
 ROUGH_BOARD_M = 0.10
 ARRIVING = 0.97  # share of its speed that a ball still has where the rough boards begin
 MIN_LEAD_S = 0.5  # a closer finish could fall between two sampled frames
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+BALL_COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
+PLAY = apart(*BALL_COLOURS)
 PLAIN = shuffled("wood", "grey", "white")
 
 
@@ -132,10 +133,10 @@ def outcome(motion: Motion, p: Params) -> Reading:
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     """The ball that is seen again first after it was out of sight, once all of them are."""
-    colours = choices_in(named["choices"])
+    colours = colours_of_balls(frames, named, BALL_COLOURS)
     out = [_seen_again(frames, colour) for colour in colours]
     seen = [frame for frame in out if frame is not None]
-    if len(seen) < len(out) or seen.count(min(seen)) > 1:
+    if not seen or len(seen) < len(out) or seen.count(min(seen)) > 1:
         return None
     return colours[seen.index(min(seen))]
 
@@ -153,6 +154,18 @@ def _seen_again(frames: np.ndarray, colour: str) -> int | None:
 def _ball_pixels(frame: np.ndarray, colour: str) -> int:
     sizes = [blob.area for blob in blobs(colour_mask(frame, colour), 20) if max(blob.box[2:]) < 80]
     return max(sizes, default=0)
+
+
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """The ball that is the first to be seen again, be it a part of it."""
+    back: dict[str, int] = {}
+    for colour in colours_of_balls(frames, named, BALL_COLOURS):
+        gone = [at for at, frame in enumerate(frames) if _ball_pixels(frame, colour) == 0]
+        again = [at for at in range(gone[0], len(frames)) if _ball_pixels(frames[at], colour)] if gone else []
+        if again:
+            back[colour] = again[0]
+    first = [colour for colour, at in back.items() if at == min(back.values())]
+    return first[0] if len(first) == 1 else None
 
 
 FAMILY = scene_family(
@@ -178,5 +191,6 @@ FAMILY = scene_family(
         ),
     ],
     observe=observe,
+    foresee=foresee,
     min_margin_m=0.03,
 )

@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import beyond
+from traps_pipeline.scenes.parts.observers import beyond, will_clear
 from traps_pipeline.scenes.parts.outcome import Reading, crossed
 from traps_pipeline.scenes.parts.questions import colour_of, goes_to, yes_no
 from traps_pipeline.scenes.parts.stage import DEAD, Point, Stage, Surface
@@ -124,6 +124,7 @@ FAMILY = scene_family(
         goes_to("Towards which side does the ball run down the slide, left or right?"),
     ],
     observe=beyond("ball", "barrier"),
+    foresee=will_clear("ball", "barrier"),
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.03,
 )

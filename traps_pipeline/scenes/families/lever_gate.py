@@ -13,7 +13,7 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import beyond
+from traps_pipeline.scenes.parts.observers import AHEAD, beyond
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import Stage, Surface
@@ -134,6 +134,7 @@ FAMILY = scene_family(
         comes_from("From which side does the ball roll in, left or right?"),
     ],
     observe=beyond("ball", "gate"),
+    foresee=beyond("ball", "gate", ahead=AHEAD),
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.03,
 )

@@ -15,11 +15,12 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, rgba
 from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import AHEAD, carried_on
 from traps_pipeline.scenes.parts.outcome import Reading, top_m, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import largest
+from traps_pipeline.scenes.vision import largest, track
 
 FLOOR_M = 0.02  # what the block stands on
 STEP_M = 0.02  # the visible lane lies higher by this
@@ -28,6 +29,7 @@ GAP_M = 0.006  # under the hanging bob
 PEG_DOWN = 0.62  # height of the peg below the pivot, as a share of the pendulum's length
 PEG_RADIUS_M = 0.012
 ROD_RADIUS_M = 0.008
+GIVES_PX = 2.0  # of a block that is struck
 PLAY, PLAIN = apart("red", "green", "blue", "cyan", "purple"), shuffled("wood", "grey")
 
 
@@ -142,6 +144,17 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return "no" if float(np.median(shapes)) > 1.0 else "yes"
 
 
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """Whether the block has begun to give way, or the bob swings against it if it goes on as it does."""
+    first, last = largest(frames[0], named["block"], 80), largest(frames[-1], named["block"], 80)
+    bob = carried_on(track(frames, named["bob"], 80), AHEAD)
+    if first is None or last is None or bob is None:
+        return None
+    pushed = abs(last.x - first.x) + abs(last.box[2] - first.box[2]) > GIVES_PX
+    reached = abs(bob.x - first.x) < (bob.box[2] + first.box[2]) / 2
+    return "yes" if pushed or reached else "no"
+
+
 FAMILY = scene_family(
     "pendulum",
     category="pendulums_levers",
@@ -162,6 +175,7 @@ FAMILY = scene_family(
         comes_from("From which side of the picture does the rolling ball set out, left or right?"),
     ],
     observe=observe,
+    foresee=foresee,
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.03,
 )

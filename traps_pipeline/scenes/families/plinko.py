@@ -175,12 +175,13 @@ def _numbers(p: Params, rng: np.random.Generator) -> Filled:
 # In lengths of the apron's lower edge, which is as long as the board is wide (1.18 to 1.43 m): a ball that lies in a
 # bucket is 0.15 to 0.18 above that edge (more if it leans on another), one yet to enter a bucket at least 0.23.
 IN_BUCKET = 0.222
+INK = 0.025, 0.075  # where the middle of the digits is
 FRAME = 0.012  # share of that edge below the frame at either side
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     """The bucket above whose share of the apron's lower edge the ball is, if it is low enough to lie in one."""
-    choices, last = choices_in(named["choices"]), frames[-1]
+    last = frames[-1]
     if not any(named["ball"] in pool for pool in SCHEMES.values()):
         return None
     ball, edge = round_ball(last, named["ball"]), _lower_edge(last)
@@ -192,7 +193,22 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     height = float(along[1] * offset[0] - along[0] * offset[1]) / float(along @ along)
     if not (0 < share < 1 and 0 < height < IN_BUCKET):
         return None
-    return choices[int(share * len(choices))]
+    buckets = len(choices_in(named["choices"])) if "choices" in named else _digits(last, edge)
+    return str(int(share * buckets) + 1) if buckets else None
+
+
+def _digits(frame: np.ndarray, edge: tuple[np.ndarray, np.ndarray]) -> int:
+    """How many digits stand on the apron: one a bucket. Beside each there is a gap without ink."""
+    left, right = edge
+    along = right - left
+    up = np.array([along[1], -along[0]])
+    across, heights = np.linspace(0.02, 0.98, 600), np.linspace(*INK, 24)
+    x, y = (left[i] + across * along[i] + heights[:, None] * up[i] for i in (0, 1))
+    inside = (x >= 0) & (x < frame.shape[1]) & (y >= 0) & (y < frame.shape[0])
+    rows, columns = (np.clip(v.round().astype(int), 0, n - 1) for v, n in zip((y, x), frame.shape[:2], strict=True))
+    ink = ((frame[rows, columns].max(axis=2) < 110) & inside).any(axis=0).astype(np.uint8)
+    ink = cv2.morphologyEx(ink[None], cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8))[0]
+    return int((np.diff(ink, prepend=0) == 1).sum())
 
 
 def _lower_edge(frame: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

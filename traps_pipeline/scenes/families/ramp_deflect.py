@@ -12,7 +12,7 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import compact, nearer_side
+from traps_pipeline.scenes.parts.observers import AHEAD, compact, nearer_side
 from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_from, left_or_right, material_of
 from traps_pipeline.scenes.parts.ramp import Ramp
@@ -133,5 +133,6 @@ FAMILY = scene_family(
         colour_from("ball", "What colour is the ball on the ramp: {choices}?", BALLS, unlike=("ball",)),
     ],
     observe=nearer_side("ball", "red", "blue", find=compact, least=100),
+    foresee=nearer_side("ball", "red", "blue", find=compact, least=100, ahead=AHEAD),
     min_margin_m=0.03,
 )

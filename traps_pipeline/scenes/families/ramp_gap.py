@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import rests_over
+from traps_pipeline.scenes.parts.observers import AHEAD, rests_over
 from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, material_of, yes_no
 from traps_pipeline.scenes.parts.ramp import Ramp
@@ -127,5 +127,6 @@ FAMILY = scene_family(
         material_of("ramp", "What colour is the ramp: {choices}?"),
     ],
     observe=rests_over("ball", "box"),
+    foresee=rests_over("ball", "box", ahead=AHEAD),
     min_margin_m=0.03,
 )

@@ -14,14 +14,13 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, listed, uniform
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import compact
+from traps_pipeline.scenes.parts.observers import colours_of_balls, compact
 from traps_pipeline.scenes.parts.outcome import Reading, first_past
 from traps_pipeline.scenes.parts.questions import which_colour
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.stage import Stage, brake
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, hidden, in_front
 from traps_pipeline.scenes.vision import Blob, at_rest
-from traps_pipeline.scenes.wording import choices_in
 
 BOARD_M = 0.016  # thickness of a ramp
 WALL_M = 0.012
@@ -29,7 +28,9 @@ ROUGH_M = 0.16  # length of the rough board
 ARRIVING = 0.86  # share of its energy that a ball still has after the foot of the ramp, as measured
 MIN_LEAD_S = 0.35  # a closer finish could fall between two sampled frames
 BALLS = ("ball_0", "ball_1")
-PLAY = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+SOON = 2.0  # frames until the first ball is in the tray
+BALL_COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
+PLAY = apart(*BALL_COLOURS)
 
 
 def _tray_colour(rng: np.random.Generator, so_far: Drawn) -> str:
@@ -155,13 +156,25 @@ SETTLING_PX = 8.0  # so far a ball may still roll in the tray when a panel comes
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     """Which ball is first near the place where it rests in the end: the same part of the tray for both."""
-    choices = choices_in(named["choices"])
+    choices = colours_of_balls(frames, named, BALL_COLOURS)
     paths = [[compact(frame, colour) for frame in frames] for colour in choices]
     if len(choices) != 2 or not all(at_rest(path, tolerance_px=SETTLING_PX) for path in paths):
         return None
     rates = [_progress(path) for path in paths]
     near_end = [int(np.argmax(rate > 0.9 * rate.max())) for rate in rates]
     return None if near_end[0] == near_end[1] else choices[int(np.argmin(near_end))]
+
+
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """Which ball will be lower in the picture, nearer to the tray, if both gain speed as they do."""
+    lower: dict[str, float] = {}
+    for colour in colours_of_balls(frames, named, BALL_COLOURS):
+        path = [compact(frame, colour) for frame in frames[-3:]]
+        ys = [ball.y + ball.box[3] / 2 for ball in path if ball is not None]
+        if len(ys) == len(path) == 3:
+            step, gain = ys[2] - ys[1], ys[2] - 2 * ys[1] + ys[0]
+            lower[colour] = ys[2] + SOON * step + SOON * (SOON + 1) / 2 * gain
+    return max(lower, key=lambda colour: lower[colour]) if len(lower) == 2 else None
 
 
 def _progress(path: list[Blob | None]) -> np.ndarray:
@@ -185,5 +198,6 @@ FAMILY = scene_family(
     ),
     asides=[_higher_or_side],
     observe=observe,
+    foresee=foresee,
     min_margin_m=0.03,
 )

@@ -9,17 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import compact
+from traps_pipeline.scenes.parts.observers import AHEAD, compact, end_of
 from traps_pipeline.scenes.parts.outcome import Reading, clear_m, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Stage, brake
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, colour_mask
+from traps_pipeline.scenes.vision import colour_mask
 
 TRACK_M = 0.04  # height of the track
 WALL_M = 0.014
@@ -101,11 +102,11 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(yes_while(past > 0, still_from(past, within_m=STILL_M)), clear_m(past, LINE_M))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
     """On which side of the line the ball rests; it came from the side where it was seen first."""
     path = [compact(frame, named["ball"], shape=(0.5, 2.0)) for frame in frames]
-    first, last = next((ball for ball in path if ball is not None), None), path[-1]
-    if first is None or last is None or not at_rest(path):
+    first, last = next((ball for ball in path if ball is not None), None), end_of(path, ahead)
+    if first is None or last is None:
         return None
     ys, xs = np.nonzero(colour_mask(frames[-1], named["line"]))
     if len(xs) < 60 or np.ptp(ys) < 10:
@@ -134,5 +135,6 @@ FAMILY = scene_family(
         colour_of("start", "What colour is the first line that the ball rolls across: {choices}?", SEEN),
     ],
     observe=observe,
+    foresee=partial(observe, ahead=AHEAD),
     min_margin_m=0.03,
 )

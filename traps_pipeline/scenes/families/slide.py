@@ -14,7 +14,7 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import compact, rests_over
+from traps_pipeline.scenes.parts.observers import AHEAD, compact, rests_over
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, material_of, yes_no
 from traps_pipeline.scenes.parts.ramp import Ramp
@@ -135,6 +135,7 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(yes_while(off, still_from(block, within_m=STILL_M)), float(abs(past[-1])))
 
 
+BLOCK = partial(compact, area=4500, shape=(0.3, 3.5), fill=0.4)
 FAMILY = scene_family(
     "slide",
     category="ramps_rolling",
@@ -153,6 +154,7 @@ FAMILY = scene_family(
         colour_from("block", "What colour is the sliding block: {choices}?", NAMED, unlike=("block", "tray")),
         material_of("incline", "What colour is the incline that the block slides down: {choices}?"),
     ],
-    observe=rests_over("block", "tray", find=partial(compact, area=4500, shape=(0.3, 3.5), fill=0.4)),
+    observe=rests_over("block", "tray", find=BLOCK),
+    foresee=rests_over("block", "tray", find=BLOCK, ahead=AHEAD),
     min_margin_m=0.03,
 )

@@ -132,7 +132,10 @@ def _height(frame: np.ndarray, colour: str) -> float | None:
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Which of the colours is nearest to the underside of the resting ball; None while it is not to be seen."""
+    """Which of the colours is nearest to the underside of the resting ball; None while it is not to be seen,
+    and of a question that offers no colours."""
+    if "choices" not in named:
+        return None
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
     end = path[-1]
     heights = {colour: _height(frames[-1], colour) for colour in choices_in(named["choices"])}

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box, distinct_colours
 from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import AHEAD, offered
 from traps_pipeline.scenes.parts.outcome import Reading, lasting_from
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, which_colour
 from traps_pipeline.scenes.parts.stage import Stage, Surface
 from traps_pipeline.scenes.parts.vary import between, drawn_by, facing, hidden_index, one_of, shuffled
 from traps_pipeline.scenes.vision import Blob, at_rest, blobs, colour_mask
-from traps_pipeline.scenes.wording import choices_in
 
 SECTORS = ("red", "green", "blue", "yellow", "cyan", "purple")
 BALLS = ("red", "green", "blue", "orange", "purple", "cyan")
@@ -136,13 +137,13 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(sectors, float(margin))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
     """The colour that surrounds the black pointer once it is at rest."""
     pointers = [_pointer(frame) for frame in frames[-3:]]
-    if not at_rest([found for found, _ in pointers]):
+    if pointers[-1][0] is None or (ahead is None and not at_rest([found for found, _ in pointers])):
         return None
     ring = cv2.dilate(pointers[-1][1], np.ones((15, 15), np.uint8)).astype(bool)
-    counts = {c: int((ring & colour_mask(frames[-1], c)).sum()) for c in choices_in(named["choices"])}
+    counts = {c: int((ring & colour_mask(frames[-1], c)).sum()) for c in offered(named, SECTORS)}
     best = max(counts, key=lambda c: counts[c])
     return best if counts[best] > 0.45 * sum(counts.values()) else None
 
@@ -177,6 +178,7 @@ FAMILY = scene_family(
         comes_from("From which side does the ball roll towards the spinner, left or right?"),
     ],
     observe=observe,
+    foresee=partial(observe, ahead=AHEAD),
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.03,
     looks=("bystanders", "camera", "material", "pale-floor", "panel"),

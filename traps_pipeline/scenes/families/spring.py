@@ -9,17 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box, rgba, uniform
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import rounded
+from traps_pipeline.scenes.parts.observers import AHEAD, end_of, rounded
 from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, SOFT, Stage, Surface
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, facing, one_of, together
-from traps_pipeline.scenes.vision import at_rest, blobs, colour_mask
+from traps_pipeline.scenes.vision import blobs, colour_mask
 
 LANE_M = 0.02  # height of the lower lane
 FEEL_M = 0.03  # the ball has met the plunger when it has been this near to it
@@ -139,12 +140,12 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(side_while(met, back), float(abs(back[-1])))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Whether the resting ball is on the side of the line that it came from."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
-    start, end = rounded(frames[0], named["ball"]), path[-1]
+    start, end = rounded(frames[0], named["ball"]), end_of(path, ahead)
     parts = [blob for blob in blobs(colour_mask(frames[-1], named["line"]), 15) if blob.area < 4000]
-    if start is None or end is None or not at_rest(path) or not parts:
+    if start is None or end is None or not parts:
         return None
     line = sum(part.x * part.area for part in parts) / sum(part.area for part in parts)
     return "yes" if (start.x - line) * (end.x - line) > 0 else "no"
@@ -169,6 +170,7 @@ FAMILY = scene_family(
         colour_of("deck", "What colour is the deck under the ball: {choices}?", SEEN),
     ],
     observe=observe,
+    foresee=partial(observe, ahead=AHEAD),
     # The same roll with the other plunger.
     twins=lambda p: [replace(p, damping_n_s_m=p.other_damping_n_s_m, other_damping_n_s_m=p.damping_n_s_m)],
     min_margin_m=0.06,

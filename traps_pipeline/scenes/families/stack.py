@@ -164,6 +164,12 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return range_of(RANGES, counts[-1])
 
 
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """Counts the blocks that are over the stand in the last frame: whatever is beside it falls."""
+    count = _count(frames[-1], named["stand"])
+    return None if count is None else range_of(RANGES, count)
+
+
 def _count(frame: np.ndarray, stand_colour: str) -> int | None:
     stand = largest(frame, stand_colour, 600)  # a flag of the stand is smaller
     if stand is None:
@@ -195,6 +201,7 @@ FAMILY = scene_family(
         comes_from("From which side does the ball roll along the ledge, left or right?"),
     ],
     observe=observe,
+    foresee=foresee,
     legible=legible,
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.012,

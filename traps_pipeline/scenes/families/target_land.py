@@ -7,7 +7,7 @@ left or the right one. The throw is the same whichever way they slant, and the t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, radians, sin
 
@@ -15,13 +15,12 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import rounded
+from traps_pipeline.scenes.parts.observers import offered, rounded
 from traps_pipeline.scenes.parts.outcome import Reading
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, which_colour
 from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, colour_mask
-from traps_pipeline.scenes.wording import choices_in
+from traps_pipeline.scenes.vision import at_rest, blobs, colour_mask, largest
 
 GRAVITY = 9.81
 FLOOR_M = 0.02  # thickness of the trays' floors
@@ -30,7 +29,10 @@ DEPTH_M = 0.14  # half of the trays' depth
 DIVIDER_M = 0.10  # height of the walls between the trays
 END_M = 0.34  # height of the outer walls
 GREYS = ("grey", "black", "white")
-PLAY, PLAIN = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple"), shuffled(*GREYS)
+SLANTS = 0.4  # columns a row: boards that hang straight down slant less in the picture
+TRAY_PX = 40  # a tray is wider in the picture
+COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
+PLAY, PLAIN = apart(*COLOURS), shuffled(*GREYS)
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,11 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading([p.tray_colours[i] if down else None for i, down in zip(over, low, strict=True)], float(margin))
 
 
+def _colours(named: Mapping[str, str]) -> Sequence[str]:
+    """The colours that the question offers, or all that a tray beside this ball may have."""
+    return offered(named, [colour for colour in COLOURS if colour != named["ball"]])
+
+
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     """The tray colour that most of the picture around the resting ball has."""
     path = [rounded(frame, named["ball"]) for frame in frames[-3:]]
@@ -129,9 +136,30 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     reach = 1.1 * max(ball.box[2:])
     rows, columns = np.ogrid[: frames.shape[1], : frames.shape[2]]
     near = (columns - ball.x) ** 2 + (rows - ball.y) ** 2 < reach**2
-    around = {c: int((colour_mask(frames[-1], c) & near).sum()) for c in choices_in(named["choices"])}
+    around = {c: int((colour_mask(frames[-1], c) & near).sum()) for c in _colours(named)}
     best = max(around, key=lambda c: around[c])
     return best if around[best] >= 60 else None
+
+
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """The tray that the boards of the chute lead to: the middle one if they hang straight down."""
+    trays = {colour: largest(frames[-1], colour, 200) for colour in _colours(named)}
+    seen = {colour: blob for colour, blob in trays.items() if blob is not None and blob.box[2] > TRAY_PX}
+    in_order = sorted(seen, key=lambda colour: seen[colour].x)
+    if len(in_order) != 3:
+        return None
+    left, right = seen[in_order[0]], seen[in_order[2]]
+    top = min(blob.y for blob in seen.values())
+    slopes = []
+    for board in blobs(colour_mask(frames[0], "wood"), 200):
+        x, y, width, height = board.box
+        if left.box[0] < board.x < right.box[0] + right.box[2] and board.y < top and height > 30:
+            rows, columns = np.nonzero(colour_mask(frames[0], "wood")[y : y + height, x : x + width])
+            slopes.append(float(np.polyfit(rows, columns, 1)[0]))
+    if not slopes:
+        return None
+    slope = float(np.mean(slopes))  # pixels to the right from row to row
+    return in_order[0 if slope < -SLANTS else 2 if slope > SLANTS else 1]
 
 
 FAMILY = scene_family(
@@ -161,5 +189,6 @@ FAMILY = scene_family(
         ),
     ],
     observe=observe,
+    foresee=foresee,
     min_margin_m=0.03,
 )

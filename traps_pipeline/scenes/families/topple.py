@@ -15,11 +15,12 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import lies_flat
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, top_m, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import SHADOW_BACK, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, track
+from traps_pipeline.scenes.vision import at_rest, largest, track
 
 FELT = Surface(2e-3)  # behind the panel: no ball comes back from there
 LIGHT, HEAVY = 200.0, 7000.0  # kg/m3
@@ -115,6 +116,14 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return "yes" if last.box[3] < 0.75 * first.box[3] else "no"
 
 
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """Whether the pillar leans: it is wider in the picture than it was, or lower."""
+    first, last = largest(frames[0], named["pillar"], 80), largest(frames[-1], named["pillar"], 80)
+    if first is None or last is None or first.box[3] < 1.2 * first.box[2]:
+        return None
+    return "yes" if last.box[2] > 1.3 * first.box[2] or last.box[3] < 0.75 * first.box[3] else "no"
+
+
 FAMILY = scene_family(
     "topple",
     category="stacks",
@@ -133,6 +142,8 @@ FAMILY = scene_family(
         comes_from("From which side does the ball roll in on the ledge, left or right?"),
     ],
     observe=observe,
+    foresee=foresee,
+    look=lies_flat("pillar"),
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.03,
 )

@@ -14,17 +14,21 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import end_of
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import choice_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import SHADOW_BACK, SHADOW_RIGHT, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, colour_mask, track
+from traps_pipeline.scenes.vision import at_rest, colour_mask, largest, track
 
 STRIP_M = 0.16  # length of the strip that is rough or smooth
 FELT = Surface(2e-3)  # behind the panel: no ball comes back from there
 HALF_DEPTH_M = 0.11
 STILL_M = 0.003
-PLAY, PLAIN = apart("red", "green", "blue", "yellow", "orange", "cyan", "purple"), shuffled("wood", "grey", "white")
+COLOURS = "red", "green", "blue", "yellow", "orange", "cyan", "purple"
+PLAY, PLAIN = apart(*COLOURS), shuffled("wood", "grey", "white")
+
+GIVES = 0.25  # of its width: a block that is so far from its place falls
 
 
 @dataclass(frozen=True)
@@ -139,6 +143,24 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return "yes" if last.y - first.y > 0.7 * first.box[3] else "no"
 
 
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """Whether the block has left its place at the top, or leans over: from there it falls."""
+    first, last = largest(frames[0], named["top"], 60), largest(frames[-1], named["top"], 60)
+    if first is None or last is None:
+        return None
+    return "yes" if abs(last.x - first.x) + abs(last.y - first.y) > GIVES * first.box[2] else "no"
+
+
+def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """Whether a block of another colour is higher in the end than the named one, which was the highest."""
+    top = end_of(track(frames, named["top"], 60))
+    if top is None:
+        return None
+    others = [largest(frames[-1], colour, top.area // 3) for colour in COLOURS if colour != named["top"]]
+    higher = [other for other in others if other is not None and other.y < top.y - 0.5 * top.box[3]]
+    return "yes" if higher else "no"
+
+
 FAMILY = scene_family(
     "tower",
     category="stacks",
@@ -161,6 +183,8 @@ FAMILY = scene_family(
         comes_from("From which side does the ball come in on the ledge, left or right?"),
     ],
     observe=observe,
+    foresee=foresee,
+    look=look,
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.03,
 )

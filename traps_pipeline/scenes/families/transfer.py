@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import reaches
+from traps_pipeline.scenes.parts.observers import AHEAD, lies_on, reaches
 from traps_pipeline.scenes.parts.outcome import Reading, clear_m, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.ramp import SteppedRamp
@@ -136,5 +136,7 @@ FAMILY = scene_family(
         comes_from("From which side does the ball roll in, left or right?"),
     ],
     observe=reaches("block", "zone", foot=0.8),
+    foresee=reaches("block", "zone", foot=0.8, ahead=AHEAD),
+    look=lies_on("block", "zone"),
     min_margin_m=0.03,
 )

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import small
+from traps_pipeline.scenes.parts.observers import AHEAD, end_of, small
 from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_from, left_or_right
 from traps_pipeline.scenes.parts.ramp import Ramp
 from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, shuffled
-from traps_pipeline.scenes.vision import at_rest, largest
+from traps_pipeline.scenes.vision import largest
 
 FLOOR_M = 0.05
 TRAY_M = 0.02  # lower than the tunnel, so that no ball rolls back into it
@@ -124,11 +125,11 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(side_while(outside > 0, across, over="right", under="left"), float(outside[-1]))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
     """The side of the tunnel on which the ball lies at the end."""
     path = [small(frame, named["ball"]) for frame in frames[-3:]]
-    tunnel, ball = largest(frames[-1], named["tunnel"], 200), path[-1]
-    if ball is None or tunnel is None or not at_rest(path, tolerance_px=4):
+    tunnel, ball = largest(frames[-1], named["tunnel"], 200), end_of(path, ahead, tolerance_px=4)
+    if ball is None or tunnel is None:
         return None
     middle = tunnel.box[0] + tunnel.box[2] / 2
     if abs(ball.x - middle) < tunnel.box[2] / 3:
@@ -153,5 +154,6 @@ FAMILY = scene_family(
         colour_from("ball", "What colour is the ball that rolls down the ramp: {choices}?", NAMED, unlike=SEEN),
     ],
     observe=observe,
+    foresee=partial(observe, ahead=AHEAD),
     min_margin_m=0.02,
 )

@@ -13,7 +13,7 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, Vec3
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import past_far_edge
+from traps_pipeline.scenes.parts.observers import AHEAD, past_far_edge
 from traps_pipeline.scenes.parts.outcome import Reading, came_through
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import Stage, Surface
@@ -156,5 +156,6 @@ FAMILY = scene_family(
         colour_from("bridge", "What colour is the bridge: {choices}?", BALL_COLOURS, unlike=("ball", "bridge")),
     ],
     observe=past_far_edge("ball", "bridge"),
+    foresee=past_far_edge("ball", "bridge", ahead=AHEAD),
     min_margin_m=0.02,
 )

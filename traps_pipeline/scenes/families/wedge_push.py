@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene, add_box, uniform
 from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import AHEAD, end_of, lies_on
 from traps_pipeline.scenes.parts.outcome import Reading, still_from, yes_while
 from traps_pipeline.scenes.parts.questions import colour_of, comes_from, yes_no
 from traps_pipeline.scenes.parts.stage import Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, drawn_by, facing, hidden, one_of
-from traps_pipeline.scenes.vision import at_rest, largest, track
+from traps_pipeline.scenes.vision import largest, track
 
 TRACK_M = 0.03  # thickness of the track
 HALF_TRACK_M = 0.13
@@ -124,11 +126,11 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(yes_while(past > 0, still), float(abs(past[-1]) - p.wedge_length_m / 2))
 
 
-def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+def observe(frames: np.ndarray, named: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Whether the wedge, once at rest, stands before or within the mat as the first frame shows it."""
     path, mat = track(frames, named["wedge"], 100), largest(frames[0], named["mat"], 100)
-    last = path[-1]
-    if path[0] is None or last is None or mat is None or not at_rest(path):
+    last = end_of(path, ahead)
+    if path[0] is None or last is None or mat is None:
         return None
     return "yes" if abs(last.x - mat.x) < mat.box[2] / 2 else "no"
 
@@ -153,6 +155,8 @@ FAMILY = scene_family(
         comes_from("From which side does the ball roll in along the track, left or right?"),
     ],
     observe=observe,
+    foresee=partial(observe, ahead=AHEAD),
+    look=lies_on("wedge", "mat"),
     physics=Physics(timestep_s=0.001),
     min_margin_m=0.02,
 )

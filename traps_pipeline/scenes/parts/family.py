@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -14,7 +14,7 @@ from traps_pipeline.scenes.look import OF_OCCLUSION, dressed, look_of, with_look
 from traps_pipeline.scenes.parts import vary
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
-from traps_pipeline.scenes.vision import before_panel, without_flags
+from traps_pipeline.scenes.vision import after_panel, before_panel, still, without_flags
 
 USUAL_PHYSICS = Physics()
 
@@ -29,6 +29,8 @@ def scene_family(
     question: Question,
     asides: Sequence[Aside],
     observe: Observer,
+    foresee: Observer | None = None,
+    look: Observer | None = None,
     physics: Physics = USUAL_PHYSICS,
     min_margin_m: float = 0.005,
     sub_scenario: str | None = None,
@@ -40,9 +42,11 @@ def scene_family(
     """A family from its parts; `kit.Family` says what the other fields mean.
 
     Parameters with a hidden element make an occlusion family, whose twins follow from it; parameters without one make a
-    chaotic family. twins: other worlds than those, for a hidden element that is more than one field. sub_scenario: the
-    family's name unless it is given. looks: parts of the look that vary; unless they are given, all but the size in an
-    occlusion family, and none in a chaotic one.
+    chaotic family. observe: what is seen of the outcome. foresee: what follows from the frames before a panel, where
+    one comes before the outcome. look: what the end alone tells, where a panel hid the beginning and went. twins: other
+    worlds than those, for a hidden element that is more than one field. sub_scenario: the family's name unless it is
+    given. looks: parts of the look that vary; unless they are given, all but the size in an occlusion family, and none
+    in a chaotic one.
     """
     if twins is None and vary.hidden_field(params) is not None:
         twins = vary.twins
@@ -54,7 +58,13 @@ def scene_family(
         if frames.shape[1:3] != (HEIGHT, WIDTH):  # what an observer takes for large is so at this size
             frames = np.stack([cv2.resize(frame, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for frame in frames])
         shown = before_panel(frames)  # what a panel covers at the end was seen before it came
-        return observe(shown if twins is None else without_flags(shown), named)
+        unflagged = shown if twins is None else without_flags(shown)
+        if foresee is not None and len(shown) < len(frames):
+            return _first(unflagged, named, (observe, foresee) if still(shown) else (foresee, observe))
+        said = observe(unflagged, named)
+        if said is None and look is not None and len(end := after_panel(unflagged)) < len(unflagged):
+            return look(end, named)
+        return said
 
     params = with_look(params)
     return Family(
@@ -78,3 +88,8 @@ def scene_family(
         looks=(() if twins is None else OF_OCCLUSION) if looks is None else looks,
         check=vary.check,
     )
+
+
+def _first(frames: np.ndarray, named: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
+    """The answer of the first observer that has one."""
+    return next((said for observe in observers if (said := observe(frames, named)) is not None), None)

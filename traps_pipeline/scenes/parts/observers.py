@@ -1,20 +1,31 @@
 """What an observer sees, as values: each takes the frames and the words of the question, and answers or abstains.
 
 An `Observer(frames, named)` gets the sampled frames (N, 360, 480, 3) RGB and what the question names, read back from
-its templates: part -> colour, and 'choices'. It gives a label, or None if the decisive thing is not to be seen or not
-at rest. A `Finder(frame, colour)` finds one thing in one frame.
+its templates: part -> colour, and 'choices' where it offers some. It gives a label, or None if the decisive thing is
+not to be seen or not at rest. A `Finder(frame, colour)` finds one thing in one frame.
+
+An observer with `ahead` is for frames that end before the outcome: it asks for no rest, and takes a thing to go on for
+so many frames as it moved last.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from traps_pipeline.scenes.vision import Blob, at_rest, blobs, colour_mask, is_panel, largest, track
+from traps_pipeline.scenes.vision import Blob, at_rest, blobs, colour_mask, is_panel, largest, moved, track
+from traps_pipeline.scenes.wording import choices_in
 
 Observer = Callable[[np.ndarray, Mapping[str, str]], str | None]
 Finder = Callable[[np.ndarray, str], Blob | None]
+
+AHEAD = 1.5  # frames after which what is about to happen has happened
+BEGUN_PX = 3.0  # what is so far from its first place has left it
+FLIGHT = 3.0  # for so many frames a thing may fly on
+STRUCK = 0.2  # of a thing's area: so much changes where something moves at it
+LOST = 2  # for so many frames a moving thing may be out of sight
 
 
 # --- one thing in one frame -------------------------------------------------------------------------------------------
@@ -38,6 +49,17 @@ def compact(
     return None
 
 
+def offered(named: Mapping[str, str], otherwise: Sequence[str]) -> Sequence[str]:
+    """The choices that the question offers, or these where it offers none."""
+    return choices_in(named["choices"]) if "choices" in named else otherwise
+
+
+def colours_of_balls(frames: np.ndarray, named: Mapping[str, str], pool: Sequence[str]) -> Sequence[str]:
+    """The colours that the question offers; where it offers none, those of the pool that a ball has at first."""
+    seen = [colour for colour in pool if sum(compact(frame, colour) is not None for frame in frames[:3]) >= 2]
+    return offered(named, seen)
+
+
 def rounded(frame: np.ndarray, colour: str, *, fill: float = 0.9, longer: float = 1.9) -> Blob | None:
     """The largest region of a colour that may be a ball: neither as large nor as rectangular as a panel.
 
@@ -57,30 +79,68 @@ def upper_half_stays(frames: np.ndarray, colour: str, first: Blob) -> bool:
     return bool((before & after).sum() > 0.7 * before.sum())
 
 
+# --- where a thing comes to be ---------------------------------------------------------------------------------------
+
+
+def end_of(path: Sequence[Blob | None], ahead: float | None = None, tolerance_px: float = 1.5) -> Blob | None:
+    """The thing where it rests, None while it does not rest; with `ahead`, where it is so many frames later."""
+    if ahead is not None:
+        return carried_on(path, ahead)
+    return path[-1] if at_rest(path, tolerance_px=tolerance_px) else None
+
+
+def carried_on(path: Sequence[Blob | None], ahead: float) -> Blob | None:
+    """The thing so many frames after the last one, if it goes on as it was seen to move last; None if it has been out
+    of sight for longer than LOST frames."""
+    seen = [(at, blob) for at, blob in enumerate(path) if blob is not None]
+    if not seen or len(path) - 1 - seen[-1][0] > LOST:
+        return None
+    at, last = seen[-1]
+    if len(seen) == 1 or at - seen[-2][0] > LOST + 1:
+        return last
+    before, frames = seen[-2], ahead + len(path) - 1 - at
+    steps = frames / (at - before[0])
+    dx, dy = steps * (last.x - before[1].x), steps * (last.y - before[1].y)
+    x, y, width, height = last.box
+    return replace(last, x=last.x + dx, y=last.y + dy, box=(round(x + dx), round(y + dy), width, height))
+
+
+def struck(frames: np.ndarray, thing: Blob, reach: float) -> bool:
+    """Whether in the last step much moved at a thing, or so near it (in its longer sides)."""
+    return bool(moved(frames)[around(thing, reach)].sum() > STRUCK * thing.area)
+
+
+def around(thing: Blob, reach: float) -> tuple[slice, slice]:
+    """The part of a frame that a thing is in, with so much around it (in its longer sides)."""
+    x, y, width, height = thing.box
+    beside = round(reach * max(width, height))
+    return slice(max(0, y - beside), y + height + beside), slice(max(0, x - beside), x + width + beside)
+
+
 # --- observers --------------------------------------------------------------------------------------------------------
 
 
-def beyond(thing: str, mark: str) -> Observer:
+def beyond(thing: str, mark: str, ahead: float | None = None) -> Observer:
     """'yes' if the thing rests on the far side of the mark, seen from where it was first, else 'no'."""
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path, line = track(frames, named[thing], 60), largest(frames[-1], named[mark], 60)
-        start, end = next((blob for blob in path if blob), None), path[-1]
-        if line is None or start is None or end is None or not at_rest(path):
+        start, end = next((blob for blob in path if blob), None), end_of(path, ahead)
+        if line is None or start is None or end is None:
             return None
         return "yes" if (end.x - line.x) * (line.x - start.x) > 0 else "no"
 
     return observe
 
 
-def past_far_edge(thing: str, screen: str) -> Observer:
+def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observer:
     """'yes' if the thing rests past that edge of the screen which is farther from where it was first, else 'no'."""
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path = [small(frame, named[thing]) for frame in frames]
         start = next((blob.x for blob in path if blob), None)
-        wall, end = largest(frames[-1], named[screen], 200), path[-1]
-        if start is None or wall is None or end is None or not at_rest(path, tolerance_px=4):
+        wall, end = largest(frames[-1], named[screen], 200), end_of(path, ahead, tolerance_px=4)
+        if start is None or wall is None or end is None:
             return None
         left, width = wall.box[0], wall.box[2]
         return "yes" if (end.x > left + width if start < wall.x else end.x < left) else "no"
@@ -88,13 +148,13 @@ def past_far_edge(thing: str, screen: str) -> Observer:
     return observe
 
 
-def rests_over(thing: str, goal: str, find: Finder = compact) -> Observer:
+def rests_over(thing: str, goal: str, find: Finder = compact, ahead: float | None = None) -> Observer:
     """'yes' if the thing rests within the goal from left to right (2 px more to either side), else 'no'."""
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path = [find(frame, named[thing]) for frame in frames]
-        box, end = largest(frames[-1], named[goal], 60), path[-1]
-        if box is None or end is None or not at_rest(path):
+        box, end = largest(frames[-1], named[goal], 60), end_of(path, ahead)
+        if box is None or end is None:
             return None
         left, width = box.box[0], box.box[2]
         return "yes" if left - 2 <= end.x <= left + width + 2 else "no"
@@ -103,7 +163,14 @@ def rests_over(thing: str, goal: str, find: Finder = compact) -> Observer:
 
 
 def nearer_side(
-    thing: str, left: str, right: str, *, find: Finder = small, least: int = 60, tolerance_px: float = 1.5
+    thing: str,
+    left: str,
+    right: str,
+    *,
+    find: Finder = small,
+    least: int = 60,
+    tolerance_px: float = 1.5,
+    ahead: float | None = None,
 ) -> Observer:
     """'left' or 'right': which of two marks the resting thing is nearer to. left, right: what the question names, or
     colours; least: of the marks (pixels)."""
@@ -111,15 +178,15 @@ def nearer_side(
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path = [find(frame, named[thing]) for frame in frames[-3:]]
         marks = [largest(frames[-1], named.get(mark, mark), least) for mark in (left, right)]
-        end = path[-1]
-        if end is None or marks[0] is None or marks[1] is None or not at_rest(path, tolerance_px=tolerance_px):
+        end = end_of(path, ahead, tolerance_px)
+        if end is None or marks[0] is None or marks[1] is None:
             return None
         return "left" if abs(end.x - marks[0].x) < abs(end.x - marks[1].x) else "right"
 
     return observe
 
 
-def reaches(thing: str, goal: str, foot: float | None = None) -> Observer:
+def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | None = None) -> Observer:
     """'yes' if the thing rests nearer to the middle of the goal than to where it was first, else 'no'.
 
     foot: which share of the thing's height, from its top, stands for its place; None takes its middle.
@@ -130,8 +197,8 @@ def reaches(thing: str, goal: str, foot: float | None = None) -> Observer:
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path, box = track(frames, named[thing], 60), largest(frames[0], named[goal], 60)
-        first, last = path[0], path[-1]
-        if first is None or last is None or box is None or not at_rest(path) or is_panel(last) or is_panel(box):
+        first, last = path[0], end_of(path, ahead)
+        if first is None or last is None or box is None or is_panel(last) or is_panel(box):
             return None
         way = np.array([box.x, box.y]) - place(first)
         return "yes" if (place(last) - place(first)) @ way / (way @ way) > 0.6 else "no"
@@ -144,8 +211,68 @@ def has_fallen(thing: str) -> Observer:
 
     def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
         path = track(frames, named[thing], 60)
-        if path[0] is None or is_panel(path[0]) or not at_rest(path):
-            return None
+        if path[0] is None or is_panel(path[0]) or path[0].box[3] < path[0].box[2] or not at_rest(path):
+            return None  # neither a panel nor a flag stands like a domino
         return "no" if upper_half_stays(frames, named[thing], path[0]) else "yes"
 
     return observe
+
+
+def has_begun(thing: str, reach: float) -> Observer:
+    """'yes' if the thing has left the place where it was first, or is about to: what moves is so near it (in its longer
+    sides), else 'no'."""
+
+    def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+        first, last = largest(frames[0], named[thing], 60), largest(frames[-1], named[thing], 60)
+        if first is None or last is None or is_panel(first):
+            return None
+        left = np.hypot(last.x - first.x, last.y - first.y) > BEGUN_PX or not upper_half_stays(
+            frames, named[thing], first
+        )
+        return "yes" if left or struck(frames, last, reach) else "no"
+
+    return foresee
+
+
+def will_clear(thing: str, mark: str) -> Observer:
+    """'yes' if the thing is beyond the mark, or flies over its upper edge when it goes on as it does, else 'no'."""
+
+    def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+        path, wall = track(frames, named[thing], 60), largest(frames[-1], named[mark], 60)
+        start, now, then = next((blob for blob in path if blob), None), carried_on(path, 0.0), carried_on(path, 1.0)
+        if wall is None or start is None or now is None or then is None:
+            return None
+        side = 1.0 if wall.x > start.x else -1.0
+        lead, speed = side * (now.x - wall.x), side * (then.x - now.x)
+        if lead > 0:
+            return "yes"
+        if speed <= 0 or lead + FLIGHT * speed < 0:
+            return "no"  # it comes back, or does not get there
+        height = now.y - lead / speed * (then.y - now.y)
+        return "yes" if height < wall.box[1] else "no"
+
+    return foresee
+
+
+def lies_on(thing: str, goal: str) -> Observer:
+    """'yes' if the thing rests between the left and the right end of all that is seen of the goal, else 'no'."""
+
+    def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+        end = end_of(track(frames, named[thing], 60))
+        boxes = [blob.box for blob in blobs(colour_mask(frames[-1], named[goal]), 30)]
+        if end is None or not boxes:
+            return None
+        left, right = min(box[0] for box in boxes), max(box[0] + box[2] for box in boxes)
+        return "yes" if left < end.x < right else "no"
+
+    return look
+
+
+def lies_flat(thing: str) -> Observer:
+    """'yes' if the thing that should stand rests and is wider than high, 'no' if it is higher."""
+
+    def look(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+        end = end_of(track(frames, named[thing], 60))
+        return None if end is None else "yes" if end.box[2] > end.box[3] else "no"
+
+    return look
