@@ -16,6 +16,7 @@ from traps_pipeline.scenes.look import PANELS
 
 FLAG_PX = (60, 50)  # a flag is no wider and no higher
 PANEL_PX = 8000  # a panel that comes before a scene is larger, whatever moves is smaller
+EDGE = 60  # least contrast of an edge
 MOVED_PX = 24  # what moves changes more pixels from frame to frame
 CHANGED, ALIKE = 16, 12  # levels of 255: by more than these a pixel changes, by no more two are of one colour
 # Hue (degrees), least saturation and value (0-1) of the saturated colours. Shade lowers the value, not the hue.
@@ -100,6 +101,20 @@ def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
     return next(iter(blobs(cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, lines), min_area)), None)
 
 
+def slanting_edges(
+    frame: np.ndarray, part: tuple[slice, slice], slants: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where edges in a part of a frame fall to the left and where they fall to the right, bool of the part's shape.
+
+    slants: between how many rows a column they fall.
+    """
+    grey = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    across, down = (cv2.Sobel(grey, cv2.CV_32F, x, 1 - x)[part] for x in (1, 0))
+    slope = -across / np.where(down == 0, 1e-3, down)
+    edges = (np.hypot(across, down) > EDGE) & (np.abs(slope) > slants[0]) & (np.abs(slope) < slants[1])
+    return edges & (slope < 0), edges & (slope > 0)
+
+
 def track(frames: Sequence[np.ndarray] | np.ndarray, colour: str, min_area: int = 12) -> list[Blob | None]:
     """The largest region of a colour in every frame."""
     return [largest(frame, colour, min_area) for frame in frames]
@@ -139,6 +154,14 @@ def after_panel(frames: np.ndarray) -> np.ndarray:
 def moved(frames: np.ndarray) -> np.ndarray:
     """Where the last frame differs from the one before, bool (360, 480)."""
     return _apart(frames[-1], frames[-2]) > CHANGED if len(frames) > 1 else np.zeros(frames.shape[1:3], bool)
+
+
+def before_hold(frames: np.ndarray) -> np.ndarray:
+    """The frames without those at the end in which nothing moves any more; at least one."""
+    shown = len(frames)
+    while shown > 1 and moved(frames[:shown]).sum() < MOVED_PX:
+        shown -= 1
+    return frames[:shown]
 
 
 def still(frames: np.ndarray) -> bool:

@@ -15,12 +15,12 @@ import numpy as np
 
 from traps_pipeline.scenes.kit import AnswerableQuestion, Motion, Physics, Scene, uniform
 from traps_pipeline.scenes.parts.family import scene_family
-from traps_pipeline.scenes.parts.observers import rounded
+from traps_pipeline.scenes.parts.observers import carried_on, rounded
 from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import Aside, choice_of, either, left_or_right
 from traps_pipeline.scenes.parts.stage import SOFT, Stage, Surface, coloured
 from traps_pipeline.scenes.parts.vary import Drawn, apart, between, drawn_by, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import at_rest, colour_mask
+from traps_pipeline.scenes.vision import at_rest, colour_mask, largest, slanting_edges
 
 GRAVITY = 9.81
 FLOOR_M = 0.02  # thickness of the bins' floors
@@ -28,6 +28,8 @@ WALL_M = 0.014
 DEPTH_M = 0.15  # half of the bins' depth
 FELT = Surface(0.004, sliding=0.6, solref=SOFT)
 FREE = ("green", "yellow", "orange", "cyan", "purple")  # the bins are red and blue
+SLANTS = 0.8, 3.0  # rows a column, of the ridge's edges in the picture
+EDGE_PX = 60  # least length of the edges of either side
 PLAY, PLAIN = apart(*FREE), shuffled("grey", "black", "white")
 
 
@@ -144,6 +146,25 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     return "left" if abs(ball.x - red) < abs(ball.x - blue) else "right"
 
 
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """The side of the ridge's top on which the ball comes down. The top is halfway between the edges that fall to the
+    left and those that fall to the right; the ball meets it about half a frame later."""
+    ball = carried_on([rounded(frame, named["ball"]) for frame in frames], 0.5)
+    red, blue = (colour_mask(frames[0], colour) for colour in ("red", "blue"))
+    bins = [largest(frames[0], colour) for colour in ("red", "blue")]
+    if ball is None or bins[0] is None or bins[1] is None:
+        return None
+    left, right = np.flatnonzero(red.sum(axis=0) >= 4)[0], np.flatnonzero(blue.sum(axis=0) >= 4)[-1]
+    floor, wide = int(min(bins[0].y, bins[1].y)), int(right - left)
+    first = int(left + 0.2 * wide)
+    part = np.s_[max(0, floor - wide // 3) : floor, first : int(right - 0.2 * wide)]
+    halves = [np.nonzero(edges)[1] for edges in slanting_edges(frames[0], part, SLANTS)]
+    if min(len(columns) for columns in halves) < EDGE_PX:
+        return None
+    top = first + sum(float(columns.mean()) for columns in halves) / 2
+    return "right" if ball.x > top else "left"
+
+
 FAMILY = scene_family(
     "drop_split",
     category="trajectories_drops",
@@ -167,6 +188,7 @@ FAMILY = scene_family(
         _one_colour("cube", "What colour is the cube beside the bins: {choices}?"),
     ],
     observe=observe,
+    foresee=foresee,
     min_margin_m=0.08,
     twins=twins,
     looks=("bystanders", "camera", "light", "material", "panel"),

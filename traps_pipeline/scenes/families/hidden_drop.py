@@ -7,8 +7,11 @@ track and the chute look like; a board behind the bins catches the shadows.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import radians
+
+import numpy as np
 
 from traps_pipeline.scenes.kit import Motion, Physics, Scene
 from traps_pipeline.scenes.parts.family import scene_family
@@ -17,9 +20,12 @@ from traps_pipeline.scenes.parts.outcome import Reading, side_while
 from traps_pipeline.scenes.parts.questions import colour_from, comes_from, left_or_right
 from traps_pipeline.scenes.parts.stage import SHADOW_RIGHT, Span, Stage, Surface
 from traps_pipeline.scenes.parts.vary import apart, between, hidden, in_front, one_of, shuffled
+from traps_pipeline.scenes.vision import largest, slanting_edges
 
 WALL_M = 0.012
 NAMED = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
+EDGE_PX = 60  # least length of the plate's edges
+SLANTS = 0.36, 1.2  # rows a column, of the plate's edges in the picture
 PLAY, PLAIN = apart(*NAMED), shuffled("wood", "grey", "white")
 
 
@@ -113,6 +119,20 @@ def outcome(motion: Motion, p: Params) -> Reading:
     return Reading(side_while(ball[:, 2] < p.rim_m + p.radius_m, x, "right", "left"), float(abs(x[-1]) - p.radius_m))
 
 
+def foresee(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
+    """The side that the plate above the middle of the bins falls to, by the slopes of its edges in the picture."""
+    left, right = (largest(frames[0], named[side], 60) for side in ("left", "right"))
+    if left is None or right is None or left.x > right.x:
+        return None
+    middle, wide = (left.box[0] + left.box[2] + right.box[0]) / 2, (left.box[2] + right.box[2]) / 2
+    floor = min(left.y, right.y)
+    part = np.s_[max(0, int(floor - 0.75 * wide)) : int(floor), int(middle - 0.4 * wide) : int(middle + 0.4 * wide)]
+    to_left, to_right = (int(edges.sum()) for edges in slanting_edges(frames[0], part, SLANTS))
+    if max(to_right, to_left) < EDGE_PX:
+        return None
+    return "right" if to_right > to_left else "left"
+
+
 FAMILY = scene_family(
     "hidden_drop",
     category="hidden",
@@ -133,5 +153,6 @@ FAMILY = scene_family(
         comes_from("From which side does the ball roll in, left or right?"),
     ],
     observe=nearer_side("ball", "left", "right", tolerance_px=4),
+    foresee=foresee,
     min_margin_m=0.02,
 )

@@ -219,17 +219,36 @@ def _counts(p: Params, rng: np.random.Generator) -> Filled:
     return Filled(LABELS, aliases, {"choices": listed(LABELS), "zone": p.zone_colours[p.asked]})
 
 
+LAST_PEGS = 0.45  # of the board's width above the zones: so low a ball has the last rows of pegs before it
+
+
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """Count the balls inside the outline of the asked zone's ground, if all three lie inside some zone's."""
+    """Count the balls that are in the asked zone, or right above it on the last rows of pegs, if all are so low."""
     if named["zone"] not in ZONE_COLOURS:
         return None
     grounds = {colour: _ground(frames[-1], colour) for colour in ZONE_COLOURS}
     colours = sorted({colour for pool in BALL_COLOURS.values() for colour in pool})
     balls = [round_ball(frames[-1], colour) for colour in colours]
-    homes = [_home(ball, grounds) for ball in balls if ball is not None]
+    homes = [_home(ball, grounds) or _above(ball, grounds) for ball in balls if ball is not None]
     if len(homes) != BALLS or None in homes:
         return None
     return str(homes.count(named["zone"]))
+
+
+def _above(ball: Blob, grounds: Mapping[str, np.ndarray | None]) -> str | None:
+    """Colour of the zone that a ball is above, seen along the board; None while it has many pegs before it."""
+    outlines = {colour: ground[:, 0].astype(float) for colour, ground in grounds.items() if ground is not None}
+    if len(outlines) < 2:
+        return None
+    middles = sorted((outline.mean(axis=0) for outline in outlines.values()), key=lambda middle: middle[0])
+    along = (middles[-1] - middles[0]) / np.linalg.norm(middles[-1] - middles[0])
+    ends = {colour: ((outline @ along).min(), (outline @ along).max()) for colour, outline in outlines.items()}
+    width = max(end for _, end in ends.values()) - min(start for start, _ in ends.values())
+    offset = np.array([ball.x, ball.y]) - middles[0]
+    if not 0 < along[1] * offset[0] - along[0] * offset[1] < LAST_PEGS * width:
+        return None
+    at = np.array([ball.x, ball.y]) @ along
+    return next((colour for colour, (start, end) in ends.items() if start <= at <= end), None)
 
 
 def _ground(frame: np.ndarray, colour: str) -> np.ndarray | None:

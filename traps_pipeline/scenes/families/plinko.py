@@ -172,15 +172,16 @@ def _numbers(p: Params, rng: np.random.Generator) -> Filled:
     return Filled(labels, aliases, {"choices": listed(labels), "ball": p.ball_colours[0]})
 
 
-# In lengths of the apron's lower edge, which is as long as the board is wide (1.18 to 1.43 m): a ball that lies in a
-# bucket is 0.15 to 0.18 above that edge (more if it leans on another), one yet to enter a bucket at least 0.23.
-IN_BUCKET = 0.222
+# In lengths of the apron's lower edge, which is as long as the board is wide (1.18 to 1.43 m): a ball that is so far
+# above that edge has two rows of pegs before it at most. One that lies in a bucket is 0.15 to 0.18 above the edge.
+LAST_PEGS = 0.44
 INK = 0.025, 0.075  # where the middle of the digits is
 FRAME = 0.012  # share of that edge below the frame at either side
 
 
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
-    """The bucket above whose share of the apron's lower edge the ball is, if it is low enough to lie in one."""
+    """The bucket that the ball is above by its share of the apron's lower edge, if it lies there or will soon: of those
+    that two rows of pegs leave to it, the one right below is the likeliest."""
     last = frames[-1]
     if not any(named["ball"] in pool for pool in SCHEMES.values()):
         return None
@@ -191,7 +192,7 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     along, offset = right - left, np.array([ball.x, ball.y]) - left
     share = float(offset @ along / (along @ along) - FRAME) / (1 - 2 * FRAME)
     height = float(along[1] * offset[0] - along[0] * offset[1]) / float(along @ along)
-    if not (0 < share < 1 and 0 < height < IN_BUCKET):
+    if not (0 < share < 1 and 0 < height < LAST_PEGS):
         return None
     buckets = len(choices_in(named["choices"])) if "choices" in named else _digits(last, edge)
     return str(int(share * buckets) + 1) if buckets else None

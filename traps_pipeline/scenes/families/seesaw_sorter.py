@@ -10,7 +10,7 @@ cut decides the place. Boards, what stands beside them and the floor differ, so 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -20,6 +20,7 @@ import numpy as np
 from traps_pipeline.scenes.kit import Box, Inventory, Motion, Physics, Scene, View, add_box, listed, rgba, uniform
 from traps_pipeline.scenes.parts.board import WALL_M, Board, looking_on, peg_rows, place, turned
 from traps_pipeline.scenes.parts.family import scene_family
+from traps_pipeline.scenes.parts.observers import AHEAD, carried_on
 from traps_pipeline.scenes.parts.outcome import Reading, turns_deg
 from traps_pipeline.scenes.parts.questions import Filled, Question, choice_of, either
 from traps_pipeline.scenes.parts.stage import Surface
@@ -283,14 +284,35 @@ def _places(p: Params, rng: np.random.Generator) -> Filled:
     return Filled(tuple(CHOICES), aliases, {"choices": listed([CHOICES[str(label)] for label in order])})
 
 
+PAST_PEGS = 1.2  # bin widths above the bins: so low a ball has at most one row of pegs before it
+
+
 def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     """In which painted bin or tray the ball lies at the end, by the middle line of the red and the blue one; None
     while it is above that line."""
     red, blue = largest(frames[0], "red", 300), largest(frames[0], "blue", 300)
     if red is None or blue is None or blue.x <= red.x or not any(named["ball"] in pool for pool in BALLS.values()):
         return None
-    places = {_lies(_ball(frame, frames[0], named["ball"]), red, blue) for frame in frames[-3:]}
-    return places.pop() if len(places) == 1 else None
+    path = [_ball(frame, frames[0], named["ball"]) for frame in frames[-3:]]
+    places = {_lies(ball, red, blue) for ball in path}
+    seen = places.pop() if len(places) == 1 else None
+    return _falls(path, red, blue) if seen is None else seen
+
+
+def _falls(path: Sequence[Blob | None], red: Blob, blue: Blob) -> str | None:
+    """Where a ball that is past the pegs goes to: the side of the seesaw that it is on, if it goes on as it does, or
+    elsewhere if that is past its end; None before."""
+    now, soon = carried_on(path, 0.0), carried_on(path, AHEAD)
+    if now is None or soon is None:
+        return None
+    middle, along = np.array([red.x + blue.x, red.y + blue.y]) / 2, np.array([blue.x - red.x, blue.y - red.y])
+    bin_px = float(np.linalg.norm(along))  # from the middle of one bin to that of the other: as wide as each is
+    along = along / bin_px
+    above = (along[1] * (now.x - middle[0]) - along[0] * (now.y - middle[1])) / bin_px
+    if not 0 < above < PAST_PEGS:
+        return None
+    out = (np.array([soon.x, soon.y]) - middle) @ along / bin_px
+    return "elsewhere" if abs(out) > 1 else "right" if out > 0 else "left"
 
 
 def _ball(frame: np.ndarray, first: np.ndarray, colour: str) -> Blob | None:
