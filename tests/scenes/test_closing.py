@@ -18,7 +18,7 @@ from traps_pipeline.scenes.certificates import CLOSING, LEGIBLE, ORDER, pair_of
 from traps_pipeline.scenes.checks import control_frames
 from traps_pipeline.scenes.policies import last_of_all, shown_at_end
 from traps_pipeline.scenes.spec import SceneSpec
-from traps_pipeline.scenes.vision import before_panel
+from traps_pipeline.scenes.vision import after_panel, before_hold, before_panel
 from traps_pipeline.scenes.world import World
 
 FLOOR, NAVY, RED = (200, 200, 188), (18, 28, 71), (219, 26, 31)
@@ -146,6 +146,18 @@ def test_an_observer_looks_at_what_is_before_a_panel_that_comes() -> None:
 def test_a_panel_that_stands_from_the_start_that_goes_or_that_is_small_closes_nothing() -> None:
     for frames in (clip(), clip(0), clip(0, 20), clip(5, 20), clip(5, size=30), clip(0, 20)[::-1][5:]):
         assert len(before_panel(frames)) == len(frames)
+
+
+def test_frames_after_a_panel_that_stood_from_the_start_are_those_after_it_goes() -> None:
+    assert [len(after_panel(clip(0, until))) for until in (1, 12, 24)] == [24, 13, 1]
+    assert [len(after_panel(frames)) for frames in (clip(), clip(0), clip(5, 20))] == [25, 25, 25]
+
+
+def test_a_last_frame_that_is_held_is_shown_once() -> None:
+    moving = clip()
+    assert len(before_hold(moving)) == 25
+    assert len(before_hold(np.concatenate([moving[:8], np.repeat(moving[7:8], 17, axis=0)]))) == 8
+    assert len(before_hold(np.repeat(moving[:1], 5, axis=0))) == 1
 
 
 def test_a_large_thing_that_comes_to_rest_in_several_steps_is_no_panel() -> None:

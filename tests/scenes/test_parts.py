@@ -205,6 +205,45 @@ def test_what_rests_beyond_a_mark_is_seen_there() -> None:
     assert see(frames, {"ball": "red", "line": "purple"}) is None
 
 
+def moving(colour: str, xs: tuple[int, ...], ys: tuple[int, ...] | None = None) -> np.ndarray:
+    """Frames of a square that moves towards a blue mark at 250 px, 150 px high."""
+    frames = np.full((len(xs), 360, 480, 3), 200, np.uint8)
+    frames[:, 150:170, 240:260] = np.array(COLOURS["blue"]) * 255
+    for frame, x, y in zip(frames, xs, ys or (150,) * len(xs), strict=True):
+        frame[y : y + 20, x : x + 20] = np.array(COLOURS[colour]) * 255
+    return frames
+
+
+def test_what_moves_is_carried_on_as_it_moved_last() -> None:
+    named = {"ball": "red", "line": "blue"}
+    foresee = observers.beyond("ball", "line", ahead=1.5)
+    assert foresee(moving("red", (40, 110, 180)), named) == "yes"  # 180 + 1.5 * 70 px
+    assert foresee(moving("red", (40, 170, 180)), named) == "no"
+    lost = moving("red", (40, 110, 180, 200))
+    lost[3, 150:170, 200:220] = 200  # behind something: where it was last is where it goes on from
+    path = [observers.compact(frame, "red") for frame in lost]
+    end = observers.carried_on(path, 1.0)
+    assert path[-1] is None and end is not None and abs(end.x - (189.5 + 2 * 70)) < 1
+    assert observers.carried_on([*path, None, None], 1.0) is None  # for too long
+    assert observers.end_of(path) is None  # it does not rest
+
+
+def test_what_flies_over_a_mark_clears_it_and_what_flies_lower_does_not() -> None:
+    named, foresee = {"ball": "red", "wall": "blue"}, observers.will_clear("ball", "wall")
+    assert foresee(moving("red", (100, 160, 210), (60, 70, 90)), named) == "yes"
+    assert foresee(moving("red", (100, 160, 210), (140, 145, 150)), named) == "no"
+    assert foresee(moving("red", (100, 210, 160), (60, 70, 90)), named) == "no"  # it comes back
+
+
+def test_what_was_struck_has_begun_and_what_nothing_moves_at_has_not() -> None:
+    named, foresee = {"last": "blue"}, observers.has_begun("last", reach=0.25)
+    assert foresee(moving("red", (40, 110, 180)), named) == "no"
+    assert foresee(moving("red", (40, 150, 220)), named) == "yes"  # it is upon it
+    pushed = moving("red", (40, 110, 180))
+    pushed[2] = np.roll(pushed[2], 6, axis=1)
+    assert foresee(pushed, named) == "yes"
+
+
 def test_a_finder_takes_what_has_the_size_and_shape_of_a_ball() -> None:
     frame = np.full((360, 480, 3), 200, np.uint8)
     frame[150:170, 100:160] = np.array(COLOURS["red"]) * 255  # three times as wide as high
