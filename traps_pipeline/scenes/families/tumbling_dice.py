@@ -244,7 +244,7 @@ def _edges(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 # --- what one sees ----------------------------------------------------------------------------------------------------
 
 NEAR_PX = 3.5  # of the place where a die lies
-SLOW_PX = 16.0  # between two sampled frames, as a mean: a die tumbles no more
+SLOW_PX = 11.0  # between two sampled frames, as a mean: a die tumbles no more
 LAST_STEP_PX = 5.0  # between two sampled frames, when a die slides to rest
 
 
