@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ import pytest
 
 import traps_pipeline.definitions  # noqa: F401 - declares the graph
 from tests import objectstore
+from tests.forked import FORKS
 from tests.objectstore import S3
 from tests.postgres import LACKING, Postgres, programs
 from tests.providers.server import Provider
@@ -75,9 +75,13 @@ class Checkout:
         out, err = process.communicate()
         return Finished(process.returncode, out, err)
 
+    def python(self, *arguments: str | Path) -> Finished:
+        """Run Python in the checkout, with `-m MODULE` or `-c CODE`, forked from a process that has the libraries."""
+        return Finished(*FORKS.run(arguments, self.root, self.environment))
+
     def traps(self, *arguments: str | Path) -> Finished:
         """Run a `traps` command."""
-        return self.run(sys.executable, "-m", "traps_pipeline.cli", *arguments)
+        return self.python("-m", "traps_pipeline.cli", *arguments)
 
     def score(self, experiment: str | Path) -> Finished:
         """`traps run` up to the leaderboard: most tests have nothing to see in the figures and pages after it."""
@@ -85,7 +89,7 @@ class Checkout:
 
     def dagster(self, *arguments: str | Path) -> Finished:
         """Run a `dagster` command."""
-        return self.run(sys.executable, "-m", "dagster", *arguments)
+        return self.python("-m", "dagster", *arguments)
 
     def correct(self, scenario_id: str, action: str = "correct", **changes: Any) -> None:
         """Append a review decision."""

@@ -55,7 +55,7 @@ with dg.DagsterInstance.get() as history:
 
 
 def stale_in_dagster(study: Checkout) -> list[str]:
-    finished = study.run(sys.executable, "-W", "ignore", "-c", STALE)
+    finished = study.python("-c", STALE)
     assert finished.code == 0, finished.err
     return json.loads(finished.out.splitlines()[-1])
 
@@ -212,7 +212,7 @@ def test_an_added_scenario_joins_and_a_copy_is_told_by_every_run_until_it_is_gon
     assert len(Workspace.open(whole.workspace).tables.read_all(RESPONSES)) == 2 * (8 + 6 + 1)
     assert "check clips_distinct of videos hidden does not pass" in whole.traps("status").out
     materialize(whole, "videos", "dominoes")  # another category passes, exit code 0; the failure stays Dagster's newest
-    latest = whole.run(sys.executable, "-W", "ignore", "-c", LATEST, "videos", "clips_distinct")
+    latest = whole.python("-c", LATEST, "videos", "clips_distinct")
     assert latest.out.split() == ["FAILED", "hidden"], latest.err
     study.correct("hidden_race-9001", params={"azimuth_deg": params["azimuth_deg"] + 3.0})
     run = whole.traps("run", tmp_path / "whole.yaml", "--until", "responses")

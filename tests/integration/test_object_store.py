@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +12,7 @@ import pytest
 
 from bench.equality import main as compare
 from tests.conftest import ROOT, SMALL, Checkout, Finished
+from tests.forked import FORKS
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from traps_pipeline.storage.objects import ObjectStore
@@ -36,9 +35,7 @@ class Host:
     def traps(self, *arguments: str | Path) -> Finished:
         own = {"TRAPS_WORKSPACE": ADDRESS, "TRAPS_SCRATCH": str(self.scratch), "PYTHONPATH": str(ROOT)}
         environment = {name: value for name, value in os.environ.items() if name != "DAGSTER_HOME"} | own
-        command = [sys.executable, "-m", "traps_pipeline.cli", *map(str, arguments)]
-        done = subprocess.run(command, cwd=ROOT, env=environment, text=True, capture_output=True, check=False)
-        return Finished(done.returncode, done.stdout, done.stderr)
+        return Finished(*FORKS.run(["-m", "traps_pipeline.cli", *arguments], ROOT, environment))
 
     @property
     def root(self) -> Path:

@@ -41,7 +41,7 @@ print(json.dumps({
 
 
 def known(study: Checkout) -> dict:
-    finished = study.run(sys.executable, "-W", "ignore", "-c", VERSIONS)
+    finished = study.python("-c", VERSIONS)
     assert finished.code == 0, finished.err
     return json.loads(finished.out.splitlines()[-1])
 
@@ -211,7 +211,7 @@ with dg.DagsterInstance.get() as history:
         history.report_engine_event("begun", run)
         history.handle_run_event(run.run_id, dg.DagsterEvent(dg.DagsterEventType.RUN_START.value, job.name))
 """
-    begun = study.run(sys.executable, "-W", "ignore", "-c", code)
+    begun = study.python("-c", code)
     assert begun.code == 0, begun.err
     assert study.traps("run", EXPERIMENT, "--until", "items").code == 0
     states = """
@@ -220,7 +220,7 @@ with dg.DagsterInstance.get() as history:
     runs = [run for run in history.get_runs() if run.tags.get("traps/pid") == "999999999"]
     print(sorted((run.tags["traps/host"], run.status.value) for run in runs))
 """
-    found = study.run(sys.executable, "-W", "ignore", "-c", states).out
+    found = study.python("-c", states).out
     assert "('another machine', 'STARTED')" in found and found.count("FAILURE") == 1, found
 
 

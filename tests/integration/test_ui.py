@@ -223,12 +223,11 @@ def test_a_selection_of_stages_over_all_their_partitions_is_one_click(study: Che
         )
     assert not stale(study)  # from the same inputs the same content: nothing below is outdated
     # Meanwhile a page of another site, and one whose name was bound to this machine, do what they can.
-    history = (sys.executable, "-W", "ignore", "-c", HISTORY)
-    before_attack = study.run(*history).out
+    before_attack = study.python("-c", HISTORY).out
     port = int(server.rsplit(":", 1)[1])
     seen = attack(port, _launch("items"), [(f"traps-ui-{port}", TOKEN)])
     assert seen and set(seen) <= {"refused", "opaque"}
-    assert study.run(*history).out == before_attack and before_attack.endswith("False\n")
+    assert study.python("-c", HISTORY).out == before_attack and before_attack.endswith("False\n")
 
 
 def _launch(asset: str) -> list[str]:
@@ -282,4 +281,4 @@ with dg.DagsterInstance.get() as history:
 
 
 def failures(study: Checkout, table: Table) -> str:
-    return study.run(sys.executable, "-W", "ignore", "-c", FAILURES, table.name).out
+    return study.python("-c", FAILURES, table.name).out

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -169,7 +168,7 @@ def test_an_input_that_changes_while_a_stage_is_at_work_leaves_the_stage_stale(
     examined: tuple[Checkout, Finished],
 ) -> None:
     study, _ = examined
-    walked = study.run(sys.executable, "-W", "ignore", "-c", MEANWHILE)
+    walked = study.python("-c", MEANWHILE)
     assert walked.code == 0, walked.err
     found = [json.loads(line.removeprefix("MADE ")) for line in walked.out.splitlines() if line.startswith("MADE ")]
     assert [one["stage"] for one in found] == walked.out.splitlines()[0].removeprefix("STAGES ").split()
