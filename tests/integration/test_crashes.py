@@ -33,8 +33,10 @@ def tables(root: Path) -> dict[str, pd.DataFrame]:
 
 
 def assert_same_tables(one: Path, other: Path) -> None:
-    for name, frame in tables(one).items():
-        pd.testing.assert_frame_equal(frame, tables(other)[name], obj=name)
+    ours, theirs = tables(one), tables(other)
+    assert ours.keys() == theirs.keys()
+    for name, frame in ours.items():
+        pd.testing.assert_frame_equal(frame, theirs[name], obj=name)
 
 
 def rows_written(study: Checkout, kind: str) -> int:
@@ -46,9 +48,9 @@ def start(study: Checkout) -> subprocess.Popen[str]:
 
 
 def wait_for_rows(study: Checkout, process: subprocess.Popen[str], kind: str, count: int) -> None:
-    while rows_written(study, kind) < count:
+    while (written := rows_written(study, kind)) < count:
         assert process.poll() is None, process.communicate()
-        time.sleep(0.002)
+        time.sleep(0.002 if written else 0.02)  # it takes seconds to begin, and then moments
 
 
 def test_kills_while_answering_and_voting_leave_the_same_tables_and_no_call_is_made_twice(

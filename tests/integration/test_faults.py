@@ -88,8 +88,8 @@ def killed_at(study: Checkout, command: Sequence[str], call: str, number: int, w
     held = strace(log, "-e", f"inject={call}:delay_{when}={HELD_US}:when={number}")
     process = study.start(*held, sys.executable, "-m", "traps_pipeline.cli", *command)
     with ThreadPoolExecutor(1) as reader:  # what is printed is read, or the command would wait for a reader
-        said = reader.submit(process.communicate)
-        while not said.done() and (thread := reached(log, call, number)) is None:
+        said, begun = reader.submit(process.communicate), Begun(log, call)
+        while not said.done() and (thread := begun.reached(number)) is None:
             wait([said], timeout=0.02)
         if not said.done() and thread is not None:
             os.kill(thread, signal.SIGKILL)
@@ -98,11 +98,24 @@ def killed_at(study: Checkout, command: Sequence[str], call: str, number: int, w
     return Finished(process.returncode, out, err)
 
 
-def reached(log: Path, call: str, number: int) -> int | None:
-    """The thread that has begun so many calls of a name, None if none has."""
-    lines = log.read_text() if log.exists() else ""
-    begun = Counter(int(thread) for thread in re.findall(rf"^(\d+) +{call}\(", lines, re.MULTILINE))
-    return next((thread for thread, n in begun.items() if n >= number), None)
+class Begun:
+    """How many calls of a name each thread has begun, from a log that grows: of each look only what is new is read."""
+
+    def __init__(self, log: Path, call: str) -> None:
+        self._log, self._call, self._at = log, re.compile(rf"^(\d+) +{call}\(", re.MULTILINE), 0
+        self._counts = Counter[str]()
+
+    def reached(self, number: int) -> int | None:
+        """The thread that has begun so many, None if none has. A call that is held is a line without its end."""
+        if not self._log.exists():
+            return None
+        with self._log.open("rb") as stream:
+            stream.seek(self._at)
+            whole, end, last = stream.read().rpartition(b"\n")
+        self._at += len(whole + end)
+        self._counts.update(self._call.findall(whole.decode()))
+        counts = self._counts + Counter(self._call.findall(last.decode()))
+        return next((int(thread) for thread, n in counts.items() if n >= number), None)
 
 
 def begun(
