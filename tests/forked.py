@@ -1,8 +1,9 @@
 """Commands in processes of their own that need not import the libraries: they are forked from one that has them.
 
 Importing Dagster, SQLAlchemy, pandas and others is most of what a short command does, and the tests give hundreds. Only
-libraries are there beforehand, nothing of this package, and none that reads its settings as it is imported. Who wants a
-process to be started in full (to be killed, traced or timed) starts the interpreter; so does a shell.
+libraries are there beforehand, nothing of this package, and none that reads its settings as it is imported, but for
+litellm, which has those that `models.api` imports it with (tests/models/test_api.py tries that import itself). Who
+wants a process to be started in full (to be killed, traced or timed) starts the interpreter; so does a shell.
 
 `python tests/forked.py FD` serves a test process over a socket until that ends. Once it has forked, the new process
 goes on as the command, and ends as any interpreter does.
@@ -57,7 +58,16 @@ LIBRARIES = (
     "cv2",
     "av",
     "PIL.Image",
+    "litellm",
+    "litellm.llms.custom_httpx.http_handler",
+    "litellm.integrations.custom_logger",
+    "openai.types.responses",
 )
+SETTINGS = {
+    "LITELLM_MODE": "PRODUCTION",
+    "LITELLM_LOCAL_MODEL_COST_MAP": "True",
+    "LITELLM_LOCAL_ANTHROPIC_BETA_HEADERS": "True",
+}
 # Anything else in the environment may have been read when the process started that commands are forked from.
 FREE = ("TRAPS_", "DAGSTER_HOME", "PYTHONPATH", "PYTEST_", "AWS_")
 MOST = 150_000  # bytes of a message; an environment has a few thousand
@@ -181,6 +191,7 @@ def become(asked: Mapping[str, Any], base: Sequence[str]) -> None:
 
 if __name__ == "__main__":
     sys.path.pop(0)  # the folder of this file, which no command has
+    os.environ.update(SETTINGS)
     for library in LIBRARIES:
         importlib.import_module(library)
     assert threading.active_count() == 1, threading.enumerate()  # no other thread would live on in a fork
