@@ -1,0 +1,39 @@
+"""What is at rest is not drawn again, and looks as if it were."""
+
+from __future__ import annotations
+
+from unittest.mock import patch
+
+import mujoco
+import numpy as np
+import pytest
+
+from tests.scenes.released import load
+from traps_pipeline.scenes.world import World
+
+
+@pytest.mark.slow
+def test_a_pose_that_stays_is_drawn_once_and_looks_as_if_drawn_again() -> None:
+    case = load("hidden_drop-0001")
+    world = World.of_record(case.spec, case.qpos)
+    last = case.qpos[-4:]
+    assert (last == last[0]).all()  # the ball lies
+    with patch.object(mujoco, "mjr_render", wraps=mujoco.mjr_render) as drawn, world.renderer() as renderer:
+        (before,) = renderer.frames(case.qpos[:1])
+        already = drawn.call_count
+        resting = list(renderer.frames(last))
+        assert drawn.call_count == already + 1
+        # Behind the panel, without a part, and by segments the same pose is another picture.
+        (behind,) = renderer.frames(last[:1], panel=True)
+        (without,) = renderer.frames(last[:1], without=world.concealed)
+        seen = renderer.visible_pixels(last[:2], world.geoms)
+        (again,) = renderer.frames(last[:1])
+        assert drawn.call_count == already + 5
+    assert (seen[0] == seen[1]).all() and seen.sum() > 0
+    for frame in (*resting, again):
+        assert np.array_equal(frame, resting[0])
+    others = (before, behind, without)
+    assert not any(np.array_equal(frame, resting[0]) for frame in others)
+    with world.renderer() as renderer:  # each after another pose
+        order = [case.qpos[0], last[0], case.qpos[0], last[1]]
+        assert all(np.array_equal(frame, resting[0]) for frame in list(renderer.frames(order))[1::2])
