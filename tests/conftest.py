@@ -142,8 +142,9 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what needs a service as slow, and let the last two workers begin with it: the one with what waits for
-    Dagster's daemon, the other with what takes longest besides. (At first each worker is dealt an equal part of the
-    items, in their order.) So the studies that all wait for are made early, and none ends alone with something long."""
+    Dagster's daemon, the other with what takes longest besides, the longest first. (At first each worker is dealt an
+    equal part of the items, in their order.) So the studies that all wait for are made early, and none ends alone with
+    something long."""
     groups: tuple[list[pytest.Item], ...] = ([], [], [])
     for item in items:
         if SERVICES & set(getattr(item, "fixturenames", ())):
@@ -152,6 +153,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         else:
             groups[0].append(item)
     rest, longest, services = groups
+    longest.sort(key=lambda item: next(k for k, name in enumerate(LONGEST) if name in item.nodeid))
     services.sort(key=lambda item: "test_ui" not in item.nodeid)
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     first, second = (max(0, len(items) * k // workers) for k in (workers - 2, workers - 1))
