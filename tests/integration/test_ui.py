@@ -12,7 +12,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -31,19 +31,20 @@ from traps_pipeline.storage.workspace import Workspace
 pytestmark = pytest.mark.slow
 TOKEN = "token-of-the-user-interface"
 RUN_SECONDS = 600  # nine times what a busy machine of two cores takes
+PAUSE_S = 3
 
 
-def wait_until(condition: Callable[[], bool], seconds: float, what: str) -> None:
+def wait_until(condition: Callable[[], bool], seconds: float, what: str, *, pause_s: float = 0.3) -> None:
+    """pause_s: between two looks; one that starts a command would keep a core from what is waited for."""
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until, f"not within {seconds} s: {what}"
-        time.sleep(0.3)
+        time.sleep(pause_s)
 
 
-@pytest.fixture
-def server(request: pytest.FixtureRequest) -> Iterator[str]:
-    """`make ui`'s command on a free port: web server and daemon, of the study that the test names."""
-    study: Checkout = request.getfixturevalue("fresh" if "fresh" in request.fixturenames else "study")
+@contextmanager
+def serving(study: Checkout) -> Iterator[str]:
+    """`make ui`'s command on a free port: web server and daemon of a study."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -75,6 +76,19 @@ def server(request: pytest.FixtureRequest) -> Iterator[str]:
         log.close()
 
 
+@pytest.fixture(scope="module")
+def study(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Checkout:
+    """A copy of the small study under one server, which takes as long to start as a test: each test of it leaves it
+    current, but for what a correction leaves to be asked in the last one."""
+    return copied(small, tmp_path_factory.mktemp("served"))
+
+
+@pytest.fixture(scope="module")
+def server(study: Checkout) -> Iterator[str]:
+    with serving(study) as url:
+        yield url
+
+
 def _answers(url: str) -> bool:
     try:
         asked = urllib.request.Request(url, headers={"Authorization": f"Bearer {TOKEN}"})
@@ -83,8 +97,8 @@ def _answers(url: str) -> bool:
         return False
 
 
-@pytest.fixture
-def page(server: str) -> Iterator[Page]:
+@contextmanager
+def browsing(server: str) -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
         page = patient(browser.new_page(viewport={"width": 1600, "height": 1000}))
@@ -92,6 +106,12 @@ def page(server: str) -> Iterator[Page]:
         expect.set_options(timeout=60_000)
         yield page
         browser.close()
+
+
+@pytest.fixture
+def page(server: str) -> Iterator[Page]:
+    with browsing(server) as page:
+        yield page
 
 
 CELL = "chaotic_ill_posed|prior__json__run1"
@@ -153,10 +173,12 @@ def fresh(small: Checkout, tmp_path: Path) -> Checkout:
     return study
 
 
-def test_materialize_all_goes_from_an_empty_history_to_the_report(
-    fresh: Checkout, server: str, page: Page, tmp_path: Path
-) -> None:
-    study = fresh
+def test_materialize_all_goes_from_an_empty_history_to_the_report(fresh: Checkout, tmp_path: Path) -> None:
+    with serving(fresh) as server, browsing(server) as page:
+        materialize_all(fresh, server, page, tmp_path)
+
+
+def materialize_all(study: Checkout, server: str, page: Page, tmp_path: Path) -> None:
     hosts = set[str]()
     page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
     shows(page, f"{server}/asset-groups", "benchmark", "evaluation", "scoring", "report")
@@ -172,37 +194,6 @@ def test_materialize_all_goes_from_an_empty_history_to_the_report(
     page.get_by_role("tab", name="Execution history").click()
     page.screenshot(path=tmp_path / "failed.png")
     assert hosts == {server.removeprefix("http://")}
-
-
-def test_a_correction_is_followed_alone_where_it_is_free_and_by_one_click_where_it_is_paid(
-    study: Checkout, server: str, page: Page
-) -> None:
-    rows, before = (
-        len(study.ledger_rows("answers")),
-        {n: written(study, n) for n in ("metrics", "report_page")},
-    )
-    time.sleep(INTERVAL_S / 3)  # the daemon has seen everything current
-    study.correct("plinko-0003", ill_posed_question="Why is the little triangle beside the board singing?")
-    tables = Workspace.open(study.workspace).tables
-
-    def followed() -> bool:
-        asked = tables.read_all(ITEMS, ["question"], dataset="chaotic_ill_posed")["question"]
-        return bool((asked == "Why is the little triangle beside the board singing?").sum() == 1)
-
-    wait_until(followed, 20 * INTERVAL_S, "free stages follow a correction")
-    time.sleep(2 * INTERVAL_S)
-    assert len(study.ledger_rows("answers")) == rows  # nothing is asked before the click
-    launch_job(page, server, "evaluation")
-    wait_until(
-        lambda: (
-            written(study, "report_page") != before["report_page"] and written(study, "metrics") != before["metrics"]
-        ),
-        RUN_SECONDS,
-        "what hangs on the answers follows alone",
-    )
-    assert len(study.ledger_rows("answers")) == rows + 3 * 2  # one item, of each model under each regime
-    # Labels of confabulations are asked by the job `scoring`; all else is current again.
-    wait_until(lambda: {*stale(study)} <= {"confabulation"}, RUN_SECONDS, "everything that was asked for is current")
 
 
 def stale(study: Checkout) -> list[str]:
@@ -250,9 +241,8 @@ def test_an_altered_table_is_a_failed_check_before_anything_below_uses_it(
     altered = table.set_column(table.schema.get_field_index("question"), table.schema.field("question"), [questions])
     pq.write_table(altered, path)
     before = written(study, "responses")
-    wait_until(
-        lambda: "is not what was written" in failures(study, ITEMS), RUN_SECONDS, "the daemon names the altered table"
-    )
+    named = "the daemon names the altered table"
+    wait_until(lambda: "is not what was written" in failures(study, ITEMS), RUN_SECONDS, named, pause_s=PAUSE_S)
     page.goto(f"{server}/assets/items?view=checks&checkDetail=current")
     page.screenshot(path=tmp_path / "altered.png")
     # What is free is made again by itself, from what it was made of; nothing below has used it meanwhile.
@@ -266,6 +256,38 @@ def test_an_altered_table_is_a_failed_check_before_anything_below_uses_it(
 
     wait_until(made_again, RUN_SECONDS, "the altered table is made again")
     assert written(study, "responses") == before
+
+
+def test_a_correction_is_followed_alone_where_it_is_free_and_by_one_click_where_it_is_paid(
+    study: Checkout, server: str, page: Page
+) -> None:
+    rows, before = (
+        len(study.ledger_rows("answers")),
+        {n: written(study, n) for n in ("metrics", "report_page")},
+    )
+    time.sleep(INTERVAL_S / 3)  # the daemon has seen everything current
+    study.correct("plinko-0003", ill_posed_question="Why is the little triangle beside the board singing?")
+    tables = Workspace.open(study.workspace).tables
+
+    def followed() -> bool:
+        asked = tables.read_all(ITEMS, ["question"], dataset="chaotic_ill_posed")["question"]
+        return bool((asked == "Why is the little triangle beside the board singing?").sum() == 1)
+
+    wait_until(followed, 20 * INTERVAL_S, "free stages follow a correction")
+    time.sleep(2 * INTERVAL_S)
+    assert len(study.ledger_rows("answers")) == rows  # nothing is asked before the click
+    launch_job(page, server, "evaluation")
+    wait_until(
+        lambda: (
+            written(study, "report_page") != before["report_page"] and written(study, "metrics") != before["metrics"]
+        ),
+        RUN_SECONDS,
+        "what hangs on the answers follows alone",
+    )
+    assert len(study.ledger_rows("answers")) == rows + 3 * 2  # one item, of each model under each regime
+    # Labels of confabulations are asked by the job `scoring`; all else is current again.
+    current = "everything that was asked for is current"
+    wait_until(lambda: {*stale(study)} <= {"confabulation"}, RUN_SECONDS, current, pause_s=PAUSE_S)
 
 
 # What failed results of an asset's check `current` say, newest first.
