@@ -125,7 +125,8 @@ def sample_family(
             yield Draw(name, seed, number, _closed(answers, count, family), tuple(parts))
 
     said: set[str] = set()  # kinds of rejections that the report has
-    results = run_in_order(try_draw, jobs(), workers)
+    # A draw takes seconds, and those that were begun are waited for: no more than could all be wanted.
+    results = run_in_order(try_draw, jobs(), workers, ahead=len(places))
     try:
         for draw, found in results:
             tally.draws += 1

@@ -21,9 +21,10 @@ Result = TypeVar("Result")
 
 
 def run_in_order(
-    function: Callable[[Job], Result], jobs: Iterable[Job], workers: int | None = None
+    function: Callable[[Job], Result], jobs: Iterable[Job], workers: int | None = None, *, ahead: int | None = None
 ) -> Iterator[tuple[Job, Result]]:
-    """Results of a picklable function over jobs, in their order. Jobs are taken late: a few ahead of what is yielded.
+    """Results of a picklable function over jobs, in their order. Jobs are taken late: a few ahead of what is yielded,
+    and no more than `ahead` at a time, for who may want no further result soon.
 
     A GL context belongs to a process, so each worker keeps its own. Closing the iterator cancels what has not begun.
     """
@@ -32,11 +33,13 @@ def run_in_order(
     more = True
     while more:  # a fresh pool for each round: recycling inside a pool can deadlock (CPython 3.11)
         batch = islice(source, workers * JOBS_A_WORKER)
-        more = yield from _one_pool(function, batch, workers)
+        more = yield from _one_pool(function, batch, workers, min(2 * workers - 1, ahead or 2 * workers - 1))
 
 
-def _one_pool(function: Callable[[Job], Result], batch: Iterator[Job], workers: int) -> Iterator[tuple[Job, Result]]:
-    first = list(islice(batch, 2 * workers - 1))  # a job begun cannot be cancelled: one worker never runs ahead
+def _one_pool(
+    function: Callable[[Job], Result], batch: Iterator[Job], workers: int, ahead: int
+) -> Iterator[tuple[Job, Result]]:
+    first = list(islice(batch, ahead))  # a job begun cannot be cancelled: one worker never runs ahead
     if not first:
         return False
     context = get_context("spawn")
