@@ -104,7 +104,7 @@ def check_clip(path: Path, sha256: str, size_bytes: int) -> None:
 
 
 def render_pair(job: Job) -> int:
-    """Render and encode what is missing of a pair and its twin; returns the number of frames drawn into clips.
+    """Render and encode what is missing of a pair and its twin; returns how many frames are new in clips.
 
     The twin's clip is its control: the other world as it is when nothing hides it.
     """
@@ -138,7 +138,9 @@ def _render_control_and_void(job: Job, family: Family, physics: Physics, missing
             save_clip(job.control, control, physics.fps)
         if job.void in missing and panel is not None:
             decisive = decisive_geoms(model, scene.decisive)
-            void = list(renderer.frames(job.qpos, panel=True))
+            closed = control[open_frames:]  # behind the same panel: these are not drawn again
+            open_to = len(job.qpos) - len(closed)
+            void = [*renderer.frames(job.qpos[:open_to], panel=True), *closed]
             drawn += save_clip(job.void, void, physics.fps, _leaked_pixels(renderer, scene, decisive, job))
         elif job.void in missing:
             save_clip(job.void, control[: spec.void["cut_frame"]], physics.fps)
