@@ -91,7 +91,8 @@ class Forks:
         if _bound(environment) != _bound(self._environment) or len(asked) > MOST:
             quiet = ("-W", "ignore") if what[0] == "-c" else ()
             command = [sys.executable, *quiet, *request["what"]]
-            done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+            how: Any = {"capture_output": True, "text": True, "check": False, "start_new_session": True}
+            done = subprocess.run(command, cwd=folder, env=environment, **how)
             return done.returncode, done.stdout, done.stderr
         with TemporaryFile() as out, TemporaryFile() as err:
             ours, theirs = socket.socketpair()
