@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -60,7 +61,7 @@ def test_the_graph_is_there_once_the_definitions_are_imported(tmp_path: Path) ->
     code = "from traps_pipeline.orchestration.graph import the_graph\n"
     code += "try: the_graph()\nexcept RuntimeError as error: print(error)\n"
     code += "import traps_pipeline.definitions\nprint(len(the_graph().stages) > 10)"
-    finished = Checkout(ROOT, tmp_path).python("-c", code)
+    finished = Checkout(ROOT, tmp_path).run(sys.executable, "-W", "ignore", "-c", code)
     assert "import traps_pipeline.definitions first" in finished.out and finished.out.endswith("True\n"), finished.err
 
 
