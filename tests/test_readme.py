@@ -28,8 +28,9 @@ def in_this_study(study: Checkout, command: str) -> str:
     command = command.replace("mine.yaml", str(study.root / "mine.yaml")).replace(
         ".workspaces/mine", str(study.workspace.parent / "mine")
     )
-    # The real Makefile of the real checkout, on this study; its set-up is there already, or is made.
-    return f"{command} -C {ROOT} DEMO={study.workspace}" if command.startswith("make") else command
+    # The real Makefile of the real checkout, on this study, but no set-up: in a checkout whose environment is another's
+    # (a link) it would install this one there.
+    return f"{command} -C {ROOT} -o .venv/.core DEMO={study.workspace}" if command.startswith("make") else command
 
 
 def run(study: Checkout, command: str) -> Finished:
