@@ -32,10 +32,11 @@ fast-tests: setup
 test: test-packages cluster-setup ## lint, types and all tests, the slow ones too
 	$(MAKE) --no-print-directory -j2 lint all-tests
 
+# Nothing that tests need may lack here (TRAPS_TEST_ALL); elsewhere what lacks is skipped, and named.
 # What is compiled is copied to the checkouts of the tests, whose hundreds of commands would each compile it again.
 all-tests: setup
 	$(BIN)/python -m compileall -q traps_pipeline
-	$(PYTEST) -n 3
+	TRAPS_TEST_ALL=1 $(PYTEST) -n 3
 
 # Of these `make test` has a small version (tests/integration/test_cluster.py).
 test-cluster: cluster-setup ## a study on two nodes of Ray, one killed in mid-run, against a run of one process; tests of runs

@@ -19,6 +19,7 @@ import pytest
 import traps_pipeline.definitions  # noqa: F401 - declares the graph
 from tests import objectstore
 from tests.forked import FORKS
+from tests.lacking import lack, need
 from tests.objectstore import S3
 from tests.postgres import LACKING, Postgres, programs
 from tests.providers.server import Provider
@@ -308,8 +309,8 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
 def postgres() -> Iterator[Postgres]:
     """A server for the tests of a process, each of which uses a study of its own."""
     if programs() is None:
-        pytest.skip(LACKING)
-    pytest.importorskip("psycopg", reason="psycopg is not installed; `pip install -e '.[dev]'` brings it")
+        lack(LACKING)
+    need("psycopg", what="psycopg is not installed; `pip install -e '.[dev]'` brings it")
     with Postgres.running() as server:
         yield server
 
@@ -318,6 +319,6 @@ def postgres() -> Iterator[Postgres]:
 def s3() -> Iterator[S3]:
     """A server for the tests of a process, each of which uses a study of its own; its keys are in the environment."""
     if not objectstore.is_installed():
-        pytest.skip(objectstore.LACKING)
+        lack(objectstore.LACKING)
     with S3.running() as server, objectstore.exported(server):
         yield server

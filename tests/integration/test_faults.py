@@ -24,6 +24,7 @@ import pytest
 
 from tests.conftest import Checkout, Finished, copied, copy_workspace, forget_answers
 from tests.integration.test_crashes import ONE_REGIME, assert_same_tables
+from tests.lacking import lack
 from tests.mechanism.test_stages_run import with_mechanism
 
 pytestmark = pytest.mark.slow
@@ -88,7 +89,7 @@ def killed_at(study: Checkout, command: Sequence[str], call: str, number: int, w
     held = strace(log, "-e", f"inject={call}:delay_{when}={HELD_US}:when={number}")
     process = study.start(*held, sys.executable, "-m", "traps_pipeline.cli", *command)
     with ThreadPoolExecutor(1) as reader:  # what is printed is read, or the command would wait for a reader
-        said, begun = reader.submit(process.communicate), Begun(log, call)
+        said, begun, thread = reader.submit(process.communicate), Begun(log, call), None
         while not said.done() and (thread := begun.reached(number)) is None:
             wait([said], timeout=0.02)
         if not said.done() and thread is not None:
@@ -123,7 +124,7 @@ def begun(
 ) -> Campaign:
     """A campaign against a study, which is run once for the number of its calls."""
     if shutil.which("strace") is None:
-        pytest.skip("strace is not installed (make test installs it)")
+        lack("strace is not installed (make test installs it)")
     start(study)
     log = study.root / "calls"
     finished = traced(study, command, log)

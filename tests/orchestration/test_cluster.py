@@ -97,9 +97,9 @@ class Shown(Progress):
         super().__init__()
         self.notes, self.stages = list[str](), list[tuple[str, int]]()
 
-    def stage(self, name: str, n: int) -> None:
+    def stage(self, name: str, partitions: int) -> None:
         """See `Progress`."""
-        self.stages.append((name, n))
+        self.stages.append((name, partitions))
 
     def note(self, text: str) -> None:
         """See `Progress`."""

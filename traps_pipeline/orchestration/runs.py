@@ -97,7 +97,7 @@ def batches(
         rows, columns = (
             [str(k) for k in d.partitions_def.get_partition_keys()] for d in scheme.definition.partitions_defs
         )
-        pairs = [str(key).partition("|")[::2] for key in keys]
+        pairs = [(row, column) for row, _, column in (str(key).partition("|") for key in keys)]
     else:
         rows, columns = [""], [str(key) for key in scheme.definition.get_partition_keys()]
         pairs = [("", str(key)) for key in keys]
