@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from tests.pocket.test_pocket import FEW, _one_thread, data, examined_study, recipe
+from tests.pocket.test_card import examined_study
+from tests.pocket.test_pocket import FEW, _one_thread, data, recipe
 from tests.remedies.remedied import remedied
 from traps_pipeline.mechanism.tables import HIDDEN_STATES
 from traps_pipeline.pocket import commands, inside

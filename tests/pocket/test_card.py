@@ -1,0 +1,162 @@
+"""The pocket model's card: what it claims is what its tables have, over training seeds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.mechanism.study import filled
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.mechanism.control_tables import GATE, PATCHING, STEERING_NULLS
+from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
+from traps_pipeline.models.local.checkpoint import folder_digest
+from traps_pipeline.pocket import inside
+from traps_pipeline.pocket.commands import CARD, EVALUATION, FACTS, MARKS, MECHANISM_FIGURES, MECHANISM_MARKS, WEIGHTS
+from traps_pipeline.pocket.evaluate import MODEL, markdown, read_cells
+from traps_pipeline.pocket.planted import planted
+from traps_pipeline.pocket.recipe import load_recipe
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.slow
+
+
+def in_card(marks: tuple[str, str]) -> str:
+    return CARD.read_text().partition(marks[0])[2].partition(marks[1])[0].strip()
+
+
+def test_the_card_shows_the_shipped_counts() -> None:
+    cells = read_cells(EVALUATION)
+    assert in_card(MARKS) == markdown(cells)
+    assert in_card(MECHANISM_MARKS) == inside.markdown(inside.read_figures(MECHANISM_FIGURES))
+    recipe = load_recipe()
+    assert {(cell.family, cell.regime) for cell in cells} == {
+        (family, regime) for family in recipe.scenes for regime in ("standard", "guided", "json")
+    }
+    assert {cell.n for cell in cells} == {recipe.held_out}
+
+
+def test_the_card_says_which_of_the_named_families_it_reads_and_which_not() -> None:
+    """It reads a family if under every regime the lower bound of Acc is 30 points above the commonest answer."""
+    controls = [cell for cell in read_cells(EVALUATION) if cell.kind == "control"]
+    above: dict[str, float] = {}
+    for cell in controls:
+        margin = cell.accuracy_low - cell.prior / cell.n
+        above[cell.family] = min(above.get(cell.family, 1.0), margin)
+    read = {family for family, margin in above.items() if margin >= 0.3}
+    assert read == {"drop_split", "ramp_deflect"}
+    assert {family for family, margin in above.items() if margin <= 0} == set(above) - read
+    assert {(cell.seed, cell.family, cell.regime) for cell in controls if cell.abstained} == {
+        (2, "plinko", "guided"),
+        (3, "plinko", "guided"),
+    }
+    assert all(cell.correct <= cell.prior for cell in controls if cell.family == "plinko")
+    card = " ".join(CARD.read_text().split())
+    assert "Every seed reads both occlusion families, and none reads plinko" in card
+    assert "two things differ from seed 1" in card and "**seed 2 above it**" in card  # of seesaw_sorter
+    assert "three training seeds" in card.replace("**", "") and {cell.seed for cell in controls} == {1, 2, 3}
+
+
+def test_the_card_says_of_every_seed_whether_the_time_stamps_have_the_effect_that_was_wanted() -> None:
+    """At most .1 in size was wanted: two seeds have it, and the one that ships has not."""
+    found = {
+        figure.seed: figure.value
+        for figure in inside.read_figures(MECHANISM_FIGURES)
+        if (figure.figure, figure.kind) == ("planted", "stamps")
+    }
+    assert {seed for seed, effect in found.items() if abs(effect) <= 0.1} == {2, 3} == found.keys() - {1}
+    card = " ".join(CARD.read_text().split())
+    assert "Seeds 2 and 3 have -.02 and .03. Seed 1 has -.27" in card
+    assert "it excludes 0, and is beyond .1 in size" in card
+    assert [round(found[seed], 2) for seed in (1, 2, 3)] == [-0.27, -0.02, 0.03]
+
+
+# --- what was found inside, over seeds --------------------------------------------------------------------------------
+
+
+def examined_study(root: Path, seed: int, area: float, share: float) -> Workspace:
+    """A finished workspace of one seed: its weights with their facts, and the tables that the card reads."""
+    weights = root / f"seed{seed}" / WEIGHTS
+    weights.mkdir(parents=True)
+    (weights / "model.safetensors").write_bytes(bytes([seed]))
+    (weights.parent / FACTS).write_text(json.dumps({"seed": seed, "weights": f"{seed}" * 64}))
+    workspace, extraction = Workspace.create(root / f"inside{seed}", Study()), {"model": MODEL, "prompt": "standard"}
+    states = filled(HIDDEN_STATES, dataset="chaotic", **extraction, checkpoint=str(weights),
+                    checkpoint_digest=folder_digest(weights))  # fmt: skip
+    workspace.tables.write(HIDDEN_STATES, {"dataset": "chaotic", **extraction}, [states], {})
+    common = {**extraction, "scope": "all", "source": "occlusion", "target": "chaotic"}
+    probes = [
+        filled(PROBES, **common, analysis="transfer", layer=layer, value=value, own_best=layer == 2,
+               source_best=layer == 1)
+        for layer, value in ((1, area - 0.1), (2, area))
+    ]  # fmt: skip
+    workspace.tables.write(PROBES, extraction, probes, {})
+    shares = [
+        filled(STEERING_SHARES, model=MODEL, path_set="all", directions="all", regime=regime, kind="void", layer=3,
+               alpha=alpha, side="void", abstention=value, low=value - 0.1, high=value + 0.2, n_answers=28,
+               n_scenarios=10)
+        for regime, alpha, value in (("all", 0.0, 0.75), ("all", 10.0, share), ("guided", 10.0, 0.01))
+    ]  # fmt: skip
+    workspace.tables.write(STEERING_SHARES, {}, shares, {})
+    return workspace
+
+
+def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Path) -> None:
+    table = tmp_path / "mechanism.csv"
+    for seed, area, share in ((1, 1.0, 0.5), (2, 0.8, 0.25)):
+        made = examined_study(tmp_path, seed, area, share)
+        inside.write_figures(table, inside.figures_of(made))
+        inside.write_figures(table, inside.figures_of(made))  # the same seed again takes its own place
+    found = inside.read_figures(table)
+    assert [figure.seed for figure in found] == [1] * 4 + [2] * 4
+    lines = inside.markdown(found).splitlines()
+    assert not any("planted" in line for line in lines)  # the study has none of these figures
+    assert "| Cross-domain | 0.900 (0.800-1.000) | 2 | 0.800 (0.700-0.900) | 1 |" in lines
+    assert "| voids, void directions | 75.0 (75.0-75.0) | 37.5 (25.0-50.0) | 15.0-70.0 | 28 | 10 |" in lines
+    assert lines[-1] == "Training seeds: 1, 2."
+
+
+def test_figures_of_weights_that_lie_there_no_more_are_refused(tmp_path: Path) -> None:
+    workspace = examined_study(tmp_path, 3, 1.0, 0.5)
+    (tmp_path / "seed3" / FACTS).unlink()
+    with pytest.raises(TrapsError, match="does not name the seed"):
+        inside.figures_of(workspace)
+    (tmp_path / "seed3" / WEIGHTS / "model.safetensors").write_bytes(b"others")
+    with pytest.raises(TrapsError, match="that folder now has other weights or none"):
+        inside.figures_of(workspace)
+
+
+def test_what_was_planted_is_read_from_the_tables_of_the_controls(tmp_path: Path) -> None:
+    workspace, at = examined_study(tmp_path, 4, 1.0, 0.5), {"model": MODEL, "prompt": "standard"}
+    effect = {"dataset": "chaotic", "source": "pair", "site": "residual", "group": "stamps"}
+    patched = [
+        filled(PATCHING, **at, **effect, into=into, layer=layer, effect=value)
+        for into, layer, value in (("control", 0, 0.02), ("void", 0, 0.06), ("void", 1, 0.9))
+    ]
+    workspace.tables.write(PATCHING, at, patched, {})
+    for dataset, regime, said in (
+        ("chaotic", "standard", False),
+        ("chaotic", "guided", True),
+        ("decoy", "guided", False),
+    ):
+        part = {"dataset": dataset, "model": MODEL, "regime": regime, "run": 1}
+        side = "control" if dataset == "decoy" else "void"
+        rows = [filled(VERDICTS, **part, item_id=f"{dataset}:{n}", side=side, abstained=said) for n in range(3)]
+        workspace.tables.write(VERDICTS, part, rows, {})
+    gated = {"features": "states", "source": "other datasets", "threshold": "mid", "target": "decoy", "false_abs": 0.25}
+    workspace.tables.write(GATE, at, [filled(GATE, **at, **gated)], {})
+    ranks = (("chaotic", "void", 2 / 21), ("chaotic", "control", 3 / 21), ("all", "void", 1.0))
+    nulls = [
+        filled(STEERING_NULLS, model=MODEL, target=name, null="isotropic", side=side, p=p) for name, side, p in ranks
+    ]
+    workspace.tables.write(STEERING_NULLS, {}, nulls, {})
+    assert planted(workspace, MODEL) == {
+        **{"stamps": pytest.approx(0.04), "standard": 0.0, "guided": 1.0, "decoy_guided": 0.0},
+        **{"decoy_gate": 0.25, "nulls": 0.5},
+    }
+    lines = inside.markdown(inside.figures_of(workspace)).splitlines()
+    assert "| AbsRec under guided, % | 30 points above | 100.0 |" in lines
+    assert "| indirect effect of the time stamps at layer 0, chaotic | at most 0.1 | 0.040 |" in lines
