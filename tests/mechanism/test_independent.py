@@ -1,0 +1,330 @@
+"""Everything that is done inside a model, once more without this package: plain transformers and scikit-learn on a
+network of its own. From the package come the inputs (clips, prompts, the tokens whose odds are the outcome) and what is
+compared: states and probes exactly, steered texts row by row, effects of patches to 1e-5."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
+from sklearn.preprocessing import StandardScaler
+
+from tests import local_models
+from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.made_answers import MadeAnswers
+from traps_pipeline.mechanism.margin import abstention_tokens
+from traps_pipeline.mechanism.patching import SITES, Patch, Site, patched_changes, record, require_patchable
+from traps_pipeline.mechanism.probes import Solver, auroc, fit_probe
+from traps_pipeline.mechanism.steered_backend import SteeredBackend
+from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
+from traps_pipeline.models.local.library import load_transformers
+from traps_pipeline.models.local.prefixes import resumable
+from traps_pipeline.models.local.tiny import build_tiny
+from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.models.request import Request
+from traps_pipeline.scenes.encode import encode
+from traps_pipeline.storage.media import Frames, MediaSpec, sample
+
+pytestmark = pytest.mark.slow
+POCKET = "pocket"
+PATCHABLE = ("qwen3-vl", "llava-next-video", POCKET)
+NEW_TOKENS = 8
+each = pytest.mark.parametrize("name", [*FAMILIES, POCKET])
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A checkpoint in memory twice. of: the package's. network: the library's own."""
+
+    entry: ModelEntry
+    of: LocalModel
+    network: Any
+
+    @property
+    def decoder(self) -> Any:
+        return self.network.model.language_model
+
+    def shown(self, clip: Path) -> Frames:
+        return sample(clip, cast(MediaSpec, self.entry.media))
+
+    def prompt(self, frames: np.ndarray, times_s: np.ndarray, question: str = QUESTIONS[1]) -> Prompt:
+        return self.of.prompt(SYSTEM, question, frames, times_s)
+
+
+@cache
+def _folder() -> TemporaryDirectory[str]:
+    return TemporaryDirectory(prefix="independent-")
+
+
+@cache
+def subject(name: str) -> Subject:
+    """The pocket model, or the tiny random one of a family; Qwen3-VL's with a vision tower whose deepstack features are
+    as large as its states, so that it shows who forgets them."""
+    if name == POCKET:
+        entry = get_model(POCKET)
+    else:
+        family, folder = cast(Family, name), Path(_folder().name) / name
+        loud = {"initializer_range": 0.2} if name == "qwen3-vl" else None
+        entry = local_models.entry(family, build_tiny(family, folder, vision=loud))
+    of = load_local_model(entry, inside=True)
+    network = load_transformers().AutoModelForImageTextToText.from_pretrained(
+        of.checkpoint.folder, dtype=torch.float32, attn_implementation="sdpa", local_files_only=True
+    )
+    return Subject(entry, of, network.eval())
+
+
+def hooked(module: Any, hook: Callable[..., Any], before: bool = False) -> Callable[[], None]:
+    """A forward hook, or one that sees the arguments; returns what removes it."""
+    made = module.register_forward_pre_hook(hook, with_kwargs=True) if before else module.register_forward_hook(hook)
+    return made.remove
+
+
+def first(output: Any) -> torch.Tensor:
+    return output[0] if isinstance(output, tuple) else output
+
+
+# --- states and probes ------------------------------------------------------------------------------------------------
+
+
+def plain_states(of: Subject, prompt: Prompt) -> np.ndarray:
+    """(layers + 2, d), of the last token: embeddings, each block's output, the last one after the final norm."""
+    raw: list[torch.Tensor] = []
+    remove = hooked(of.decoder.layers[-1], lambda _, __, output: raw.append(first(output)))
+    with torch.no_grad():
+        out = of.network(**prompt.inputs, output_hidden_states=True, use_cache=False)
+    remove()
+    own = [*out.hidden_states[:-1], *raw, out.hidden_states[-1]]
+    return np.stack([states[0, -1].numpy() for states in own])
+
+
+@cache
+def many(name: str) -> tuple[list[Prompt], np.ndarray]:
+    """Sixteen prompts about noise, one half of them darker, and which these are."""
+    of, rng, dark = subject(name), np.random.default_rng(0), np.arange(16) % 2 == 1
+    shown = of.shown(local_models.clip())
+    noise = [rng.integers(0, 190 if is_dark else 256, shown.frames.shape, np.uint8) for is_dark in dark]
+    return [of.prompt(frames, shown.times_s) for frames in noise], dark
+
+
+@each
+def test_states_of_every_layer_are_the_librarys_own_to_the_bit(name: str) -> None:
+    of = subject(name)
+    for prompt in many(name)[0][:4]:
+        own, found = plain_states(of, prompt), of.of.forward_states(prompt)
+        assert found.raw.shape == (of.of.n_layers + 1, of.of.d_model)
+        assert np.array_equal(own, np.vstack([found.raw, found.normed]))
+
+
+@each
+def test_probes_score_as_scikit_learns_pipeline_does(name: str) -> None:
+    of, (prompts, dark) = subject(name), many(name)
+    own = np.stack([plain_states(of, prompt) for prompt in prompts])
+    found = np.stack([of.of.forward_states(prompt).raw for prompt in prompts])
+    seen = np.arange(len(dark)) < 10
+    for layer in range(1, of.of.n_layers + 1):
+        scale = StandardScaler().fit(own[seen, layer].astype(float))
+        fitted = LogisticRegression(C=1.0, solver="newton-cg", tol=1e-10, max_iter=100_000)
+        fitted.fit(scale.transform(own[seen, layer].astype(float)), dark[seen])
+        expected = fitted.decision_function(scale.transform(own[:, layer].astype(float)))
+        solvers: dict[Solver, float] = {"exact": 1e-6, "sklearn": 1e-9}
+        for solver, close in solvers.items():
+            scores = fit_probe(found[seen, layer], dark[seen], solver).scores(found[:, layer].astype(float))
+            assert scores == pytest.approx(expected, abs=close)
+            assert float(auroc(dark[~seen], scores[~seen])) == roc_auc_score(dark[~seen], expected[~seen])
+
+
+# --- steering ---------------------------------------------------------------------------------------------------------
+
+
+def plain_answer(of: Subject, prompt: Prompt, layer: int, added: np.ndarray | None) -> str:
+    """One row, no batch, the library's whole `generate` from the pixels, with one hook that adds a vector."""
+    places = [of.of.processor.image_token_id, of.of.processor.video_token_id]
+    if hasattr(of.of.processor, "audio_token_id"):
+        places.append(of.of.processor.audio_token_id)
+    with ExitStack() as hooks:
+        if added is not None:
+            vector = torch.from_numpy(added)
+
+            def add(_: Any, __: Any, output: Any) -> Any:
+                return (output[0] + vector, *output[1:]) if isinstance(output, tuple) else output + vector
+
+            hooks.callback(hooked(of.decoder.layers[layer - 1], add))
+        with torch.no_grad():
+            made = of.network.generate(
+                **prompt.inputs, do_sample=False, max_new_tokens=NEW_TOKENS, suppress_tokens=sorted(places)
+            )
+    return of.of.processor.tokenizer.decode(made[0, prompt.n_tokens :], skip_special_tokens=True).strip()
+
+
+@cache
+def other_clip() -> Path:
+    """Stripes that move downwards."""
+    lines = np.arange(72)[:, None, None]
+    frames = [np.broadcast_to(((lines + 3 * i) // 12 % 2) * np.array([40, 90, 250]), (72, 96, 3)) for i in range(20)]
+    path = Path(_folder().name) / "other.mp4"
+    encode([np.ascontiguousarray(frame.astype(np.uint8)) for frame in frames], path, 10)
+    return path
+
+
+@each
+def test_a_sheet_of_steered_answers_is_what_a_plain_hook_gives_row_by_row(name: str, tmp_path: Path) -> None:
+    """Batched, resumed at the steered block and with clips seen once, against none of these."""
+    of, layer = subject(name), 2
+    rng = np.random.default_rng(1)
+    drawn = rng.normal(size=(2, of.of.d_model))
+    vectors = {f"v{k}": (v / np.linalg.norm(v)).astype(np.float32) for k, v in enumerate(drawn)}
+    asked = [(local_models.clip(), QUESTIONS[0]), (local_models.clip(), QUESTIONS[1]), (other_clip(), QUESTIONS[1])]
+    shown = {clip: of.shown(clip) for clip, _ in asked}
+    prompts = [of.prompt(shown[clip].frames, shown[clip].times_s, question) for clip, question in asked]
+    length = float(np.linalg.norm(plain_states(of, prompts[0])[layer]))
+    sheet = [*product(range(3), vectors, (-length, 0.5 * length, 2 * length))]
+    rows: list[tuple[int, dict[str, Any] | None]] = [(number, None) for number in range(3)]  # unsteered ones between
+    rows += [(number, {"direction": key, "layer": layer, "alpha": alpha}) for number, key, alpha in sheet]
+    requests = [
+        Request(
+            POCKET, "local", {"max_new_tokens": NEW_TOKENS, "steering": steering}, SYSTEM, asked[number][1], {},
+            media=asked[number][0], media_digest=asked[number][0].name,
+        )
+        for number, steering in rows
+    ]  # fmt: skip
+    backend = SteeredBackend(of.entry, vectors, MadeAnswers(tmp_path, len(requests)))
+    before = of.of.prefixes.used, of.of.clips.used
+    found = [outcome.text or "" for outcome in backend.generate(requests, lambda: False)]
+    if resumable(of.of):
+        assert of.of.prefixes.used >= before[0] + len(sheet) - 3
+    if of.of.clips.passes:  # of classes whose features come clip by clip
+        assert of.of.clips.used > before[1]
+    expected = []
+    for number, steering in rows:
+        added = None if steering is None else np.float32(steering["alpha"]) * vectors[steering["direction"]]
+        expected.append(plain_answer(of, prompts[number], layer, added))
+    assert found == expected
+    assert len(set(found)) > 4, "the rows must differ, or nothing is compared"
+
+
+# --- patching ---------------------------------------------------------------------------------------------------------
+
+
+def plain_pass(of: Subject, prompt: Prompt, hooks: ExitStack) -> torch.Tensor:
+    with hooks, torch.no_grad():
+        return of.network(**prompt.inputs, use_cache=False).logits[0, -1].double()
+
+
+def plain_margin(of: Subject, logits: torch.Tensor, tokens: list[int]) -> float:
+    """Log-odds of the tokens against all others that an answer may begin with."""
+    places = {of.of.processor.image_token_id, of.of.processor.video_token_id}
+    rest = [token for token in range(len(logits)) if token not in places and token not in tokens]
+    return float(torch.logsumexp(logits[tokens], 0) - torch.logsumexp(logits[rest], 0))
+
+
+def module_of(of: Subject, site: Site, layer: int) -> Any:
+    """Where a site is replaced. A residual is replaced where it is read: at the next block, or at the final norm."""
+    if site == "residual":
+        return of.decoder.layers[layer] if layer < len(of.decoder.layers) else of.decoder.norm
+    return getattr(of.decoder.layers[layer - 1], {"attention": "self_attn", "mlp": "mlp"}[site])
+
+
+def plain_patch(
+    of: Subject, target: Prompt, source: Prompt, at: tuple[Site, int], chosen: torch.Tensor, features: bool = True
+) -> torch.Tensor:
+    """Logits of the target, from its pixels, with what the source has at some positions of a site. What is added to the
+    residual stream behind the block that reads it (deepstack) is the source's at these positions, too, but for a naive
+    patch without these features."""
+    kept: dict[str, Any] = {}
+    module, reading, layer = module_of(of, *at), at[0] == "residual", at[1]
+
+    def keep(_: Any, args: Any, output: Any) -> None:
+        kept["states"] = first(args if reading else output).clone()
+
+    def keep_features(_: Any, __: Any, kwargs: dict[str, Any]) -> None:
+        kept["features"] = kwargs.get("deepstack_visual_embeds")
+
+    def swapped(states: torch.Tensor) -> torch.Tensor:
+        return torch.where(chosen[None, :, None], kept["states"], states)
+
+    def swap_read(_: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+        return (swapped(args[0]), *args[1:]), kwargs
+
+    def swap_made(_: Any, __: Any, output: Any) -> Any:
+        return (swapped(output[0]), *output[1:]) if isinstance(output, tuple) else swapped(output)
+
+    def swap_features(_: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+        visual = chosen[kwargs["visual_pos_masks"][0]][:, None]
+        both = zip(kept["features"], kwargs["deepstack_visual_embeds"], strict=True)
+        mixed = [
+            own if number < layer else torch.where(visual, theirs, own) for number, (theirs, own) in enumerate(both)
+        ]
+        return args, kwargs | {"deepstack_visual_embeds": mixed}
+
+    hooks = ExitStack()
+    hooks.callback(hooked(module, keep))
+    hooks.callback(hooked(of.decoder, keep_features, before=True))
+    plain_pass(of, source, hooks)
+    hooks = ExitStack()
+    hooks.callback(hooked(module, swap_read, before=True) if reading else hooked(module, swap_made))
+    if reading and features and kept["features"] is not None:
+        hooks.callback(hooked(of.decoder, swap_features, before=True))
+    return plain_pass(of, target, hooks)
+
+
+def groups_of(of: Subject, prompt: Prompt) -> dict[str, torch.Tensor]:
+    """Positions by their token ids alone: visual tokens, every third of them, what stands before and between them
+    (system prompt and time stamps), time stamps, question and end, all."""
+    ids, kind = prompt.inputs["input_ids"][0], of.of.processor
+    visual = ids == kind.video_token_id
+    places = visual.nonzero()[:, 0]
+    some = torch.zeros_like(visual)
+    some[places[::3]] = True
+    behind = torch.arange(len(ids)) > places[-1]
+    found = {"visual": visual, "some": some, "before": ~visual & ~behind, "behind": behind, "all": visual | ~visual}
+    if "qwen3" in type(of.network).__name__.lower():  # <|vision_start|><0.2 seconds><|vision_start|>...<|vision_end|>
+        marks = (ids == kind.vision_start_token_id) | (ids == kind.vision_end_token_id)
+        found["stamps"] = ~visual & ~marks & ~behind & (torch.arange(len(ids)) > marks.nonzero()[0, 0])
+    return found
+
+
+@pytest.mark.parametrize("name", PATCHABLE)
+def test_effects_of_patches_are_those_of_plain_hooks_at_every_site_and_group(name: str) -> None:
+    of = subject(name)
+    here, there = of.shown(local_models.clip()), of.shown(other_clip())
+    target = of.prompt(here.frames, here.times_s)
+    turned = QUESTIONS[1].replace("left, right", "right, left")
+    source = of.prompt(there.frames, there.times_s + 7, turned)
+    tokens, groups = abstention_tokens(of.of), groups_of(of, target)
+    recorded = [record(of.of, prompt, tokens) for prompt in (target, source)]
+    own = [plain_margin(of, plain_pass(of, prompt, ExitStack()), tokens) for prompt in (target, source)]
+    assert [one.margin for one in recorded] == pytest.approx(own, abs=1e-5)
+    gap = own[1] - own[0]
+    wanted: list[tuple[Site, int, str]] = [
+        (site, layer, group)
+        for site, layer, group in product(SITES, range(of.of.n_layers + 1), groups)
+        if layer or site == "residual"
+    ]
+    patches = [Patch(site, layer, groups[group].numpy()) for site, layer, group in wanted]
+    found = patched_changes(of.of, recorded[0], recorded[1], patches, tokens) / gap
+    plain = [plain_patch(of, target, source, (site, layer), groups[group]) for site, layer, group in wanted]
+    expected = np.array([(plain_margin(of, logits, tokens) - own[0]) / gap for logits in plain])
+    assert np.abs(found - expected).max() < 1e-5
+    effect = dict(zip(wanted, found, strict=True))
+    assert abs(effect["residual", 0, "visual"]) > 0.01, "the clip must tell in the answer, or nothing is compared"
+    if "stamps" in groups:
+        assert abs(effect["residual", 0, "stamps"]) > 0.01
+        naive = plain_patch(of, target, source, ("residual", 0), groups["visual"], features=False)
+        assert abs((plain_margin(of, naive, tokens) - own[0]) / gap - effect["residual", 0, "visual"]) > 1e-3
+
+
+def test_a_family_whose_blocks_read_more_than_the_residual_stream_is_refused() -> None:
+    with pytest.raises(TrapsError, match="later blocks reuse keys and values of earlier ones"):
+        require_patchable(subject("gemma-4").of)
