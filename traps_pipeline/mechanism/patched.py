@@ -222,11 +222,14 @@ def effect_of(
 ) -> tuple[float | None, float | None, float | None]:
     """The indirect effect of pairs and its 95 % interval from resampled scenarios (one pair each): sum(after - before)
     over sum(there - before), each (pairs,). A ratio of sums, since the ratio of a pair whose sides hardly differ is
-    noise. None where the sides do not differ at all."""
+    noise. None where the sides do not differ at all; and an end of the interval that comes from resamples in which they
+    do not, shares of nothing, is None too."""
     moved, apart = after - before, there - before
     if not apart.sum():
         return None, None, None
     weights = scenario_weights(len(moved), RESAMPLES, seed).astype(float)
     with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = percentiles((weights @ moved) / (weights @ apart))
-    return float(moved.sum() / apart.sum()), float(low), float(high)
+        low, high = (
+            end if np.isfinite(end) else None for end in percentiles((weights @ moved) / (weights @ apart)).tolist()
+        )
+    return float(moved.sum() / apart.sum()), low, high

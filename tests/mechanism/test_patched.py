@@ -1,0 +1,239 @@
+"""The patching stage: its ratio, interval and flips worked out by hand, which tokens count as changed, and where the
+nulls of a pair come from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.local_models import SYSTEM, ask, clip, model
+from tests.mechanism.study import PAIRS, SETTINGS, make_study, register, tiny_entry
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.digests import file_digest
+from traps_pipeline.mechanism import patched
+from traps_pipeline.mechanism.directions import seeded_order
+from traps_pipeline.mechanism.margin import abstention_tokens
+from traps_pipeline.mechanism.patched import Side, _groups, _summed, changed_tokens, effect_of, patching_rows
+from traps_pipeline.mechanism.patching import Patch, Recorded, record
+from traps_pipeline.mechanism.probe_items import probe_items
+from traps_pipeline.mechanism.tables import PROBE_ITEMS
+from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
+from traps_pipeline.models.local.spans import spans
+from traps_pipeline.models.prompts import vqa_prompt
+from traps_pipeline.models.registry import ModelEntry, get_model
+from traps_pipeline.partitions import SIDES, Extraction
+from traps_pipeline.scenes.encode import encode
+from traps_pipeline.storage.media import MediaSpec, sample
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.slow
+TINY = Extraction("tiny", "standard")
+QUESTION = "Does the ball end up left or right?"
+
+
+def test_an_effect_is_a_ratio_of_sums_with_the_interval_of_resampled_pairs() -> None:
+    """Of two pairs a resample has twice the one (1/4), each (1/2) or twice the other (1/4)."""
+    before, after, there = np.zeros(2), np.ones(2), np.array([2.0, 4.0])
+    effect, low, high = effect_of(before, after, there, 0)
+    assert effect == pytest.approx(2 / 6)  # a mean of ratios were 3/8
+    assert (low, high) == (pytest.approx(1 / 4), pytest.approx(1 / 2))
+    moved = effect_of(before - 3, after - 3, there - 3, 0)
+    assert moved == pytest.approx((effect, low, high))  # from where one starts tells nothing
+
+
+def test_a_pair_whose_sides_hardly_differ_hardly_counts() -> None:
+    before, after, there = np.zeros(3), np.array([0.9, 1.1, 0.05]), np.array([1.0, 1.0, 0.001])
+    assert effect_of(before, after, there, 0)[0] == pytest.approx(2.05 / 2.001)  # the third one's own ratio is 50
+
+
+def test_sides_that_do_not_differ_have_no_effect_and_a_resample_of_such_pairs_no_end() -> None:
+    assert effect_of(np.zeros(2), np.ones(2), np.zeros(2), 0) == (None, None, None)
+    effect, low, high = effect_of(np.zeros(2), np.ones(2), np.array([4.0, 0.0]), 0)
+    assert (effect, low) == (pytest.approx(1 / 2), pytest.approx(1 / 4))
+    assert high is None  # twice the second pair is a share of nothing
+
+
+def change(scenario: str, before: float, after: float, there: float, **other: Any) -> dict[str, Any]:
+    about = {"scenario": scenario, "into": "control", "source": "pair", "left_out": False}
+    about |= {"site": "residual", "layer": 1, "group": "stamps", "tokens": 4}
+    return about | {"before": before, "after": after, "there": there} | other
+
+
+def left_out(scenario: str, into: str, source: str) -> dict[str, Any]:
+    return {"scenario": scenario, "into": into, "source": source, "left_out": True}
+
+
+def test_rows_count_flips_among_pairs_that_could_flip_and_say_which_were_left_out() -> None:
+    changes = [
+        change("a", -2.0, 1.0, 2.0),  # flips, and could
+        change("b", -2.0, -1.0, 2.0, tokens=8),  # could, and does not
+        change("c", -2.0, 1.0, -3.0, tokens=6),  # flips, though both sides say the same
+        change("a", -2.0, -2.0, 2.0, group="last"),
+        left_out("d", "control", "pair"),
+        left_out("e", "control", "pair"),
+        left_out("a", "void", "other scenario"),
+        left_out("d", "control", "other scenario"),
+        change("a", -2.0, 0.0, 2.0, source="other scenario"),
+    ]
+    rows = {(row.into, row.source, row.group): row for row in _summed(pd.DataFrame(changes), TINY, "chaotic", 0)}
+    assert set(rows) == {
+        ("control", "pair", "stamps"), ("control", "pair", "last"), ("control", "other scenario", "stamps"),
+        ("void", "other scenario", "all"),
+    }  # fmt: skip
+    stamps = rows["control", "pair", "stamps"]
+    assert stamps.effect == pytest.approx((3 + 1 + 3) / (4 + 4 - 1))
+    assert (stamps.flips, stamps.n_flippable, stamps.n, stamps.n_left_out) == (0.5, 2, 3, 2)
+    assert stamps.tokens == 6 and (stamps.site, stamps.layer) == ("residual", 1)
+    null = rows["control", "other scenario", "stamps"]  # a margin of 0 is neither sign
+    assert (null.effect, null.flips, null.n, null.n_left_out) == (0.5, 1.0, 1, 1)
+    nothing = rows["void", "other scenario", "all"]
+    assert (nothing.effect, nothing.low, nothing.high, nothing.flips) == (None, None, None, None)
+    assert (nothing.n, nothing.n_flippable, nothing.n_left_out) == (0, 0, 1)
+
+
+def test_no_flips_are_told_where_no_pair_could_flip() -> None:
+    (row,) = _summed(pd.DataFrame([change("a", 1.0, -1.0, 2.0)]), TINY, "chaotic", 0)
+    assert row.effect == -2.0 and row.flips is None and row.n_flippable == 0
+
+
+# --- which tokens changed ---------------------------------------------------------------------------------------------
+
+
+def pocket() -> tuple[LocalModel, np.ndarray, np.ndarray]:
+    shown = sample(clip(), get_model("pocket").media or MediaSpec(profile="frames"))
+    return load_local_model(get_model("pocket"), inside=True), shown.frames, shown.times_s
+
+
+def side(of: LocalModel, frames: np.ndarray, times_s: np.ndarray, question: str = QUESTION) -> Side:
+    prompt = of.prompt(SYSTEM, question, frames, times_s)
+    return Side(prompt, record(of, prompt, abstention_tokens(of)), spans(of, prompt, SYSTEM, question))
+
+
+def test_one_changed_square_of_pixels_is_one_changed_token() -> None:
+    """The pocket reads squares of 16 pixels in pairs of frames: 8 x 6 tokens for each of four pairs."""
+    of, frames, times = pocket()
+    altered, faintly = frames.copy(), frames.copy()
+    altered[5, 32:48, 64:80] = 255 - altered[5, 32:48, 64:80]  # third pair of frames, row 2, column 4
+    one, other = side(of, frames, times), side(of, altered, times)
+    n_visual = int(one.parts["visual"].sum())
+    assert n_visual == 4 * 48
+    found = changed_tokens(of, one.prompt, other.prompt, n_visual)
+    assert found is not None and np.flatnonzero(found).tolist() == [2 * 48 + 2 * 8 + 4]
+    groups = _groups(of, one, other)
+    assert groups is not None
+    visual = np.flatnonzero(one.parts["visual"])
+    assert np.flatnonzero(groups["changed"]).tolist() == visual[found].tolist()
+    assert (groups["changed"] | groups["unchanged"]).tolist() == one.parts["visual"].tolist()
+    assert not (groups["changed"] & groups["unchanged"]).any() and groups["all"].all()
+    for part in ("system", "stamps", "question", "last"):
+        assert groups[part].tolist() == one.parts[part].tolist()
+    faintly[5, 32:48, 64:80] += np.uint8(3)  # as a codec might: no change
+    same = changed_tokens(of, one.prompt, side(of, faintly, times).prompt, n_visual)
+    assert same is not None and not same.any()
+
+
+def test_where_pixels_do_not_come_token_by_token_all_visual_tokens_count_as_changed() -> None:
+    of = model("llava-next-video")
+    prompt = ask(of)
+    recorded, parts = record(of, prompt, abstention_tokens(of)), spans(of, prompt, SYSTEM, "Does it stop?")
+    assert changed_tokens(of, prompt, prompt, int(parts["visual"].sum())) is None
+    groups = _groups(of, Side(prompt, recorded, parts), Side(prompt, recorded, parts))
+    assert groups is not None and not groups["unchanged"].any()
+    assert groups["changed"].tolist() == parts["visual"].tolist()
+
+
+def test_prompts_of_another_form_have_no_groups() -> None:
+    of, frames, times = pocket()
+    one = side(of, frames, times)
+    assert _groups(of, one, side(of, frames, times, QUESTION.replace("left or right", "left, right or behind"))) is None
+    assert _groups(of, one, side(of, frames, times + 10)) is None  # stamps of more digits
+    assert _groups(of, one, side(of, frames, times, QUESTION.replace("left or right", "right or left"))) is not None
+
+
+# --- where nulls come from --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModelEntry:
+    made = tiny_entry(tmp_path / "checkpoint")
+    patching = {"patching": {"pairs": PAIRS, "sites": ["residual", "attention"]}}
+    monkeypatch.setattr("tests.mechanism.study.SETTINGS", SETTINGS | patching)
+    register(monkeypatch, made)
+    return made
+
+
+def with_longer_voids(root: Path) -> Workspace:
+    """A study whose chaotic voids go on for longer than their controls, so that the sides have other time stamps, and
+    whose question about plinko-2 is longer than the others."""
+    workspace = make_study(root)
+    items = workspace.tables.read(ITEMS, {"dataset": "chaotic"})
+    for number, row in enumerate(items.to_dict("records")):
+        if row["side"] == "void":
+            noise = np.random.default_rng(number).integers(0, 256, (6, 6, 8, 3))
+            encode(list(np.kron(noise, np.ones((1, 8, 8, 1))).astype(np.uint8)), workspace.resolve(row["clip"]), 2)
+    items["media_digest"] = [file_digest(workspace.resolve(path)) for path in items["clip"]]
+    longer = items["scenario_id"] == "plinko-2"
+    items.loc[longer, "question"] = "Does plinko-2 end left, right or behind the wall?"
+    rows = [ITEMS.row_type(**{str(name): value for name, value in row.items()}) for row in items.to_dict("records")]
+    workspace.tables.write(ITEMS, {"dataset": "chaotic"}, rows, {})
+    workspace.tables.write(PROBE_ITEMS, {"dataset": "chaotic"}, probe_items(workspace, "chaotic"), {})
+    return workspace
+
+
+def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_sides_times(
+    entry: ModelEntry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workspace, of = with_longer_voids(tmp_path), load_local_model(entry, inside=True)
+    assert entry.media is not None
+    names = {}
+    rows = {
+        (row["scenario_id"], row["side"]): row
+        for row in workspace.tables.read(ITEMS, {"dataset": "chaotic"}).to_dict("records")
+    }
+    for (name, which), row in rows.items():
+        for times_of in SIDES:
+            shown = sample(workspace.resolve(row["clip"]), entry.media)
+            times = sample(workspace.resolve(rows[name, times_of]["clip"]), entry.media).times_s
+            prompt = of.prompt(vqa_prompt("standard"), row["question"], shown.frames, times)
+            names[prompt.digest] = (name, which, times_of)
+    assert len(names) == 2 * 2 * PAIRS  # no two of them alike
+
+    prompts: dict[int, tuple[str, str, str]] = {}
+    kept: list[Recorded] = []
+    asked: list[tuple[tuple[str, str, str], tuple[str, str, str]]] = []
+
+    def recording(of: LocalModel, prompt: Prompt, tokens: Sequence[int]) -> Recorded:
+        made = record(of, prompt, tokens)
+        kept.append(made)  # or another one might get its address
+        prompts[id(made)] = names[prompt.digest]
+        return made
+
+    def nothing(_: LocalModel, target: Recorded, source: Recorded, patches: Sequence[Patch], __: Any) -> np.ndarray:
+        asked.append((prompts[id(target)], prompts[id(source)]))
+        return np.zeros(len(patches))
+
+    monkeypatch.setattr(patched, "record", recording)
+    monkeypatch.setattr(patched, "patched_changes", nothing)
+    made = patching_rows(workspace, entry, TINY)
+    order = seeded_order(sorted({name for name, _ in rows}), workspace.mechanism.seed)
+    fitting = [name for name in order if name != "plinko-2"]
+    expected = set()
+    for name, (into, towards) in [(n, pair) for n in order for pair in (SIDES, SIDES[::-1])]:
+        target = (name, into, into)
+        expected |= {(target, (name, towards, towards)), (target, (name, into, towards))}
+        if name in fitting:
+            following = fitting[(fitting.index(name) + 1) % len(fitting)]
+            expected |= {(target, (following, towards, towards)), (target, (following, into, into))}
+    assert set(asked) == expected and len(asked) == len(expected)
+    for row in made:  # plinko-2 has no scenario of its form
+        null = row.source in ("other scenario", "same side")
+        assert (row.n, row.n_left_out) == ((PAIRS - 1, 1) if null else (PAIRS, 0)), row
+    assert {row.source for row in made} == {"pair", "other scenario", "same side", "other times"}
+    sites = {(row.source, row.site, row.layer > 0) for row in made}
+    residual = {(source, "residual", late) for source in patched.SOURCES for late in (False, True)}
+    assert sites == residual | {("pair", "attention", True)}  # nulls are of the residual stream alone
