@@ -213,12 +213,12 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
         prompts[id(made)] = names[prompt.digest]
         return made
 
-    def nothing(_: LocalModel, target: Recorded, source: Recorded, patches: Sequence[Patch], __: Any) -> np.ndarray:
+    def told(_: LocalModel, target: Recorded, source: Recorded, patches: Sequence[Patch], __: Any) -> np.ndarray:
         asked.append((prompts[id(target)], prompts[id(source)]))
-        return np.zeros(len(patches))
+        return np.full(len(patches), float(asked[-1][0][1] != asked[-1][1][1]))  # 1 for frames of the other side
 
     monkeypatch.setattr(patched, "record", recording)
-    monkeypatch.setattr(patched, "patched_changes", nothing)
+    monkeypatch.setattr(patched, "patched_changes", told)
     made = patching_rows(workspace, entry, TINY)
     order = seeded_order(sorted({name for name, _ in rows}), workspace.mechanism.seed)
     fitting = [name for name in order if name != "plinko-2"]
@@ -232,6 +232,7 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
     assert set(asked) == expected and len(asked) == len(expected)
     for row in made:  # plinko-2 has no scenario of its form
         null = row.source in ("other scenario", "same side")
+        assert (row.effect != 0) == (row.source in ("pair", "other scenario"))
         assert (row.n, row.n_left_out) == ((PAIRS - 1, 1) if null else (PAIRS, 0)), row
     assert {row.source for row in made} == {"pair", "other scenario", "same side", "other times"}
     sites = {(row.source, row.site, row.layer > 0) for row in made}
