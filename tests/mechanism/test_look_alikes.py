@@ -1,0 +1,231 @@
+"""What a probe or a gate does to items that look like voids and have an answer (decoys, clips as short as a void),
+what a gate does on states that no training made, and states under the benchmark's own prompts: through the stages, on a
+tiny random checkpoint."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from tests.mechanism.study import CATEGORY, PAIRS, SETTINGS, filled, make_study, register, tiny_entry
+from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.tables import VERDICTS
+from traps_pipeline.mechanism import stages
+from traps_pipeline.mechanism.control_tables import GateRow
+from traps_pipeline.mechanism.gate import OTHER_DATASETS, THRESHOLDS
+from traps_pipeline.mechanism.gating import UNTRAINED, gate_rows
+from traps_pipeline.mechanism.paths import LOOK_ALIKES
+from traps_pipeline.mechanism.probe_items import probe_items
+from traps_pipeline.mechanism.probing import ProbeRun
+from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBE_ITEMS, PROBES
+from traps_pipeline.mechanism.untrained import untrained_states
+from traps_pipeline.models.local.adapter import load_local_model
+from traps_pipeline.models.local.library import load_transformers
+from traps_pipeline.models.prompts import states_prompt, system_prompt, vqa_prompt
+from traps_pipeline.models.registry import ModelEntry
+from traps_pipeline.partitions import DATASETS, Extraction, StatesCell
+from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.study import ProbeSettings
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.slow
+STANDARD = Extraction("tiny", "standard")
+ARMS = ("decoy", "length_matched")
+EVERY = (*DATASETS, *ARMS)
+
+
+@pytest.fixture(scope="module")
+def patch() -> Iterator[pytest.MonkeyPatch]:
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def entry(patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> ModelEntry:
+    made = tiny_entry(tmp_path_factory.mktemp("tiny") / "checkpoint")
+    register(patch, made)
+    patch.setattr("tests.mechanism.study.SETTINGS", SETTINGS | {"gate": {"untrained": True}})
+    return made
+
+
+def extract(workspace: Workspace, dataset: str) -> None:
+    workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
+    cell = StatesCell(dataset, STANDARD)
+    workspace.tables.write(HIDDEN_STATES, cell.partition, stages.extract_states(workspace, cell)[0], {})
+
+
+@pytest.fixture(scope="module")
+def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """Extracted, probed and judged, with a void's clip as a decoy and a control's as a short one: both are controls."""
+    workspace = make_study(tmp_path_factory.mktemp("study"))
+    for arm, shown in zip(ARMS, ("void", "control"), strict=True):
+        rows = []
+        for row in workspace.tables.read(ITEMS, {"dataset": LOOK_ALIKES[arm]}).to_dict("records"):
+            if row["side"] == shown:
+                name = f"{arm}:{row['scenario_id']}"
+                made: dict[str, Any] = {str(key): value for key, value in row.items()}
+                made |= {"item_id": f"{name}:control", "pair_id": name, "dataset": arm, "side": "control"}
+                made |= {"question": f"Where does {row['scenario_id']} end?", "ground_truth": "left"}
+                rows.append(ITEMS.row_type(**made))
+        workspace.tables.write(ITEMS, {"dataset": arm}, rows, {})
+    for dataset in EVERY:
+        extract(workspace, dataset)
+        partition = {"dataset": dataset, "model": "tiny", "regime": "standard", "run": 1}
+        items = workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
+        judged = [
+            filled(
+                VERDICTS, **partition, **{name: row[name] for name in ("item_id", "pair_id", "scenario_id", "side")},
+                abstained=row["side"] == "void" and number % 4 == 1, correct=row["side"] == "control" or None,
+            )
+            for number, row in enumerate(items)
+        ]  # fmt: skip
+        workspace.tables.write(VERDICTS, partition, judged, {})
+    workspace.tables.write(PROBES, STANDARD.partition, stages.probe_rows(workspace, STANDARD), {})
+    return workspace
+
+
+@pytest.fixture(scope="module")
+def gates(study: Workspace, entry: ModelEntry) -> list[GateRow]:
+    return gate_rows(study, entry, StoredStates.of(study, STANDARD))
+
+
+# --- look-alikes as targets -------------------------------------------------------------------------------------------
+
+
+def test_decoys_and_short_clips_are_probe_items_and_targets_of_every_probe(study: Workspace) -> None:
+    for arm in ARMS:
+        items = study.tables.read(PROBE_ITEMS, {"dataset": arm})
+        assert items["item_id"].tolist() == [f"{arm}:{CATEGORY[LOOK_ALIKES[arm]]}-{n}:control" for n in range(PAIRS)]
+    rows = pd.DataFrame(study.tables.read(PROBES, STANDARD.partition))
+    layers = StoredStates.of(study, STANDARD).n_layers
+    for arm in ARMS:
+        for analysis in ("answerable_void", "answerable_control"):
+            found = rows[(rows["analysis"] == analysis) & (rows["target"] == arm)]
+            assert set(zip(found["source"], found["layer"], strict=True)) == {
+                (source, layer) for source in DATASETS for layer in range(layers)
+            }
+            assert {*found["n_voids"]} == {*found["n_controls"]} == {PAIRS}
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_probe_that_reads_what_look_alikes_share_with_voids_is_told_from_one_that_reads_what_they_do_not(
+    arm: str,
+) -> None:
+    """Layer 0 holds what voids and look-alikes have (a panel, the length), layer 1 what voids alone have."""
+    rng, rows, states = np.random.default_rng(0), [], dict[tuple[str, int], np.ndarray]()
+    for dataset in (*DATASETS, arm):
+        taxonomy = LOOK_ALIKES.get(dataset, dataset.split("_")[0])
+        sides = ("control",) if dataset == arm else ("control", "void")
+        of = [(dataset, f"{taxonomy}-{n:02d}", side, "sub") for n in range(60) for side in sides]
+        rows += of
+        void = np.array([side == "void" for *_, side, _ in of])
+        for layer, shown in ((0, void | (dataset == arm)), (1, void)):
+            states[dataset, layer] = rng.normal(size=(len(of), 3))
+            states[dataset, layer][:, 0] = 8.0 * shown + rng.normal(size=len(of))
+    items = pd.DataFrame(rows, columns=["dataset", "scenario_id", "side", "sub_scenario"])
+    run = ProbeRun(items, lambda d, n: states[d, n], 2, 1, ProbeSettings(folds=4, resamples=100), 7)
+    source = LOOK_ALIKES[arm]
+    for layer, against_voids, against_controls in ((0, 0.5, 1.0), (1, 1.0, 0.5)):
+        value = {
+            row["analysis"]: row["value"]
+            for row in run.comparable(layer)
+            if (row["source"], row["target"]) == (source, arm)
+        }
+        assert value["answerable_void"] == pytest.approx(against_voids, abs=0.2)
+        assert value["answerable_control"] == pytest.approx(against_controls, abs=0.2)
+
+
+def test_a_gate_reports_how_many_look_alikes_it_abstains_on(gates: list[GateRow]) -> None:
+    for arm in ARMS:
+        rows = [row for row in gates if row.target == arm and row.features == "states"]
+        assert {row.threshold for row in rows} == {*THRESHOLDS} and OTHER_DATASETS in {row.source for row in rows}
+        for row in rows:
+            assert (row.n_controls, row.n_voids) == (PAIRS, 0)
+            assert row.false_abs in {k / PAIRS for k in range(PAIRS + 1)} and row.pecs is None
+
+
+# --- a network that has learnt nothing --------------------------------------------------------------------------------
+
+
+def test_the_gate_of_an_untrained_network_is_a_row_beside_the_trained_ones_where_it_is_asked_for(
+    study: Workspace, entry: ModelEntry, gates: list[GateRow]
+) -> None:
+    rows = [row for row in gates if row.features == UNTRAINED]
+    assert {(row.source, row.layer, row.regime) for row in rows} == {(OTHER_DATASETS, -1, "standard")}
+    assert {(row.target, row.threshold) for row in rows} == {(t, h) for t in (*EVERY, "all") for h in THRESHOLDS}
+    assert all(row.pecs is not None and row.auroc is not None for row in rows if row.target in DATASETS)
+    settings = study.mechanism
+    gate = settings.gate.model_copy(update={"untrained": False})
+    without = study.allow(mechanism=settings.model_copy(update={"gate": gate}))
+    assert UNTRAINED not in {row.features for row in gate_rows(without, entry, StoredStates.of(without, STANDARD))}
+
+
+def test_untrained_states_are_those_of_random_weights_the_same_at_every_call(
+    study: Workspace, entry: ModelEntry
+) -> None:
+    states = StoredStates.of(study, STANDARD)
+    items = {"chaotic": study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"})}
+    stream = torch.get_rng_state()
+    found = untrained_states(study, entry, states, items)["chaotic"]
+    again = untrained_states(study, entry, states, items)["chaotic"]
+    assert np.array_equal(found, again) and torch.equal(stream, torch.get_rng_state())
+    trained = load_local_model(entry, inside=True)
+    layer = (trained.n_layers + 1) // 2
+    assert found.shape == states.read("chaotic", layer).shape
+    assert np.abs(found - states.read("chaotic", layer)).max(axis=1).min() > 1e-2  # of every item
+    other = study.allow(mechanism=study.mechanism.model_copy(update={"seed": study.mechanism.seed + 1}))
+    assert np.abs(untrained_states(other, entry, states, items)["chaotic"] - found).max() > 1e-2
+    with torch.random.fork_rng(devices=[]):  # once more, in plain transformers
+        torch.manual_seed(study.mechanism.seed)
+        network = load_transformers().AutoModelForImageTextToText.from_config(trained.network.config).eval()
+    for row, expected in zip(items["chaotic"].to_dict("records"), found, strict=True):
+        prompt = own_prompt(study, entry, {str(name): value for name, value in row.items()}, vqa_prompt("standard"))
+        with torch.no_grad():
+            out = network(**prompt, output_hidden_states=True)
+        assert np.array_equal(out.hidden_states[layer][0, -1].numpy(), expected)
+
+
+def own_prompt(workspace: Workspace, entry: ModelEntry, row: dict, system: str) -> dict[str, torch.Tensor]:
+    assert entry.media is not None
+    shown = sample(workspace.resolve(row["clip"]), entry.media)
+    model = load_local_model(entry, inside=True)
+    return dict(model.prompt(system, row["question"], shown.frames, shown.times_s).inputs)
+
+
+# --- the benchmark's own prompts --------------------------------------------------------------------------------------
+
+
+def test_the_prompt_of_states_is_the_papers_or_the_benchmarks_own() -> None:
+    for name in ("standard", "guided"):
+        assert states_prompt("vqa", name) == vqa_prompt(name) != system_prompt(name) == states_prompt("benchmark", name)
+
+
+def test_states_under_the_benchmarks_own_prompt_have_other_keys_and_are_the_librarys(
+    study: Workspace, entry: ModelEntry, tmp_path: Path
+) -> None:
+    shutil.copytree(study.root, tmp_path / "study", symlinks=True)
+    own = Workspace.open(tmp_path / "study")
+    own = own.allow(mechanism=own.mechanism.model_copy(update={"system": "benchmark"}))
+    before = StoredStates.of(study, STANDARD).dataset("chaotic")
+    extract(own, "chaotic")
+    states = StoredStates.of(own, STANDARD)
+    assert states.dataset("chaotic")["item_id"].tolist() == before["item_id"].tolist()
+    assert not {*states.dataset("chaotic")["states_key"]} & {*before["states_key"]}
+    model = load_local_model(entry, inside=True)
+    items = own.tables.read(PROBE_ITEMS, {"dataset": "chaotic"}).set_index("item_id")
+    for place, name in enumerate(states.dataset("chaotic")["item_id"]):
+        row = {str(key): value for key, value in items.loc[name].to_dict().items()}
+        with torch.no_grad():
+            inputs = own_prompt(own, entry, row, system_prompt("standard"))
+            library = model.network(**inputs, output_hidden_states=True).hidden_states
+        for layer in range(model.n_layers):  # the library's last one is normed
+            assert np.array_equal(states.read("chaotic", layer)[place], library[layer][0, -1].numpy())
+        assert np.array_equal(states.read("chaotic", "normed")[place], library[-1][0, -1].numpy())
