@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from itertools import product
 from typing import ClassVar
 
@@ -13,6 +15,7 @@ from traps_pipeline.mechanism.control_tables import GATE, PATCHING, PROBE_BASELI
 from traps_pipeline.mechanism.effects import own_effects
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS
 from traps_pipeline.partitions import DATASETS
+from traps_pipeline.report import publish
 from traps_pipeline.report.catalogue import FIGURES, INSIDE
 from traps_pipeline.report.page import Card, picture_block, report_html
 from traps_pipeline.report.results import Makers, Results
@@ -26,8 +29,8 @@ from traps_pipeline.storage.tables import Table
 ABOUT = {"model": "m", "prompt": "standard", "epoch": "e"}
 
 
-def frame(table: Table, *rows: dict[str, object]) -> pd.DataFrame:
-    return pd.DataFrame([ABOUT | row for row in rows]).reindex(columns=pd.Index(table.names))
+def frame(table: Table, *rows: Mapping[str, object]) -> pd.DataFrame:
+    return pd.DataFrame([{**ABOUT, **row} for row in rows]).reindex(columns=pd.Index(table.names))
 
 
 def probes() -> pd.DataFrame:
@@ -174,6 +177,27 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
     report = next(report for report in FIGURES if report.name == name)
     axes = report.make(Made()).axes
     assert axes and all(ax.has_data() for ax in axes)  # no panel for a dataset that was not asked
+
+
+def test_the_page_of_a_study_that_looked_inside_leads_with_the_four_figures_of_its_controls_in_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What can refute a claim about probes comes first, then gates, patches and doses; else figures stand as ever."""
+    monkeypatch.setattr(publish, "TABLES", ())
+    study, paper, pixel = Results(), Results(), b"\x89PNG" + bytes(20)
+    study.is_study, paper.is_study = True, False
+    pictures = {report.path(results): pixel for report in FIGURES for results in (study, paper)}
+
+    def shown() -> list[str]:
+        chapters = publish._chapters(study, paper, str, pictures)
+        page = report_html(frame(LEADERBOARD).astype(object), chapters=chapters)
+        return re.findall(r'<section[^>]* id="figure-(\w+)"', page)
+
+    order = [report.name for report in FIGURES]
+    assert shown() == order and order[:4] != [*INSIDE]
+    study.mechanism = MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)})
+    assert shown()[:4] == ["probe_baselines", "gate_arrows", "patching", "doses_among_nulls"] == [*INSIDE]
+    assert shown()[4:] == [name for name in order if name not in INSIDE]
 
 
 def test_doses_in_alpha_do_not_set_the_scale_of_the_figure_of_class_gaps() -> None:
