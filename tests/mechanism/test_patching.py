@@ -3,7 +3,8 @@ the positions of a prompt's parts; and an independent re-implementation in plain
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Callable
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import torch
 from tests.local_models import QUESTIONS, SYSTEM, Family, ask, clip, model
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patching import SITES, Patch, Recorded, patched_changes, record, require_patchable
+from traps_pipeline.mechanism.patching import SITES, Patch, Recorded, Site, patched_changes, record, require_patchable
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.spans import PARTS, spans
@@ -94,10 +95,11 @@ def test_a_patch_is_what_a_plain_hook_on_the_whole_model_does(name: str) -> None
     of, target, source, tokens, prompt, donor = pair(name)
     chosen = torch.zeros(target.length, dtype=torch.bool)
     chosen[-9:-2] = True  # text behind the clip, so that no deepstack feature is concerned
-    for site, layer, get in (
+    hooked: tuple[tuple[Site, int, Callable[[Any], Any]], ...] = (
         ("residual", 3, lambda block: block), ("attention", 2, lambda block: block.self_attn),
         ("mlp", 4, lambda block: block.mlp),
-    ):  # fmt: skip
+    )  # fmt: skip
+    for site, layer, get in hooked:
         kept: list[torch.Tensor] = []
         module = get(of.network.get_decoder().layers[layer - 1])
 
@@ -143,7 +145,7 @@ def test_the_parts_of_a_prompt_are_where_their_texts_are(family: Family) -> None
     of = model(family)
     prompt = ask(of, QUESTIONS[1])
     found = spans(of, prompt, SYSTEM, QUESTIONS[1])
-    assert set(found) == {*PARTS} and sum(part.astype(int) for part in found.values()).max() == 1
+    assert set(found) == {*PARTS} and np.stack([*found.values()]).sum(axis=0).max() == 1
     ids, decode = prompt.inputs["input_ids"][0], of.processor.tokenizer.decode
 
     def text(part: str) -> str:
@@ -151,7 +153,8 @@ def test_the_parts_of_a_prompt_are_where_their_texts_are(family: Family) -> None
 
     assert text("system") == "".join(SYSTEM.split()) and text("question") == "".join(QUESTIONS[1].split())
     videos = ids == of.processor.tokenizer.convert_tokens_to_ids(of.processor.video_token)
-    assert found["visual"].sum() >= videos.sum().item() > 0 and not found["visual"][found["question"].argmax() :].any()
+    assert np.array_equal(found["visual"], videos.numpy()) and videos.any()
+    assert not found["visual"][found["question"].argmax() :].any()
     stamps = {"qwen3-vl": 3, "gemma-4": 6, "llava-next-video": 0}[family]  # Qwen3-VL merges two of the six frames
     assert text("stamps").count("seconds" if family == "qwen3-vl" else ":") == stamps
     assert found["last"].nonzero()[0].tolist() == [len(ids) - 1]

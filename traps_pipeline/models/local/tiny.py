@@ -279,7 +279,7 @@ def make_processor(family: Family, tokenizer: Any, video: Overrides | None = Non
             side = {"size": {"shortest_edge": 56}, "crop_size": {"height": 56, "width": 56}}
             return transformers.LlavaNextVideoProcessor(
                 video_processor=transformers.LlavaNextVideoVideoProcessor(**side | asked),
-                image_processor=transformers.LlavaNextImageProcessor(**side),
+                image_processor=transformers.LlavaNextImageProcessor(**side, image_grid_pinpoints=[[56, 112]]),
                 tokenizer=tokenizer,
                 chat_template=_TEMPLATES[family],
                 patch_size=14,
