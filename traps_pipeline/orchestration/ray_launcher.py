@@ -13,7 +13,7 @@ from dagster_ray import RayRunLauncher  # pyright: ignore[reportMissingImports] 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.cluster import RUN_CPUS, RUN_GPUS, STUDY_TAG, keys_in, own_tags
-from traps_pipeline.orchestration.graph import Stage, the_graph
+from traps_pipeline.orchestration.graph import DECLARED, Stage, the_graph
 from traps_pipeline.orchestration.runs import range_of
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
 from traps_pipeline.storage.workspace import RAY, Workspace
@@ -41,8 +41,8 @@ class QuotingRayRunLauncher(RayRunLauncher):
 
 def tags_of_page_run(run: Any) -> dict[str, str]:
     """What `traps run --cluster` would have said of a run that was launched in Dagster's pages, or by its sensors."""
-    import traps_pipeline.definitions  # noqa: F401 - the stages; the daemon's own process has loaded none
-
+    if not DECLARED:  # the daemon's own process has not loaded the stages
+        run.job_code_origin.repository_origin.code_pointer.load_target()
     workspace, declared = Workspace.open(), the_graph().declared
     names = [key.path[-1] for key in run.asset_selection or ()]
     stages = [one for name in names if isinstance(one := declared.get(name), Stage)]
