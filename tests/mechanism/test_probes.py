@@ -225,6 +225,31 @@ def test_cf_restricts_both_sets_and_says_why_where_it_cannot(rows: pd.DataFrame)
     assert cf[cf["all_sample_best"]]["layer"].unique().tolist() == [PLANTED]
 
 
+def test_cf_of_shared_controls_is_held_out_by_scenario_too_or_says_that_too_few_are_left(rows: pd.DataFrame) -> None:
+    """Noise, with the same controls in both datasets of a taxonomy, restricted to 12 and to 2 scenarios."""
+    held = rows[rows["analysis"] == "confabulated_held_out"]
+    pairs = {("occlusion", "occlusion_ill_posed"), ("occlusion_ill_posed", "occlusion")}
+    assert set(zip(held["source"], held["target"], strict=True)) == pairs
+    assert held.loc[held["layer"] == PLANTED, "value"].min() > 0.95 and set(held["n_voids"]) == {8}
+    items, states = study(pairs=15)
+    items = items[items["dataset"].isin(["occlusion", "occlusion_ill_posed"])].reset_index(drop=True)
+    for dataset in ("occlusion", "occlusion_ill_posed"):
+        states[dataset, 0] = np.random.default_rng(len(dataset)).normal(size=(30, 200))
+    states["occlusion_ill_posed", 0][::2] = states["occlusion", 0][::2]
+    settings = ProbeSettings(folds=5, shuffles=20, resamples=100)
+
+    def of(scenarios: int) -> dict[str, pd.DataFrame]:
+        some = frozenset(f"occlusion-{n:02d}" for n in range(scenarios))
+        cf = Confabulated({"occlusion": some, "occlusion_ill_posed": some})
+        run = ProbeRun(items, lambda d, n: states[d, n], LAYERS, 1, settings, 7, cf)
+        return {str(name): part for name, part in pd.DataFrame(run.comparable(0)).groupby("analysis")}
+
+    many, two = of(12), of(2)
+    assert many["confabulated"]["value"].min() > 0.9 > 0.8 > many["confabulated_held_out"]["value"].max()
+    assert two["confabulated_held_out"]["value"].isna().all()
+    assert "2 confabulated voids are too few for 5 folds" in two["confabulated_held_out"]["note"].iloc[0]
+
+
 def test_a_target_label_never_influences_a_fit() -> None:
     """Swapping the sides of a target mirrors its AUROC exactly, and leaves every figure of other targets as it is."""
     items, states = study(pairs=6)

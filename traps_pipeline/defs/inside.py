@@ -6,6 +6,7 @@ import dagster as dg
 
 from traps_pipeline.defs.evaluation import verdicts
 from traps_pipeline.defs.mechanism import (
+    ANSWERED,
     GROUP,
     hidden_states,
     probe_items,
@@ -67,13 +68,15 @@ probe_baselines = stage(
     PROBE_BASELINES,
     _make_baselines,
     group=GROUP,
+    code="2",
     deps=[
         dg.AssetDep(hidden_states, partition_mapping=by_extraction),
         dg.AssetDep(probe_items, partition_mapping=dg.AllPartitionMapping()),
+        dg.AssetDep(verdicts, partition_mapping=ANSWERED),
         probing_settings,
     ],
     scheme=EXTRACTION,
-    needs={"hidden_states": "some"},
+    needs={"hidden_states": "some", "verdicts": "none"},
     kinds=["parquet", "scikitlearn"],
     cost="machine",  # the output margin needs the model's head
     wants=lambda wanted, key: Extraction.parse(key).prompt in wanted.probed_prompts,

@@ -90,7 +90,7 @@ steering_settings = source(
     scheme=STEERED,
 )
 # Cells in which the local models answered under Standard in run 1: their verdicts say what the models confabulated on.
-_ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
+ANSWERED = these_keys(CELL, [Cell(d, Evaluation(m, "standard", 1)).key for d in DATASETS for m in local_models()])
 _OCCLUSION = to_keys(CATEGORY, PROBED, lambda key: [ANSWERABLE] if taxonomy_of_category(key) == "occlusion" else [])
 
 
@@ -178,7 +178,7 @@ probes = stage(
     code="2",
     deps=[
         dg.AssetDep(hidden_states, partition_mapping=by_extraction),
-        dg.AssetDep(verdicts, partition_mapping=_ANSWERED),
+        dg.AssetDep(verdicts, partition_mapping=ANSWERED),
         probing_settings,
     ],
     scheme=EXTRACTION,

@@ -22,7 +22,8 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.control_tables import ProbeBaselineRow
 from traps_pipeline.mechanism.other_probes import fit_named
 from traps_pipeline.mechanism.probes import Fit
-from traps_pipeline.mechanism.probing import ProbeRun, Row
+from traps_pipeline.mechanism.probing import Confabulated, ProbeRun, Row
+from traps_pipeline.mechanism.stages import confabulations
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import PROBE_ITEMS
 from traps_pipeline.models.registry import ModelEntry
@@ -45,7 +46,7 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
     found: list[ProbeBaselineRow] = []
 
     def add(features: str, rows: Sequence[Row], note: str | None = None) -> None:
-        names = ("analysis", "source", "target", "value", "low", "high", "spread", "n_voids", "n_controls")
+        names = ("analysis", "source", "target", "scope", "value", "low", "high", "spread", "n_voids", "n_controls")
         found.extend(
             ProbeBaselineRow(
                 **states.extraction.partition, features=features, note=note, **{name: row[name] for name in names}
@@ -53,7 +54,8 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
             for row in rows
         )
 
-    run = ProbeRun(states.items, lambda dataset, _: np.empty(0), 1, 0, settings.probes, settings.seed)
+    confabulated = confabulations(workspace, entry.id)
+    run = ProbeRun(states.items, lambda dataset, _: np.empty(0), 1, 0, settings.probes, settings.seed, confabulated)
     raw = raw_features(items, entry.media, workspace.resolve)
     for number, (name, features) in enumerate(raw.items()):
         progress.current().tick("probe_baselines", f"of {states.extraction.key}", number + 1, len(raw) + 2)
@@ -66,7 +68,9 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
     layer = settings.models[entry.id].steering
     for name in settings.probes.others:
         fit = fit_named(name, settings.seed)
-        others = replace(run, read=lambda dataset, _: states.read(dataset, layer), fit=fit)
+        others = replace(
+            run, read=lambda dataset, _: states.read(dataset, layer), fit=fit, confabulated=Confabulated({})
+        )
         add(f"states, {name}", others.comparable(0))
     return found
 
@@ -80,8 +84,10 @@ class AsItIs:
 
 
 def scored(run: ProbeRun, features: Features, fit: Fit | None = None) -> list[Row]:
-    """The rows of the protocol on features in the place of states. fit: another probe than the protocol's."""
-    return replace(run, read=lambda dataset, _: features[dataset], fit=fit).comparable(0)
+    """The rows of the protocol on features in the place of states, those of nearest centroids included. fit: another
+    probe than the protocol's."""
+    on = replace(run, read=lambda dataset, _: features[dataset], fit=fit)
+    return on.comparable(0) + on.centroids(0)
 
 
 # --- features ---------------------------------------------------------------------------------------------------------
@@ -185,18 +191,28 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
     items, width = run.items, int(run.items["width"].iloc[0])
     prompts, place = np.unique(items["states_key"].to_numpy(str), return_inverse=True)
     of = {name: place[(items["dataset"] == name).to_numpy()] for name in dict.fromkeys(items["dataset"])}
-    drawn: dict[tuple[str, str, str], list[Row]] = {}
+    drawn: dict[tuple[str, ...], list[Row]] = {}
     for draw in range(draws):
         vectors = np.random.default_rng([seed, draw]).standard_normal((len(prompts), width))
         for row in scored(run, {name: vectors[rows] for name, rows in of.items()}):
-            drawn.setdefault((row["analysis"], row["source"], row["target"]), []).append(row)
+            drawn.setdefault(tuple(row[name] for name in ("analysis", "source", "target", "scope")), []).append(row)
     rows = []
     for same in drawn.values():
         values = np.array([row["value"] for row in same], float)
+        if np.isnan(values).any():  # a figure that cannot be computed of these items, whatever their features are
+            continue
         rows.append(same[0] | {"value": values.mean(), "spread": values.std(), "low": None, "high": None})
     return rows
 
 
 def _without_figure() -> Row:
     nothing = dict.fromkeys(("value", "low", "high", "spread"))
-    return {"analysis": "held_out", "source": "", "target": "", "n_voids": 0, "n_controls": 0, **nothing}
+    return {
+        "analysis": "held_out",
+        "source": "",
+        "target": "",
+        "scope": "all",
+        "n_voids": 0,
+        "n_controls": 0,
+        **nothing,
+    }

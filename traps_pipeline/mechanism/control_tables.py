@@ -87,10 +87,11 @@ class ProbeBaselineRow:
         "question words, first frame, all frames, length, time stamps, output margin, noise as wide as states, or "
         "states with the name of another probe than that of `probes`, at the layer that is steered",
     ]
-    analysis: Annotated[str, "as in probes: transfer, held_out, answerable_void, answerable_control, time_swapped"]
+    analysis: Annotated[str, "as in probes, but for within and shuffled"]
     source: Annotated[str, "dataset that was fitted"]
     target: Annotated[str, "dataset that was scored"]
-    value: Annotated[float | None, "AUROC; of noise the mean over draws"]
+    scope: Annotated[str, "as in probes"]
+    value: Annotated[float | None, "AUROC, or the share assigned to void; of noise the mean over draws"]
     low: Annotated[float | None, "as in probes"]
     high: Annotated[float | None, "as in probes"]
     spread: Annotated[float | None, "of noise: standard deviation over draws"]
@@ -103,7 +104,7 @@ PROBE_BASELINES = Table(
     "probe_baselines",
     ProbeBaselineRow,
     partition_by=("model", "prompt"),
-    key=("features", "analysis", "source", "target"),
+    key=("features", "analysis", "source", "target", "scope"),
 )
 
 

@@ -17,7 +17,7 @@ import pandas as pd
 
 from traps_pipeline.cores import cores
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.mechanism.paths import CURVES, LOOK_ALIKES, TRANSFER_PAIRS, Path, probed_taxonomy
+from traps_pipeline.mechanism.paths import CURVES, LOOK_ALIKES, TRANSFER_PAIRS, Path, path_name, probed_taxonomy
 from traps_pipeline.mechanism.probes import (
     Fit,
     Split,
@@ -136,14 +136,15 @@ class ProbeRun:
     def layer_rows(self, layer: int) -> list[Row]:
         """Every row of one layer, whose states are in memory only during this call."""
         splits = {name: self._split(name, layer) for name in self._datasets}
-        rows = self.comparable(layer, splits) + self.confabulated_transfer(layer, splits) + self.within(layer, splits)
+        rows = self.comparable(layer, splits) + self.within(layer, splits)
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
 
     def comparable(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
-        """The rows of one layer that baselines have as well: transfer, held out, look-alikes, swapped times."""
+        """The rows of one layer that baselines have as well: transfer, held out, Cf->Cf, look-alikes, swapped times."""
         splits = splits or {name: self._split(name, layer) for name in self._datasets}
         unseen = {source: self._unseen_scores(source, splits) for source in self._own}
         rows = self.transfer(layer, splits) + self.held_out(layer, splits, unseen)
+        rows += self.confabulated_transfer(layer, splits) + self.confabulated_held_out(layer, splits)
         return rows + self.answerable(layer, splits, unseen) + self.time_swapped(layer, splits, unseen)
 
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
@@ -154,10 +155,43 @@ class ProbeRun:
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """The same pairs with source and target restricted to confabulated void items and their own controls."""
-        restricted = {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
+        restricted = self._confabulated(splits)
         pairs = [pair for pair in self._pairs if set(pair) <= set(restricted)]
         scores = transfer_scores(restricted, pairs, self._fit)
         return [self._scored("confabulated", path, layer, restricted[path[1]], v) for path, v in scores.items()]
+
+    def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
+        """Those of these pairs whose datasets share their controls, by probes that were fitted without the scored
+        scenario; without a figure where too few scenarios are left to split."""
+        restricted, rows = self._confabulated(splits), []
+        for source, target in self._pairs:
+            if not {source, target} <= set(restricted) or taxonomy_of(source) != taxonomy_of(target):
+                continue
+            both = {name: restricted[name] for name in (source, target)}
+            few = self._too_few(source, both)
+            scores = None if few else self._unseen_scores(source, both)[target]
+            if scores is None:
+                rows.append(_row("confabulated_held_out", (source, target), layer, None, both[target], note=few))
+            else:
+                rows.append(self._scored("confabulated_held_out", (source, target), layer, both[target], scores))
+        return rows
+
+    def _confabulated(self, splits: Mapping[str, Split]) -> dict[str, Split]:
+        return {name: splits[name].rows(mask) for name, mask in self._restricted.items()}
+
+    def _too_few(self, source: str, splits: Mapping[str, Split]) -> str:
+        """Why probes of a source cannot leave a fold of scenarios out; empty if they can."""
+        n, folds = len(np.unique(splits[source].scenario)), self.settings.folds
+        every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
+        if len(every) >= folds and len(np.unique(self._folds(splits)[source])) > 1:
+            return ""
+        return f"{path_name(*splits)}, held out: {n} confabulated voids are too few for {folds} folds of scenarios"
+
+    def _folds(self, splits: Mapping[str, Split]) -> dict[str, np.ndarray]:
+        """The fold of each item, by dataset; a scenario has one fold in all of them."""
+        every = np.unique(np.concatenate([split.scenario for split in splits.values()]))
+        fold_of = dict(zip(every, scenario_folds(every, self.settings.folds, self.seed), strict=True))
+        return {name: np.array([fold_of[s] for s in split.scenario]) for name, split in splits.items()}
 
     def within(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Grouped cross-validation within each dataset, with the true and with swapped labels."""
@@ -232,9 +266,7 @@ class ProbeRun:
         if others:
             probe = self._fit(split.states, split.void)
             scores |= {name: probe.scores(splits[name].states) for name in others}
-        every = np.unique(np.concatenate([splits[name].scenario for name in own]))
-        fold_of = dict(zip(every, scenario_folds(every, self.settings.folds, self.seed), strict=True))
-        folds = {name: np.array([fold_of[s] for s in splits[name].scenario]) for name in own}
+        folds = self._folds({name: splits[name] for name in own})
         for fold in range(self.settings.folds):
             train = split.rows(folds[source] != fold)
             probe = self._fit(train.states, train.void)
@@ -242,9 +274,11 @@ class ProbeRun:
                 scores[name][folds[name] == fold] = probe.scores(splits[name].states[folds[name] == fold])
         return scores
 
-    def centroids(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Shares of each target's items, by sub-scenario, that the source's nearest centroid assigns to void."""
-        rows = []
+    def centroids(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
+        """Shares of each target's items, by sub-scenario, that the source's nearest centroid assigns to void. The
+        centroids of a taxonomy's two datasets come from the same controls, so that of their controls these shares are
+        too low; `baselines` has the same of noise."""
+        splits, rows = splits or {name: self._split(name, layer) for name in self._own}, []
         for source, target in self._pairs:
             assigned, split = nearest_centroid(splits[source], splits[target].states), splits[target]
             groups = self._of[target]["sub_scenario"].to_numpy(str)

@@ -93,8 +93,8 @@ class ProbeRow:
     prompt: Prompt
     analysis: Annotated[
         str,
-        "transfer, held_out, confabulated, within, shuffled, answerable_void, answerable_control, time_swapped or "
-        "centroid_..",
+        "transfer, held_out, confabulated, confabulated_held_out, within, shuffled, answerable_void, "
+        "answerable_control, time_swapped or centroid_..",
     ]
     source: Annotated[str, "dataset that the probe or the centroids were fitted on"]
     target: Annotated[str, "dataset that they were applied to"]
