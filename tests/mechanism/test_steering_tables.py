@@ -8,7 +8,7 @@ import pytest
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS, TRANSFER_TYPES
 from traps_pipeline.report.published_results import PublishedResults
-from traps_pipeline.report.tables import mechanism
+from traps_pipeline.report.tables import mechanism, probes
 from traps_pipeline.scoring.published import published, published_rows
 
 PAPER = PublishedResults()
@@ -81,7 +81,7 @@ def test_the_sweep_is_the_mean_of_four_splits_on_their_own_controls() -> None:
 
 
 def test_means_over_four_paths_differ_between_all_samples_and_cf_by_what_the_paper_claims() -> None:
-    means = next(t for t in mechanism.probes(PAPER) if t.name == "probe_means").rows
+    means = next(t for t in probes.probes(PAPER) if t.name == "probe_means").rows
     qwen = means.query("model == 'qwen3-vl-8b'")
     assert qwen["transfer_type"].tolist() == list(TRANSFER_TYPES[:3]) and set(qwen["n_paths"]) == {4}
     assert (qwen["best_value"] - qwen["cf_value"]).abs().max() == pytest.approx(0.03, abs=0.005)
@@ -93,6 +93,6 @@ def test_published_rows_without_a_figure_are_left_out_and_not_invented() -> None
     assert cosines["qwen3-vl-8b", "occlusion", "chaotic"] == -0.05
     assert cosines["gemma-4-e4b", "chaotic_ill_posed", "chaotic"] == 0.55
     assert ("llava-next-video-7b", "chaotic", "occlusion") not in cosines.index
-    answerable = next(t for t in mechanism.probes(PAPER) if t.name == "probe_answerable")
+    answerable = next(t for t in probes.probes(PAPER) if t.name == "probe_answerable")
     assert answerable.absence == "not run: the paper has no such control"
     assert set(PAPER.effects["directions"]) == {"standard"} and set(PAPER.effects["regime"]) == {"guided"}

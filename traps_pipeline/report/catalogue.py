@@ -28,6 +28,7 @@ from traps_pipeline.report.tables import (
     sub_scenarios,
 )
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
+from traps_pipeline.report.tables import probes as tables_of_probes
 from traps_pipeline.report.tables.shared import printed
 from traps_pipeline.report.writing import SOFT, PrintedTable, figure_bytes, figure_files, figure_style, table_files
 
@@ -225,7 +226,12 @@ TABLES: tuple[TableReport, ...] = (
     ),
     TableReport("judge_validation", judges.validation, ("judge_validation",), printed_setup.validation),
     TableReport(
-        "probes", tables_of_mechanism.probes, ("probes",), printed_mechanism.probes, ("probe_means",), "Probes"
+        "probes",
+        tables_of_probes.probes,
+        ("probes", "probe_baselines"),
+        printed_mechanism.probes,
+        ("probe_means",),
+        "Probes",
     ),
     TableReport(
         "probe_baselines", inside.probe_baselines, ("probes", "probe_baselines"), title="Probes and their baselines"

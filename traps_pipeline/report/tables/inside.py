@@ -23,8 +23,11 @@ SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "−
 
 
 def few(rows: pd.DataFrame, *counts: str) -> list[str]:
-    """The mark of each row: a dagger where one of the counts is below FEW."""
-    return ["†" if min(values) < FEW else "" for values in zip(*(rows[name] for name in counts), strict=True)]
+    """The mark of each row: a dagger where one of the counts is below FEW; none where a count is not known."""
+    import pandas as pd
+
+    numbers = [pd.to_numeric(rows[name], errors="coerce") for name in counts]
+    return ["†" if any(value < FEW for value in values) else "" for values in zip(*numbers, strict=True)]
 
 
 # --- probes and their baselines ---------------------------------------------------------------------------------------
