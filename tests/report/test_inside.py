@@ -21,6 +21,7 @@ from traps_pipeline.report.page import Card, picture_block, report_html
 from traps_pipeline.report.results import Makers, Results
 from traps_pipeline.report.tables import inside
 from traps_pipeline.report.tables.mechanism import why
+from traps_pipeline.report.tables.patching import patching as patching_table
 from traps_pipeline.report.writing import PrintedTable
 from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.study import Layers, MechanismSettings
@@ -156,7 +157,7 @@ def test_few_answers_are_marked_and_p_is_printed() -> None:
     (row,) = cells(nulls)
     assert (row["Effect, points"], row["p"], row["Draws"]) == ("80.0 †", "0.048", "20")
     assert any(note.startswith("†") for note in nulls.notes)
-    (patched,) = inside.patching(Made())
+    (patched,) = patching_table(Made())
     (row,) = cells(patched)
     assert (row["Indirect effect"], row["Same side"], row["Other times"], row["Left out"]) == (
         "0.990 †",
@@ -164,6 +165,18 @@ def test_few_answers_are_marked_and_p_is_printed() -> None:
         "–",
         "1",
     )
+
+
+def test_every_site_that_was_patched_is_in_the_table_and_has_a_panel() -> None:
+    made, rows = Made(), patching()
+    sites = [rows.assign(site=site, effect=rows["effect"] / n) for n, site in enumerate(("mlp", "attention"), start=2)]
+    made.made["patching"] = pd.concat([*(part.loc[part["source"] == "pair"] for part in sites), rows])
+    (table,) = patching_table(made)
+    found = [(row["Site"], row["Indirect effect"], row["Same side"]) for row in cells(table)]
+    assert found == [("residual stream", "0.990 †", "0.010"), ("attention", "0.330 †", "–"), ("MLP", "0.495 †", "–")]
+    axes = next(report for report in FIGURES if report.name == "patching").make(made).axes
+    titles = [ax.get_title(loc="left").splitlines()[-1] for ax in axes if ax.get_title(loc="left")]
+    assert titles == ["residual stream, 6 pairs", "attention, 6 pairs", "MLP, 6 pairs"]
 
 
 def test_doses_are_in_units_of_the_class_gap() -> None:

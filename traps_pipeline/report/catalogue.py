@@ -28,6 +28,7 @@ from traps_pipeline.report.tables import (
     sub_scenarios,
 )
 from traps_pipeline.report.tables import mechanism as tables_of_mechanism
+from traps_pipeline.report.tables import patching as tables_of_patching
 from traps_pipeline.report.tables import probes as tables_of_probes
 from traps_pipeline.report.tables.shared import printed
 from traps_pipeline.report.writing import SOFT, PrintedTable, figure_bytes, figure_files, figure_style, table_files
@@ -237,7 +238,7 @@ TABLES: tuple[TableReport, ...] = (
         "probe_baselines", inside.probe_baselines, ("probes", "probe_baselines"), title="Probes and their baselines"
     ),
     TableReport("gate", inside.gate, ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
-    TableReport("patching", inside.patching, ("patching",)),
+    TableReport("patching", tables_of_patching.patching, ("patching",)),
     TableReport(
         "cosines", tables_of_mechanism.cosines, ("cosines",), printed_mechanism.cosines, title="Void directions"
     ),

@@ -13,6 +13,7 @@ from traps_pipeline.report.figures.looks import arrow, frame_plane
 from traps_pipeline.report.results import Results, datasets_of
 from traps_pipeline.report.tables.inside import SHORTCUTS, beside
 from traps_pipeline.report.tables.mechanism import why
+from traps_pipeline.report.tables.patching import SITES
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import (
     COLOURS,
@@ -146,26 +147,34 @@ def _risk(ax: Axes, rows: pd.DataFrame, regime: str, colour: dict[str, str]) -> 
 
 
 def patching(results: Results) -> Figure:
-    """Indirect effect of each group of positions at each layer of the residual stream, for patches from the void into
-    the control and back; 1 is the whole difference of the outcome. stamps are the time stamps, changed and unchanged
+    """Indirect effect of each group of positions at each layer, for patches from the void into the control and back; 1
+    is the whole difference of the outcome. The residual stream is all that a block hands on; attention and MLP, where
+    they were patched, are what one block adds to it. stamps are the time stamps, changed and unchanged
     the visual tokens whose pixels differ between the sides and those whose pixels do not; last is the last token."""
     rows = results.patching
-    rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
+    rows = rows.loc[(rows["source"] == "pair") & rows["effect"].notna()]
     if not len(rows):
         absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
         return not_run_figure("Activation patching", absent, PAGE_IN)
-    panels = [(key, part) for key, part in rows.groupby(["model", "dataset", "into"], sort=False)]
-    across = min(2, len(panels))
+    sites = [site for site in SITES if site in set(rows["site"])]
+    cases = dict.fromkeys(zip(rows["model"], rows["dataset"], rows["into"], strict=True))
+    panels = [(case, site) for case in cases for site in sites]
+    across = len(sites) if len(sites) > 1 else min(2, len(panels))  # a line has the sites of one case
     lines = -(-len(panels) // across)
     with figure_style():
         figure = new_figure(PAGE_IN, 0.3 + 1.9 * lines)
         axes = figure.subplots(lines, across, squeeze=False)
         images = []
-        for ax, (key, part) in zip(axes.flat, panels, strict=False):
-            model, dataset, into = (str(name) for name in key)  # pyright: ignore[reportGeneralTypeIssues]
+        for ax, ((model, dataset, into), site) in zip(axes.flat, panels, strict=False):
+            chosen = (rows["model"] == model) & (rows["dataset"] == dataset) & (rows["into"] == into)
+            part = rows.loc[chosen & (rows["site"] == site)]
+            if not len(part):
+                ax.set_axis_off()
+                continue
             images.append(_effects(ax, part))
-            n = int(part["n"].max())
-            ax.set_title(f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {into}, {n} pairs", size=7)
+            where = f"\n{SITES[site]}" if len(sites) > 1 else ""
+            title = f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {into}{where}"
+            ax.set_title(f"{title}, {int(part['n'].max())} pairs", size=6.5 if len(sites) > 1 else 7)
         for ax in axes.flat[len(panels) :]:
             ax.set_axis_off()
         figure.colorbar(images[-1], ax=list(axes.flat), label="indirect effect", shrink=0.8, aspect=25, pad=0.01)

@@ -1,4 +1,5 @@
-"""Controls beside the mechanistic claims: directions among their nulls, and what steering does to PECS."""
+"""Controls beside the mechanistic claims: probes beside baselines, directions among their nulls, what steering and the
+gate do to PECS."""
 
 from __future__ import annotations
 
@@ -218,7 +219,7 @@ def _pecs(results: Results) -> PrintedTable:
     return PrintedTable("steering_pecs", "PECS of the steered model", named, columns, notes, absent)
 
 
-# --- the gate and patching --------------------------------------------------------------------------------------------
+# --- the gate ---------------------------------------------------------------------------------------------------------
 
 DEFAULT_GATE = {"source": "other datasets", "threshold": "mid"}
 SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
@@ -342,32 +343,3 @@ def _prompts(results: Results) -> PrintedTable:
     return PrintedTable(
         "prompt_gate", "What the prompt changes, in answers and in states", rows, columns, notes, absent
     )
-
-
-def patching(results: Results) -> list[PrintedTable]:
-    """Indirect effects of activation patching between matched controls and voids, by group of positions, beside
-    nulls."""
-    rows = results.patching
-    own = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual")]
-    keys = ["model", "dataset", "into", "layer", "group"]
-    nulls = rows.loc[(rows["source"] != "pair") & (rows["site"] == "residual")]
-    wide = nulls.pivot_table(index=keys, columns="source", values="effect", observed=True)
-    names = ["other scenario", "same side", "other times"]
-    table = own.merge(wide.reindex(columns=names).reset_index(), on=keys, how="left")
-    table = table.assign(name=[SHORT.get(name, name) for name in table["dataset"]], mark=few(table, "n"))
-    columns = [
-        MODEL, Column("name", "Dataset"), Column("into", "Into"), LAYER, Column("group", "Positions"),
-        Column("tokens", "Tokens", "ratio"), Column("effect", "Indirect effect", "fraction", mark="mark"),
-        Column("low", "from", "fraction"), Column("high", "to", "fraction"), Column("flips", "Flipped %", "percent"),
-        Column("n_flippable", "of", "count"), *(Column(name, name.capitalize(), "fraction") for name in names),
-        Column("n", "Pairs", "count"), Column("n_left_out", "Left out", "count"),
-    ]  # fmt: skip
-    notes = [
-        "share of the way from the patched side’s log-odds of abstention to the other side’s, residual stream; 1 for "
-        "all positions by construction; effects of groups need not add up",
-        "changed: visual tokens whose pixels differ between the sides; the last columns are patches from another "
-        "scenario’s other side, another scenario’s same side, and the item’s own frames with the other side’s times",
-        *([FEW_NOTE.replace("controls or voids", "pairs")] if "†" in set(table["mark"]) else []),
-    ]
-    absent = "the experiment asks for no `patching`" if results.is_study else "the paper patches nothing"
-    return [PrintedTable("patching", "Activation patching", table, columns, notes, absent)]
