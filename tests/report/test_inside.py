@@ -133,7 +133,8 @@ def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
         ("question words", "0.640"),
     ]
     (row,) = cells(answerable)
-    assert (row["Abstained on %"], row["n"]) == ("40.0", "8") and row["Items"].startswith("decoy")
+    assert (row["Abstained on %"], row["n"]) == ("40.0 †", "8") and any(n.startswith("†") for n in answerable.notes)
+    assert row["Items"].startswith("decoy")
 
 
 def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
@@ -141,6 +142,12 @@ def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
     (row,) = cells(table)  # chaotic alone has answers, under guided; the output margin was read under standard
     assert (row["Dataset"], row["guided"], row["guided − standard"]) == ("ch", "50.0", "–")
     assert (row["Probe, standard"], row["Output margin, standard"]) == ("0.980", "0.900")
+    assert (row["Voids answered about"], row["Voids"], row["Controls"]) == ("64", "16", "16")
+    made = Made()
+    made.made["prompted_probes"] = probes().assign(n_voids=9)
+    made.made["gate"] = gate().assign(n_voids=9)
+    (few,) = cells(inside.gate(made)[-1])
+    assert (few["guided"], few["Probe, standard"], few["Output margin, standard"]) == ("50.0 †", "0.980 †", "0.900 †")
     assert row["Probe, guided"] == "0.960" and row["Output margin, guided"] == row["AbsRec %, standard"] == "–"
 
 

@@ -290,13 +290,16 @@ def _gate_answerable(results: Results) -> PrintedTable:
     rows = rows.loc[~rows["target"].isin([*SHORT, "all"]) & (rows["source"] == DEFAULT_GATE["source"])]
     rows = rows.loc[rows["target"].isin([*WHAT]) & (rows["target"] != "chaotic_time_swapped")]
     rows = rows.drop_duplicates(["model", "features", "threshold", "target"])  # gates know no regime here
-    rows = rows.assign(what=[WHAT[name] for name in rows["target"]])
+    rows = rows.assign(what=[WHAT[name] for name in rows["target"]], mark=few(rows, "n_controls"))
     columns = [
         MODEL, Column("features", "Features"), Column("threshold", "Threshold"), Column("what", "Items"),
-        Column("false_abs", "Abstained on %", "percent"), Column("expected_false_abs", "expected %", "percent"),
-        Column("n_controls", "n", "count"),
+        Column("false_abs", "Abstained on %", "percent", mark="mark"),
+        Column("expected_false_abs", "expected %", "percent"), Column("n_controls", "n", "count"),
     ]  # fmt: skip
-    notes = ["all of these items can be answered, so that every abstention of a gate is a false one"]
+    notes = [
+        "all of these items can be answered, so that every abstention of a gate is a false one",
+        *([FEW_NOTE.replace("controls or voids", "items")] if "†" in set(rows["mark"]) else []),
+    ]
     absent = why(results) if results.is_study else "the paper gates nothing"
     return PrintedTable("gate_answerable", "The gate on items that can be answered", rows, columns, notes, absent)
 
@@ -304,7 +307,7 @@ def _gate_answerable(results: Results) -> PrintedTable:
 def prompts(results: Results) -> pd.DataFrame:
     """One row per model and dataset: AbsRec under standard and guided, in shares, their difference, and for both
     prompts the AUROC of the probe (at the dataset's own layer, fitted without the scored scenario) and of the output
-    margin."""
+    margin; n_answered, the fewest voids that were answered under either prompt, n_voids and n_controls of the probe."""
     import pandas as pd
 
     keys = ["model", "dataset"]
@@ -313,6 +316,7 @@ def prompts(results: Results) -> pd.DataFrame:
     table = plain.pivot_table(index=keys, columns="regime", values="plain_abs_rec", observed=True)
     table = table.reindex(columns=pd.Index(PROMPTED)).add_prefix("said_")
     table["change"] = table["said_guided"] - table["said_standard"]
+    counted = {"n_answered": (plain, "n_voids")}
     own = [results.prompted_probes.loc[results.prompted_probes["source_best"].eq(True)]]
     own += [results.prompted_baselines.loc[results.prompted_baselines["features"] == "output margin"]]
     for name, rows in zip(("probe", "margin"), own, strict=True):
@@ -320,6 +324,10 @@ def prompts(results: Results) -> pd.DataFrame:
         rows = rows.rename(columns={"target": "dataset"}).astype({"prompt": object, "dataset": object})
         wide = rows.pivot_table(index=keys, columns="prompt", values="value", observed=True)
         table = table.join(wide.reindex(columns=pd.Index(PROMPTED)).add_prefix(f"{name}_"))
+        if name == "probe":
+            counted |= {count: (rows, count) for count in ("n_voids", "n_controls")}
+    for name, (rows, count) in counted.items():
+        table[name] = rows.groupby(keys)[count].min().reindex(table.index)
     return table.reset_index()
 
 
@@ -328,16 +336,23 @@ PROMPTED = ("standard", "guided")
 
 def _prompts(results: Results) -> PrintedTable:
     rows = prompts(results)
-    rows = rows.assign(name=[SHORT.get(name, name) for name in rows["dataset"]])
+    rows = rows.assign(
+        name=[SHORT.get(name, name) for name in rows["dataset"]],
+        said_mark=few(rows, "n_answered"),
+        probe_mark=few(rows, "n_voids", "n_controls"),
+    )
     columns = [
-        MODEL, Column("name", "Dataset"), Column("said_standard", "AbsRec %, standard", "percent"),
-        Column("said_guided", "guided", "percent"), Column("change", "guided − standard", "percent"),
-        *(Column(f"{kind}_{prompt}", f"{label}, {prompt}", "fraction")
+        MODEL, Column("name", "Dataset"), Column("said_standard", "AbsRec %, standard", "percent", mark="said_mark"),
+        Column("said_guided", "guided", "percent", mark="said_mark"),
+        Column("change", "guided − standard", "percent", mark="said_mark"),
+        *(Column(f"{kind}_{prompt}", f"{label}, {prompt}", "fraction", mark="probe_mark")
           for kind, label in (("probe", "Probe"), ("margin", "Output margin")) for prompt in PROMPTED),
+        Column("n_answered", "Voids answered about", "count"), *_SIDES,
     ]  # fmt: skip
     notes = [
         "what the prompt changes: the answers (AbsRec), or what is represented (AUROC of voids against controls, "
         "states under the VQA prompt of that name, fitted without the scored scenario)",
+        *([FEW_NOTE] if "†" in {*rows["said_mark"], *rows["probe_mark"]} else []),
     ]
     absent = why(results) if results.is_study else "the paper prints no such figures"
     return PrintedTable(
