@@ -242,7 +242,7 @@ steering = stage(
     STEERING_TABLE,
     collect=_collect_steering,
     group=GROUP,
-    code="2",
+    code="3",
     deps=[
         dg.AssetDep(items, partition_mapping=by_dataset),
         dg.AssetDep(directions, partition_mapping=dg.AllPartitionMapping()),

@@ -62,7 +62,7 @@ class SteeringPecsRow:
     abs_rec: Share
     j: Annotated[float | None, "abs_rec - false_abs"]
     pecs: Share
-    degenerate: Annotated[float, "share of answers that are cut off, repetitive or in another script"]
+    degenerate: Annotated[float, "share of answers that are cut off, repetitive, or in another script or language"]
     n_controls: Annotated[int, "decided answers to controls"]
     n_voids: Annotated[int, "decided answers to voids"]
     epoch: shared.AnswerEpochs

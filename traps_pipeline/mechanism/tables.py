@@ -291,7 +291,7 @@ class SteeringEffectRow:
     high: shared.Wilson
     correct: Annotated[int, "answers to controls that are correct"]
     n_correct: Annotated[int, "answers to controls that were decided for correctness"]
-    degenerate: Annotated[int, "answers cut off, repetitive or in another script than the unsteered one"]
+    degenerate: Annotated[int, "answers cut off, repetitive, or in another script or language than the unsteered one"]
     epoch: shared.AnswerEpochs
 
 

@@ -212,7 +212,7 @@ def _pecs(results: Results) -> PrintedTable:
     notes = [
         "each dataset along its own direction; + on controls and − on voids needs the side of each item, which nobody "
         "has who uses a model",
-        "degenerate: cut off, a phrase four times in a row, or another script than the unsteered answer",
+        "degenerate: cut off, a phrase four times in a row, or another script or language than the unsteered answer",
         *([FEW_NOTE] if "†" in set(named["mark"]) else []),
     ]
     absent = why(results) if results.is_study else "the paper prints no correctness of steered answers"
