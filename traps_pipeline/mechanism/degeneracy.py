@@ -65,8 +65,8 @@ def script(text: str) -> str:
 
 
 def language(text: str) -> str:
-    """The language of STOP_WORDS that most of a text's stop words are of; empty for a text that has few of them, as short
-    answers do, or as many of two languages."""
+    """The language of STOP_WORDS that most of a text's stop words are of; empty for a text with few of them, as short
+    answers are, or with as many of two languages."""
     words = "".join(letter if letter.isalpha() else " " for letter in text.lower()).split()
     counts = Counter({name: sum(word in of for word in words) for name, of in STOP_WORDS.items()})
     (first, most), (_, second) = counts.most_common(2)
