@@ -7,6 +7,7 @@ import pytest
 
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS, TRANSFER_TYPES
+from traps_pipeline.mechanism.tables import STEERING_EFFECTS
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables import mechanism, probes
 from traps_pipeline.scoring.published import published, published_rows
@@ -96,3 +97,14 @@ def test_published_rows_without_a_figure_are_left_out_and_not_invented() -> None
     answerable = next(t for t in probes.probes(PAPER) if t.name == "probe_answerable")
     assert answerable.absence == "not run: the paper has no such control"
     assert set(PAPER.effects["directions"]) == {"standard"} and set(PAPER.effects["regime"]) == {"guided"}
+
+
+def test_a_study_that_steers_no_guided_directions_says_so_where_families_would_stand() -> None:
+    class Made(type(PAPER)):
+        is_study = True
+
+    made = Made()
+    rows = made_up(BASE).reindex(columns=pd.Index(STEERING_EFFECTS.names))
+    made.made["effects"] = rows.assign(directions="standard")
+    (table,) = (t for t in mechanism.steering(made) if t.name == "steering_families")
+    assert table.absence == "not run: no directions of the guided prompt were steered under guided inference"

@@ -11,7 +11,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.mechanism.control_tables import GATE, PATCHING, PROBE_BASELINES, RISK_COVERAGE, STEERING_NULLS
+from traps_pipeline.mechanism.control_tables import (
+    GATE,
+    PATCHING,
+    PROBE_BASELINES,
+    RISK_COVERAGE,
+    STEERING_NULLS,
+    STEERING_PECS,
+)
 from traps_pipeline.mechanism.effects import own_effects
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS
 from traps_pipeline.partitions import DATASETS
@@ -182,8 +189,9 @@ def test_every_site_that_was_patched_is_in_the_table_and_has_a_panel() -> None:
     found = [(row["Site"], row["Indirect effect"], row["Same side"]) for row in cells(table)]
     assert found == [("residual stream", "0.990 †", "0.010"), ("attention", "0.330 †", "–"), ("MLP", "0.495 †", "–")]
     axes = next(report for report in FIGURES if report.name == "patching").make(made).axes
-    titles = [ax.get_title(loc="left").splitlines()[-1] for ax in axes if ax.get_title(loc="left")]
-    assert titles == ["residual stream, 6 pairs", "attention, 6 pairs", "MLP, 6 pairs"]
+    titles = [ax.get_title(loc="left") for ax in axes if ax.get_title(loc="left")]
+    assert titles == ["residual stream", "attention", "MLP"]
+    assert axes[0].get_ylabel().replace("\n", " ") == "m: chaotic, into the control, 6 pairs"
 
 
 def test_doses_are_in_units_of_the_class_gap() -> None:
@@ -262,3 +270,35 @@ def test_only_a_study_without_a_mechanism_section_is_told_so() -> None:
     assert "no `mechanism` section" in why(made)
     made.mechanism = MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)})
     assert why(made) == "this study has no such results yet"
+
+
+def steered() -> pd.DataFrame:
+    row = {"directions": "standard", "regime": "guided", "source": "chaotic", "target": "chaotic", "layer": 3}
+    row |= {"acc": 0.5, "false_abs": 0.0, "abs_rec": 0.5, "j": 0.5, "pecs": 0.25, "degenerate": 0.0}
+    row |= {"n_controls": 16, "n_voids": 16}
+    doses = product((("alpha", 0.0), ("alpha", 5.0), ("gap", 0.0), ("gap", 1.0)), ("label", "plus"))
+    return frame(STEERING_PECS, *(row | {"unit": unit, "dose": dose, "signs": signs} for (unit, dose), signs in doses))
+
+
+def test_the_unsteered_model_is_one_row_a_path() -> None:
+    made = Made()
+    made.made["steering_pecs"] = steered()
+    _, table = inside.steering_nulls(made)
+    found = [(row["Signs"], row["Dose"]) for row in cells(table)]
+    assert found[0] == ("not steered", "none") and len(found) == len(set(found)) == 5
+
+
+def test_gates_on_states_at_the_mid_threshold_come_first() -> None:
+    made, rows = Made(), gate()
+    first = rows.loc[(rows["features"] == "states") & (rows["target"] != "decoy")]
+    made.made["gate"] = pd.concat([rows.assign(features="length"), first.assign(threshold="J"), rows])
+    sources, controls, *_ = inside.gate(made)
+    assert [row["Threshold"] for row in cells(sources)] == ["mid", "mid", "J", "J"]
+    assert [row["Target"] for row in cells(sources)][:2] == ["all", "ch"]
+    assert cells(controls)[0]["Features"] == "states"
+
+
+def test_the_deviation_of_noise_is_not_said_to_be_over_runs() -> None:
+    for table in inside.probe_baselines(Made()):
+        assert "± standard deviation over draws of noise" in table.remarks
+        assert any("log-odds that the first answer token" in note for note in table.notes)

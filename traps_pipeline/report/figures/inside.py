@@ -158,23 +158,29 @@ def patching(results: Results) -> Figure:
         return not_run_figure("Activation patching", absent, PAGE_IN)
     sites = [site for site in SITES if site in set(rows["site"])]
     cases = dict.fromkeys(zip(rows["model"], rows["dataset"], rows["into"], strict=True))
+    alone = len(sites) == 1  # then cases stand side by side; else a line has the sites of one case
+    across = min(2, len(cases)) if alone else len(sites)
     panels = [(case, site) for case in cases for site in sites]
-    across = len(sites) if len(sites) > 1 else min(2, len(panels))  # a line has the sites of one case
     lines = -(-len(panels) // across)
     with figure_style():
         figure = new_figure(PAGE_IN, 0.3 + 1.9 * lines)
         axes = figure.subplots(lines, across, squeeze=False)
         images = []
-        for ax, ((model, dataset, into), site) in zip(axes.flat, panels, strict=False):
+        for place, (ax, ((model, dataset, into), site)) in enumerate(zip(axes.flat, panels, strict=False)):
             chosen = (rows["model"] == model) & (rows["dataset"] == dataset) & (rows["into"] == into)
             part = rows.loc[chosen & (rows["site"] == site)]
             if not len(part):
                 ax.set_axis_off()
                 continue
             images.append(_effects(ax, part))
-            where = f"\n{SITES[site]}" if len(sites) > 1 else ""
-            title = f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {into}{where}"
-            ax.set_title(f"{title}, {int(part['n'].max())} pairs", size=6.5 if len(sites) > 1 else 7)
+            n = int(part["n"].max())
+            if alone:
+                ax.set_title(f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {into}, {n} pairs", size=7)
+                continue
+            if place < across:
+                ax.set_title(SITES[site], size=7.5)
+            if place % across == 0:
+                ax.set_ylabel(f"{plain(model)[:20]}: {TITLES[dataset].lower()},\ninto the {into}, {n} pairs", size=7)
         for ax in axes.flat[len(panels) :]:
             ax.set_axis_off()
         figure.colorbar(images[-1], ax=list(axes.flat), label="indirect effect", shrink=0.8, aspect=25, pad=0.01)

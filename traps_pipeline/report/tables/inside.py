@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 FEW = 10  # items of a side below which a value is marked
 FEW_NOTE = f"† fewer than {FEW} controls or voids: the value says little"
+DRAWS = "± standard deviation over draws of noise"
 LAYER = Column("layer", "Layer", "count")
 DOSE = Column("step", "Dose")
 SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "− everywhere"}
@@ -119,7 +120,8 @@ def _beside(results: Results) -> PrintedTable:
         *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
     ]
     absent = why(results) if results.is_study else "the paper has no such baselines"
-    return PrintedTable("probe_baselines", "Probes beside their baselines", rows, columns, notes, absent)
+    title = "Probes beside their baselines"
+    return PrintedTable("probe_baselines", title, rows, columns, notes, absent, deviation=DRAWS)
 
 
 def _look_alikes(results: Results) -> PrintedTable:
@@ -134,13 +136,15 @@ def _look_alikes(results: Results) -> PrintedTable:
         *_BASELINES, *_SIDES,
     ]  # fmt: skip
     notes = [
+        *_NOTES[:2],
         "told apart from voids: 1 for a probe that detects what cannot be known, 0.5 for one that detects what both "
         "have; from controls: the reverse",
         "frame times of the other side: 1 for a probe that reads the frames, 0 for one that reads the time stamps",
         *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
     ]
     absent = why(results) if results.is_study else "the paper has no such items"
-    return PrintedTable("probe_look_alikes", "What only looks like a void", named, columns, notes, absent)
+    title = "What only looks like a void"
+    return PrintedTable("probe_look_alikes", title, named, columns, notes, absent, deviation=DRAWS)
 
 
 AGAINST = {"answerable_void": "voids", "answerable_control": "controls", "time_swapped": "its other side"}
@@ -193,12 +197,20 @@ def _ahead(rows: pd.DataFrame) -> list[str]:
     return [f"the void direction is ahead of 19 of 20 draws {where}; one row in ten would be so by chance"]
 
 
+MODEL_OF = ("model", "directions", "regime")
+
+
 def _pecs(results: Results) -> PrintedTable:
+    import pandas as pd
+
     rows = results.steering_pecs
     rows = rows.loc[rows["source"] == rows["target"]]
+    unsteered = rows["dose"] == 0  # once for each path: it is the same model in every unit and under all signs
+    named = pd.concat([rows.loc[unsteered].drop_duplicates([*MODEL_OF, "source", "target"]), rows.loc[~unsteered]])
+    rows = named.sort_values([*MODEL_OF, "source"], kind="stable", ignore_index=True)
     named = rows.assign(
         step=_dose(rows),
-        policy=[SIGNS[name] for name in rows["signs"]],
+        policy=[SIGNS[name] if dose else "not steered" for name, dose in zip(rows["signs"], rows["dose"], strict=True)],
         path=[path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)],
         mark=few(rows, "n_controls", "n_voids"),
     )
@@ -246,12 +258,16 @@ _GATE_NOTES = (
 
 
 def _gates(results: Results) -> pd.DataFrame:
+    """The rows of gates: those on states first, from the other datasets, at the mid threshold, over all datasets."""
     rows = results.gate
+    firsts = {"features": "states", **DEFAULT_GATE, "target": "all"}
+    later = {f"{name}_later": rows[name].astype(object) != first for name, first in firsts.items()}
+    rows = rows.assign(**later).sort_values(["model", "regime", *later], kind="stable", ignore_index=True)
     return rows.assign(
         mark=few(rows, "n_controls", "n_voids"),
         dataset=[SHORT.get(name, name) for name in rows["target"]],
         sources=[SOURCE_NAMES.get(name, name) for name in rows["source"]],
-    )
+    ).drop(columns=[*later])
 
 
 def _gate_sources(results: Results) -> PrintedTable:

@@ -124,7 +124,10 @@ def _regimes(results: Results, name: str, title: str) -> PrintedTable:
         Column("void_top", "Void, α, %", "percent"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
     notes = ["mean over the paths of a set; +α on controls, −α on voids"]
-    return PrintedTable(name, title, rows, columns, notes, why(results))
+    absent = why(results)
+    if name.endswith("families") and len(results.effects):
+        absent = "no directions of the guided prompt were steered under guided inference"
+    return PrintedTable(name, title, rows, columns, notes, absent)
 
 
 def _domains(results: Results) -> PrintedTable:

@@ -11,7 +11,7 @@ import numpy as np
 from traps_pipeline.mechanism.paths import TRANSFER_PAIRS, path_name
 from traps_pipeline.partitions import ANSWERABLE, transfer_type
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.inside import FEW_NOTE, SHORTCUTS, few
+from traps_pipeline.report.tables.inside import DRAWS, FEW_NOTE, SHORTCUTS, few
 from traps_pipeline.report.tables.mechanism import PATH, TYPE, short_names, why
 from traps_pipeline.report.tables.shared import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
@@ -32,6 +32,7 @@ def probes(results: Results) -> list[PrintedTable]:
 # --- what stands beside a probe ---------------------------------------------------------------------------------------
 
 KEYS = ["model", "source", "target"]
+APART = "not computed; held out: these datasets share no controls and no scenarios"
 BESIDE = ("raw", "raw_value", "margin", "noise", "noise_spread")
 _BESIDE_NOTES = (
     "best raw input: the one of question words, first frame, all frames, length and time stamps with the highest "
@@ -160,7 +161,8 @@ def _transfer(results: Results) -> PrintedTable:
         *_beside_notes(results),
         *_few_note([] if not len(rows) else rows["mark"].tolist()),
     ]
-    return PrintedTable("probe_transfer", "Probe transfer: AUROC by ordered pair", rows, columns, notes, why(results))
+    title = "Probe transfer: AUROC by ordered pair"
+    return PrintedTable("probe_transfer", title, rows, columns, notes, why(results), dash=APART, deviation=DRAWS)
 
 
 def _confabulated(results: Results) -> PrintedTable:
@@ -189,7 +191,8 @@ def _confabulated(results: Results) -> PrintedTable:
     if results.is_study and len(results.probes):
         absent = "; ".join(silent) or absent
     title = "Probes on confabulated voids (Cf→Cf)"
-    return PrintedTable("probe_confabulated", title, rows if results.is_study else rows.head(0), columns, notes, absent)
+    rows = rows if results.is_study else rows.head(0)
+    return PrintedTable("probe_confabulated", title, rows, columns, notes, absent, dash=APART, deviation=DRAWS)
 
 
 def _means(results: Results) -> PrintedTable:
@@ -211,7 +214,8 @@ def _means(results: Results) -> PrintedTable:
     notes = [*_shared_controls(results), *_beside_notes(results)]
     if results.is_study:
         notes.append("best raw inputs are the best of each path, and their AUROC is the mean over these")
-    return PrintedTable("probe_means", "Probe transfer: means over paths", rows, columns, notes, why(results))
+    title = "Probe transfer: means over paths"
+    return PrintedTable("probe_means", title, rows, columns, notes, why(results), dash=APART, deviation=DRAWS)
 
 
 def _listed(names: pd.Series) -> str:
@@ -263,7 +267,8 @@ def _within(results: Results) -> PrintedTable:
             *_BESIDE_NOTES,
         ]
     notes += _few_note(table["mark"].tolist())
-    return PrintedTable("probe_within", "Probes within a dataset", table, columns, notes, why(results))
+    title, over = "Probes within a dataset", "± standard deviation over shuffles of labels, or over draws of noise"
+    return PrintedTable("probe_within", title, table, columns, notes, why(results), deviation=over)
 
 
 def _catch(results: Results) -> PrintedTable:
@@ -360,4 +365,4 @@ def _answerable(results: Results) -> PrintedTable:
         *_few_note([*table["answerable_void_mark"].dropna(), *table["answerable_control_mark"].dropna()]),
     ]
     absent = why(results) if results.is_study else "the paper has no such control"
-    return PrintedTable("probe_answerable", "Hidden, or unknowable", table, columns, notes, absent)
+    return PrintedTable("probe_answerable", "Hidden, or unknowable", table, columns, notes, absent, deviation=DRAWS)
