@@ -295,6 +295,8 @@ def test_gates_on_states_at_the_mid_threshold_come_first() -> None:
     sources, controls, *_ = inside.gate(made)
     assert [row["Threshold"] for row in cells(sources)] == ["mid", "mid", "J", "J"]
     assert [row["Target"] for row in cells(sources)][:2] == ["all", "ch"]
+    made.made["gate"] = gate().assign(layer=-1)  # as the stage writes it of a mean over datasets
+    assert cells(inside.gate(made)[0])[0]["Layer"] == "–"
     assert cells(controls)[0]["Features"] == "states"
 
 

@@ -130,3 +130,10 @@ def test_the_papers_tables_have_no_empty_columns_of_baselines() -> None:
     assert "Cf→Cf" in first(of_paper["probe_transfer"]) and "Noise" not in first(of_paper["probe_transfer"])
     assert of_paper["probe_confabulated"].absence.endswith("table of probe transfer")
     assert not any(mark for mark in of_paper["probe_transfer"].rows["mark"])  # it prints no counts to mark
+
+
+def test_a_raw_input_is_named_only_where_it_is_above_chance() -> None:
+    made = Made()
+    rows = baselines()
+    made.made["prompted_baselines"] = rows.assign(value=rows["value"].where(rows["features"] == "noise", 0.5))
+    assert first(tables(made)["probe_transfer"])["Best raw input"] == "none above .5"

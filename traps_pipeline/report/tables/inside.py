@@ -265,6 +265,7 @@ def _gates(results: Results) -> pd.DataFrame:
     rows = rows.assign(**later).sort_values(["model", "regime", *later], kind="stable", ignore_index=True)
     return rows.assign(
         mark=few(rows, "n_controls", "n_voids"),
+        layer=rows["layer"].where(rows["layer"] >= 0),  # a mean over datasets has no layer of its own
         dataset=[SHORT.get(name, name) for name in rows["target"]],
         sources=[SOURCE_NAMES.get(name, name) for name in rows["source"]],
     ).drop(columns=[*later])

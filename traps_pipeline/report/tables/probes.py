@@ -33,6 +33,7 @@ def probes(results: Results) -> list[PrintedTable]:
 
 KEYS = ["model", "source", "target"]
 APART = "not computed; held out: these datasets share no controls and no scenarios"
+NO_RAW = "none above .5"
 BESIDE = ("raw", "raw_value", "margin", "noise", "noise_spread")
 _BESIDE_NOTES = (
     "best raw input: the one of question words, first frame, all frames, length and time stamps with the highest "
@@ -67,9 +68,11 @@ def against(results: Results, analysis: str, prefix: str = "") -> pd.DataFrame:
 
 
 def best_name(values: Mapping[Any, float]) -> str:
-    """The feature with the highest value, the first of equals; empty where there is none."""
+    """The feature with the highest AUROC, the first of equals; NO_RAW where none is above chance, empty where there is
+    none at all."""
     known = {str(name): value for name, value in values.items() if value == value}
-    return max(known, key=lambda name: known[name], default="")
+    best = max(known, key=lambda name: known[name], default="")
+    return NO_RAW if best and known[best] <= 0.5 else best
 
 
 def _beside(results: Results, prefix: str = "", head: str = "") -> list[Column]:
