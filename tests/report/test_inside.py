@@ -25,6 +25,7 @@ from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report import publish
 from traps_pipeline.report.catalogue import FIGURES, INSIDE
 from traps_pipeline.report.page import Card, picture_block, report_html
+from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.results import Makers, Results
 from traps_pipeline.report.tables import inside
 from traps_pipeline.report.tables.mechanism import why
@@ -304,3 +305,12 @@ def test_the_deviation_of_noise_is_not_said_to_be_over_runs() -> None:
     for table in inside.probe_baselines(Made()):
         assert "± standard deviation over draws of noise" in table.remarks
         assert any("log-odds that the first answer token" in note for note in table.notes)
+
+
+def test_the_page_of_a_study_that_looks_inside_explains_its_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(publish, "_chapters", lambda *_: [])
+    results = PublishedResults()
+    for mechanism, there in ((None, False), (MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)}), True)):
+        results.mechanism = mechanism
+        page = publish.report_files(results, results, [], {})[publish.PAGE].decode()
+        assert ("distance between the mean states of voids and of controls" in page) == there

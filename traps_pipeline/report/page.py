@@ -42,12 +42,13 @@ def report_html(
     title: str = "TRAPSBench report",
     robust: pd.DataFrame | None = None,
     said: Sequence[str] = (),
+    terms: Mapping[str, str] | None = None,
 ) -> str:
     """The page: leaderboard, figures (title -> PNG bytes, inlined), legend, one table per dataset, then the chapters.
 
-    robust: ROBUST rows, whose figures the leaderboard shows; said: further notes below it. With `address`, every number
-    is a link to the items behind it. The page opens from disk and makes no network request; its content policy forbids
-    any.
+    robust: ROBUST rows, whose figures the leaderboard shows; said: further notes below it; terms: further words
+    of the legend. With `address`, every number is a link to the items behind it. The page opens from disk and makes no
+    network request; its content policy forbids any.
     """
     return (
         environment()
@@ -59,7 +60,7 @@ def report_html(
             figures={name: base64.b64encode(png).decode() for name, png in (figures or {}).items()},
             chapters=chapters,
             all_items=address(Behind()) if address else "",
-            legend=legend(board, robust),
+            legend={**legend(board, robust), **(terms or {})},
         )
     )
 

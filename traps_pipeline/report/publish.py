@@ -28,6 +28,7 @@ from traps_pipeline.report.results import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables.audited import audit_table
 from traps_pipeline.report.tables.people import said_by_people
+from traps_pipeline.report.terms import INSIDE_TERMS
 from traps_pipeline.report.writing import Behind, environment, figure_files, table_files
 from traps_pipeline.storage.workspace import Workspace
 
@@ -54,7 +55,8 @@ def report_files(study: Results, paper: Results, cells: Sequence[Cell], pictures
     first = {landscape.title: pictures[landscape.path(study)]} if landscape.path(study) in pictures else {}
     said = said_by_people(study.human_row, study.panel_errors)
     chapters = _chapters(study, paper, address, pictures)
-    page = report_html(study.board, first, chapters, address, robust=study.robust, said=said)
+    terms = INSIDE_TERMS if study.mechanism else None
+    page = report_html(study.board, first, chapters, address, robust=study.robust, said=said, terms=terms)
     markdown = leaderboard_markdown(study.board, study.robust, said)
     return {PAGE: page.encode(), MARKDOWN: markdown.encode(), METRICS: metrics_lines(study.board).encode()}
 

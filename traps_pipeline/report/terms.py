@@ -33,3 +33,14 @@ MARKS = {
     INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered",
     BROKEN_MARK: f"broken: {BROKEN_TEXTS}",
 }
+# Words of the tables and figures of what is found inside models; a page without them does not explain them.
+INSIDE_TERMS = {
+    "oc, ch, _ip": "the datasets occlusion and chaotic, with _ip their ill-posed questions; oc→ch: learnt from oc and "
+    "applied to ch",
+    "States": "numbers inside the model at one layer: layer 0 is the embeddings, layer l what block l hands on",
+    "AUROC": "chance that a probe scores a void above a control: 1 tells all apart, 0.5 is guessing, 0 is always wrong",
+    "Output margin": "log-odds that the first answer token begins an abstention",
+    "Class gap": "distance between the mean states of voids and of controls at a layer",
+    "Indirect effect": "share of the difference between the answers to both sides that goes over with patched states",
+    "† inside models": "from fewer than ten items a side",
+}
