@@ -32,8 +32,8 @@ from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_bytes
 from traps_pipeline.mechanism.chunks import alone, end_leases, leased
-from traps_pipeline.models.local.capture import OF_PARTS, ONE_TOKEN, Pooling
-from traps_pipeline.models.local.spans import spans
+from traps_pipeline.models.local.capture import OF_PAIRS, OF_PARTS, ONE_TOKEN, Pooling
+from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
 from traps_pipeline.storage.parquet import read_sealed, write_sealed
 
@@ -54,13 +54,15 @@ _NOT_RECORDED = "not recorded"  # the device in shards of earlier versions
 
 @dataclass(frozen=True)
 class Item:
-    """One forward pass to make. about: everything that the prompt depends on (question, clip, system prompt), for the
-    key. prompt: makes the prompt, and is called only when the states are missing."""
+    """One forward pass to make. about: everything that the states depend on (question, clips, system prompt), for the
+    key. prompt: makes the prompt, and is called only when the states are missing; other: the same about the pair's
+    other clip, for poolings over what differs."""
 
     item_id: str
     side: str
     about: Mapping[str, Any]
     prompt: Callable[[], Prompt]
+    other: Callable[[], Prompt] | None = None
 
 
 @dataclass(frozen=True)
@@ -78,22 +80,25 @@ _Place = tuple[str, int, str]  # shard, row and device of an item's states
 
 
 def clip_item(
-    model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], clip: Path, system: str, times: Path | None = None
-) -> Item:
+    model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], clip: Path, system: str,
+    times: Path | None = None, other: tuple[Path, str] | None = None,
+) -> Item:  # fmt: skip
     """The item that asks a question about a clip under a system prompt.
 
     row: a row of the items table (item_id, side, question, media_digest; times_digest where there is `times`). spec:
     how the model is shown a clip. times: another clip, whose frame times are shown in the place of the clip's own.
+    other: the pair's other clip and its SHA-256, where the pooling depends on it.
     """
 
-    def prompt() -> Prompt:
-        shown = sample(clip, spec)
-        return model.prompt(system, row["question"], shown.frames, shown_times(shown, clip, spec, times))
+    def asked(frames_of: Path) -> Prompt:
+        shown = sample(frames_of, spec)
+        return model.prompt(system, row["question"], shown.frames, shown_times(shown, frames_of, spec, times))
 
     about = {"question": row["question"], "clip": row["media_digest"], "media": profile_digest(spec), "system": system}
     if times is not None:
         about["times"] = row["times_digest"]
-    return Item(row["item_id"], row["side"], about, prompt)
+    about |= {"other": other[1]} if other else {}
+    return Item(row["item_id"], row["side"], about, partial(asked, clip), partial(asked, other[0]) if other else None)
 
 
 def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
@@ -220,15 +225,26 @@ def item_states(model: LocalModel, item: Item, prompt: Prompt, pooling: Pooling)
 
 def _chosen(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooling) -> np.ndarray | None:
     """The tokens over which states are pooled; None where the pooling says so itself. Raises TrapsError for a part that
-    the prompt does not have (a model that writes no time stamps)."""
+    the prompt does not have (a model that writes no time stamps, a pair with equal clips)."""
     if pooling not in OF_PARTS:
         return None
-    found = spans(model, prompt, item.about["system"], item.about["question"])[pooling]
+    parts = spans(model, prompt, item.about["system"], item.about["question"])
+    found = parts[pooling] if pooling not in OF_PAIRS else _of_pair(parts["visual"], prompt, item)[pooling]
     if not found.any():
         raise TrapsError(
             f"{item.item_id}: its prompt for {model.checkpoint.name} has no {pooling}; choose another pooling"
         )
     return found
+
+
+def _of_pair(visual: np.ndarray, prompt: Prompt, item: Item) -> dict[str, np.ndarray]:
+    changed = changed_tokens(prompt, item.other(), visual) if item.other else None
+    if changed is None:
+        raise TrapsError(
+            f"{item.item_id}: its visual tokens cannot be compared with those of the pair's other clip (not as many, "
+            "or pixels that do not come token by token); choose another pooling"
+        )
+    return {"changed": changed, "unchanged": visual & ~changed}
 
 
 def _prepared(missing: Sequence[tuple[Item, str]]) -> Iterator[tuple[tuple[Item, str], Prompt]]:

@@ -19,7 +19,7 @@ from traps_pipeline.mechanism.hidden_states import shown_times
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching import Patch, Recorded, patched_changes, record, require_patchable
 from traps_pipeline.mechanism.tables import PROBE_ITEMS
-from traps_pipeline.models.local.spans import spans
+from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.models.prompts import states_prompt
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.partitions import SIDES, Extraction
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 WELL_POSED = ("occlusion", "chaotic")  # their sides have the same question, and clips of as many shown frames
 OWN, OTHER, SAME, TIMES = SOURCES = ("pair", "other scenario", "same side", "other times")
 GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
-CHANGED = 0.05  # mean absolute difference of a visual token's pixels, as the model reads them, that is a change
 RESAMPLES = 1000
 
 
@@ -110,7 +109,7 @@ def _changes(
         if (name, into) not in sides or (name, towards) not in sides:
             continue
         target, own = sides[name, into], sides[name, towards]
-        groups = _groups(model, target, own)
+        groups = _groups(target, own)
         if groups is None:
             yield {"scenario": name, "into": into, "source": OWN, "left_out": True}
             continue
@@ -149,31 +148,17 @@ def _patches(n_layers: int, groups: Mapping[str, np.ndarray], sites: Sequence[st
     return wanted
 
 
-def _groups(model: LocalModel, target: Side, other: Side) -> dict[str, np.ndarray] | None:
+def _groups(target: Side, other: Side) -> dict[str, np.ndarray] | None:
     """The groups of positions of a pair; None if the two prompts have another form. A model whose pixels do not lie
     token by token (LLaVA-NeXT-Video) has no group of unchanged visual tokens: all count as changed."""
     if not _fits(target, other):
         return None
     parts, visual = target.parts, target.parts["visual"]
-    changed = visual.copy()
-    differs = changed_tokens(model, target.prompt, other.prompt, int(visual.sum()))
-    if differs is not None:
-        changed[np.flatnonzero(visual)] = differs
+    changed = changed_tokens(target.prompt, other.prompt, visual)
+    changed = visual if changed is None else changed
     found = {"system": parts["system"], "stamps": parts["stamps"], "changed": changed, "unchanged": visual & ~changed}
     found |= {"question": parts["question"], "last": parts["last"], "all": np.ones(len(visual), bool)}
     return {name: found[name] for name in GROUPS}
-
-
-def changed_tokens(model: LocalModel, one: Prompt, other: Prompt, n_visual: int) -> np.ndarray | None:
-    """Whether the pixels of each visual token differ between two prompts, (n_visual,) bool; None where the processor's
-    pixels do not come token by token. Qwen's do: the patches that are merged into one token follow each other."""
-    pixels = [prompt.inputs.get("pixel_values_videos") for prompt in (one, other)]
-    if pixels[0] is None or pixels[1] is None or pixels[0].shape != pixels[1].shape or pixels[0].ndim != 2:
-        return None
-    if not n_visual or len(pixels[0]) % n_visual:
-        return None
-    difference = (pixels[0].float() - pixels[1].float()).abs().mean(dim=1)
-    return (difference.reshape(n_visual, -1).amax(dim=1) > CHANGED).numpy()
 
 
 def _summed(changes: pd.DataFrame, extraction: Extraction, dataset: str, seed: int) -> Iterator[PatchingRow]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -43,6 +44,21 @@ def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
     if not rows:
         raise TrapsError(f"probe_items {dataset}: no occlusion scenarios yet; materialize scene_specs and videos first")
     return rows
+
+
+def other_clip(workspace: Workspace, row: Mapping[str, Any]) -> tuple[Path, str]:
+    """The clip with which a row of PROBE_ITEMS is compared, and its SHA-256: of its scenario's two clips that of the
+    other side, whichever question the row has, and for any other clip (an arm's) the control's.
+
+    So an ill-posed row, whose two sides have one clip, is compared where the scenario's panel would be. Raises
+    TrapsError for a scenario without both clips.
+    """
+    clips = workspace.tables.read(VIDEOS, {"category": row["category"]})
+    sides = clips.loc[clips["scenario_id"] == row["scenario_id"]].set_index("side")
+    if not {"control", "void"} <= set(sides.index):
+        raise TrapsError(f"{row['scenario_id']}: lacks a clip of its pair; materialize videos for {row['category']}")
+    which = "void" if sides.loc["control", "file_sha256"] == row["media_digest"] else "control"
+    return workspace.resolve(str(sides.loc[which, "path"])), str(sides.loc[which, "file_sha256"])
 
 
 def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeItemRow:

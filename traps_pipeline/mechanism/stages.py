@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +24,7 @@ from traps_pipeline.mechanism.directions import (
     vector_digest,
 )
 from traps_pipeline.mechanism.paths import CURVES
+from traps_pipeline.mechanism.probe_items import other_clip
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import (
@@ -44,7 +47,12 @@ from traps_pipeline.partitions import (
     StatesCell,
     is_ill_posed,
 )
+from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    from traps_pipeline.mechanism.hidden_states import Item
+    from traps_pipeline.models.local.adapter import LocalModel
 
 COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "question", "clip", "media_digest")
 
@@ -68,7 +76,7 @@ def examined_model(workspace: Workspace, model: str) -> ModelEntry:
 
 def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenStatesRow], int]:
     """Make the missing states of a partition; returns its rows, and how many states were made."""
-    from traps_pipeline.mechanism.hidden_states import clip_item, extract, read_layer, read_record
+    from traps_pipeline.mechanism.hidden_states import extract, read_layer, read_record
     from traps_pipeline.models.local.adapter import load_local_model
 
     entry, settings = examined_model(workspace, cell.extraction.model), workspace.mechanism
@@ -78,15 +86,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     _check_layers(workspace, entry.id, model.n_layers)
     folder = states_folder(workspace, cell)
     wanted = [
-        clip_item(
-            model,
-            entry.media,
-            {str(k): v for k, v in item.items()},
-            workspace.resolve(item["clip"]),
-            system,
-            workspace.resolve(item["times_clip"]) if isinstance(item["times_clip"], str) else None,
-        )
-        for item in items
+        probed_item(workspace, model, entry.media, {str(k): v for k, v in item.items()}, system) for item in items
     ]
     held = workspace.store.below(folder)
     workspace.store.bring(held)
@@ -114,6 +114,17 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
         for item in items
     ]
     return rows, done.n_new
+
+
+def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], system: str) -> Item:
+    """The item of a row of PROBE_ITEMS, as the study pools its states. Raises TrapsError where a pooling compares the
+    clips of a pair and the scenario lacks one."""
+    from traps_pipeline.mechanism.hidden_states import clip_item
+    from traps_pipeline.models.local.capture import OF_PAIRS
+
+    times = workspace.resolve(row["times_clip"]) if isinstance(row["times_clip"], str) else None
+    other = other_clip(workspace, row) if workspace.mechanism.pooling in OF_PAIRS else None
+    return clip_item(model, spec, row, workspace.resolve(row["clip"]), system, times, other)
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:

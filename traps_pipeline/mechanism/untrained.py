@@ -10,7 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.mechanism.hidden_states import clip_item, item_states
+from traps_pipeline.mechanism.hidden_states import item_states
+from traps_pipeline.mechanism.stages import probed_item
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.local.library import load_transformers
@@ -49,9 +50,8 @@ def untrained_states(
         keys = states.dataset(dataset)["states_key"]
         for key, row in zip(keys, rows.to_dict("records"), strict=True):
             if key not in made:
-                times = workspace.resolve(row["times_clip"]) if isinstance(row["times_clip"], str) else None
                 named = {str(name): value for name, value in row.items()}
-                item = clip_item(model, entry.media, named, workspace.resolve(row["clip"]), system, times)
+                item = probed_item(workspace, model, entry.media, named, system)
                 made[key] = item_states(model, item, item.prompt(), workspace.mechanism.pooling).raw[layer]
             found.setdefault(dataset, []).append(made[key])
     return {dataset: np.stack(vectors) for dataset, vectors in found.items()}

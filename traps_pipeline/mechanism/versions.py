@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.paths import CURVES
 from traps_pipeline.mechanism.tables import DIRECTIONS
+from traps_pipeline.models.local.capture import OF_PAIRS
 from traps_pipeline.models.prompts import states_prompt, system_prompt
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.partitions import Extraction, StatesCell
@@ -58,7 +60,10 @@ def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
     media = profile_digest(entry.media) if entry.media else None
     pooling = settings.pooling if settings else None
     system = states_prompt(settings.system if settings else "vqa", extraction.prompt)
-    return digest([loaded_params(entry), media, system, pooling])[:16]
+    made_of = [loaded_params(entry), media, system, pooling]
+    if pooling in OF_PAIRS:  # an item's states depend on the other clip of its scenario, which is not in its own table
+        made_of.append(sorted(workspace.tables.read_all(VIDEOS, ["file_sha256"])["file_sha256"]))
+    return digest(made_of)[:16]
 
 
 def probing_version(workspace: Workspace, extraction: Extraction) -> str:

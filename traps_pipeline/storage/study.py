@@ -121,7 +121,7 @@ class MechanismSettings(BaseModel):
     system: Literal["vqa", "benchmark"] = Field(
         default="vqa", description="system prompts of extraction: the short VQA ones, or the benchmark's own"
     )
-    pooling: Literal["last", "answer", "mean", "visual", "stamps", "question"] = Field(
+    pooling: Literal["last", "answer", "mean", "visual", "changed", "unchanged", "stamps", "question"] = Field(
         default="last", description="of tokens; the paper does not say which"
     )
     steering: SteeringSettings | None = SteeringSettings()

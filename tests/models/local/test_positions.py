@@ -12,7 +12,7 @@ from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family, ask, model
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.hidden_states import Item, item_states
 from traps_pipeline.models.local.adapter import LocalModel, Prompt
-from traps_pipeline.models.local.spans import spans
+from traps_pipeline.models.local.spans import changed_tokens, spans
 
 pytestmark = pytest.mark.slow
 
@@ -101,3 +101,49 @@ def test_the_state_at_the_first_answer_token_is_that_of_the_prompt_with_the_mode
     found = item_states(of, item(prompt), prompt, "answer").raw[2]
     assert found == pytest.approx(own, abs=1e-5)
     assert np.abs(found - of.forward_states(prompt).raw[2]).max() > 1e-3
+
+
+def changed_item(one: Prompt, other: Prompt) -> Item:
+    about = {"system": SYSTEM, "question": QUESTIONS[1]}
+    return Item("a:b:void", "void", about, lambda: one, lambda: other)
+
+
+def with_panel(of: LocalModel) -> tuple[Prompt, Prompt]:
+    """Prompts about four frames of 32 x 64 pixels, and about the same with a black panel over the right half of the
+    last two."""
+    frames = np.random.default_rng(0).integers(90, 255, (4, 32, 64, 3)).astype(np.uint8)
+    covered = frames.copy()
+    covered[2:, :, 32:] = 0
+    one, other = (of.prompt(SYSTEM, QUESTIONS[1], shown, [0.0, 0.5, 1.0, 1.5]) for shown in (frames, covered))
+    return one, other
+
+
+def test_states_at_panel_tokens_are_means_over_the_visual_tokens_that_the_panel_covers() -> None:
+    """A token is 32 x 32 pixels of two frames, so there are four: left and right, early and late. The panel is one."""
+    of = model("qwen3-vl")
+    one, other = with_panel(of)
+    mask = spans(of, one, SYSTEM, QUESTIONS[1])["visual"]
+    visual, differs = np.flatnonzero(mask), changed_tokens(one, other, mask)
+    assert one.inputs["video_grid_thw"].tolist() == [[2, 2, 4]] and len(visual) == 4
+    assert differs is not None and np.flatnonzero(differs).tolist() == [visual[3]]
+    for prompt, its_other in ((one, other), (other, one)):
+        asked, own = changed_item(prompt, its_other), library(of, prompt)
+        for pooling, tokens in (("changed", visual[3:]), ("unchanged", visual[:3])):
+            found = item_states(of, asked, prompt, pooling).raw[2]  # pyright: ignore[reportArgumentType]
+            assert found == pytest.approx(own[torch.from_numpy(tokens)].mean(dim=0).numpy(), abs=1e-5)
+
+
+def test_states_at_panel_tokens_are_refused_where_nothing_differs_or_nothing_can_be_compared() -> None:
+    of = model("qwen3-vl")
+    one, other = with_panel(of)
+    with pytest.raises(TrapsError, match=r"a:b:void: its prompt for .* has no changed; choose another pooling"):
+        item_states(of, changed_item(one, one), one, "changed")
+    same = item_states(of, changed_item(one, one), one, "unchanged").raw
+    assert (same == item_states(of, item(one), one, "visual").raw).all()
+    for wrong in (item(one), changed_item(one, ask(of, QUESTIONS[1]))):
+        with pytest.raises(TrapsError, match="cannot be compared with those of the pair's other clip"):
+            item_states(of, wrong, one, "changed")
+    llava = model("llava-next-video")
+    one, other = with_panel(llava)
+    with pytest.raises(TrapsError, match="pixels that do not come token by token"):
+        item_states(llava, changed_item(one, other), one, "changed")

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
 PARTS = ("system", "stamps", "visual", "question", "last")
+CHANGED = 0.05  # mean absolute difference of a visual token's pixels, as the model reads them, that is a change
 # `<0.4 seconds>` of Qwen3-VL and `00:01` of Gemma 4; LLaVA-NeXT-Video writes no times.
 _STAMP = re.compile(r"<\d+(?:\.\d+)?seconds>|\d\d:\d\d(?!\d)")
 
@@ -57,6 +58,23 @@ def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict
     for name in PARTS[:-1]:
         found[name] &= ~found["last"]
     return found
+
+
+def changed_tokens(one: Prompt, other: Prompt, visual: np.ndarray) -> np.ndarray | None:
+    """The visual tokens (T,) of a prompt whose pixels differ from those of another one, (T,) bool.
+
+    None where the clips do not give as many pixels, or the processor's pixels do not come token by token. Qwen's do:
+    the patches that are merged into one token follow each other.
+    """
+    pixels, n_visual = [prompt.inputs.get("pixel_values_videos") for prompt in (one, other)], int(visual.sum())
+    if pixels[0] is None or pixels[1] is None or pixels[0].shape != pixels[1].shape or pixels[0].ndim != 2:
+        return None
+    if not n_visual or len(pixels[0]) % n_visual:
+        return None
+    difference = (pixels[0].float() - pixels[1].float()).abs().mean(dim=1)
+    changed = np.zeros(len(visual), bool)
+    changed[visual] = (difference.reshape(n_visual, -1).amax(dim=1) > CHANGED).numpy()
+    return changed
 
 
 def _stamps(whole: str, first: int, last: int) -> Iterator[tuple[int, int]]:
