@@ -29,6 +29,7 @@ from traps_pipeline.mechanism.other_probes import from_sklearn as from_sklearn
 from traps_pipeline.mechanism.other_probes import mean_difference as mean_difference
 from traps_pipeline.mechanism.probes import Fit, Scorer, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun
+from traps_pipeline.mechanism.sites import Site, changing, check_head, head_slice, into_head
 from traps_pipeline.mechanism.stages import saved_directions
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.registry import get_model
@@ -215,8 +216,9 @@ INTERVENTIONS: dict[str, Change] = {"add": _add, "project out": _project_out, "c
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """A direction at a layer of a model. vector: (d,), of any length but 0. layer: 1 to the number of blocks, counted
-    as in hidden_states. gap: the distance between the sides' means along it, for doses in that unit."""
+    """A direction at a layer of a model. vector: (d,), of any length but 0; (hd,) for one head. layer: 1 to the number
+    of blocks, counted as in hidden_states. gap: the distance between the sides' means along it, for doses in that
+    unit."""
 
     vector: np.ndarray
     layer: int
@@ -230,7 +232,8 @@ class Direction:
         *,
         gaps: float | None = None,
         how: str = "add",
-        site: Literal["residual", "attention", "mlp"] = "residual",
+        site: Site = "residual",
+        head: int | None = None,
         positions: Callable[[Tensor], Tensor] | None = None,
         when: tuple[Scorer, float] | None = None,
     ) -> Iterator[None]:
@@ -239,14 +242,29 @@ class Direction:
         model: a transformers model, or one of ours. amount: in the model's own unit, or gaps: in class gaps. how: a key
         of INTERVENTIONS. positions: of states (rows, T, d), a mask (rows, T) of what is changed; all by default (with a
         cache, T is 1 after the prompt). when: a probe on states of this very layer and a threshold: a row is changed
-        only if the score of its last token is above it. Raises TrapsError for a layer or width that the model lacks.
+        only if the score of its last token is above it.
+
+        head: with site attention, one head alone, from 0: the slice (rows, T, hd) that it gives to the output
+        projection. A vector of the residual stream is then turned into the head's own direction that writes the most
+        along it, and amounts are lengths of the head's output. Raises TrapsError for a layer, head or width that the
+        model lacks.
         """
-        block, width = _block(model, self.layer)
+        block, width, n_heads = _block(model, self.layer)
         change = INTERVENTIONS.get(how)
         unit = np.asarray(self.vector, np.float32)
         length = float(np.linalg.norm(unit))
         if change is None:
             raise TrapsError(f"no intervention {how!r}; there are {', '.join(INTERVENTIONS)}")
+        check_head(site, head)
+        if head is not None:
+            mine = head_slice(block, head, n_heads)
+            own = mine.stop - mine.start
+            if gaps is not None:
+                raise TrapsError("class gaps are measured in the residual stream, not in a head; give amount")
+            if unit.shape == (width,) and own != width and length:
+                unit = into_head(block, head, n_heads, unit)
+                length = float(np.linalg.norm(unit))
+            width = own
         if unit.shape != (width,) or not np.isfinite(unit).all() or not length:
             raise TrapsError(
                 f"the direction has shape {unit.shape}, but states of this model are {width} finite numbers"
@@ -256,9 +274,7 @@ class Direction:
         if gaps is not None and self.gap is None:
             raise TrapsError("this direction has no class gap; give amount, or take a direction of `inside.direction`")
         dose = float(amount) if amount is not None else float(gaps or 0) * float(self.gap or 0)
-        module = block if site == "residual" else getattr(block, {"attention": "self_attn", "mlp": "mlp"}[site])
-        hook = _hook(change, unit / length, dose, positions, when)
-        handle = module.register_forward_hook(hook, prepend=True)
+        handle = changing(block, site, head, n_heads, _changer(change, unit / length, dose, positions, when))
         try:
             yield
         finally:
@@ -269,7 +285,8 @@ class Direction:
         return replace(self, vector=-self.vector)
 
 
-def _block(model: Any, layer: int) -> tuple[Module, int]:
+def _block(model: Any, layer: int) -> tuple[Module, int, int]:
+    """A block, the width of the model's states, and the number of its attention heads."""
     network = getattr(model, "network", model)
     decoder = network.get_decoder() if hasattr(network, "get_decoder") else None
     blocks = getattr(decoder, "layers", None)
@@ -277,23 +294,23 @@ def _block(model: Any, layer: int) -> tuple[Module, int]:
         raise TrapsError(f"{type(network).__name__} has no get_decoder().layers, so no block can be changed in it")
     if not 1 <= layer <= len(blocks):
         raise TrapsError(f"no block {layer}; {type(network).__name__} has blocks 1 to {len(blocks)}")
-    return blocks[layer - 1], int(network.config.get_text_config().hidden_size)
+    config = network.config.get_text_config()
+    return blocks[layer - 1], int(config.hidden_size), int(config.num_attention_heads)
 
 
-def _hook(
+def _changer(
     change: Change,
     unit: np.ndarray,
     dose: float,
     positions: Callable[[Tensor], Tensor] | None,
     when: tuple[Scorer, float] | None,
-) -> Callable[[Any, Any, Any], Any]:
+) -> Callable[[Tensor], Tensor]:
     import torch
 
     chosen_rows: Tensor | None = None
 
-    def hook(_: Any, __: Any, output: Any) -> Any:
+    def changed(states: Tensor) -> Tensor:
         nonlocal chosen_rows
-        states = output[0] if isinstance(output, tuple) else output
         along = torch.from_numpy(unit).to(states.device, states.dtype)
         made = change(states, along, dose)
         if positions is not None:
@@ -304,9 +321,9 @@ def _hook(
                 score = when[0].scores(states[:, -1].float().cpu().numpy())
                 chosen_rows = torch.from_numpy(np.asarray(score) > when[1])
             made = torch.where(chosen_rows.to(states.device)[:, None, None], made, states)
-        return (made, *output[1:]) if isinstance(output, tuple) else made
+        return made
 
-    return hook
+    return changed
 
 
 def direction(

@@ -17,12 +17,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.margin import first_token_margins
+from traps_pipeline.mechanism.sites import Site
 from traps_pipeline.models.local.capture import first_tensor
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
-Site = Literal["residual", "attention", "mlp"]
 SITES: tuple[Site, ...] = ("residual", "attention", "mlp")
 ROWS = 64  # patches in one pass
 
