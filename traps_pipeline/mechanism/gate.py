@@ -19,7 +19,7 @@ import pandas as pd
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.paths import probed_taxonomy
-from traps_pipeline.mechanism.probes import Solver, auroc, fit_probe, scenario_folds
+from traps_pipeline.mechanism.probes import Scorer, Solver, auroc, fit_probe, scenario_folds
 from traps_pipeline.partitions import DATASETS
 
 MID, J, CONFORMAL = THRESHOLDS = ("mid", "J", "conformal")
@@ -106,13 +106,22 @@ def decide(
         train = items.rows(inside & ~np.isin(groups, held))
         if len(set(train.void)) < 2:
             continue
-        probe = fit_probe(train.features, train.void, solver)
+        probe, cuts, shares = fit_gate(train, folds, seed, false_abs, solver)
         score[here] = probe.scores(items.features[scored[here]])
-        calibrating, void = _own_scores(train, folds, seed, solver)
-        for name, value in thresholds(calibrating, void, false_abs).items():
-            cut[name][here] = value
-            expected[name][here] = (calibrating[~void] > value).mean()
+        for name in THRESHOLDS:
+            cut[name][here], expected[name][here] = cuts[name], shares[name]
     return Decisions(scored, score, cut, expected)
+
+
+def fit_gate(
+    train: Items, folds: int, seed: int, false_abs: float, solver: Solver = "exact"
+) -> tuple[Scorer, dict[str, float], dict[str, float]]:
+    """A gate from its source's items: the probe, its thresholds by name, and the share of the calibrating controls
+    above each. There must be both sides, in two scenarios or more."""
+    probe = fit_probe(train.features, train.void, solver)
+    calibrating, void = _own_scores(train, folds, seed, solver)
+    cuts = thresholds(calibrating, void, false_abs)
+    return probe, cuts, {name: float((calibrating[~void] > cut).mean()) for name, cut in cuts.items()}
 
 
 def _held_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> Iterator[np.ndarray]:

@@ -93,8 +93,8 @@ def _each(
             f"gate {states.extraction.key}: {entry.id} has no verdicts under {' or '.join(REGIMES)} in run 1; the "
             "experiment must ask the model under one of these regimes"
         )
-    table = _table(states)
-    best = _best_layers(workspace, states)
+    table = gate_table(states)
+    best = best_layers(workspace, states)
     kinds = [*_kinds(workspace, entry, states, best, sources)]
     for number, gates in enumerate(kinds):
         progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
@@ -104,14 +104,14 @@ def _each(
             yield regime, outcomes[regime], gates.name, source, own
 
 
-def _table(states: StoredStates) -> pd.DataFrame:
+def gate_table(states: StoredStates) -> pd.DataFrame:
     """The items of all datasets in the order of `states.items`, as a gate wants them."""
     items = states.items
     named = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
     return named.assign(family=families(items), prompt=items["states_key"], void=items["side"] == "void")
 
 
-def _best_layers(workspace: Workspace, states: StoredStates) -> dict[str, int]:
+def best_layers(workspace: Workspace, states: StoredStates) -> dict[str, int]:
     """The layer of each source's gates: the highest mean AUROC of its datasets' own cross-validations. For `other
     datasets` the key is that with the target behind a colon."""
     probes = workspace.tables.read(PROBES, states.extraction.partition)
@@ -120,6 +120,12 @@ def _best_layers(workspace: Workspace, states: StoredStates) -> dict[str, int]:
     of |= {f"{OTHER_DATASETS}:{name}": [other for other in within if other != name] for name in DATASETS}
     every = {source: [*within] for source in SOURCES if source not in of and source != OTHER_DATASETS}
     return {source: int(within[names].mean(axis=1).idxmax()) for source, names in (of | every).items() if names}
+
+
+def layer_of(best: Mapping[str, int], source: str, target: str) -> int:
+    """The layer of a source's gates for a target, of `best_layers`. To a target that is no dataset of pairs all four
+    datasets are others, as they are to other families."""
+    return best.get(f"{source}:{target}", best.get(source, best[OTHER_FAMILIES]))
 
 
 def _kinds(
@@ -159,17 +165,16 @@ def _decisions(
     for source, target in product(gates.sources, dict.fromkeys(table["dataset"])):
         if not sources_of_gate(source, str(target), there):
             continue  # a study of some datasets has the gates that these allow
-        # To a target that is no dataset of pairs all four datasets are others, as they are to other families.
-        layer = best.get(f"{source}:{target}", best.get(source, best[OTHER_FAMILIES]))
+        layer = layer_of(best, source, str(target))
         layer = layer if layer in gates.by_layer else -1
-        items = _items(table, gates.by_layer[layer], gates.name == SHUFFLED, seed)
+        items = gate_items(table, gates.by_layer[layer], gates.name == SHUFFLED, seed)
         found = decide(items, source, str(target), solver=settings.probes.solver, **about)
         if np.isfinite(found.score).any():
             made[source, str(target)] = found, layer
     return made
 
 
-def _items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> Items:
+def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> Items:
     """The table with its features; with shuffled labels, where a coin for each scenario swaps its sides."""
     values = np.empty((len(table), next(iter(features.values())).shape[1]))
     for name, of in features.items():

@@ -4,7 +4,8 @@ A steered answer is a request like any other, so it goes through the same ledger
 the layer and the signed alpha, beside the prompt, the clip and the checkpoint. At alpha 0 the key holds none of the
 three, so that all directions share one answer. The two datasets of a taxonomy have the same control items, and share
 their answers too; so do two sign policies where they add the same. What takes out a state's part along a direction, or
-sets it, is steering too, with the share that is taken out in the key.
+sets it, is steering too, with the share that is taken out in the key. Where a study steers another site than the
+residual stream, a part of the prompt alone, or only where a gate says so, the key holds that as well.
 
 Doses are given as alphas, the paper's, and in units of the class gap, since one alpha is a large step in one model and
 none in another. Nulls are steered at the largest dose, along the direction of the dataset that is steered.
@@ -23,6 +24,7 @@ from traps_pipeline import progress
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
+from traps_pipeline.mechanism.deciding import Gate, conditions
 from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.made_answers import MadeAnswers, is_written, make_meanwhile
@@ -37,7 +39,7 @@ from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Request
-from traps_pipeline.partitions import SIDES, SteeringCell, taxonomy_of
+from traps_pipeline.partitions import SIDES, Extraction, SteeringCell, taxonomy_of
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace
@@ -50,7 +52,7 @@ BY_LABEL = "label"  # the paper's sign policy, which knows the side of each item
 class Strength:
     """One direction at one strength. alpha has no sign: `signs` says on which side alpha times the direction is added
     and on which it is subtracted. dose: in its unit, one of DoseUnit. removed: the share of a state's part along the
-    direction that is taken out first."""
+    direction that is taken out first. gate: what the gate is made of that decides whether it is steered at all."""
 
     source: str
     kind: str
@@ -63,6 +65,7 @@ class Strength:
     dose: float = 0.0
     signs: str = BY_LABEL
     removed: float = 0.0
+    gate: str | None = None
 
     def signed(self, side: str) -> float:
         """The signed alpha for a row of that side."""
@@ -192,16 +195,28 @@ def _in_range(layer: int, directions: Directions) -> int:
 
 
 def wanted_steered(
-    workspace: Workspace, entry: ModelEntry, cell: SteeringCell, directions: Mapping[str, Directions]
+    workspace: Workspace,
+    entry: ModelEntry,
+    cell: SteeringCell,
+    directions: Mapping[str, Directions],
+    gates: Mapping[tuple[str, int], Gate],
 ) -> list[SteeredQuestion]:
     """The calls for every answer of a cell; calls about one prompt are adjacent, so that they share what the blocks
-    below the steered one make of it."""
+    below the steered one make of it. gates: by source and layer (`conditions`); empty where every item is steered."""
     settings = workspace.mechanism
     assert settings.steering is not None, "an experiment without steering has no steering cells"
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset})
     chosen = steered_scenarios(sorted(set(items["scenario_id"])), settings.steering.pairs, settings.seed)
     rows = items.loc[items["scenario_id"].isin(chosen)].to_dict("records")
-    plan = strengths(cell.dataset, settings.models[entry.id], settings, directions)
+    plan = [
+        (
+            replace(strength, gate=gate.made_of)
+            if (gate := gates.get((strength.source, strength.layer)))
+            else strength,
+            s,
+        )
+        for strength, s in strengths(cell.dataset, settings.models[entry.id], settings, directions)
+    ]
     most = settings.steering.max_new_tokens
     return [
         SteeredQuestion(steered_request(workspace, entry, item, cell, strength, most), item, strength)
@@ -228,6 +243,9 @@ def steered_request(
         signed = strength.signed(item["side"])
         steering = {"direction": strength.digest, "layer": strength.layer, "alpha": signed}
         steering |= {"removed": strength.removed} if strength.removed else {}
+        assert workspace.mechanism.steering is not None, "an experiment without steering has no steering cells"
+        steering |= workspace.mechanism.steering.acting
+        steering |= {"gate": strength.gate} if strength.gate else {}
     return Request(
         participant=entry.id,
         endpoint=entry.backend,
@@ -262,6 +280,8 @@ def collect_steered(
     Several processes may do so at once, on one machine: one writes the answers of an evaluation, and whoever waits for
     it makes answers in the meantime (`made_answers`).
     """
+    assert workspace.mechanism.steering is not None, "an experiment without steering has no steering cells"
+    place = place_of(workspace.mechanism.steering)
     vectors = {
         vector_digest(vector): vector
         for of_prompt in directions.values()
@@ -271,10 +291,11 @@ def collect_steered(
         for vector in draw
     }
 
+    gates = {prompt: conditions(workspace, Extraction(entry.id, prompt)) for prompt in directions}
     made = MadeAnswers(workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
 
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
-        wanted = wanted_steered(workspace, entry, cell, directions[cell.directions])
+        wanted = wanted_steered(workspace, entry, cell, directions[cell.directions], gates[cell.directions])
         made.chunks([each.request for each in wanted])
         return wanted
 
@@ -282,15 +303,22 @@ def collect_steered(
         made.forget([each.request for each in settled.calls])
         answered = settled.answered()
         plain = {q.item["item_id"]: row["text"] for q, row in answered if q.strength.kind == UNSTEERED}
-        return settled.made(partial(_steering_row, plain))
+        return settled.made(partial(_steering_row, plain, place))
 
     def make(entry: Entry) -> SteeredBackend:
-        return SteeredBackend(entry, vectors, made)
+        return SteeredBackend(entry, vectors, made, {g.made_of: g for of in gates.values() for g in of.values()})
 
     for cell in cells:
         if is_written(workspace.answers, cell.evaluation.key):
             _make_meanwhile(workspace, cell, calls(cell), made, make(entry))
     yield from collect(workspace, "steering", workspace.answers, [entry], cells, calls, finish, make)
+
+
+def place_of(steering: SteeringSettings) -> str:
+    """Where a study's steering acts, in a few words, for the column `place`."""
+    site = f"{steering.site} head {steering.head}" if steering.head is not None else steering.site
+    where = "all tokens" if steering.positions == "all" else f"{steering.positions} tokens"
+    return f"{site}, {where}" + (f", where a gate says so ({steering.when})" if steering.when else "")
 
 
 def _make_meanwhile(
@@ -310,7 +338,7 @@ def _make_meanwhile(
 
 
 def _steering_row(
-    plain: Mapping[str, str | None], cell: SteeringCell, question: SteeredQuestion, row: Row
+    plain: Mapping[str, str | None], place: str, cell: SteeringCell, question: SteeredQuestion, row: Row
 ) -> SteeringRow:
     item, strength = question.item, question.strength
     return SteeringRow(
@@ -323,6 +351,7 @@ def _steering_row(
         alpha_relative=strength.relative,
         degenerate=degeneracy(row["text"], row["outcome"], plain.get(item["item_id"])),
         direction_digest=strength.digest,
+        place=place,
         request_key=row["key"],
     )
 

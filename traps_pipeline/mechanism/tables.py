@@ -210,6 +210,7 @@ class SteeringRow:
     completion_tokens: shared.Tokens
     degenerate: Annotated[str | None, "why the text is no answer: truncated, repetition or script; null if it is one"]
     direction_digest: Annotated[str | None, "digest of the direction's numbers"]
+    place: Annotated[str, "where the direction acts: site, tokens, and under which condition"]
     request_key: Annotated[str, "ledger key; the two datasets of a taxonomy share the key of a control"]
     epoch: shared.Epoch
     created_at: shared.AskedAt

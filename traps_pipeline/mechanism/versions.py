@@ -15,6 +15,7 @@ from traps_pipeline.models.prompts import states_prompt, system_prompt
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.partitions import Extraction, StatesCell
 from traps_pipeline.storage.media import profile_digest
+from traps_pipeline.storage.study import ACTING
 from traps_pipeline.storage.workspace import Workspace
 
 SAMPLING = ("do_sample", "temperature", "top_p", "max_new_tokens")
@@ -95,6 +96,7 @@ def steering_version(workspace: Workspace, run: str) -> str:
     entry, settings = get_model(model), workspace.study.mechanism
     if settings is None or settings.steering is None or model not in settings.models:
         return "none"
-    chosen = settings.steering.model_dump(mode="json"), settings.models[model].model_dump(mode="json"), settings.seed
+    steering = settings.steering.model_dump(mode="json", exclude=set(ACTING)) | settings.steering.acting
+    chosen = steering, settings.models[model].model_dump(mode="json"), settings.seed
     media = profile_digest(entry.media) if entry.media else None
     return digest([*chosen, loaded_params(entry), media, system_prompt(regime)])[:16]

@@ -49,6 +49,9 @@ class NullSettings(BaseModel):
     draws: int = Field(default=20, ge=1, description="19 are the fewest with which p can reach .05")
 
 
+ACTING = ("site", "head", "positions", "when")  # where and when steering acts
+
+
 class SteeringSettings(BaseModel):
     """What is steered (docs/spec.md 8.2)."""
 
@@ -72,7 +75,30 @@ class SteeringSettings(BaseModel):
         default=(), description="what the part along the direction is set to, in class gaps; for 0 say project_out: [1]"
     )
     nulls: NullSettings | None = NullSettings()
+    site: Literal["residual", "attention", "mlp"] = Field(
+        default="residual", description="what of the steered block is changed: its output, or that of a part of it"
+    )
+    head: int | None = Field(default=None, ge=0, description="one attention head alone; needs site attention")
+    positions: Literal["all", "system", "stamps", "visual", "question", "last"] = Field(
+        default="all", description="tokens that are changed: all, answers included, or a part of the prompt"
+    )
+    when: Literal["mid", "J", "conformal"] | None = Field(
+        default=None, description="steer only where a gate's probe of the plain state exceeds this threshold"
+    )
     max_new_tokens: int = Field(default=512, ge=1)
+
+    @property
+    def acting(self) -> dict[str, Any]:
+        """Those of site, head, positions and when that are not as the paper has them, for keys and versions."""
+        return {n: getattr(self, n) for n in ACTING if getattr(self, n) != type(self).model_fields[n].default}
+
+    @model_validator(mode="after")
+    def _one_head(self) -> SteeringSettings:
+        if self.head is not None and self.site != "attention":
+            raise ValueError(f"head {self.head}: heads are of attention; set site: attention")
+        if self.head is not None and (self.gaps or self.clamp):
+            raise ValueError("class gaps are measured in the residual stream, not in a head: set gaps and clamp to []")
+        return self
 
     @field_validator("alphas", "gaps")
     @classmethod

@@ -20,12 +20,16 @@ class Steers(Protocol):
     """What may change hidden states during a pass: `mechanism.hook.Steering`."""
 
     @property
-    def layer(self) -> int:
-        """The block whose output is changed; those below it are as they were."""
+    def resumes_at(self) -> int:
+        """The last block up to which passes are as they were, but for a change of that block's output; 0: none."""
         ...
 
     def rows(self, chosen: Sequence[int]) -> Steers:
         """That of some of the prompts."""
+        ...
+
+    def begun(self, chosen: Sequence[int]) -> Steers:
+        """That of some of the prompts, for passes behind them."""
         ...
 
     def applied(self, model: Any) -> AbstractContextManager[None]:
@@ -54,11 +58,12 @@ def decode(
     transformers, config = load_transformers(), model.network.generation_config
     nucleus = SeededNucleus(sampling) if sampling else None
     ends = _ends(config.eos_token_id)
-    prefixes = None
-    if steering is not None and use_cache and model.prefixes.active:
-        prefixes = model.prefixes.of(model, prompts, steering.layer)
+    steers = steering
+    prefixes, at = None, steering.resumes_at if steering is not None else 0
+    if at and use_cache and model.prefixes.active:
+        prefixes = model.prefixes.of(model, prompts, at)
         if prefixes is not None:
-            prompts = without_pictures(model, prompts, steering.layer)
+            prompts = without_pictures(model, prompts, at)
     inputs: dict[str, Any] = model.placed(collate(prompts, config.pad_token_id))
     width, rows = inputs["input_ids"].shape[1], [*range(len(prompts))]
     answers: dict[int, list[int]] = {}
@@ -67,9 +72,9 @@ def decode(
             stopping = _Stopping(stopped)
             criteria: list[Any] = [stopping] + ([_HalfEnded(ends, width)] if use_cache else [])
             with ExitStack() as stack:
-                if prefixes is not None and steering is not None:
-                    stack.enter_context(resumed(model, prefixes, steering.layer))
-                stack.enter_context(steered(steering.rows(rows) if steering else None, model))
+                if prefixes is not None:
+                    stack.enter_context(resumed(model, prefixes, at))
+                stack.enter_context(steered(steers, model))
                 out = model.network.generate(
                     **inputs,
                     max_new_tokens=max_new_tokens + width - inputs["input_ids"].shape[1],
@@ -89,6 +94,7 @@ def decode(
                 return [answers[row] for row in range(len(prompts))]
             inputs, prefixes = _without(model, inputs, out, going), None
             rows = [rows[place] for place in going]
+            steers = steering.begun(rows) if steering else None
             if nucleus:
                 nucleus.keep(going)
 

@@ -1,0 +1,128 @@
+"""A gate in memory, which decides about prompts that are shown to a model now: the same probe and threshold as those
+that the gate stage counts, for a notebook and as the condition under which a study steers."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from traps_pipeline.digests import digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.directions import steered_scenarios
+from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
+from traps_pipeline.mechanism.gating import best_layers, gate_items, gate_table, layer_of
+from traps_pipeline.mechanism.probes import Scorer
+from traps_pipeline.mechanism.stored import StoredStates
+from traps_pipeline.models.local.capture import OF_PARTS, Pooling
+from traps_pipeline.partitions import DATASETS, Extraction
+from traps_pipeline.storage.workspace import Workspace
+
+if TYPE_CHECKING:
+    from traps_pipeline.models.local.adapter import LocalModel, Prompt
+
+ABSTENTION = "I don't know: this cannot be determined from the video."
+Threshold = Literal["mid", "J", "conformal"]
+
+
+@dataclass(frozen=True, eq=False)
+class Gate:
+    """A gate: a probe of the states at a layer, whose score above the threshold means abstaining. pooling: of the
+    states that it was fitted on. made_of: digest of these states and of what else decided it."""
+
+    layer: int
+    probe: Scorer
+    threshold: float
+    pooling: Pooling
+    made_of: str
+
+    def score(self, model: LocalModel, prompt: Prompt) -> float:
+        """The probe's log-odds of void for a prompt: one pass of the plain model."""
+        with model.remembering_clips():
+            states = model.forward_states(prompt, self.pooling).raw[self.layer]
+        return float(self.probe.scores(states[None])[0])
+
+    def abstains(self, model: LocalModel, prompt: Prompt) -> bool:
+        """Whether the gate turns the model's answer to a prompt into an abstention."""
+        return self.score(model, prompt) > self.threshold
+
+    def answer(self, model: LocalModel, prompt: Prompt, max_new_tokens: int = 512) -> str:
+        """The model's greedy answer to a prompt, or ABSTENTION where the gate abstains, without generating any."""
+        return ABSTENTION if self.abstains(model, prompt) else model.generate([prompt], max_new_tokens)[0].text
+
+
+def fitted_gate(
+    workspace: Workspace,
+    extraction: Extraction,
+    *,
+    source: str,
+    threshold: Threshold,
+    target: str = "",
+    layer: int | None = None,
+    without: Collection[str] = (),
+) -> Gate:
+    """A gate of a source, one of `gate.SOURCES`, fitted on the study's stored states.
+
+    target: the dataset that `other datasets` leaves out. layer: that of the gate stage by default. without: scenarios,
+    or families as `gate.families` names them, that the gate must not have seen. Raises TrapsError for another source or
+    threshold, for a source without both sides in as many scenarios as there are folds, and for states that are means
+    over a part of the prompt.
+    """
+    states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
+    if threshold not in THRESHOLDS:
+        raise TrapsError(f"no threshold {threshold!r}; there are {', '.join(THRESHOLDS)}")
+    pooling = str(states.items["pooling"].iloc[0])
+    if pooling in OF_PARTS:
+        raise TrapsError(
+            f"these states are means over a part of the prompt ({pooling}), which a prompt alone does not tell; "
+            "set `pooling: last`"
+        )
+    if layer is None:
+        layer = layer_of(best_layers(workspace, states), source, target)
+    if not 0 <= layer < states.n_layers:
+        raise TrapsError(f"no layer {layer}; these states have layers 0 to {states.n_layers - 1}")
+    train = _train(states, source, target, layer, without)
+    folds, false_abs = settings.probes.folds, settings.gate.false_abs
+    if len(set(train.void)) < 2 or len(set(train.table["scenario_id"])) < folds:
+        raise TrapsError(
+            f"a gate from {source} needs both sides of {folds} scenarios (`probes.folds`), and has "
+            f"{len(train.table)} items; extract the hidden states of more pairs"
+        )
+    probe, cuts, _ = fit_gate(train, folds, settings.seed, false_abs, settings.probes.solver)
+    made_of: list[Any] = [sorted(train.table["prompt"]), layer, threshold, folds, settings.seed, false_abs]
+    return Gate(layer, probe, cuts[threshold], pooling, digest([*made_of, settings.probes.solver])[:32])  # pyright: ignore[reportArgumentType]
+
+
+def _train(states: StoredStates, source: str, target: str, layer: int, without: Collection[str]) -> Items:
+    table = gate_table(states)
+    there = [name for name in DATASETS if name in set(table["dataset"])]
+    names = sources_of_gate(source, target, there)
+    if not names:
+        raise TrapsError(f"no gate from {source!r}; the study has states of {', '.join(there) or 'no dataset'}")
+    table = table.loc[table["dataset"].isin(names)].reset_index(drop=True)
+    unseen = ~(table["scenario_id"].isin(without) | table["family"].isin(without)).to_numpy(bool)
+    features = {name: states.read(name, layer) for name in names}
+    return gate_items(table, features, shuffled=False, seed=0).rows(unseen)
+
+
+def conditions(workspace: Workspace, extraction: Extraction) -> dict[tuple[str, int], Gate]:
+    """By source dataset and layer, the gates that decide where steering with `when` acts, fitted without the scenarios
+    that are steered; empty where the study steers all items. The gate of a path is of the dataset whose direction it
+    takes. Raises TrapsError where too few scenarios are left."""
+    settings = workspace.mechanism
+    steering = settings.steering
+    if steering is None or steering.when is None:
+        return {}
+    states, layers = StoredStates.of(workspace, extraction), settings.models[extraction.model]
+    steered = set[str]()
+    sources = [name for name in DATASETS if not states.dataset(name).empty]
+    for name in sources:
+        scenarios = sorted(set(states.dataset(name)["scenario_id"]))
+        steered |= {*steered_scenarios(scenarios, steering.pairs, settings.seed)}
+    return {
+        (name, layer): fitted_gate(
+            workspace, extraction, source=f"one:{name}", threshold=steering.when, layer=layer, without=steered
+        )
+        for name in sources
+        for layer in sorted({layers.steering, *layers.sweep})
+    }
