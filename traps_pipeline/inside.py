@@ -12,7 +12,7 @@ docs/inside.md walks through this; a test runs that page.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,8 +23,11 @@ import pandas as pd
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS
-from traps_pipeline.mechanism.contrast import ccs, contrast_states
-from traps_pipeline.mechanism.other_probes import NAMED
+from traps_pipeline.mechanism.contrast import ccs as ccs
+from traps_pipeline.mechanism.contrast import contrast_states
+from traps_pipeline.mechanism.deciding import Gate, Threshold, fitted_gate
+from traps_pipeline.mechanism.other_probes import NAMED, fit_named
+from traps_pipeline.mechanism.other_probes import erased as erased
 from traps_pipeline.mechanism.other_probes import from_sklearn as from_sklearn
 from traps_pipeline.mechanism.other_probes import mean_difference as mean_difference
 from traps_pipeline.mechanism.probes import Fit, Scorer, fit_probe
@@ -121,22 +124,8 @@ def _verdicts(workspace: Workspace, cell: Cell) -> pd.DataFrame:
 # --- probes -----------------------------------------------------------------------------------------------------------
 
 
-def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
-    """States (n, d) from which no linear classifier can tell the sides: the smallest change, in the metric of the
-    states' own covariance, after which both sides have the same mean (least-squares concept erasure, LEACE, of Belrose
-    et al. 2023, for one binary concept)."""
-    states = np.asarray(states, float)
-    centred, label = states - states.mean(axis=0), void - void.mean()
-    left, size, right = np.linalg.svd(centred, full_matrices=False)
-    kept = size > size[0] * max(states.shape) * np.finfo(float).eps
-    whitened = left[:, kept]  # rows have unit covariance up to a factor
-    towards = whitened.T @ label
-    towards /= np.linalg.norm(towards)
-    return states - np.outer(whitened @ towards, (towards * size[kept]) @ right[kept])
-
-
-# By name: probes that `protocol` takes. CCS takes the states of `contrast`.
-PROBES: dict[str, Fit] = {**NAMED, "CCS": ccs}
+# By name: probes that `protocol` and an experiment's `probes.others` take. CCS takes the states of `contrast`.
+PROBES: dict[str, Fit] = NAMED
 
 
 def contrast(
@@ -164,17 +153,15 @@ def protocol(
     """The study's own protocol for another probe: the rows that the table `probe_baselines` has for its baselines, with
     the same items, folds, splits by scenario and intervals.
 
-    fit: states (n, d) and void (n,) to anything with `scores` (a key of PROBES, `from_sklearn`, your own). change: a
-    change of the states of a dataset, (n, d) to (n, k). features: what items have in the place of the study's states
-    (`contrast`, or your own); datasets that it lacks are left out. Columns: analysis, source, target, value (AUROC),
-    low, high, n_voids, n_controls.
+    fit: states (n, d) and void (n,) to anything with `scores` (`from_sklearn`, your own), or a name of PROBES or of a
+    classifier of scikit-learn. change: a change of the states of a dataset, (n, d) to (n, k). features: what items have
+    in the place of the study's states (`contrast`, or your own); datasets that it lacks are left out. Columns:
+    analysis, source, target, value (AUROC), low, high, n_voids, n_controls.
     """
     opened = _workspace(workspace)
     states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
     mechanism = opened.study.mechanism
     settings = mechanism.probes if mechanism else ProbeSettings()
-    if isinstance(fit, str) and fit not in PROBES:
-        raise TrapsError(f"no probe {fit!r}; there are {', '.join(PROBES)}")
     items = states.items
     if features is not None:
         items = items.loc[items["dataset"].isin([*dict.fromkeys(features.items["dataset"])])].reset_index(drop=True)
@@ -187,10 +174,44 @@ def protocol(
             raise TrapsError(f"`features` lacks {int((places < 0).sum())} items of {dataset}; give all items of it")
         return change(features.X[places])
 
-    chosen = PROBES[fit] if isinstance(fit, str) else fit
-    run = ProbeRun(items, read, 1, 0, settings, mechanism.seed if mechanism else 0, fit=chosen)
+    seed = mechanism.seed if mechanism else 0
+    run = ProbeRun(items, read, 1, 0, settings, seed, fit=fit_named(fit, seed) if isinstance(fit, str) else fit)
     columns = ["analysis", "source", "target", "value", "low", "high", "n_voids", "n_controls"]
     return pd.DataFrame(run.comparable(0), columns=pd.Index(columns))
+
+
+# --- a gate -----------------------------------------------------------------------------------------------------------
+
+
+def gate(
+    workspace: Where,
+    model: str,
+    *,
+    source: str,
+    threshold: Threshold = "mid",
+    target: str = "",
+    layer: int | None = None,
+    prompt: str = "standard",
+    without: Collection[str] = (),
+) -> Gate:
+    """A gate that decides now: `abstains(model, prompt)` and `answer(model, prompt)` for a model and prompt of ours.
+
+    source: `one:DATASET`, `other datasets` (than the target) or `other families`. threshold: mid, J or conformal.
+    layer: that of the gate stage by default. without: scenarios, or families as the gate stage names them
+    (`occlusion:tunnel`), that the gate must not have seen: without those of a fold, its decisions about that fold are
+    the ones that the stage counts. Raises TrapsError for a source without enough pairs, and for states that are means
+    over a part of the prompt.
+    """
+    extraction = Extraction(get_model(model).id, prompt)
+    return fitted_gate(
+        _workspace(workspace),
+        extraction,
+        source=source,
+        threshold=threshold,
+        target=target,
+        layer=layer,
+        without=without,
+    )
 
 
 # --- interventions ----------------------------------------------------------------------------------------------------

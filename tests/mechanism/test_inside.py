@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -17,14 +18,16 @@ from tests.mechanism.study import PAIRS, make_study, register, tiny_entry, write
 from traps_pipeline import inside
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism import stages
-from traps_pipeline.mechanism.baselines import RAW, output_margins
+from traps_pipeline.mechanism.baselines import RAW, baseline_rows, output_margins
 from traps_pipeline.mechanism.contrast import _loss
-from traps_pipeline.mechanism.gate import SOURCES
-from traps_pipeline.mechanism.gating import curve_rows, gate_rows
+from traps_pipeline.mechanism.deciding import ABSTENTION
+from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, decide
+from traps_pipeline.mechanism.gating import curve_rows, gate_items, gate_rows, gate_table
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.margin import abstention_tokens
+from traps_pipeline.mechanism.other_probes import Eraser
 from traps_pipeline.mechanism.probe_items import probe_items
-from traps_pipeline.mechanism.probes import auroc
+from traps_pipeline.mechanism.probes import auroc, scenario_folds
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITEMS, PROBES
 from traps_pipeline.models.local.adapter import load_local_model
@@ -163,6 +166,55 @@ def test_a_gate_is_made_from_states_and_verdicts_that_exist(study: Workspace, en
     assert (curve["coverage"], curve["risk"], curve["n"]) == (2 / 32, 1.0, 2)  # two answered voids of 32 items
 
 
+def test_a_gate_in_memory_decides_as_the_gate_stage_counts(study: Workspace, entry: ModelEntry) -> None:
+    """`decide` holds folds of scenarios out; the gate without such a fold decides the same about its items."""
+    study.tables.write(PROBES, STANDARD.partition, stages.probe_rows(study, STANDARD), {})
+    model, states, settings = load_local_model(entry), StoredStates.of(study, STANDARD), study.mechanism
+    items = study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"}).set_index("item_id")
+    assert entry.media is not None
+    about = {"folds": settings.probes.folds, "seed": settings.seed, "false_abs": settings.gate.false_abs}
+    decided = set[bool]()
+    # One source shares no scenario with the target; the other has its scenarios, of which a fold is held out.
+    for source, leaves_out in (("one:occlusion", False), ("one:chaotic_ill_posed", True)):
+        layer = inside.gate(study, "tiny", source=source).layer
+        table = gate_table(states)
+        features = {name: states.read(name, layer) for name in dict.fromkeys(table["dataset"])}
+        counted = decide(gate_items(table, features, False, 0), source, "chaotic", **about)
+        names = table["scenario_id"].to_numpy(str)[counted.place]
+        fold = scenario_folds(names, settings.probes.folds, settings.seed)
+        for threshold, k in product(THRESHOLDS, range(settings.probes.folds)):
+            without = sorted({*names[fold == k]}) if leaves_out else ()
+            # Two of the four scenarios are left, which are as many as the folds.
+            gate = inside.gate(study, "tiny", source=source, threshold=threshold, without=without)
+            for row in np.flatnonzero(fold == k):
+                item = items.loc[table["item_id"].iloc[counted.place[row]]]
+                shown = sample(study.resolve(item["clip"]), entry.media)
+                prompt = model.prompt(vqa_prompt("standard"), item["question"], shown.frames, shown.times_s)
+                assert gate.score(model, prompt) == pytest.approx(counted.score[row], abs=1e-6)
+                theirs = bool(counted.score[row] > counted.threshold[threshold][row])
+                assert gate.abstains(model, prompt) == theirs
+                expected = ABSTENTION if theirs else model.generate([prompt], 4)[0].text
+                assert gate.answer(model, prompt, 4) == expected
+                decided.add(theirs)
+    assert decided == {True, False}
+
+
+def test_every_named_probe_is_one_for_the_study_and_for_a_notebook(study: Workspace, entry: ModelEntry) -> None:
+    probes = study.mechanism.probes.model_copy(update={"others": ("CCS", "erased", "mean difference")})
+    own = study.allow(mechanism=study.mechanism.model_copy(update={"probes": probes}))
+    rows = pd.DataFrame([vars(row) for row in baseline_rows(own, entry, StoredStates.of(own, STANDARD))])
+    pairs = inside.contrast(own, "tiny", layer=2)
+    for name, features in (("CCS", pairs), ("erased", None), ("mean difference", None)):
+        theirs = inside.protocol(own, "tiny", layer=2, fit=name, features=features)
+        ours = rows.query(f"features == 'states, {name}'")
+        assert list(ours["value"]) == list(theirs["value"]) and len(ours) > 4
+    states = inside.load(own, "tiny", layer=2, datasets=["chaotic"])
+    assert (inside.PROBES["erased"](states.X, states.void).scores(states.X) == 0).all()
+    eraser = Eraser.of(states.X, states.void)
+    assert eraser(states.X) == pytest.approx(inside.erased(states.X, states.void))
+    assert eraser(states.X[:3]) == pytest.approx(eraser(states.X)[:3])  # a state is changed whatever stands beside it
+
+
 def test_erasure_leaves_nothing_that_a_linear_probe_can_use_and_changes_little_else() -> None:
     rng = np.random.default_rng(0)
     void = np.arange(60) % 2 == 1
@@ -211,7 +263,7 @@ def test_probes_of_pairs_take_the_protocol_of_the_study(study: Workspace, entry:
     states = inside.load(study, "tiny", layer=2)
     own = inside.protocol(study, "tiny", layer=2, fit="logistic")
     assert inside.protocol(study, "tiny", layer=2, features=states).equals(own)
-    with pytest.raises(TrapsError, match="no probe 'mine'; there are logistic, mean difference, CCS"):
+    with pytest.raises(TrapsError, match="no probe 'mine'; name one of logistic, mean difference, CCS"):
         inside.protocol(study, "tiny", layer=2, fit="mine")
     with pytest.raises(TrapsError, match="lacks 2 items of chaotic"):
         few = inside.Loaded(pairs.X[2:], pairs.items.iloc[2:])

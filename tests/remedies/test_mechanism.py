@@ -467,12 +467,12 @@ def test_a_further_probe_is_named_by_a_name_that_there_is() -> None:
     states, void = random_states(20, 5)
     remedied(
         lambda: fit_named("os.system", 1),
-        "or a classifier of scikit-learn by its class, e.g. LinearSVC",
+        "no probe {}; name one of {}, or a classifier of scikit-learn by its class, e.g. LinearSVC",
         again=lambda: fit_named("mean difference", 1),
     )
     fit = remedied(
         lambda: fit_named("StackingClassifier", 1),
-        "mechanism.probes.others: {} cannot be made without settings ({}); name another classifier",
+        "probe {} cannot be made without settings ({}); name another classifier",
         again=lambda: fit_named("LinearSVC", 1),
     )
     assert fit(states, void).scores(states).shape == (20,)

@@ -19,8 +19,9 @@ import pandas as pd
 
 from traps_pipeline import progress
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.contrast import contrast_states
 from traps_pipeline.mechanism.control_tables import ProbeBaselineRow
-from traps_pipeline.mechanism.other_probes import fit_named
+from traps_pipeline.mechanism.other_probes import OF_PAIRS, fit_named
 from traps_pipeline.mechanism.probes import Fit
 from traps_pipeline.mechanism.probing import Confabulated, ProbeRun, Row
 from traps_pipeline.mechanism.stages import confabulations
@@ -68,9 +69,12 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
     layer = settings.models[entry.id].steering
     for name in settings.probes.others:
         fit = fit_named(name, settings.seed)
-        others = replace(
-            run, read=lambda dataset, _: states.read(dataset, layer), fit=fit, confabulated=Confabulated({})
+        at_layer = (
+            contrast_states(workspace, states.extraction, layer, [*items])
+            if name in OF_PAIRS
+            else {dataset: states.read(dataset, layer) for dataset in items}
         )
+        others = replace(run, read=lambda dataset, _, of=at_layer: of[dataset], fit=fit, confabulated=Confabulated({}))
         add(f"states, {name}", others.comparable(0))
     return found
 

@@ -36,7 +36,8 @@ class ProbeSettings(BaseModel):
         default=(PROBE_PROMPT,), description="VQA prompts; others than standard are for what a prompt changes alone"
     )
     others: tuple[str, ...] = Field(
-        default=(), description="further probes, at the steered layer: mean difference, or classifiers of scikit-learn"
+        default=(),
+        description="further probes, at the steered layer: mean difference, CCS, erased, or classifiers of sklearn",
     )
 
 
