@@ -39,8 +39,9 @@ all-tests: setup
 	TRAPS_TEST_ALL=1 $(PYTEST) -n 3
 
 # Of these `make test` has a small version (tests/integration/test_cluster.py).
-test-cluster: cluster-setup ## a study on two nodes of Ray, one killed in mid-run, against a run of one process; tests of runs
+test-cluster: cluster-setup ## two studies on two nodes of Ray, one killed in mid-run, against runs of one process; tests of runs
 	$(BIN)/python bench/cluster_study.py --kill
+	$(BIN)/python bench/cluster_study.py --mechanism --kill --at hidden_states
 	$(BIN)/python -m pytest tests/orchestration/test_cluster.py tests/remedies/test_cluster.py
 
 test-cluster-kills: cluster-setup ## a study on a cluster while this and that is killed, in about half an hour (docs/cluster.md)
