@@ -18,12 +18,12 @@ from traps_pipeline.digests import file_digest
 from traps_pipeline.mechanism import patched
 from traps_pipeline.mechanism.directions import seeded_order
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patched import Side, _groups, _summed, changed_tokens, effect_of, patching_rows
+from traps_pipeline.mechanism.patched import Side, _groups, _summed, effect_of, patching_rows
 from traps_pipeline.mechanism.patching import Patch, Recorded, record
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.mechanism.tables import PROBE_ITEMS
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
-from traps_pipeline.models.local.spans import spans
+from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.models.prompts import vqa_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.partitions import SIDES, Extraction
@@ -122,18 +122,18 @@ def test_one_changed_square_of_pixels_is_one_changed_token() -> None:
     one, other = side(of, frames, times), side(of, altered, times)
     n_visual = int(one.parts["visual"].sum())
     assert n_visual == 4 * 48
-    found = changed_tokens(of, one.prompt, other.prompt, n_visual)
-    assert found is not None and np.flatnonzero(found).tolist() == [2 * 48 + 2 * 8 + 4]
-    groups = _groups(of, one, other)
+    found = changed_tokens(one.prompt, other.prompt, one.parts["visual"])
+    assert found is not None and np.flatnonzero(found[one.parts["visual"]]).tolist() == [2 * 48 + 2 * 8 + 4]
+    groups = _groups(one, other)
     assert groups is not None
-    visual = np.flatnonzero(one.parts["visual"])
-    assert np.flatnonzero(groups["changed"]).tolist() == visual[found].tolist()
+    visual = one.parts["visual"]
+    assert np.flatnonzero(groups["changed"]).tolist() == np.flatnonzero(visual & found).tolist()
     assert (groups["changed"] | groups["unchanged"]).tolist() == one.parts["visual"].tolist()
     assert not (groups["changed"] & groups["unchanged"]).any() and groups["all"].all()
     for part in ("system", "stamps", "question", "last"):
         assert groups[part].tolist() == one.parts[part].tolist()
     faintly[5, 32:48, 64:80] += np.uint8(3)  # as a codec might: no change
-    same = changed_tokens(of, one.prompt, side(of, faintly, times).prompt, n_visual)
+    same = changed_tokens(one.prompt, side(of, faintly, times).prompt, visual)
     assert same is not None and not same.any()
 
 
@@ -141,8 +141,8 @@ def test_where_pixels_do_not_come_token_by_token_all_visual_tokens_count_as_chan
     of = model("llava-next-video")
     prompt = ask(of)
     recorded, parts = record(of, prompt, abstention_tokens(of)), spans(of, prompt, SYSTEM, "Does it stop?")
-    assert changed_tokens(of, prompt, prompt, int(parts["visual"].sum())) is None
-    groups = _groups(of, Side(prompt, recorded, parts), Side(prompt, recorded, parts))
+    assert changed_tokens(prompt, prompt, parts["visual"]) is None
+    groups = _groups(Side(prompt, recorded, parts), Side(prompt, recorded, parts))
     assert groups is not None and not groups["unchanged"].any()
     assert groups["changed"].tolist() == parts["visual"].tolist()
 
@@ -150,9 +150,9 @@ def test_where_pixels_do_not_come_token_by_token_all_visual_tokens_count_as_chan
 def test_prompts_of_another_form_have_no_groups() -> None:
     of, frames, times = pocket()
     one = side(of, frames, times)
-    assert _groups(of, one, side(of, frames, times, QUESTION.replace("left or right", "left, right or behind"))) is None
-    assert _groups(of, one, side(of, frames, times + 10)) is None  # stamps of more digits
-    assert _groups(of, one, side(of, frames, times, QUESTION.replace("left or right", "right or left"))) is not None
+    assert _groups(one, side(of, frames, times, QUESTION.replace("left or right", "left, right or behind"))) is None
+    assert _groups(one, side(of, frames, times + 10)) is None  # stamps of more digits
+    assert _groups(one, side(of, frames, times, QUESTION.replace("left or right", "right or left"))) is not None
 
 
 # --- where nulls come from --------------------------------------------------------------------------------------------

@@ -281,6 +281,19 @@ def test_a_run_of_a_host_is_taken_once_it_has_the_same_version(tmp_path: Path) -
     assert tags() == {CODE_TAG: code_here()}
 
 
+def test_a_worker_whose_password_is_wrong_opens_the_history_once_it_is_right(
+    postgres: Postgres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("dagster_postgres", reason="the extra `cluster` is not installed")
+    monkeypatch.setenv(DATABASE, postgres.address(password="wrong"))
+    history: Any = remedied(
+        lambda: SharedHistory.from_config_value(None, {"variable": DATABASE}),
+        "with {} ({}); see that the address, its user and its password are right on this host, and run the same",
+        lambda: monkeypatch.setenv(DATABASE, postgres.address()),
+    )
+    assert history.run_storage.get_runs() == []
+
+
 def test_a_host_that_exports_the_database_opens_the_history(
     postgres: Postgres, monkeypatch: pytest.MonkeyPatch
 ) -> None:
