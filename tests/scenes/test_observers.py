@@ -81,12 +81,19 @@ def test_the_observer_answers_a_question_without_choices_by_sight(scenario_id: s
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario_id", ["pachinko_waterfall-0001", "seesaw_sorter-0001", "tumbling_dice-0001"])
+@pytest.mark.parametrize("scenario_id", ["pachinko_waterfall-0001", "seesaw_sorter-0001"])
 def test_the_observer_foretells_a_cut_that_is_predictable_and_abstains_on_the_held_void(scenario_id: str) -> None:
     said, answer = _reads("predictable_cut", scenario_id)
     assert said == answer
     said, _ = _reads("held_void", scenario_id)
     assert said is None
+
+
+@pytest.mark.slow
+def test_the_observer_does_not_foretell_a_die_whose_slow_tumbling_tells_nothing() -> None:
+    """A face that a slowed die shows was wrong twice as often as right, and some held voids have one."""
+    assert _reads("predictable_cut", "tumbling_dice-0001")[0] is None
+    assert _reads("held_void", "tumbling_dice-0066")[0] is None
 
 
 def _with_panel_elsewhere(case: Released, frames: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.outcome import Reading, undecided
 from traps_pipeline.scenes.parts.questions import either, goes_to, which_colour
 from traps_pipeline.scenes.parts.stage import Stage
 from traps_pipeline.scenes.parts.vary import Drawn, between, chance, drawn_by, in_front, one_of, shuffled
-from traps_pipeline.scenes.vision import before_hold, blobs, colour_mask
+from traps_pipeline.scenes.vision import blobs, colour_mask
 
 FACES = ("red", "green", "blue", "cyan", "orange", "yellow")
 EDGES = ("white", "black", "purple")  # nothing else in the scene has them
@@ -244,7 +244,6 @@ def _edges(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 # --- what one sees ----------------------------------------------------------------------------------------------------
 
 NEAR_PX = 3.5  # of the place where a die lies
-SLOW_PX = 11.0  # between two sampled frames, as a mean: a die tumbles no more
 LAST_STEP_PX = 5.0  # between two sampled frames, when a die slides to rest
 
 
@@ -264,10 +263,8 @@ def observe(frames: np.ndarray, named: Mapping[str, str]) -> str | None:
     paths = {colour: [_sight(frame, colour) for frame in frames] for colour in EDGES}
     dice = [path for path in paths.values() if sum(sight is not None for sight in path) >= len(frames) / 2]
     path = _first_over(_tray_edge(frames), dice)
-    if path is None:
+    if path is None or not _came_to_rest(frames, path):
         return None
-    if not _came_to_rest(frames, path):
-        return _as_it_slows(frames, path)
     tops = {_upper_face(frame, sight) for frame, sight in zip(frames[-3:], path[-3:], strict=True) if sight is not None}
     return tops.pop() if len(tops) == 1 else None
 
@@ -350,17 +347,6 @@ def _came_to_rest(frames: np.ndarray, path: Sequence[_Sight | None]) -> bool:
         return True
     steps = np.linalg.norm(np.diff(places[max(since - 2, 0) : since + 1], axis=0), axis=1)
     return bool(steps[-1] <= LAST_STEP_PX and steps[0] <= 2 * LAST_STEP_PX)
-
-
-def _as_it_slows(frames: np.ndarray, path: Sequence[_Sight | None]) -> str | None:
-    """The upper face of a die that has slowed down in the tray: it has hardly the speed for another turn. What comes
-    after a frame that is merely held counts for nothing."""
-    shown = len(before_hold(frames))
-    last = path[max(shown - 3, 0) : shown]
-    places = np.array([(sight.x, sight.y) for sight in last if sight is not None])
-    if len(places) < 3 or np.linalg.norm(np.diff(places, axis=0), axis=1).mean() > SLOW_PX:
-        return None
-    return None if last[-1] is None else _upper_face(frames[shown - 1], last[-1])
 
 
 def _upper_face(frame: np.ndarray, die: _Sight) -> str | None:
