@@ -33,10 +33,7 @@ def test_states_and_steered_answers_are_the_same_with_remembered_clips(family: F
         assert all((own == known).all() for own, known in zip(states, plain[0], strict=True))
         assert [one.tokens for one in answers] == [one.tokens for one in plain[1]]
     assert "get_video_features" not in vars(of.network.base_model)  # the hook is gone
-    if family == "qwen3-vl":
-        assert memory.passes == 2 and memory.used == 2 * 8 - 2  # two clips, in 2 x (4 passes + a batch of 4)
-    else:
-        assert memory.passes == memory.used == 0
+    assert memory.passes == 2 and memory.used == 2 * 8 - 2  # two clips, in 2 x (4 passes + a batch of 4)
 
 
 def test_a_clip_is_known_by_its_pixels_and_the_oldest_are_forgotten() -> None:

@@ -1,14 +1,16 @@
 """What the vision tower makes of a clip, kept: looking inside a model shows it the same clip under several prompts, and
 steering shows it again for every direction and dose.
 
-Only classes whose features come clip by clip are remembered (Qwen3-VL); others run as they are. A clip is known by the
-bytes of its pixels and its grid, so that a re-rendered clip is another one. Whoever changes the weights of a vision
-tower in memory must give the model a new `ClipMemory`.
+The three families say in their own ways which pixels are of which clip (`_clips_of`); a class that says it in none of
+them runs as it is. A clip is known by the bytes of its pixels and its grid, so that a re-rendered clip is another one.
+Whoever changes the weights of a vision tower in memory must give the model a new `ClipMemory`.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import inspect
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,7 +45,7 @@ class ClipMemory:
     used: int = 0
     _kept: OrderedDict[str, _Features] = field(default_factory=OrderedDict)
     _size: int = 0
-    _make: Any = None  # the library's class of outputs
+    _form: Any = None  # the library's class of outputs, and whether its tokens come as a tuple
 
     @contextmanager
     def remembering(self, network: Any) -> Iterator[None]:
@@ -51,27 +53,26 @@ class ClipMemory:
         another such context nothing changes."""
         owner = network.base_model
         original = getattr(owner, "get_video_features", None)
-        if (
-            original is None
-            or "get_video_features" in vars(owner)
-            or not hasattr(getattr(owner, "visual", None), "deepstack_merger_list")
-        ):
+        if original is None or "get_video_features" in vars(owner):
             yield
             return
+        names = inspect.signature(original)
 
-        def features(pixel_values_videos: Tensor, video_grid_thw: Tensor | None = None, **kwargs: Any) -> Any:
-            if video_grid_thw is None:
-                return original(pixel_values_videos, video_grid_thw, **kwargs)
-            parts = pixel_values_videos.split(video_grid_thw.prod(-1).tolist())
-            keys = [_key(part, grid) for part, grid in zip(parts, video_grid_thw, strict=True)]
-            found = {key: self._kept[key] for key in keys if key in self._kept}
-            missing = [n for n, key in enumerate(keys) if key not in found and keys.index(key) == n]
-            if missing:
-                found |= self._pass(original, [(keys[n], parts[n], video_grid_thw[n]) for n in missing], kwargs)
-            self.used += len(keys) - len(missing)
-            rows = [found[key] for key in keys]
-            deepstack = [tuple(layer) for layer in zip(*(row.deepstack for row in rows), strict=True)]
-            return self._make(pooler_output=tuple(row.tokens for row in rows), deepstack_features=deepstack)
+        @functools.wraps(original)  # the library looks at the names of its arguments
+        def features(*given: Any, **named: Any) -> Any:
+            asked = dict(names.bind(*given, **named).arguments)
+            rest = asked.pop("kwargs", {})
+            clips = _clips_of(asked)
+            if clips is None:
+                return original(*given, **named)
+            keys = [_key(clip) for clip in clips]
+            rows = {key: self._kept[key] for key in keys if key in self._kept}
+            for key, clip in zip(keys, clips, strict=True):
+                if key in rows:
+                    self.used += 1
+                else:
+                    rows[key] = self._pass(original, key, {**asked, **clip, **rest})
+            return self._joined([rows[key] for key in keys])
 
         owner.get_video_features = features
         try:
@@ -79,21 +80,26 @@ class ClipMemory:
         finally:
             del owner.get_video_features  # the class's own method is found again
 
-    def _pass(
-        self, original: Any, clips: list[tuple[str, Tensor, Tensor]], kwargs: dict[str, Any]
-    ) -> dict[str, _Features]:
+    def _pass(self, original: Any, key: str, asked: dict[str, Any]) -> _Features:
+        made = original(**asked)
+        self._form = type(made), isinstance(made.pooler_output, tuple | list)
+        self.passes += 1
+        tokens = made.pooler_output[0] if self._form[1] else made.pooler_output
+        layers = getattr(made, "deepstack_features", None) or ()
+        found = _Features(tokens.clone(), tuple(layer[0].clone() for layer in layers))
+        self._keep(key, found)
+        return found
+
+    def _joined(self, rows: list[_Features]) -> Any:
+        """What the library returns of these clips together."""
         import torch
 
-        pixels, grids = torch.cat([part for _, part, _ in clips]), torch.stack([grid for _, _, grid in clips])
-        made = original(pixels, grids, **kwargs)
-        self._make = type(made)
-        self.passes += len(clips)
-        found: dict[str, _Features] = {}
-        for number, (key, _, _) in enumerate(clips):
-            deepstack = tuple(layer[number].clone() for layer in made.deepstack_features)
-            found[key] = _Features(made.pooler_output[number].clone(), deepstack)
-            self._keep(key, found[key])
-        return found
+        make, is_tuple = self._form
+        tokens = [row.tokens for row in rows]
+        given: dict[str, Any] = {"pooler_output": tuple(tokens) if is_tuple else torch.cat(tokens)}
+        if rows[0].deepstack:
+            given["deepstack_features"] = [tuple(layer) for layer in zip(*(row.deepstack for row in rows), strict=True)]
+        return make(**given)
 
     def _keep(self, key: str, features: _Features) -> None:
         self._kept[key] = features
@@ -103,6 +109,27 @@ class ClipMemory:
             self._size -= oldest.size
 
 
-def _key(pixels: Tensor, grid: Tensor) -> str:
-    content = pixels.detach().cpu().contiguous().view(-1).float().numpy().tobytes()
-    return hashlib.sha256(content + repr(grid.tolist()).encode()).hexdigest()
+def _clips_of(asked: dict[str, Any]) -> list[dict[str, Tensor]] | None:
+    """The arguments of each clip alone; None where a class does not say which pixels are whose."""
+    pixels, grids = asked["pixel_values_videos"], asked.get("video_grid_thw")
+    if grids is not None:  # Qwen3-VL: patches of all clips one after the other, and how many each has
+        parts = pixels.split(grids.prod(-1).tolist())
+        return [
+            {"pixel_values_videos": part, "video_grid_thw": grid[None]} for part, grid in zip(parts, grids, strict=True)
+        ]
+    counts, places = asked.get("num_frames_per_video"), asked.get("video_position_ids")
+    if counts is not None and places is not None:  # Gemma 4: frames of all clips one after the other
+        each = zip(pixels.split(counts.tolist()), places.split(counts.tolist()), counts, strict=True)
+        names = ("pixel_values_videos", "video_position_ids", "num_frames_per_video")
+        return [dict(zip(names, (part, place, count[None]), strict=True)) for part, place, count in each]
+    if pixels.dim() == 5:  # LLaVA-NeXT-Video: a row a clip
+        return [{"pixel_values_videos": row[None]} for row in pixels]
+    return None
+
+
+def _key(clip: dict[str, Tensor]) -> str:
+    whole = hashlib.sha256()
+    for name, part in clip.items():
+        whole.update(f"{name} {tuple(part.shape)}".encode())
+        whole.update(part.detach().cpu().contiguous().view(-1).float().numpy().tobytes())
+    return whole.hexdigest()
