@@ -13,11 +13,13 @@ import pytest
 import yaml
 
 from bench.lite import chosen
+from traps_pipeline.benchmark.certificates import family_table
 from traps_pipeline.benchmark.composition import load_composition, prior_accuracy, problems
 from traps_pipeline.benchmark.evidence import answerable_ill_posed, answerable_voids, unanswerable_controls
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
 from traps_pipeline.paths import ASSETS, RELEASED
+from traps_pipeline.scenes.certify import Verdict
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.spec import SceneSpec
 
@@ -205,3 +207,12 @@ def test_certify_passes_what_is_released_and_names_what_is_altered(
 
 def test_the_lite_set_is_the_one_that_its_rule_chooses_from_the_released_records() -> None:
     assert yaml.safe_load((ASSETS / "lite.yaml").read_text())["scenarios"] == chosen()
+
+
+def test_the_table_of_certificates_has_the_best_guess_beside_the_entropy(tmp_path: Path) -> None:
+    futures = ({"entropy_bits": 1.0, "top_share": 0.5}, {"entropy_bits": 0.97, "top_share": 0.6})
+    verdicts = [Verdict(f"plinko-000{n}", "plinko", {}, found, True) for n, found in enumerate(futures)]
+    headings, row, other = family_table(tmp_path, [*verdicts, Verdict("slide-0001", "slide", {}, {}, True)]).splitlines()
+    assert [name.strip() for name in headings.split("  ") if name][4:6] == ["entropy", "best guess"]
+    assert row.split()[:6] == ["plinko", "2", "2", "0", "0.97-1.00", "0.50-0.60"]
+    assert other.split()[4:6] == ["-", "-"]

@@ -89,6 +89,9 @@ def test_the_place_of_a_record_that_is_taken_out_is_filled_by_a_later_draw(tmp_p
     far = json.loads(lines[0])
     far["params"]["run_m"] += 0.1  # which its draw does not give
     (folder / "hidden_race.jsonl").write_text(f"{json.dumps(far)}\n{lines[1]}\n", encoding="utf-8")
+    altered = (folder / "hidden_race.jsonl").read_text(encoding="utf-8")
+    assert draw_again(folder, "hidden_race", workers=1, only={"hidden_race-0002"}) == {}
+    assert (folder / "hidden_race.jsonl").read_text(encoding="utf-8") == altered  # the other one is left alone
     rejected = "its draw gives another scene"
     assert draw_again(folder, "hidden_race", workers=1) == {"hidden_race-0001": rejected}
     assert (folder / "hidden_race.jsonl").read_text(encoding="utf-8").splitlines() == [lines[1]]

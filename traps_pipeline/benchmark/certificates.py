@@ -108,18 +108,22 @@ def _alike(verdicts: Iterable[Verdict]) -> list[str]:
 
 
 def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
-    """One line a family: scenarios, passed, draws rejected, entropy, margins, twins, CPU seconds."""
+    """One line a family: scenarios, passed, draws rejected, entropy of the futures and how often the
+    best guess at them is right, margins, twins, CPU seconds."""
     tallies = load_tallies(folder / "released")
     members: defaultdict[str, list[Verdict]] = defaultdict(list)
     for verdict in verdicts:
         members[verdict.family].append(verdict)
-    headings = ("family", "scenarios", "passed", "rejected", "entropy", "margin m", "twins", "CPU s", "other physics")
+    headings = (
+        *("family", "scenarios", "passed", "rejected", "entropy", "best guess"),
+        *("margin m", "twins", "CPU s", "other physics"),
+    )
     rows = []
     for family, found in sorted(members.items()):
         twins = sum("twin" not in v.failures and "record" not in v.failures for v in found)
         rejected = tallies.get(family, Tally(0, 0)).rejected.total()
         others = sum(not v.same_physics for v in found)
-        spans = (_span(found, "entropy_bits", 2), _span(found, "margin_m", 3))
+        spans = (_span(found, "entropy_bits", 2), _span(found, "top_share", 2), _span(found, "margin_m", 3))
         seconds = f"{np.median([v.cpu_s for v in found]):.1f}"
         rows.append((family, len(found), sum(v.passed for v in found), rejected, *spans, twins, seconds, others))
     lines = [text_table(headings, rows)]

@@ -61,7 +61,7 @@ scene_specs = stage(
     group=GROUP,
     deps=[released_specs, corrections],
     scheme=CATEGORY,
-    code="2",
+    code="3",
     kinds=["parquet", "mujoco"],
     checks=[
         Check(

@@ -120,7 +120,7 @@ _PHRASES = {
     "panel_covers": "the panel covers {:.0%} of where things move",
     "twin_px": "{} pixels between void and twin's void",
     "entropy_bits": "futures disagree by {:.2f} bits",
-    "top_share": "commonest future {:.0%}",
+    "top_share": "the best guess is right in {:.0%} of them",
     "accepted": "{} futures look alike",
     "twin_largest_difference": "twin differs by at most {} of 255 before the cut",
 }

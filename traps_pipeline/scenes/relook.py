@@ -8,7 +8,7 @@ it then runs `traps certify`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,12 +32,16 @@ _Job = tuple[SceneSpec, Path, int]  # a record, the folder of trajectories and t
 
 
 def draw_again(
-    released: Path, name: str, workers: int | None = None, report: Callable[[str], None] = lambda _: None
+    released: Path,
+    name: str,
+    workers: int | None = None,
+    report: Callable[[str], None] = lambda _: None,
+    only: Collection[str] | None = None,
 ) -> dict[str, str]:
-    """Draw all records of a family again, under its looks and by the rules of today; each keeps its id and its
-    ill-posed question. Takes out those that are rejected now, so that `sample_family` fills their places, and returns
-    why, by id."""
-    return _rewritten(released, name, _drawn_again, workers, report)
+    """Draw all records of a family, or those of some ids, again, under its looks and by the rules of today; each keeps
+    its id and its ill-posed question. Takes out those that are rejected now, so that `sample_family` fills their
+    places, and returns why, by id."""
+    return _rewritten(released, name, _drawn_again, workers, report, only)
 
 
 def relook_family(
@@ -57,20 +61,23 @@ def _rewritten(
     change: Callable[[_Job], Resolved | str],
     workers: int | None,
     report: Callable[[str], None],
+    only: Collection[str] | None = None,
 ) -> dict[str, str]:
-    """Change all records of a family; what it says of a record that it rejects, by id. Those are taken out."""
-    seed, rejected, records = load_tallies(released)[name].seed, dict[str, str](), list[str]()
+    """Change the records of a family, or those of some ids; what it says of a record that it rejects, by id. Those are
+    taken out."""
+    seed, rejected = load_tallies(released)[name].seed, dict[str, str]()
     lines = (released / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
-    jobs = [(SceneSpec.model_validate_json(line), released / "trajectories", seed) for line in lines]
-    for (spec, folder, _), found in run_in_order(change, jobs, workers):
+    records = {spec.scenario_id: spec for spec in map(SceneSpec.model_validate_json, lines)}
+    chosen = [id_ for id_ in records if only is None or id_ in only]
+    jobs = [(records[id_], released / "trajectories", seed) for id_ in chosen]
+    for done, ((spec, folder, _), found) in enumerate(run_in_order(change, jobs, workers), start=1):
         if isinstance(found, str):
             rejected[spec.scenario_id] = found
-            records.append(record_line(spec))
         else:
             save_trajectory(folder, spec.scenario_id, found.qpos, found.twin)
-            records.append(record_line(found.spec))
-        report(f"{spec.scenario_id}: {rejected.get(spec.scenario_id, 'written again')}; {len(records)} of {len(jobs)}")
-    write_text(released / f"{name}.jsonl", "".join(records))
+            records[spec.scenario_id] = found.spec
+        report(f"{spec.scenario_id}: {rejected.get(spec.scenario_id, 'written again')}; {done} of {len(jobs)}")
+    write_text(released / f"{name}.jsonl", "".join(map(record_line, records.values())))
     tallies = load_tallies(released)
     tallies[name] = replace(tallies[name], file=family_digest(name), look=sorted(get_family(name).looks))
     save_tallies(released, tallies)
