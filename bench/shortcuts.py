@@ -30,9 +30,11 @@ import mujoco
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.benchmark.foretelling import foretold
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.certificates import CLOSING, REFERENTS, Certificate, stored_evidence
+from traps_pipeline.scenes.certify import state_at_cut
 from traps_pipeline.scenes.checks import control_frames
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.scenes.evidence import Claim
@@ -44,7 +46,6 @@ from traps_pipeline.storage.workspace import Workspace
 
 STEP = 2  # every second frame is shown: 5 of 10 a second
 NEAR_BITS = 8  # of 64: two pictures whose hashes differ in so few look alike
-FOLDS, SEED = 5, 0
 TURN_DEG = 10.0
 SETTLED = 0.3, 0.8  # wanted: outcomes settle between these shares of the clip
 
@@ -158,11 +159,6 @@ def turned_deg(model: mujoco.MjModel, qpos: np.ndarray) -> float:
     return math.degrees(float(np.ptp(qpos[:, hinges], axis=0).max()))
 
 
-def state_at_cut(qpos: np.ndarray, cut_frame: int) -> np.ndarray:
-    """Poses in the last frame that the void shows, and how they changed since the frame before."""
-    return np.concatenate([qpos[cut_frame - 1], qpos[cut_frame - 1] - qpos[cut_frame - 2]])
-
-
 def by_family(found: Sequence[Measured]) -> dict[str, list[Measured]]:
     families: dict[str, list[Measured]] = {}
     for one in found:
@@ -247,29 +243,12 @@ def print_seesaws(found: Sequence[Measured]) -> None:
 
 
 def print_states(found: Sequence[Measured]) -> None:
-    """Two cross-validated readers of the state at the cut; the better one is printed, which favours it."""
-    from sklearn.ensemble import ExtraTreesClassifier
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.model_selection import StratifiedKFold, cross_val_score
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-
     print("\nOutcome predicted from the state at the cut (best of two readers, commonest outcome, difference, of)")
-    readers = (
-        make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000)),
-        ExtraTreesClassifier(300, min_samples_leaf=3, random_state=SEED),
-    )
     for family, ones in sorted(by_family(found).items()):
         states = [one.at_cut for one in ones if one.at_cut is not None]
-        truths = pd.Series([one.truth for one in ones])
-        if not states or truths.value_counts().min() < FOLDS:
-            continue
-        width = max(map(len, states))
-        features = np.stack([np.pad(state, (0, width - len(state))) for state in states])
-        folds = StratifiedKFold(FOLDS, shuffle=True, random_state=SEED)
-        best = max(float(cross_val_score(reader, features, truths, cv=folds).mean()) for reader in readers)
-        prior = float(truths.value_counts(normalize=True).max())
-        print(f"  {family:20} {best:6.3f} {prior:6.3f} {best - prior:+6.3f} {len(ones):4d}")
+        told = foretold(states, [one.truth for one in ones]) if states else None
+        if told is not None:
+            print(f"  {family:20} {told.best:6.3f} {told.prior:6.3f} {told.gain:+6.3f} {len(ones):4d}")
 
 
 def print_rules(workspace: Workspace) -> None:

@@ -13,15 +13,15 @@ import pytest
 import yaml
 
 from bench.lite import chosen
-from traps_pipeline.benchmark.certificates import family_table
+from traps_pipeline.benchmark.certificates import family_table, foreseeable
 from traps_pipeline.benchmark.composition import load_composition, prior_accuracy, problems
 from traps_pipeline.benchmark.evidence import answerable_ill_posed, answerable_voids, unanswerable_controls
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
 from traps_pipeline.paths import ASSETS, RELEASED
-from traps_pipeline.scenes.certify import Verdict
+from traps_pipeline.scenes.certify import Verdict, state_at_cut
 from traps_pipeline.scenes.registry import family_names, get_family
-from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
 
 PAPER = {  # counts of the paper's composition table (docs/spec.md 2.1)
     "ramps_rolling": 39,
@@ -212,7 +212,28 @@ def test_the_lite_set_is_the_one_that_its_rule_chooses_from_the_released_records
 def test_the_table_of_certificates_has_the_best_guess_beside_the_entropy(tmp_path: Path) -> None:
     futures = ({"entropy_bits": 1.0, "top_share": 0.5}, {"entropy_bits": 0.97, "top_share": 0.6})
     verdicts = [Verdict(f"plinko-000{n}", "plinko", {}, found, True) for n, found in enumerate(futures)]
-    headings, row, other = family_table(tmp_path, [*verdicts, Verdict("slide-0001", "slide", {}, {}, True)]).splitlines()
+    headings, row, other = family_table(
+        tmp_path, [*verdicts, Verdict("slide-0001", "slide", {}, {}, True)]
+    ).splitlines()
     assert [name.strip() for name in headings.split("  ") if name][4:6] == ["entropy", "best guess"]
     assert row.split()[:6] == ["plinko", "2", "2", "0", "0.97-1.00", "0.50-0.60"]
     assert other.split()[4:6] == ["-", "-"]
+
+
+@pytest.mark.slow  # fits trees
+def test_seesaws_whose_side_the_state_at_the_cut_foretells_are_told_and_the_released_ones_are_not(
+    tmp_path: Path,
+) -> None:
+    specs = [spec for spec in load_released().values() if spec.family == "seesaw_sorter"]
+    states = {}
+    for spec in specs:
+        qpos = load_trajectory(RELEASED / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
+        states[spec.scenario_id] = state_at_cut(qpos, spec.void["cut_frame"])
+    verdicts = [Verdict(id_, "seesaw_sorter", {}, {}, True, at_cut=state.tolist()) for id_, state in states.items()]
+    assert foreseeable(specs, verdicts) == []
+    place = {id_: float(state[0]) for id_, state in states.items()}
+    middle = sorted(place.values())[len(place) // 2]
+    sides = [s.model_copy(update={"ground_truth": "left" if place[s.scenario_id] < middle else "right"}) for s in specs]
+    (said,) = foreseeable(sides, verdicts)
+    assert said.startswith("seesaw_sorter: the state at the cut foretells 0.9") or "foretells 1.000" in said
+    assert foreseeable(sides[:99], verdicts) == []  # too few to tell

@@ -22,16 +22,20 @@ from traps_pipeline.scenes.certificates import (
     OUTCOME,
     REFERENTS,
     TURNS,
+    WALLS,
     pair_of,
     settled_outcome,
 )
 from traps_pipeline.scenes.certify import certify
 from traps_pipeline.scenes.evidence import Certificate, Claim, Evidence, Number
+from traps_pipeline.scenes.families import tumbling_dice
+from traps_pipeline.scenes.families.tumbling_dice import GLASS
 from traps_pipeline.scenes.kit import Motion, Reading
 from traps_pipeline.scenes.outcome import Rejected, compile_scene
 from traps_pipeline.scenes.resolve import resolve
 from traps_pipeline.scenes.simulate import replay
 from traps_pipeline.scenes.spec import SceneSpec, trajectory_digest
+from traps_pipeline.scenes.walls import outlines
 
 
 # `traps certify` looks at all 702; what is particular to a family, its world and readings, test_fingerprints.py holds.
@@ -263,6 +267,7 @@ GOOD: dict[str, Any] = {
     "outcome": {"label": CLAIM.answer, "commit_s": 2.3, "margin_m": 0.17},
     "pace": {"settles_share": 0.3},
     "turns": {"turns_deg": 10.0},
+    "walls": {"walls_px": {"pane": 150.0}},
     "physics": {"same_physics": False, "simulated_answer": CLAIM.answer, "parted_m": 0.005},
     "in_frame": {"in_frame": True},
     "legible": {"too_small": [], "least_visible_px": 150.0},
@@ -307,6 +312,7 @@ BAD: list[tuple[str, dict[str, Any], str]] = [
     ("pace", {"settles_share": 0.29}, "settles after 29% of the clip, 30% is wanted"),
     ("pace", {"settles_share": 0.82}, "settles after 82% of the clip, 80% at most is wanted"),
     ("turns", {"turns_deg": 9.9}, "turns by 9.9 degrees, 10 wanted"),
+    ("walls", {"walls_px": {"pane": 149.75}}, "the edges of 'pane', a wall that is not drawn, have 150 pixels"),
     ("physics", {"simulated_answer": "teal"}, "simulated here, the scene ends in 'teal'"),
     ("physics", {"parted_m": 0.0051}, "parts from its trajectory at once"),
     ("in_frame", {"in_frame": False}, "leaves the frame"),
@@ -378,6 +384,32 @@ def test_a_seesaw_that_nothing_strikes_loses_and_what_turns_nothing_is_not_asked
     measured = TURNS.measured(replace(pair, control=replace(pair.control, qpos=still)))
     assert TURNS.failure(measured, pair.claim) == "what the scene is about turns by 0.0 degrees, 10 wanted"
     assert TURNS.failure({"turns_deg": None}, CHAOTIC) is None
+
+
+@pytest.mark.parametrize("colour", [GLASS, (1, 1, 1, 0)])
+def test_panes_are_walls_that_nobody_can_know_of_once_their_edges_are_not_drawn(
+    colour: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = load("tumbling_dice-0001")
+    monkeypatch.setattr(tumbling_dice, "GLASS", colour)
+    pair = pair_of(case.spec, case.qpos, case.twin)
+    measured = WALLS.measured(pair)
+    assert set(measured["walls_px"]) == {"fence_front", "fence_back", "fence_top", "fence_end"}
+    if colour == GLASS:
+        assert WALLS.failure(measured, pair.claim) is None
+    else:
+        assert {*measured["walls_px"].values()} == {0}
+        said = "the edges of 'fence_front', a wall that is not drawn, have 0 pixels, 150 wanted"
+        assert WALLS.failure(measured, pair.claim) == said
+
+
+def test_the_pane_of_a_board_that_faces_the_eye_needs_no_edges_and_seen_from_the_side_it_does() -> None:
+    case = load("plinko-0001")
+    control = pair_of(case.spec, case.qpos, case.twin).control
+    assert control.model.geom("glass").rgba[3] == 0
+    assert outlines(control.model, control.camera, case.qpos[0]) == {}
+    aside = replace(control.camera, elevation_deg=control.camera.elevation_deg + 40)
+    assert outlines(control.model, aside, case.qpos[0]) == {"glass": ()}
 
 
 def test_three_answers_need_less_entropy_than_two() -> None:

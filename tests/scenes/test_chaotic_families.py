@@ -238,8 +238,8 @@ def test_fewer_than_64_accepted_rollouts_make_no_cut():
     assert latest_open_cut(rollouts(20, left=32, right=31), range(11, 31), asking(3)) is None
 
 
-def test_an_outcome_above_65_percent_makes_no_cut_however_high_the_entropy():
-    futures = rollouts(20, a=66, b=8, c=8, d=9, e=9)  # 1.51 bits, but 66 %
+def test_an_outcome_above_60_percent_makes_no_cut_however_high_the_entropy():
+    futures = rollouts(20, a=61, b=9, c=10, d=10, e=10)  # 1.75 bits, but 61 %
     assert latest_open_cut(futures, range(11, 31), asking(2)) is None
     assert latest_open_cut([*futures[1:], Rollout(0, 20, "b")], range(11, 31), asking(2)) is not None
 

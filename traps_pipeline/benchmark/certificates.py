@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from traps_pipeline.benchmark.composition import load_composition, problems
+from traps_pipeline.benchmark.foretelling import AT_MOST, FEWEST, foretold
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.errors import TrapsError
@@ -62,7 +63,7 @@ def certify_all(
     found = [f"{v.scenario_id}: {name}: {why}" for v in verdicts for name, why in v.failures.items()]
     whole = families is None and (folder / "composition.yaml").is_file()
     found += problems(specs, load_composition(folder / "composition.yaml") if whole else None)
-    return verdicts, found + _alike(verdicts)
+    return verdicts, found + _alike(verdicts) + foreseeable(specs, verdicts)
 
 
 def _case(released: Path, kept: Path, spec: SceneSpec) -> Case:
@@ -104,6 +105,25 @@ def _alike(verdicts: Iterable[Verdict]) -> list[str]:
             if getattr(verdict, side):
                 owners[getattr(verdict, side)].append(verdict.scenario_id)
         found += [f"{', '.join(ids)}: clips end in the same frame" for ids in owners.values() if len(ids) > 1]
+    return found
+
+
+def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list[str]:
+    """Families of cut clips, of a hundred records or more, whose outcomes the state at the cut foretells."""
+    states = {verdict.scenario_id: verdict.at_cut for verdict in verdicts if len(verdict.at_cut)}
+    families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
+    for spec in specs:
+        if spec.scenario_id in states:
+            families[spec.family].append(spec)
+    found = []
+    for family, members in families.items():
+        outcomes = [spec.ground_truth for spec in members]
+        told = foretold([states[spec.scenario_id] for spec in members], outcomes) if len(members) >= FEWEST else None
+        if told is not None and told.gain > AT_MOST:
+            found.append(
+                f"{family}: the state at the cut foretells {told.best:.3f} of the outcomes, the commonest one is "
+                f"{told.prior:.3f}; at most {AT_MOST} more is allowed"
+            )
     return found
 
 

@@ -27,6 +27,7 @@ from traps_pipeline.scenes.policies import POLICIES, fewest_within, last_of_all,
 from traps_pipeline.scenes.simulate import swept_points
 from traps_pipeline.scenes.soft import flexes, is_carrier
 from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.walls import FACES_THE_EYE_DEG, outlines
 from traps_pipeline.scenes.wording import FAR_COLOUR, false_premises, refutation
 from traps_pipeline.scenes.world import World
 
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 TURNS_DEG = 10.0  # so far the thing turns that a scene is about
 COMMITTED_BEFORE_END_S = 0.6  # so long the outcome must have stood at the end
 READ_S = 0.8  # so long a settled outcome stands in view before a control closes
+WALL_PIXELS = 150.0  # of the drawn edges of a wall that is not drawn itself
 LEGIBLE_PIXELS = 150.0  # of each decisive body at the end of the control
 REFERENT_PIXELS = 80.0  # of whatever a question names, in each frame of the void
 MOVING_S = 0.5  # so long a body must be seen moving that is hidden later
@@ -198,6 +200,36 @@ TURNS = Certificate(
     numbers=(Number("turns_deg", kept=False),),
     measure=lambda pair: {"turns_deg": pair.control.outcome.turns_deg},
     judge=_judge_turns,
+)
+
+
+def _walls(pair: Pair) -> Evidence:
+    control = pair.control
+    shown_by = outlines(control.model, control.camera, control.qpos[0])
+    if not shown_by:
+        return {"walls_px": {}}
+    edges = sorted({edge for names in shown_by.values() for edge in names})
+    with control.renderer() as renderer:
+        seen = dict(zip(edges, renderer.visible_pixels(control.qpos[:1], edges)[0].tolist(), strict=True))
+    return {"walls_px": {wall: sum(seen[edge] for edge in names) for wall, names in shown_by.items()}}
+
+
+def _judge_walls(e: Evidence, claim: Claim) -> Judged:
+    for wall, pixels in e.get("walls_px", {}).items():
+        if pixels < WALL_PIXELS:
+            yield f"the edges of {wall!r}, a wall that is not drawn, have {pixels:.0f} pixels, {WALL_PIXELS:.0f} wanted"
+
+
+WALLS = Certificate(
+    name="walls",
+    about="control",
+    promises="whatever things could bounce off is drawn: each solid part that is not has drawn edges, which have "
+    f"{WALL_PIXELS:.0f} pixels in the first frame (but for a pane before the scene that lies parallel to the picture, "
+    f"within {FACES_THE_EYE_DEG:.0f} degrees: it stops only what would come towards the eye)",
+    does_not_promise="that a person sees at once how far a pane reaches",
+    numbers=(Number("walls_px", kept=False),),
+    measure=_walls,
+    judge=_judge_walls,
 )
 
 
@@ -738,6 +770,7 @@ CERTIFICATES = (
     OUTCOME,
     PACE,
     TURNS,
+    WALLS,
     PHYSICS,
     IN_FRAME,
     LEGIBLE,

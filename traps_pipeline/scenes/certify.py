@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,8 @@ class Verdict:
 
     failures: certificate -> why it cannot be given; empty if the record passes. measured: the evidence of all
     certificates. same_physics: whether simulating here gives the frozen trajectory bit by bit. control_end, void_end:
-    digests of the clips' last frames; where these differ between scenarios the clips differ.
+    digests of the clips' last frames; where these differ between scenarios the clips differ. at_cut: what moves at the
+    end of a void that is cut (`state_at_cut`); empty where a panel makes the void.
     """
 
     scenario_id: str
@@ -35,6 +36,7 @@ class Verdict:
     same_physics: bool
     control_end: str = ""
     void_end: str = ""
+    at_cut: Sequence[float] = ()
     cpu_s: float = 0.0
 
     @property
@@ -74,8 +76,14 @@ def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
         same_physics=same_physics,
         control_end=control_end,
         void_end=void_end,
+        at_cut=state_at_cut(qpos, pair.void_from).tolist() if spec.void_kind == "truncation" else [],
         cpu_s=time.process_time() - begun,
     )
+
+
+def state_at_cut(qpos: np.ndarray, cut_frame: int) -> np.ndarray:
+    """Poses in the last frame that a cut void shows, and how they changed since the frame before, (2 nq,)."""
+    return np.concatenate([qpos[cut_frame - 1], qpos[cut_frame - 1] - qpos[cut_frame - 2]])
 
 
 def _same_physics(pair: Pair) -> bool:
