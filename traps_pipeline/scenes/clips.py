@@ -141,20 +141,23 @@ def _render_control_and_void(job: Job, family: Family, physics: Physics, missing
             closed = control[open_frames:]  # behind the same panel: these are not drawn again
             open_to = len(job.qpos) - len(closed)
             void = [*renderer.frames(job.qpos[:open_to], panel=True), *closed]
-            drawn += save_clip(job.void, void, physics.fps, _leaked_pixels(renderer, scene, decisive, job))
+            drawn += save_clip(job.void, void, physics.fps, _leaked_pixels(renderer, scene, decisive, job, void))
         elif job.void in missing:
             save_clip(job.void, control[: spec.void["cut_frame"]], physics.fps)
     return drawn
 
 
-def _leaked_pixels(renderer: Renderer, scene: Scene, decisive: Sequence[str], job: Job) -> float:
+def _leaked_pixels(
+    renderer: Renderer, scene: Scene, decisive: Sequence[str], job: Job, void: Sequence[np.ndarray]
+) -> float:
     """What the certificates `hidden` and `ablation` measure, on the sampled frames and on a few: 0 if the panel hides
     decisive bodies from hiding on, and the hidden element, without a trace."""
     step = job.spec.physics["fps"] // checks.SAMPLED_FPS
     first = job.spec.void["hidden_from_frame"]
     seen = checks.past_panel(renderer, job.qpos[::step], decisive, scene.hidden).leaked(-(-first // step))
     ablated = np.unique(np.linspace(first, len(job.qpos) - 1, ABLATION_FRAMES).astype(int))
-    return seen + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden])
+    whole = [void[frame] for frame in ablated]
+    return seen + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden], whole)
 
 
 def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:
