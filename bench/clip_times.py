@@ -102,13 +102,13 @@ def measure(versions: Sequence[Version], families: Sequence[str], records: int, 
     for family in families:
         ids = [f"{family}-{number:04}" for number in range(1, records + 1)]
         least = [[[float("inf")] * len(versions) for _ in WHAT] for _ in ids]
-        for at, scenario_id in enumerate(ids):
-            for _ in range(repeats):
+        for of, scenario_id in zip(least, ids, strict=True):
+            for turn in range(repeats):
                 answers = [version.work(scenario_id) for version in versions]
-                for what, row in zip(WHAT, least[at], strict=True):
+                for what, row in zip(WHAT, of, strict=True):
                     row[:] = [min(known, answer[what]) for known, answer in zip(row, answers, strict=True)]
-            same_record = len({answer["record"] for answer in answers}) == 1
-            unlike += same_record and len({answer["found"] for answer in answers}) > 1
+                same_record = len({answer["record"] for answer in answers}) == 1
+                unlike += turn == 0 and same_record and len({answer["found"] for answer in answers}) > 1
         times[family] = [
             [statistics.mean(of[what][which] for of in least) for which in range(len(versions))]
             for what in range(len(WHAT))
