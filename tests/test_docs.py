@@ -23,6 +23,7 @@ NUMBER = r"\d+(?:\.\d+)*"
 SECTION = re.compile(rf'([\w./-]+\.md)`?,?\s[ #]*(?:sections? )?("[^"\n]+"|{NUMBER}(?:(?:, | and ){NUMBER})*)')
 PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join(FOLDERS[:-1])})/[\w./-]*\.(?:md|py|yaml|csv|txt|png)\b")
 MODULE = re.compile(r"(?<![\w./<>-])[\w/]+\.py\b")
+NAMED = re.compile(r"`(\w+)`\s(?:of|in)\s`([\w./]+\.py)`")  # `draw_again` of `scenes/relook.py`
 LINK = re.compile(r"\[[^]\n]*\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
 PAPER_IN = (
     "README.md", "docs/spec.md", "assets/published/README.md", "traps_pipeline/report/templates/report.html.j2",
@@ -40,14 +41,21 @@ def sections(page: Path) -> set[str]:
     return {*titles, *anchors, *numbers, *re.findall(r"^\*\*(.+?)\.?\*\*", text, re.MULTILINE)}
 
 
+def defines(module: str, name: str) -> bool:
+    """Whether a module, named by the end of its path, defines a function, a class, a constant or a field."""
+    texts = [path.read_text() for path in FILES if str(path).endswith(f"/{module}")]
+    return any(re.search(rf"^ *(?:def |class )?{name}\b *[(:=\[]", text, re.MULTILINE) for text in texts)
+
+
 def wrong(file: Path, text: str) -> Iterator[str]:
-    """Every citation in the text of a file whose page, section or module does not exist, with its line."""
+    """Every citation in a file's text whose page, section, module or name in a module does not exist, with its line."""
     found = [(at, any(f"/{path}".endswith(f"/{at[0]}") for path in KNOWN)) for at in PATH.finditer(text)]
     for at in SECTION.finditer(text):
         parts = [at[2].strip('"')] if at[2].startswith('"') else re.findall(NUMBER, at[2])
         found.append((at, {*parts} <= sections(ROOT / at[1])))
     if file.suffix == ".md":
         found += [(at, any(f"/{path}".endswith(f"/{at[0]}") for path in KNOWN)) for at in MODULE.finditer(text)]
+        found += [(at, defines(at[2], at[1])) for at in NAMED.finditer(text)]
         for at in LINK.finditer(text):
             target = file.parent / at[1] if at[1] else file
             found.append((at, target.exists() and (not at[2] or f"#{at[2]}" in sections(target))))
@@ -66,8 +74,10 @@ def test_a_citation_of_what_is_not_there_is_named_with_its_line(cited: str) -> N
     assert list(wrong(ROOT / "bench" / "x.py", f"one\n({cited})")) == [f"bench/x.py:2: there is no {cited}"]
 
 
-@pytest.mark.parametrize("cited", ["x.md section 5", "[x](x.md)", "[x](spec.md#x)", "models/x.py"])
-def test_so_is_a_link_or_a_module_on_a_page(cited: str) -> None:
+@pytest.mark.parametrize(
+    "cited", ["x.md section 5", "[x](x.md)", "[x](spec.md#x)", "models/x.py", "`close` of `scenes/relook.py`"]
+)
+def test_so_is_a_link_a_module_or_a_name_in_one_on_a_page(cited: str) -> None:
     assert list(wrong(ROOT / "docs" / "x.md", f"one\n{cited}")) == [f"docs/x.md:2: there is no {cited}"]
 
 

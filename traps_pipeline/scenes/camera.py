@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -82,11 +83,14 @@ def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:
     return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
 
 
+@cache  # points are projected for every pose of every rollout
 def _axes(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
     a, e = np.radians(azimuth_deg), np.radians(elevation_deg)
     forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([np.sin(a), -np.cos(a), 0.0])
-    return np.stack([right, np.cross(right, forward), forward])
+    axes = np.stack([right, np.cross(right, forward), forward])
+    axes.setflags(write=False)
+    return axes
 
 
 def fit_camera(view: View, points: np.ndarray) -> Camera:

@@ -84,19 +84,20 @@ def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
     frame_step: pixel certificates look at every so many frames (1: full rate; 2: the 5 FPS sample).
     """
     control = World.of_record(spec, qpos, frame_step=frame_step)
+    void_frame = spec.void["hidden_from_frame" if spec.void_kind == "occluder" else "cut_frame"]
     return Pair(
         control=control,
         claim=Claim.of_record(spec),
-        futures=futures_of(control, spec.seed),
-        void_frame=spec.void["hidden_from_frame" if spec.void_kind == "occluder" else "cut_frame"],
+        futures=futures_of(control, spec.seed, void_frame),
+        void_frame=void_frame,
         twin=World.of_record(spec, twin, twin=True, frame_step=frame_step),
         rollout=spec.twin.rollout,
     )
 
 
-def futures_of(control: World, seed: int) -> ensemble.Futures:
-    """The futures of a control by which a cut is chosen and certified."""
-    first = earliest_cut(control.physics)
+def futures_of(control: World, seed: int, cut: int | None = None) -> ensemble.Futures:
+    """The futures of a control by which a cut is chosen, or, if it is chosen, certified."""
+    first = earliest_cut(control.physics) if cut is None else cut
     alike_px = MAX_DEVIATION_PX / fineness(control.params)
     return ensemble.Futures(control, seed, first=first, alike_px=alike_px, held_s=COMMITTED_BEFORE_END_S)
 
@@ -406,10 +407,8 @@ HIDDEN = Certificate(
 
 
 def _ablation(pair: Pair) -> Evidence:
-    control, first = pair.control, _first_hidden(pair)
-    void = control.void_frames[first:]
-    with control.renderer() as renderer:
-        return {"ablation_px": checks.ablation_pixels(renderer, control.looked_at[first:], control.concealed, void)}
+    control = pair.control
+    return {"ablation_px": control.ablation_px(control.looked_at[_first_hidden(pair) :], control.concealed)}
 
 
 def _judge_ablation(e: Evidence, claim: Claim) -> Judged:
@@ -439,9 +438,7 @@ def _judge_answer_of_twin(e: Evidence, claim: Claim) -> Judged:
 
 def _twin_behind_panel(pair: Pair) -> Evidence:
     control, twin, twins = pair.control, pair.other_world, pair.control.family.twins
-    void = control.void_frames
-    with twin.renderer() as renderer:
-        pixels, _ = checks.differing_pixels(void, checks.void_frames(renderer, twin.looked_at))
+    pixels, _ = checks.differing_pixels(control.void_frames, twin.void_frames)
     return {
         "hidden_alone": twins is not None and twin.params in list(twins(control.params)),
         "twin_answer": settled_answer(twin),
@@ -682,16 +679,14 @@ def _closing(pair: Pair) -> Evidence:
     if control.closing is None:
         unread = {"read_answer": None, "read_s": None, "closed_px": None, "closed_change_px": None}
         return {**_closes(None, control.physics), **unread}
-    outcome, end = control.outcome_read, control.closed_frames
-    with control.closed_renderer() as renderer:
-        seen = renderer.visible_pixels(control.closed_at, control.closed_off, panel=True)
-        changed = checks.ablation_pixels(renderer, control.closed_at, control.closed_off, end)
-    differing, _ = checks.differing_pixels(end, pair.other_world.closed_frames)
+    outcome, end = control.outcome_read, control.closed_at
+    changed = control.ablation_px(end, control.closed_off)
+    differing, _ = checks.differing_pixels(control.behind_panel(end), pair.other_world.behind_panel(end))
     return {
         **_closes(control.closing.frame, control.physics),
         "read_answer": outcome.label,
         "read_s": (control.closing.frame - outcome.commit_frame) / fps,
-        "closed_px": float(seen.sum()),
+        "closed_px": float(control.pixels_of(control.closed_off, end).sum()),
         "closed_change_px": changed + differing,
     }
 

@@ -95,7 +95,10 @@ def _same_physics(pair: Pair) -> bool:
 
 def _last_frames(pair: Pair) -> tuple[str, str]:
     """Digests of the last frame of the control and of the void."""
-    control = pair.control
+    control, last = pair.control, len(pair.control.qpos) - 1
+    if control.panel is not None and control.closing is not None:
+        (end,) = control.behind_panel([last])
+        return frames_digest([end]), frames_digest([end])
     with control.closed_renderer() as renderer:
         end = list(renderer.frames(control.qpos[-1:], panel=control.closing is not None))
         if control.panel is not None:

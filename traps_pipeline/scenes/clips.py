@@ -111,19 +111,19 @@ def render_pair(job: Job) -> int:
     missing = [path for path in job.clips if read_clip(path) is None]
     if not missing:
         return 0
-    family, physics = get_family(job.spec.family), Physics(**job.spec.physics)
+    family, physics, other = get_family(job.spec.family), Physics(**job.spec.physics), job.spec.twin.params
     drawn = 0
-    if job.control in missing or job.void in missing:
-        drawn += _render_control_and_void(job, family, physics, missing)
-    if job.twin in missing:
-        params = job.spec.params if job.spec.twin.params is None else job.spec.twin.params
-        model, _ = compile_scene(family, family.params_from(params), physics)
+    if missing != [job.twin] or other is None:
+        drawn += _render_scene(job, family, physics, missing)
+    if job.twin in missing and other is not None:
+        model, _ = compile_scene(family, family.params_from(other), physics)
         with Renderer(model, Camera.from_record(job.spec.camera)) as renderer:
             drawn += save_clip(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
     return drawn
 
 
-def _render_control_and_void(job: Job, family: Family, physics: Physics, missing: Sequence[Path]) -> int:
+def _render_scene(job: Job, family: Family, physics: Physics, missing: Sequence[Path]) -> int:
+    """What is missing of control and void, and of a twin that is the same scene from another start."""
     spec = job.spec
     panel, closing = Panel.from_record(spec.void["panel"]) if spec.void_kind == "occluder" else None, closing_of(spec)
     behind = panel if closing is None else closing.panel
@@ -131,7 +131,7 @@ def _render_control_and_void(job: Job, family: Family, physics: Physics, missing
     drawn, open_frames = 0, len(job.qpos) if closing is None else closing.frame
     with Renderer(model, Camera.from_record(spec.camera)) as renderer:
         control: list[np.ndarray] = []
-        if job.control in missing or panel is None:
+        if job.control in missing or (panel is None and job.void in missing):
             control = list(checks.control_frames(renderer, job.qpos, open_frames))
             drawn += len(control)
         if job.control in missing:
@@ -141,20 +141,25 @@ def _render_control_and_void(job: Job, family: Family, physics: Physics, missing
             closed = control[open_frames:]  # behind the same panel: these are not drawn again
             open_to = len(job.qpos) - len(closed)
             void = [*renderer.frames(job.qpos[:open_to], panel=True), *closed]
-            drawn += save_clip(job.void, void, physics.fps, _leaked_pixels(renderer, scene, decisive, job))
+            drawn += save_clip(job.void, void, physics.fps, _leaked_pixels(renderer, scene, decisive, job, void))
         elif job.void in missing:
             save_clip(job.void, control[: spec.void["cut_frame"]], physics.fps)
+        if job.twin in missing and spec.twin.params is None:
+            drawn += save_clip(job.twin, list(renderer.frames(job.twin_qpos)), physics.fps)
     return drawn
 
 
-def _leaked_pixels(renderer: Renderer, scene: Scene, decisive: Sequence[str], job: Job) -> float:
+def _leaked_pixels(
+    renderer: Renderer, scene: Scene, decisive: Sequence[str], job: Job, void: Sequence[np.ndarray]
+) -> float:
     """What the certificates `hidden` and `ablation` measure, on the sampled frames and on a few: 0 if the panel hides
     decisive bodies from hiding on, and the hidden element, without a trace."""
     step = job.spec.physics["fps"] // checks.SAMPLED_FPS
     first = job.spec.void["hidden_from_frame"]
     seen = checks.past_panel(renderer, job.qpos[::step], decisive, scene.hidden).leaked(-(-first // step))
     ablated = np.unique(np.linspace(first, len(job.qpos) - 1, ABLATION_FRAMES).astype(int))
-    return seen + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden])
+    whole = [void[frame] for frame in ablated]
+    return seen + checks.ablation_pixels(renderer, job.qpos[ablated], [*decisive, *scene.hidden], whole)
 
 
 def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels: float | None = None) -> int:

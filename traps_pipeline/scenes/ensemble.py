@@ -57,7 +57,7 @@ class Rollout:
     """One perturbed future. number: which of the starts. parted: first frame that looks different from the control
     (n_frames if none does).
 
-    qpos (F, nq) float32: its trajectory, None if it parted before the earliest cut or diverged.
+    qpos (F, nq) float32: its trajectory, None if it was given up or diverged.
     """
 
     number: int
@@ -87,8 +87,9 @@ class _Prepared:
 class Futures:
     """Rollouts of perturbed starts of a control, simulated as they are asked for, each once.
 
-    first: the earliest cut; a rollout that has parted before it is given up. alike_px: a rollout parts from the control
-    when a point of it is further off than this. held_s: so long a label must have stood at the end to be an outcome.
+    first: the cut, or the earliest that may be; a rollout that has parted before it counts nowhere and is given up.
+    alike_px: a rollout parts from the control when a point of it is further off than this. held_s: so long a label must
+    have stood at the end to be an outcome.
     """
 
     def __init__(self, control: World, seed: int, *, first: int, alike_px: float, held_s: float) -> None:
@@ -112,9 +113,10 @@ class Futures:
         return self._prepared.starts[number]
 
     def rollout(self, number: int) -> Rollout:
-        """The future of one start, simulated here. Raises Rejected if there is none of that number."""
+        """The future of one start, simulated here to its end. Raises Rejected if there is none of that number."""
         self.start(number)
-        return self._rollouts[number] if number < len(self._rollouts) else self._roll(number)
+        known = self._rollouts[number] if number < len(self._rollouts) else None
+        return self._roll(number, whole=True) if known is None or known.qpos is None else known
 
     def _simulated(self, which: range) -> list[Rollout]:
         with ThreadPoolExecutor(THREADS) as pool:  # mj_step releases the GIL
@@ -122,34 +124,36 @@ class Futures:
 
     @cached_property
     def _prepared(self) -> _Prepared:
+        import mujoco
+
         control = self._control
         scene = control.family.build(control.params, control.physics)
         model = scene.spec.compile()
-        silhouette = _Silhouette(model, control.camera)
+        silhouette, placed = _Silhouette(model, control.camera), mujoco.MjData(model)
         start = np.asarray(control.qpos[0], float)
         return _Prepared(
             model=model,
             starts=_perturbed_starts(model, start, control.family.perturbation, self._seed),
             velocity=initial_velocity(model, scene.velocity),
             silhouette=silhouette,
-            shown=np.stack([silhouette.pixels(row) for row in control.qpos]),
+            shown=np.stack([silhouette.pixels(row, placed) for row in control.qpos]),
         )
 
-    def _roll(self, number: int) -> Rollout:
-        """Simulate one start to the end of the control; give up early if it parts before the earliest cut."""
+    def _roll(self, number: int, *, whole: bool = False) -> Rollout:
+        """Simulate one start to the end of the control; give up if it parts before `first`, unless wanted `whole`."""
         import mujoco
 
         control, prepared = self._control, self._prepared
         shown, outline = prepared.shown, prepared.silhouette
-        data = mujoco.MjData(prepared.model)
+        data, placed = mujoco.MjData(prepared.model), mujoco.MjData(prepared.model)
         data.qpos[:], data.qvel[:] = prepared.starts[number], prepared.velocity
         frames = np.empty((len(shown), prepared.model.nq))
         parted = len(shown)
         for i in range(len(shown)):
             frames[i] = data.qpos
-            if parted == len(shown) and np.abs(outline.pixels(data.qpos) - shown[i]).max() > self._alike_px:
+            if parted == len(shown) and np.abs(outline.pixels(data.qpos, placed) - shown[i]).max() > self._alike_px:
                 parted = i
-                if i < self.first:
+                if i < self.first and not whole:
                     return Rollout(number, parted, None)
             mujoco.mj_step(prepared.model, data, control.physics.substeps)
         if not np.isfinite(frames).all():
@@ -176,10 +180,11 @@ def twin_of(rollouts: Sequence[Rollout], frame: int, truth: str | None) -> Rollo
 
 def deviation_px(model: mujoco.MjModel, camera: Camera, qpos: np.ndarray, twin: np.ndarray) -> float:
     """The furthest (px) that any corner or outline point of a moving body is from its place in the other trajectory."""
-    silhouette = _Silhouette(model, camera)
-    return max(
-        float(np.abs(silhouette.pixels(a) - silhouette.pixels(b)).max()) for a, b in zip(qpos, twin, strict=True)
-    )
+    import mujoco
+
+    silhouette, placed = _Silhouette(model, camera), mujoco.MjData(model)
+    pairs = ((silhouette.pixels(a, placed), silhouette.pixels(b, placed)) for a, b in zip(qpos, twin, strict=True))
+    return max(float(np.abs(a - b).max()) for a, b in pairs)
 
 
 def _perturbed_starts(model: mujoco.MjModel, start: np.ndarray, scale: float, seed: int) -> np.ndarray:
@@ -214,11 +219,11 @@ class _Silhouette:
         outline = np.stack([right, -right, up, -up])
         self._outline = model.geom_size[self._balls, :1, None] * outline
 
-    def pixels(self, qpos: np.ndarray) -> np.ndarray:
-        """Pixel coordinates of all outline points in one pose, shape (N, 2)."""
+    def pixels(self, qpos: np.ndarray, data: mujoco.MjData) -> np.ndarray:
+        """Pixel coordinates of all outline points in one pose, shape (N, 2). data: where it is computed, of the model;
+        its own for each thread, and made once, since making it takes longer than all else here."""
         import mujoco
 
-        data = mujoco.MjData(self._model)
         data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, data)
         rotation = data.geom_xmat[self._solids].reshape(-1, 3, 3)

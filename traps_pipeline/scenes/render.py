@@ -130,11 +130,14 @@ class Renderer:
         return counts
 
     def _draw(self, qpos: np.ndarray, *, panel: bool, without: Sequence[str]) -> np.ndarray:
-        """The picture of a pose, RGBA, bottom row first, until the next one is drawn. The same pose is not drawn again:
-        things come to rest, in some families for half of a clip. (The model does not change while it is drawn.)"""
+        """The picture of a pose, RGBA, bottom row first, until the next one is drawn. What is shown is not drawn again
+        while all of it stays where it is: things come to rest, in some families for half of a clip, or what moves is
+        taken away. (The model does not change while it is drawn.)"""
         import mujoco
 
-        wanted = (np.asarray(qpos).tobytes(), panel, tuple(without), self._scene.flags.tobytes())
+        self._data.qpos[:] = qpos
+        self._place()
+        wanted = (*self._places(panel, without), panel, tuple(without), self._scene.flags.tobytes())
         if wanted == self._drawn:
             return self._pixels
         self._drawn = None
@@ -147,8 +150,6 @@ class Renderer:
             of = self._model.flex_group if self._is_soft(name) else self._model.geom_group
             of[self._number(name)] = REMOVED_GROUP
         try:
-            self._data.qpos[:] = qpos
-            self._place()
             everything = mujoco.mjtCatBit.mjCAT_ALL
             mujoco.mjv_updateScene(
                 self._model, self._data, option, mujoco.MjvPerturb(), self._camera, everything, self._scene
@@ -167,6 +168,17 @@ class Renderer:
     def _number(self, name: str) -> int:
         """Of a geom, or of a soft body."""
         return self._soft[name] if self._is_soft(name) else self._model.geom(name).id
+
+    def _places(self, panel: bool, without: Sequence[str]) -> tuple[bytes, ...]:
+        """Where everything is that is shown, to the last bit, and the lights. In a model with other things than geoms
+        the whole pose stands for them."""
+        model, data = self._model, self._data
+        gone = [self._number(name) for name in without if not self._is_soft(name)]
+        shown = (model.geom_group != REMOVED_GROUP) & ((model.geom_group != PANEL_GROUP) | panel)
+        shown[gone] = False
+        places = (data.geom_xpos[shown], data.geom_xmat[shown], data.light_xpos, data.light_xdir)
+        more = data.qpos if model.nflex or model.nsite or model.ntendon or model.nskin else np.empty(0)
+        return (*(values.tobytes() for values in places), more.tobytes())
 
     def _place(self) -> None:
         """Where everything is at the present qpos: all that drawing needs of mj_forward (no contacts, no dynamics)."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from traps_pipeline.scenes.camera import Camera, Closing, Panel
-from traps_pipeline.scenes.checks import PastPanel, void_frames
+from traps_pipeline.scenes.checks import PastPanel, differing_pixels, void_frames
 from traps_pipeline.scenes.kit import Family, Inventory, Motion, Physics, Scene
 from traps_pipeline.scenes.outcome import Outcome, compile_scene, decisive_geoms, moving_geoms, read_outcome, simulated
 from traps_pipeline.scenes.registry import get_family
@@ -119,9 +119,9 @@ class World:
         return np.array_equal(self.resimulated, self.qpos)
 
     @property
-    def looked_at(self) -> np.ndarray:
-        """The poses that pixel evidence looks at."""
-        return self.qpos[:: self.frame_step]
+    def looked_at(self) -> range:
+        """The frames that pixel evidence looks at."""
+        return range(0, len(self.qpos), self.frame_step)
 
     def renderer(self) -> Renderer:
         """A renderer of this world; close it before another one is opened."""
@@ -141,17 +141,59 @@ class World:
     @cached_property
     def geoms(self) -> tuple[str, ...]:
         """Names of all geoms, in the order of the model, and of all soft bodies, which are drawn like one."""
-        return (*(self.model.geom(i).name for i in range(self.model.ngeom)), *flexes(self.model))
+        model = self.closed_model
+        return (*(model.geom(i).name for i in range(model.ngeom)), *flexes(model))
+
+    @property
+    def closed_at(self) -> list[int]:
+        """The frames that pixel evidence of the closed control looks at, the last one always among them."""
+        return sorted(range(len(self.qpos) - 1, self.open_frames - 1, -self.frame_step))
+
+    # What is drawn behind the panel, that of the void or the one that closes the control, is needed by several
+    # certificates; each frame is drawn once.
+
+    def behind_panel(self, which: Sequence[int]) -> list[np.ndarray]:
+        """Some frames of the world behind its panel, as they are drawn."""
+        missing = [frame for frame in which if frame not in self._behind]
+        if missing:
+            with self.closed_renderer() as renderer:
+                self._behind.update(zip(missing, void_frames(renderer, self.qpos[missing]), strict=True))
+        return [self._behind[frame] for frame in which]
 
     @cached_property
-    def void_pixels(self) -> np.ndarray:
-        """How many pixels each of the `geoms` has in each frame of the void, (F, G), by segmentation."""
-        with self.renderer() as renderer:
-            return renderer.visible_pixels(self.looked_at, self.geoms, panel=True)
+    def _behind(self) -> dict[int, np.ndarray]:
+        return {}
 
-    def pixels_of(self, names: Sequence[str]) -> np.ndarray:
-        """How many pixels some geoms have together in each frame of the void, (F,)."""
-        return self.void_pixels[:, [self.geoms.index(name) for name in names]].sum(axis=1)
+    def pixels_of(self, names: Sequence[str], which: Sequence[int] | None = None) -> np.ndarray:
+        """How many pixels some geoms have together behind the panel, by segmentation, in some frames, or in those that
+        are looked at, (F,)."""
+        which = self.looked_at if which is None else which
+        missing = [frame for frame in which if frame not in self._segmented]
+        if missing:
+            with self.closed_renderer() as renderer:
+                seen = renderer.visible_pixels(self.qpos[missing], self.geoms, panel=True)
+            self._segmented.update(zip(missing, seen, strict=True))
+        columns = [self.geoms.index(name) for name in names]
+        return np.array([self._segmented[frame][columns].sum() for frame in which])
+
+    @cached_property
+    def _segmented(self) -> dict[int, np.ndarray]:
+        return {}
+
+    def ablation_px(self, which: Sequence[int], geoms: tuple[str, ...]) -> int:
+        """How many pixels change behind the panel, over some frames, when geoms are taken away."""
+        missing = [frame for frame in which if (frame, geoms) not in self._ablated]
+        if missing:
+            whole = self.behind_panel(missing)
+            with self.closed_renderer() as renderer:
+                without = void_frames(renderer, self.qpos[missing], without=geoms)
+                for frame, one, other in zip(missing, whole, without, strict=True):
+                    self._ablated[frame, geoms] = differing_pixels([one], [other])[0]
+        return sum(self._ablated[frame, geoms] for frame in which)
+
+    @cached_property
+    def _ablated(self) -> dict[tuple[int, tuple[str, ...]], int]:
+        return {}
 
     @cached_property
     def past_panel(self) -> PastPanel:
@@ -159,22 +201,10 @@ class World:
         decisive = decisive_geoms(self.model, self.scene.decisive)
         return PastPanel(self.pixels_of(decisive), self.pixels_of(self.scene.hidden))
 
-    @cached_property
-    def void_frames(self) -> list[np.ndarray]:
-        """The world with its panel, as it is drawn."""
-        with self.renderer() as renderer:
-            return list(void_frames(renderer, self.looked_at))
-
     @property
-    def closed_at(self) -> np.ndarray:
-        """The poses that pixel evidence of the closed control looks at, the last one always among them."""
-        return self.qpos[sorted(range(len(self.qpos) - 1, self.open_frames - 1, -self.frame_step))]
-
-    @cached_property
-    def closed_frames(self) -> list[np.ndarray]:
-        """The end of the control, behind the panel that closes it, as it is drawn."""
-        with self.closed_renderer() as renderer:
-            return list(void_frames(renderer, self.closed_at))
+    def void_frames(self) -> list[np.ndarray]:
+        """The world with the panel of its void, as it is drawn."""
+        return self.behind_panel(self.looked_at)
 
     def closed_renderer(self) -> Renderer:
         """A renderer of this world with the panel that closes the control; close it before another one is opened."""
