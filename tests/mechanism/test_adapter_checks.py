@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.local_models import FAMILIES, model
+from tests.local_models import FAMILIES, Family, model
 from tests.models.local import check_table
 from tests.remedies.remedied import carries_out
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism import patching
 from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local import capture, clips, prefixes
@@ -56,6 +57,10 @@ def rounded_features(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(clips, "_Features", lambda tokens, deepstack: made(tokens * 1.01, deepstack))
 
 
+def paths_beside_the_stream_forgotten(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(patching, "_patch_arguments", lambda _, __, ___, ____, args, kwargs: (args, kwargs))
+
+
 def prefixes_of_other_states(patch: pytest.MonkeyPatch) -> None:
     record = prefixes._record
 
@@ -68,19 +73,30 @@ def prefixes_of_other_states(patch: pytest.MonkeyPatch) -> None:
 
 @carries_out("{}; install the pinned versions, or do not look into this model")  # what is broken stands for another
 @pytest.mark.parametrize(
-    ("check", "broken", "said"),
+    ("family", "check", "broken", "said"),
     [
-        ("states", one_block_late, "hooked states differ from the library's own at layers"),
-        ("alpha 0", a_hook_that_stays, "steering with alpha 0 leaves a hook"),
-        ("alpha", a_hook_that_stays, "a steered state at layer 2 is not the plain one and alpha times v"),
-        ("clips", rounded_features, "a remembered clip gives other states"),
-        ("resuming", prefixes_of_other_states, "a resumed answer is another one"),
+        ("qwen3-vl", "states", one_block_late, "hooked states differ from the library's own at layers"),
+        ("qwen3-vl", "alpha 0", a_hook_that_stays, "steering with alpha 0 leaves a hook"),
+        ("qwen3-vl", "alpha", a_hook_that_stays, "a steered state at layer 2 is not the plain one and alpha times v"),
+        ("qwen3-vl", "clips", rounded_features, "a remembered clip gives other states"),
+        ("qwen3-vl", "resuming", prefixes_of_other_states, "a resumed answer is another one"),
+        ("gemma-4", "resuming", prefixes_of_other_states, "a resumed answer is another one"),
+        (
+            "gemma-4",
+            "patching",
+            paths_beside_the_stream_forgotten,
+            "patching all positions misses the source's",
+        ),
     ],
 )
 def test_a_check_loses_where_the_adapter_is_broken(
-    check: str, broken: Callable[[pytest.MonkeyPatch], None], said: str, monkeypatch: pytest.MonkeyPatch
+    family: Family,
+    check: str,
+    broken: Callable[[pytest.MonkeyPatch], None],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    subject = Subject(model("qwen3-vl"), *brightening())
+    subject = Subject(model(family), *brightening())
     subject.model.clips, subject.model.prefixes = clips.ClipMemory(), prefixes.PrefixMemory()
     with monkeypatch.context() as patch:
         broken(patch)

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,15 +22,13 @@ from sklearn.preprocessing import StandardScaler
 
 from tests import local_models
 from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.made_answers import MadeAnswers
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patching import SITES, Patch, Site, patched_changes, record, require_patchable
+from traps_pipeline.mechanism.patching import SITES, Patch, Site, patched_changes, record
 from traps_pipeline.mechanism.probes import Solver, auroc, fit_probe
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prefixes import resumable
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.models.request import Request
@@ -39,7 +37,6 @@ from traps_pipeline.storage.media import Frames, MediaSpec, sample
 
 pytestmark = pytest.mark.slow
 POCKET = "pocket"
-PATCHABLE = ("qwen3-vl", "llava-next-video", POCKET)
 NEW_TOKENS = 8
 each = pytest.mark.parametrize("name", [*FAMILIES, POCKET])
 
@@ -202,8 +199,7 @@ def test_a_sheet_of_steered_answers_is_what_a_plain_hook_gives_row_by_row(name: 
     backend = SteeredBackend(of.entry, vectors, MadeAnswers(tmp_path, len(requests)), {})
     before = of.of.prefixes.used, of.of.clips.used
     found = [outcome.text or "" for outcome in backend.generate(requests, lambda: False)]
-    if resumable(of.of):
-        assert of.of.prefixes.used >= before[0] + len(sheet) - 3
+    assert of.of.prefixes.used >= before[0] + len(sheet) - 3
     if of.of.clips.passes:  # of classes whose features come clip by clip
         assert of.of.clips.used > before[1]
     expected = []
@@ -224,7 +220,7 @@ def plain_pass(of: Subject, prompt: Prompt, hooks: ExitStack) -> torch.Tensor:
 
 def plain_margin(of: Subject, logits: torch.Tensor, tokens: list[int]) -> float:
     """Log-odds of the tokens against all others that an answer may begin with."""
-    places = {of.of.processor.image_token_id, of.of.processor.video_token_id}
+    places = {getattr(of.of.processor, f"{kind}_token_id", None) for kind in ("image", "video", "audio")}
     rest = [token for token in range(len(logits)) if token not in places and token not in tokens]
     return float(torch.logsumexp(logits[tokens], 0) - torch.logsumexp(logits[rest], 0))
 
@@ -236,12 +232,23 @@ def module_of(of: Subject, site: Site, layer: int) -> Any:
     return getattr(of.decoder.layers[layer - 1], {"attention": "self_attn", "mlp": "mlp"}[site])
 
 
+def maker_of(of: Subject, reader: int) -> int | None:
+    """Of a block of Gemma's that reads another one's keys and values, which one that is, both counted from 0: the last
+    block with the same kind of attention among those that make their own."""
+    config = of.decoder.config
+    makers = config.num_hidden_layers - getattr(config, "num_kv_shared_layers", 0)
+    if reader < makers:
+        return None
+    return max(block for block in range(makers) if config.layer_types[block] == config.layer_types[reader])
+
+
 def plain_patch(
-    of: Subject, target: Prompt, source: Prompt, at: tuple[Site, int], chosen: torch.Tensor, features: bool = True
+    of: Subject, target: Prompt, source: Prompt, at: tuple[Site, int], chosen: torch.Tensor, naive: bool = False
 ) -> torch.Tensor:
-    """Logits of the target, from its pixels, with what the source has at some positions of a site. What is added to the
-    residual stream behind the block that reads it (deepstack) is the source's at these positions, too, but for a naive
-    patch without these features."""
+    """Logits of the target, from its pixels, with what the source has at some positions of a site. What blocks behind a
+    residual read beside it is the source's at these positions, too, but in a naive patch: what is added to the residual
+    stream behind the block that reads it (deepstack), what a block is given of each token, and the keys and values that
+    a block up to the site made and another one reads."""
     kept: dict[str, Any] = {}
     module, reading, layer = module_of(of, *at), at[0] == "residual", at[1]
 
@@ -250,6 +257,18 @@ def plain_patch(
 
     def keep_features(_: Any, __: Any, kwargs: dict[str, Any]) -> None:
         kept["features"] = kwargs.get("deepstack_visual_embeds")
+
+    def keep_beside(number: int, _: Any, args: Any, kwargs: dict[str, Any]) -> None:
+        kept["own", number], kept["shared"] = args[1], kwargs["shared_kv_states"]
+
+    def swap_beside(number: int, _: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+        own, maker, shared = torch.where(chosen[None, :, None], kept["own", number], args[1]), maker_of(of, number), {}
+        if maker is not None and maker < layer:
+            kind = of.decoder.config.layer_types[number]
+            both = zip(kept["shared"][kind], kwargs["shared_kv_states"][kind], strict=True)
+            pair = [torch.where(chosen[None, None, :, None], theirs, mine) for theirs, mine in both]
+            shared = {"shared_kv_states": {kind: (pair[0], pair[1])}}
+        return (args[0], own, *args[2:]), kwargs | shared
 
     def swapped(states: torch.Tensor) -> torch.Tensor:
         return torch.where(chosen[None, :, None], kept["states"], states)
@@ -271,11 +290,16 @@ def plain_patch(
     hooks = ExitStack()
     hooks.callback(hooked(module, keep))
     hooks.callback(hooked(of.decoder, keep_features, before=True))
+    beside = [*enumerate(of.decoder.layers)] if hasattr(of.decoder, "project_per_layer_inputs") else []  # Gemma's
+    for number, block in beside:
+        hooks.callback(hooked(block, partial(keep_beside, number), before=True))
     plain_pass(of, source, hooks)
     hooks = ExitStack()
     hooks.callback(hooked(module, swap_read, before=True) if reading else hooked(module, swap_made))
-    if reading and features and kept["features"] is not None:
+    if reading and not naive and kept["features"] is not None:
         hooks.callback(hooked(of.decoder, swap_features, before=True))
+    for number, block in beside[layer:] if reading and not naive else ():
+        hooks.callback(hooked(block, partial(swap_beside, number), before=True))
     return plain_pass(of, target, hooks)
 
 
@@ -295,7 +319,7 @@ def groups_of(of: Subject, prompt: Prompt) -> dict[str, torch.Tensor]:
     return found
 
 
-@pytest.mark.parametrize("name", PATCHABLE)
+@each
 def test_effects_of_patches_are_those_of_plain_hooks_at_every_site_and_group(name: str) -> None:
     of = subject(name)
     here, there = of.shown(local_models.clip()), of.shown(other_clip())
@@ -319,12 +343,12 @@ def test_effects_of_patches_are_those_of_plain_hooks_at_every_site_and_group(nam
     assert np.abs(found - expected).max() < 1e-5
     effect = dict(zip(wanted, found, strict=True))
     assert abs(effect["residual", 0, "visual"]) > 0.01, "the clip must tell in the answer, or nothing is compared"
+    assert max(abs(effect["residual", layer, "all"] - 1) for layer in range(of.of.n_layers + 1)) < 1e-4
     if "stamps" in groups:
         assert abs(effect["residual", 0, "stamps"]) > 0.01
-        naive = plain_patch(of, target, source, ("residual", 0), groups["visual"], features=False)
-        assert abs((plain_margin(of, naive, tokens) - own[0]) / gap - effect["residual", 0, "visual"]) > 1e-3
-
-
-def test_a_family_whose_blocks_read_more_than_the_residual_stream_is_refused() -> None:
-    with pytest.raises(TrapsError, match="later blocks reuse keys and values of earlier ones"):
-        require_patchable(subject("gemma-4").of)
+    told = {"qwen3-vl": [(0, "visual")], POCKET: [(0, "visual")]}
+    told["gemma-4"] = [(layer, "all") for layer in range(of.of.n_layers)]
+    for layer, group in told.get(name, ()):
+        logits = plain_patch(of, target, source, ("residual", layer), groups[group], naive=True)
+        naive = (plain_margin(of, logits, tokens) - own[0]) / gap
+        assert abs(naive - effect["residual", layer, group]) > 1e-3

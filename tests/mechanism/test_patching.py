@@ -4,25 +4,30 @@ the positions of a prompt's parts; and an independent re-implementation in plain
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 
+from tests import local_models
 from tests.local_models import QUESTIONS, SYSTEM, Family, ask, clip, model
 from traps_pipeline.errors import TrapsError
+from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching import SITES, Patch, Recorded, Site, patched_changes, record, require_patchable
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.spans import PARTS, spans
+from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import get_model
 from traps_pipeline.storage.media import MediaSpec, sample
 
 pytestmark = pytest.mark.slow
 POCKET = "pocket"  # the shipped weights, whose states mean something, beside tiny random ones
-PATCHABLE = ("qwen3-vl", "llava-next-video", POCKET)
+PATCHABLE = ("qwen3-vl", "gemma-4", "llava-next-video", POCKET)
 
 
 def subject(name: str) -> LocalModel:
@@ -30,8 +35,9 @@ def subject(name: str) -> LocalModel:
     return load_local_model(get_model(POCKET), inside=True) if name == POCKET else model(cast(Family, name))
 
 
-def other(prompt: Prompt, seed: int = 0) -> Prompt:
-    """The prompt with other pixels and another question of the same length."""
+def other(prompt: Prompt, seed: int = 2) -> Prompt:
+    """The prompt with other pixels and another question of the same length. The default seed is one at which the
+    outcomes of all models are far apart."""
     generator = torch.Generator().manual_seed(seed)
     inputs = dict(prompt.inputs)
     for name, value in inputs.items():
@@ -42,8 +48,8 @@ def other(prompt: Prompt, seed: int = 0) -> Prompt:
     return Prompt(prompt.text, inputs | {"input_ids": ids})
 
 
-def pair(name: str) -> tuple[LocalModel, Recorded, Recorded, list[int], Prompt, Prompt]:
-    of = subject(name)
+def pair(name: str, of: LocalModel | None = None) -> tuple[LocalModel, Recorded, Recorded, list[int], Prompt, Prompt]:
+    of = of or subject(name)
     if name == POCKET:
         shown = sample(clip(), cast(MediaSpec, get_model(POCKET).media))
         target = of.prompt(SYSTEM, QUESTIONS[0], shown.frames, shown.times_s.tolist())
@@ -77,7 +83,7 @@ def test_without_the_deepstack_features_all_positions_do_not_give_the_source() -
     try:
         of, target, source, tokens, *_ = pair("qwen3-vl")
         own = {"deepstack_visual_embeds": target.inputs["deepstack_visual_embeds"]}
-        naive = Recorded({**source.inputs, **own}, source.states, source.margin)
+        naive = replace(source, inputs={**source.inputs, **own})
         whole = [Patch("residual", layer, np.ones(target.length, bool)) for layer in range(of.n_layers + 1)]
         gap = source.margin - target.margin
         assert np.abs(patched_changes(of, target, source, whole, tokens) / gap - 1).max() < 1e-4
@@ -89,14 +95,65 @@ def test_without_the_deepstack_features_all_positions_do_not_give_the_source() -
         model("qwen3-vl").clips = ClipMemory()
 
 
+def test_the_tiny_gemma_has_both_side_paths_of_the_released_ones() -> None:
+    """Blocks that keep keys and values to themselves, then one of each kind that hands its own on, then blocks that
+    read them; so that each path tells behind some layer, or the tests below hold of nothing."""
+    of = model("gemma-4")
+    config = of.network.config.get_text_config()
+    assert config.kv_sharing_modes == [None, None, "store", "store", "reuse", "reuse"]
+    assert config.layer_types == ["sliding_attention", "full_attention"] * 3
+    assert config.hidden_size_per_layer_input > 0 and ask(of).n_tokens > 2 * config.sliding_window
+    _, target, *_ = pair("gemma-4")
+    assert {*target.shared} == {*config.layer_types} and len(target.per_layer) == of.n_layers == 6
+
+
+def test_without_the_side_paths_of_gemma_all_positions_do_not_give_the_source() -> None:
+    """With the target's own vectors of the tokens, states at blocks below those that make keys and values are not
+    enough; with its own keys and values, states at blocks behind these are not."""
+    of, target, source, tokens, *_ = pair("gemma-4")
+    gap, whole = source.margin - target.margin, np.ones(target.length, bool)
+    everywhere = [Patch("residual", layer, whole) for layer in range(of.n_layers + 1)]
+
+    def missing(naive: Recorded) -> list[int]:
+        """The layers at which an effect is not 1."""
+        return np.flatnonzero(np.abs(patched_changes(of, target, naive, everywhere, tokens) / gap - 1) > 1e-2).tolist()
+
+    assert missing(source) == []
+    assert missing(replace(source, per_layer=target.per_layer)) == [0, 1, 2]
+    assert missing(replace(source, shared=target.shared)) == [3, 4, 5]
+
+
+def test_what_experts_make_beside_an_mlp_is_of_its_site(tmp_path: Path) -> None:
+    """As in Gemma 4's large checkpoints, which have none of the side paths."""
+    experts = {"enable_moe_block": True, "num_experts": 4, "top_k_experts": 2, "moe_intermediate_size": 32}
+    none = {"num_kv_shared_layers": 0, "hidden_size_per_layer_input": 0}
+    folder = build_tiny("gemma-4", tmp_path / "experts", text=experts | none)
+    of = load_local_model(local_models.entry("gemma-4", folder))
+    of, target, source, tokens, prompt, donor = pair("gemma-4", of)
+    assert (target.per_layer, target.shared) == ((), {})
+    whole, gap = np.ones(target.length, bool), source.margin - target.margin
+    everywhere = [Patch("residual", layer, whole) for layer in range(of.n_layers + 1)]
+    assert np.abs(patched_changes(of, target, source, everywhere, tokens) / gap - 1).max() < 1e-4
+    block = of.blocks[1]
+    kept: list[torch.Tensor] = []
+    handle = block.post_feedforward_layernorm.register_forward_hook(lambda _, __, output: kept.append(output))
+    of.forward(donor)
+    handle.remove()
+    handle = block.post_feedforward_layernorm.register_forward_hook(lambda *_: kept[0])
+    margin = record(of, prompt, tokens).margin
+    handle.remove()
+    change = patched_changes(of, target, source, [Patch("mlp", 2, whole)], tokens)[0]
+    assert abs(change) > 1e-3 and target.margin + change == pytest.approx(margin, abs=1e-5)
+
+
 @pytest.mark.parametrize("name", PATCHABLE)
 def test_a_patch_is_what_a_plain_hook_on_the_whole_model_does(name: str) -> None:
     """Independent: the library's own forward pass from pixels to logits, one hook, one prompt at a time."""
     of, target, source, tokens, prompt, donor = pair(name)
     chosen = torch.zeros(target.length, dtype=torch.bool)
-    chosen[-9:-2] = True  # text behind the clip, so that no deepstack feature is concerned
+    chosen[-9:-2] = True  # text behind the clip, so that no deepstack feature is concerned, and no vector of its own
     hooked: tuple[tuple[Site, int, Callable[[Any], Any]], ...] = (
-        ("residual", 3, lambda block: block), ("attention", 2, lambda block: block.self_attn),
+        ("residual", 2, lambda block: block), ("attention", 2, lambda block: block.self_attn),
         ("mlp", 4, lambda block: block.mlp),
     )  # fmt: skip
     for site, layer, get in hooked:
@@ -127,17 +184,34 @@ def test_a_patch_is_what_a_plain_hook_on_the_whole_model_does(name: str) -> None
         assert target.margin + change == pytest.approx(expected, abs=1e-5)
 
 
-def test_models_that_read_more_than_the_residual_stream_are_refused() -> None:
-    require_patchable(model("qwen3-vl"))
-    with pytest.raises(TrapsError, match="later blocks reuse keys and values of earlier ones"):
-        require_patchable(model("gemma-4"))
+@pytest.mark.parametrize(
+    ("field", "what"),
+    [
+        ("num_kv_shared_layers", "later blocks reuse keys and values of earlier ones"),
+        ("hidden_size_per_layer_input", "every block reads the token's own embedding again"),
+        ("altup_num_inputs", "blocks hand on several residual streams"),
+    ],
+)
+def test_models_whose_blocks_read_more_than_is_known_are_refused(
+    field: str, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for family in local_models.FAMILIES:
+        require_patchable(model(family))
+    of = model("qwen3-vl")
+    monkeypatch.setattr(of.network.config.text_config, field, 1, raising=False)
+    (check,) = [check for check in CHECKS if check.name == "patching"]
+    assert check.found(Subject(of, *brightening())) == f"refused: {what}"
+    with pytest.raises(TrapsError, match=rf"{what} \({field}\), which patching does not replace"):
+        require_patchable(of)
 
 
 def test_prompts_of_another_form_are_refused() -> None:
     of, target, _, tokens, *_ = pair("qwen3-vl")
     longer = record(of, ask(of, QUESTIONS[1]), tokens)
-    with pytest.raises(TrapsError, match="cannot be patched into one of"):
-        patched_changes(of, target, longer, [], tokens)
+    elsewhere = replace(target, pictures=np.roll(target.pictures, 1))
+    for source in (longer, elsewhere):
+        with pytest.raises(TrapsError, match="cannot be patched into one of"):
+            patched_changes(of, target, source, [], tokens)
 
 
 @pytest.mark.parametrize("family", ["qwen3-vl", "gemma-4", "llava-next-video"])

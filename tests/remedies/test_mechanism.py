@@ -414,6 +414,27 @@ def test_what_needs_an_abstentions_first_token_is_left_out_for_a_model_without_o
     assert nothing is None
 
 
+def test_a_model_that_cannot_be_patched_is_left_out(
+    own: Workspace, entry: ModelEntry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = Asked(datasets=("chaotic",), models=("tiny",), regimes=("standard",), runs=(1,), mechanism=True)
+    patching = own.mechanism.model_copy(update={"patching": PatchingSettings(pairs=1)})
+    own.allow(mechanism=patching, experiments={"inside": asked}, scenarios=["plinko-0001"])
+    text = load_local_model(entry, inside=True).network.config.get_text_config()
+    monkeypatch.setattr(text, "altup_num_inputs", 4, raising=False)  # as Gemma 3n has several residual streams
+
+    def patched_if_wanted() -> object:
+        workspace = Workspace.open(own.root)
+        return patching_rows(workspace, entry, STANDARD) if Wanted(workspace).patches else None
+
+    nothing = remedied(
+        patched_if_wanted,
+        "so that its effects would be too small; set `patching: null` in the experiment and in study.yaml",
+        lambda: Workspace.open(own.root).allow(mechanism=patching.model_copy(update={"patching": None})),
+    )
+    assert nothing is None
+
+
 def test_activations_are_patched_once_there_are_probe_items(own: Workspace, entry: ModelEntry) -> None:
     own.allow(mechanism=own.mechanism.model_copy(update={"patching": PatchingSettings(pairs=1, sites=("residual",))}))
     items = {dataset: own.tables.read(PROBE_ITEMS, {"dataset": dataset}) for dataset in WELL_POSED}

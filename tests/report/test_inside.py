@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from itertools import product
-from typing import ClassVar
+from types import SimpleNamespace
+from typing import ClassVar, cast
 
 import numpy as np
 import pandas as pd
@@ -22,12 +23,14 @@ from traps_pipeline.mechanism.control_tables import (
 from traps_pipeline.mechanism.effects import own_effects
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS
 from traps_pipeline.partitions import DATASETS
-from traps_pipeline.report import publish
+from traps_pipeline.report import publish, study_results
 from traps_pipeline.report.catalogue import FIGURES, INSIDE
 from traps_pipeline.report.page import Card, picture_block, report_html
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.results import Makers, Results
+from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables import inside
+from traps_pipeline.report.tables.mechanism import steering as steering_tables
 from traps_pipeline.report.tables.mechanism import why
 from traps_pipeline.report.tables.patching import patching as patching_table
 from traps_pipeline.report.writing import PrintedTable
@@ -136,6 +139,7 @@ def test_probes_stand_beside_their_baselines_at_the_sources_own_layer() -> None:
 def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
     sources, controls, answerable, _ = inside.gate(Made())
     assert [row["Target"] for row in cells(sources)] == ["all", "ch"]
+    assert [(row["Controls"], row["Voids"]) for row in (*cells(sources), *cells(controls))] == [("64", "64")] * 4
     assert [(row["Features"], row["PECS, gated"]) for row in cells(controls)] == [
         ("states", "0.640"),
         ("question words", "0.640"),
@@ -150,6 +154,7 @@ def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
     (row,) = cells(table)  # chaotic alone has answers, under guided; the output margin was read under standard
     assert (row["Dataset"], row["guided"], row["guided − standard"]) == ("ch", "50.0", "–")
     assert (row["Probe, standard"], row["Output margin, standard"]) == ("0.980", "0.900")
+    assert (row["Best raw input"], row["its AUROC"], row["Noise"]) == ("time stamps", "1.000", "0.500 ± 0.100")
     assert (row["Voids answered about"], row["Voids"], row["Controls"]) == ("64", "16", "16")
     made = Made()
     made.made["prompted_probes"] = probes().assign(n_voids=9)
@@ -227,6 +232,31 @@ def test_the_page_of_a_study_that_looked_inside_leads_with_the_four_figures_of_i
     study.mechanism = MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)})
     assert shown()[:4] == ["probe_baselines", "gate_arrows", "patching", "doses_among_nulls"] == [*INSIDE]
     assert shown()[4:] == [name for name in order if name not in INSIDE]
+
+
+def test_steered_cells_have_their_dose_in_class_gaps_their_counts_and_what_is_no_answer() -> None:
+    every = effects().assign(n_missing=0, degenerate=1)
+    made = Made()
+    made.made["effects"] = study_results._effects(cast(StudyResults, SimpleNamespace(rows=lambda _: every)))
+    found = {table.name: table for table in steering_tables(made)}
+    (row,) = cells(found["steering_top"])
+    assert (row["α"], row["in class gaps"]) == ("10", "0.05")  # the gap is 200
+    assert row["Controls abstained on %"].endswith("†") and (row["Controls"], row["Voids"]) == ("5", "5")
+    assert (row["Degenerate %, controls"], row["voids"]) == ("20.0", "20.0")
+    assert [line["in class gaps"] for line in cells(found["steering_dose"])] == ["0.00", "0.05"]
+    assert all(any("answers per cell" in note for note in found[name].notes) and
+               any(note.startswith("† and means of such cells") for note in found[name].notes)
+               for name in ("steering_top", "steering_dose", "steering_regimes", "steering_domains"))  # fmt: skip
+
+
+def test_figures_say_from_how_many_items_they_are_and_how_a_direction_ranks() -> None:
+    made = Made()
+    made.made["prompted_probes"] = probes().assign(n_voids=9)
+    axes = {report.name: report.make(made).axes[0] for report in FIGURES if report.name in INSIDE}
+    assert axes["probe_baselines"].get_title(loc="left") == "m, 9 to 16 items a side"
+    assert [label.get_text() for label in axes["probe_baselines"].get_xticklabels()] == ["ch †", "ch→oc †"]
+    title = axes["doses_among_nulls"].get_title(loc="left")
+    assert title.splitlines() == ["ch, standard→guided, n 5†", "p + .05 – –"]  # of isotropic nulls on controls alone
 
 
 def test_doses_in_alpha_do_not_set_the_scale_of_the_figure_of_class_gaps() -> None:

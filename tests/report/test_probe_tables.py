@@ -51,7 +51,7 @@ def states() -> pd.DataFrame:
 
 def baselines() -> pd.DataFrame:
     found = []
-    pairs = (("transfer", *PAIRS[0]), ("transfer", *PAIRS[1]), ("confabulated", *PAIRS[0]),
+    pairs = (("transfer", *PAIRS[0]), ("transfer", *PAIRS[1]), ("confabulated", *PAIRS[0]), ("held_out", *PAIRS[0]),
              ("held_out", "occlusion", "occlusion"), ("answerable_void", "occlusion", ANSWERABLE),
              ("answerable_control", "occlusion", ANSWERABLE))  # fmt: skip
     for (analysis, source, target), (features, value) in product(pairs, FEATURES):
@@ -87,6 +87,11 @@ def test_the_best_raw_input_the_output_margin_and_noise_stand_beside_a_probe(nam
     assert BESIDE.items() <= first(tables()[name]).items()
 
 
+def test_a_figure_without_the_scored_scenario_stands_beside_the_floor_of_its_own_split() -> None:
+    row = first(tables()["probe_transfer"])
+    assert (row["Held out"], row["Noise, held out"]) == ("0.850", "0.500 ± 0.050")
+
+
 def test_confabulated_voids_stand_beside_baselines_of_the_same_voids_and_with_their_scenario_held_out() -> None:
     table = tables()["probe_confabulated"]
     row = first(table)
@@ -98,11 +103,13 @@ def test_confabulated_voids_stand_beside_baselines_of_the_same_voids_and_with_th
 def test_means_over_paths_have_means_of_baselines_beside_them() -> None:
     row = first(tables()["probe_means"])
     assert BESIDE.items() - {("Noise", "0.500 ± 0.050")} <= row.items() and row["Noise"] == "0.500"
-    assert (row["Cf→Cf, held out"], row["Cf→Cf: Best raw input"], row["Cf→Cf: its AUROC"]) == (
+    assert (row["Cf→Cf: Held out"], row["Cf→Cf: Best raw input"], row["Cf→Cf: its AUROC"]) == (
         "0.610",
         "length",
         "0.800",
     )
+    assert (row["Held out"], row["Noise, held out"]) == ("0.850", "0.500")
+    assert (row["AUROC"], row["Cf→Cf"], row["Fewest voids"], row["Fewest Cf voids"]) == ("0.950", "0.930 †", "16", "6")
 
 
 def test_a_dataset_on_itself_has_counts_an_interval_and_a_mark() -> None:

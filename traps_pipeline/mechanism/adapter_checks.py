@@ -185,7 +185,13 @@ def _patching(subject: Subject) -> str:
     gap = source.margin - target.margin
     far = np.abs(patched_changes(model, target, source, everywhere, tokens) / gap - 1)
     _require(bool(gap and far.max() <= CLOSE), f"patching all positions misses the source's outcome by {far.max():.1e}")
-    return "exactly 0, and 1" + ("" if target.visual is None else " with deepstack features")
+    beside = {
+        "deepstack features": target.visual is not None,
+        "shared keys and values": bool(target.shared),
+        "per-layer inputs": bool(target.per_layer),
+    }
+    also = ", ".join(what for what, there in beside.items() if there)
+    return "exactly 0, and 1" + (f" with {also}" if also else "")
 
 
 # --- faster ways ------------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CELL = ["model", "directions", "regime"]
+BESIDE = ("n", "gaps", "broken")  # of an effect: answers, dose in class gaps, share of degenerate ones
 REGIME_COLUMNS = (
     *("model", "path_set", "family", "directions", "regime", "kind", "n_paths", "alpha"),
     *("control_0", "control_top", "void_0", "void_top"),
@@ -31,13 +32,14 @@ def on_both_sides(effects: pd.DataFrame) -> pd.DataFrame:
 
 def paths(effects: pd.DataFrame) -> pd.DataFrame:
     """One row per path and strength at the steered layer, with transfer_type and the abstention of control and void; if
-    the effects have intervals, also `control_low` and so on."""
+    the effects have intervals, counts, doses in class gaps or shares of degenerate answers, also `control_low` and so
+    on."""
     import pandas as pd
 
     keys = [*CELL, "source", "target", "kind", "layer", "alpha"]
     rows, columns = on_both_sides(effects), keys.copy()
     parts: list[pd.DataFrame] = []
-    for value, suffix in (("abstention", ""), ("low", "_low"), ("high", "_high")):
+    for value, suffix in [("abstention", ""), *((name, f"_{name}") for name in ("low", "high", *BESIDE))]:
         if value in rows:
             wide = rows.pivot_table(index=keys, columns="side", values=value, dropna=False, observed=True)
             parts.append(wide.dropna(how="all").reindex(columns=pd.Index(["control", "void"])).add_suffix(suffix))
@@ -122,12 +124,18 @@ def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
     sides; with `gaps`, the dose in units of the class gap. Without a dose in that unit there are no rows."""
     own = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
     both = own.loc[own["side"] == "void", ["model", "layer"]].drop_duplicates()
-    own = own.merge(both, on=["model", "layer"])
-    keys = ["model", "directions", "target", "layer"]
-    length = own.loc[(own["unit"] == "gap") & (own["dose"] > 0) & (own["kind"] == "void")]
+    own = in_gaps(own.merge(both, on=["model", "layer"]), own)
+    return own.loc[own["gaps"].notna()].reset_index(drop=True)
+
+
+def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
+    """Effects with `gaps`, their strength in units of the class gap of the direction's own dataset, which is read off
+    the doses in that unit among `every` effect; NaN where there is none."""
+    keys = ["model", "directions", "source", "layer"]
+    length = every.loc[(every["unit"] == "gap") & (every["dose"] > 0) & (every["kind"] == "void")]
     length = length.assign(length=length["alpha"] / length["dose"])[[*keys, "length"]].drop_duplicates(keys)
-    joined = own.merge(length, on=keys)
-    return joined.assign(gaps=joined["alpha"] / joined["length"])
+    joined = effects.merge(length, on=keys, how="left")
+    return joined.assign(gaps=joined["alpha"] / joined["length"]).drop(columns="length")
 
 
 def _in_order(rows: pd.DataFrame) -> pd.DataFrame:

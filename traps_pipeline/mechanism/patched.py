@@ -150,7 +150,7 @@ def _patches(n_layers: int, groups: Mapping[str, np.ndarray], sites: Sequence[st
 
 def _groups(target: Side, other: Side) -> dict[str, np.ndarray] | None:
     """The groups of positions of a pair; None if the two prompts have another form. A model whose pixels do not lie
-    token by token (LLaVA-NeXT-Video) has no group of unchanged visual tokens: all count as changed."""
+    token by token (LLaVA-NeXT-Video, Gemma 4) has no group of unchanged visual tokens: all count as changed."""
     if not _fits(target, other):
         return None
     parts, visual = target.parts, target.parts["visual"]

@@ -208,7 +208,9 @@ class SteeringRow:
     text: Annotated[str | None, "the answer; null unless outcome is answer or truncated"]
     served_model: Annotated[str | None, "checkpoint, digest and precision that answered"]
     completion_tokens: shared.Tokens
-    degenerate: Annotated[str | None, "why the text is no answer: truncated, repetition or script; null if it is one"]
+    degenerate: Annotated[
+        str | None, "why the text is no answer: truncated, empty, repetition, script or language; null if it is one"
+    ]
     direction_digest: Annotated[str | None, "digest of the direction's numbers"]
     place: Annotated[str, "where the direction acts: site, tokens, and under which condition"]
     request_key: Annotated[str, "ledger key; the two datasets of a taxonomy share the key of a control"]

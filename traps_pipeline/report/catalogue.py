@@ -289,7 +289,7 @@ FIGURES: tuple[FigureReport, ...] = (
         "doses_among_nulls",
         "Doses among nulls",
         figures_of_inside.doses_among_nulls,
-        ("steering_effects",),
+        ("steering_effects", "steering_nulls"),
         published=False,
     ),
     FigureReport("probe_curves", "Probe transfer by layer", mechanism.probe_curves, ("probes",), published=False),

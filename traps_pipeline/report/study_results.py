@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.mechanism.effects import in_gaps
 from traps_pipeline.mechanism.shares import of_paper
 from traps_pipeline.mechanism.tables import COSINES, STEERING_EFFECTS
 from traps_pipeline.models.judges import panel_id
@@ -97,6 +98,14 @@ def _cosines(results: StudyResults) -> pd.DataFrame:
     return rows.loc[wanted].reset_index(drop=True)
 
 
+def _effects(results: StudyResults) -> pd.DataFrame:
+    """The rows of the paper's protocol, with the dose in class gaps and the share of degenerate answers."""
+    every = results.rows(STEERING_EFFECTS)
+    rows = in_gaps(of_paper(every), every)
+    answers = rows["n"].astype(float) + rows["n_missing"].astype(float)
+    return rows.assign(broken=rows["degenerate"].astype(float) / answers)
+
+
 def _ill_posed(frame: pd.DataFrame) -> pd.DataFrame:
     return frame["dataset"].str.endswith("_ill_posed")
 
@@ -123,7 +132,7 @@ class StudyResults(Results):
         "labels": lambda results: analyses.accuracy_by_label(_scoped(results, "label")),
         "composition": _composition,
         "cosines": _cosines,
-        "effects": lambda results: of_paper(results.rows(STEERING_EFFECTS)),
+        "effects": _effects,
     }
 
     def __init__(self, workspace: Workspace) -> None:

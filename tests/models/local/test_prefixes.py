@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,10 +42,11 @@ def widths(of: LocalModel) -> Iterator[list[tuple[int, int]]]:
 
 
 @each_family
-@pytest.mark.parametrize("layer", [1, 3])
+@pytest.mark.parametrize("layer", [1, 3, -1])
 def test_a_resumed_sheet_has_the_answers_of_the_plain_path(family: Family, layer: int) -> None:
     """Prompts of three lengths and two clips, each with three doses along two directions, in one batch."""
     of = model(family)
+    layer = layer if layer > 0 else of.n_layers - 1  # in Gemma one of the blocks that read keys and values of others
     prompts = [*three_prompts(family), ask(of, frames=4)]
     of.prefixes = PrefixMemory()
     sheet = [(p, v, alpha) for p in prompts for v in (0, 1) for alpha in (-60.0, 0.0, 60.0)]
@@ -59,14 +61,12 @@ def test_a_resumed_sheet_has_the_answers_of_the_plain_path(family: Family, layer
         assert [one.text for one in made] == [one.text for one in plain]
     assert len({one.tokens for one in plain}) > len(prompts)  # directions do change answers
     assert not any("forward" in vars(block) for block in of.blocks)
-    if family == "gemma-4":  # its upper blocks reuse keys and values of lower ones
-        assert of.prefixes.passes == 0
-    else:
-        assert of.prefixes.passes == len(prompts)
+    assert of.prefixes.passes == len(prompts)
 
 
-@pytest.mark.parametrize("family", ["qwen3-vl", "llava-next-video"])
-@pytest.mark.parametrize("layer", [1, 2, 3, 4])
+@pytest.mark.parametrize(
+    ("family", "layer"), [(family, layer) for family in FAMILIES for layer in range(1, 7 if family == "gemma-4" else 5)]
+)
 def test_logits_of_a_resumed_pass_are_those_of_a_whole_one(family: Family, layer: int) -> None:
     of, prompts = model(family), [*three_prompts(family)]
     of.prefixes = PrefixMemory()
@@ -84,11 +84,49 @@ def test_logits_of_a_resumed_pass_are_those_of_a_whole_one(family: Family, layer
     found = of.prefixes.of(of, prompts, layer)
     assert found is not None
     few = without_pictures(of, prompts, layer)
-    n_deepstack = 2 if family == "qwen3-vl" else 0
-    assert ("pixel_values_videos" in few[0].inputs) == (layer <= n_deepstack)
+    last = {"qwen3-vl": 2, "gemma-4": of.n_layers}.get(family, 0)  # the last layer behind which pictures enter
+    assert ("pixel_values_videos" in few[0].inputs) == (layer <= last)
     with torch.inference_mode(), resumed(of, found, layer), hook.applied(of):
         part = logits(collate(few, pad))
     np.testing.assert_allclose(part.numpy(), whole.numpy(), rtol=0, atol=1e-4 * float(whole.abs().max()))
+
+
+def test_a_prefix_of_gemma_has_all_keys_and_values_that_later_blocks_read() -> None:
+    """Those of a whole prompt, of which the cache of its sliding blocks keeps the latest; and none of the upper blocks,
+    which make none."""
+    of = model("gemma-4")
+    prompt, window = ask(of), of.network.config.get_text_config().sliding_window
+    for layer, n_made, shared in ((1, 1, {}), (3, 3, {"sliding_attention": 2}), (4, 4, None), (6, 4, None)):
+        found = PrefixMemory().of(of, [prompt], layer)
+        assert found is not None and len(found[0].keys) == len(found[0].values) == n_made
+        both = {"sliding_attention": 2, "full_attention": 3}
+        assert found[0].shared == (both if shared is None else shared)
+        assert {keys.shape[1] for keys in found[0].keys} == {prompt.n_tokens} and prompt.n_tokens > 2 * window
+
+
+def test_what_is_not_handed_on_to_later_blocks_tells_in_the_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Resumed behind the blocks that make them, Gemma's upper blocks find no keys and values but those handed on."""
+    of, prompt = model("gemma-4"), ask(model("gemma-4"))
+    hook = Steering(direction(of), 4, (40.0,))
+    of.prefixes = PrefixMemory()
+    plain = of.generate([prompt], NEW_TOKENS, steering=hook)
+    found = PrefixMemory().of(of, [prompt], 4)
+    assert found is not None
+    lost = replace(found[0], shared={})
+    with pytest.raises(KeyError), torch.inference_mode(), resumed(of, [lost], 4):
+        of.network.base_model(**of.placed(prompt.inputs), use_cache=True)
+    blind = replace(found[0], keys=tuple(0 * keys for keys in found[0].keys))
+    for prefix, same in ((found[0], True), (blind, False)):
+        monkeypatch.setattr(of.prefixes, "of", lambda *_, prefix=prefix: [prefix])
+        with of.resuming():
+            assert (of.generate([prompt], NEW_TOKENS, steering=hook)[0].tokens == plain[0].tokens) is same
+
+
+def test_a_model_whose_blocks_read_more_than_is_known_runs_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    of, prompt = model("qwen3-vl"), ask(model("qwen3-vl"))
+    monkeypatch.setattr(of.network.config.text_config, "num_kv_shared_layers", 1, raising=False)
+    memory = PrefixMemory()
+    assert memory.of(of, [prompt], 2) is None and memory.passes == 0
 
 
 def test_the_oldest_prefixes_are_forgotten_and_known_by_their_inputs() -> None:

@@ -27,9 +27,7 @@ _STAMP = re.compile(r"<\d+(?:\.\d+)?seconds>|\d\d:\d\d(?!\d)")
 def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict[str, np.ndarray]:
     """By part, whether each token of the prompt belongs to it, (T,) bool. No token belongs to two parts; those of the
     chat template belong to none. Raises TrapsError where a part cannot be found."""
-    ids = prompt.inputs["input_ids"][0].tolist()
-    placeholders = {getattr(model.processor, f"{kind}_token_id", None) for kind in ("image", "video")}
-    visual = np.isin(ids, [token for token in placeholders if token is not None])
+    ids, visual = prompt.inputs["input_ids"][0].tolist(), visual_tokens(model, prompt)
     texts = [
         "" if is_visual else _plain(model.processor.tokenizer.decode([token]))
         for token, is_visual in zip(ids, visual, strict=True)
@@ -58,6 +56,12 @@ def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict
     for name in PARTS[:-1]:
         found[name] &= ~found["last"]
     return found
+
+
+def visual_tokens(model: LocalModel, prompt: Prompt) -> np.ndarray:
+    """Which tokens of a prompt stand for pictures, (T,) bool."""
+    placeholders = {getattr(model.processor, f"{kind}_token_id", None) for kind in ("image", "video")}
+    return np.isin(prompt.inputs["input_ids"][0].tolist(), [token for token in placeholders if token is not None])
 
 
 def changed_tokens(one: Prompt, other: Prompt, visual: np.ndarray) -> np.ndarray | None:

@@ -192,14 +192,16 @@ def _qwen3_vl(transformers: Any, ids: Mapping[str, int], base: Overrides, text: 
 
 
 def _gemma_4(transformers: Any, ids: Mapping[str, int], base: Overrides, text: Overrides, vision: Overrides) -> Any:
-    """As E4B is made: sliding and full attention, per-layer embeddings, and upper layers that share keys and values."""
+    """As E4B is made: sliding and full attention, per-layer embeddings, and upper blocks that read the keys and values
+    of lower ones, below which there are blocks whose keys and values nobody else reads."""
     words = {
         **base,
         "vocab_size_per_layer_input": base["vocab_size"],
         "hidden_size_per_layer_input": 64,  # of 64: what NF4 needs on a CPU
         "global_head_dim": 32,
+        "num_hidden_layers": 6,
         "num_kv_shared_layers": 2,
-        "layer_types": ["sliding_attention", "full_attention"] * 2,
+        "layer_types": ["sliding_attention", "full_attention"] * 3,
         "sliding_window": 64,
         **text,
     }

@@ -11,8 +11,9 @@ from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.partitions import DATASETS, SHORT
 from traps_pipeline.report.figures.looks import arrow, frame_plane
 from traps_pipeline.report.results import Results, datasets_of
-from traps_pipeline.report.tables.inside import SHORTCUTS, beside
-from traps_pipeline.report.tables.mechanism import why
+from traps_pipeline.report.tables.beside import SHORTCUTS
+from traps_pipeline.report.tables.inside import beside
+from traps_pipeline.report.tables.mechanism import few, why
 from traps_pipeline.report.tables.patching import SITES
 from traps_pipeline.report.terms import TITLES
 from traps_pipeline.report.writing import (
@@ -41,8 +42,8 @@ GROUPS = ("system", "stamps", "changed", "unchanged", "question", "last", "all")
 def probe_baselines(results: Results) -> Figure:
     """AUROC of each dataset's probe on itself and on the other datasets (black, with its interval) beside probes on raw
     inputs and on the output margin; grey is what noise gives under the same split, mean ± 2 deviations. oc and ch are
-    occlusion and chaotic, and with _ip their ill-posed questions; oc→ch is fitted on oc and scored on ch. A probe shows
-    what the states add only as far as it is above all coloured marks."""
+    occlusion and chaotic, and with _ip their ill-posed questions; oc→ch is fitted on oc and scored on ch; † is from
+    fewer than ten items a side. A probe shows what the states add only as far as it is above all coloured marks."""
     rows = beside(results)
     if not len(rows):
         return not_run_figure("Probes and their baselines", why(results), PAGE_IN)
@@ -54,7 +55,8 @@ def probe_baselines(results: Results) -> Figure:
         axes = figure.subplots(len(models), 1, squeeze=False, sharex=True)[:, 0]
         for ax, model in zip(axes, models, strict=True):
             _baselines(ax, rows.loc[rows["model"] == model])
-            ax.set_title(plain(model)[:40], size=7.5)
+            sides = rows.loc[rows["model"] == model, ["n_voids", "n_controls"]].astype(int).to_numpy()
+            ax.set_title(f"{plain(model)[:40]}, {_from_to(sides.min(), sides.max())} items a side", size=7.5)
             ax.set_ylabel("AUROC")
         handles = [Line2D([], [], color=INK, marker="o", markersize=4, label="states, at the source’s own layer")]
         handles += [
@@ -64,6 +66,10 @@ def probe_baselines(results: Results) -> Figure:
         handles += [Line2D([], [], color=GRID, linewidth=6, label="noise, mean ± 2 sd")]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
+
+
+def _from_to(low: int, high: int) -> str:
+    return f"{low}" if low == high else f"{low} to {high}"
 
 
 def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
@@ -81,7 +87,9 @@ def _baselines(ax: Axes, rows: pd.DataFrame) -> None:
         ax.plot(x - 0.32, row["value"], marker="o", color=INK, markersize=3.5)
     ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
     names = ["itself" if s == t else f"{SHORT[s]}→{SHORT[t]}" for s, t in shown]
-    ax.set_xticks(range(len(shown)), [SHORT[s] if s == t else n for n, (s, t) in zip(names, shown, strict=True)])
+    names = [SHORT[s] if s == t else n for n, (s, t) in zip(names, shown, strict=True)]
+    marked = [f"{name} {found[pair]['mark']}".strip() for name, pair in zip(names, shown, strict=True)]
+    ax.set_xticks(range(len(shown)), marked)
     ax.tick_params(axis="x", labelrotation=60, length=0)
     ax.set_ylim(-0.03, 1.05)
 
@@ -209,7 +217,9 @@ def doses_among_nulls(results: Results) -> Figure:
     """Abstention of each dataset's controls (+) and voids (−) along its own direction, by dose in units of the class
     gap. Right of the line: the nulls, which are orthogonal to the direction, at the largest dose, added on controls (+)
     and subtracted on voids (−); a larger dot stands for more draws. The direction does something of its own where its
-    line ends away from the dots. oc and ch are occlusion and chaotic, and with _ip their ill-posed questions."""
+    line ends away from the dots. oc and ch are occlusion and chaotic, and with _ip their ill-posed questions. n:
+    answers of a side, † fewer than ten. p: share of the draws of each null, in the order of the legend, that do as
+    much, the direction itself counted with them; on controls, then on voids."""
     rows = results.own_effects
     if not len(rows):
         absent = why(results) if results.is_study else "the paper has no such nulls"
@@ -224,8 +234,12 @@ def doses_among_nulls(results: Results) -> Figure:
         for line, (model, directions, regime) in zip(axes, cells, strict=True):
             of = rows.loc[(rows["model"] == model) & (rows["directions"] == directions) & (rows["regime"] == regime)]
             for ax, dataset in zip(line, datasets, strict=True):
-                _dose(ax, of.loc[of["target"] == dataset], colour)
-                ax.set_title(f"{SHORT[dataset]}, {directions}→{regime}", size=7)
+                part = of.loc[of["target"] == dataset]
+                _dose(ax, part, colour)
+                own = part.loc[part["kind"] == "void"].assign(mark=few(part.loc[part["kind"] == "void"], "n"))
+                n = _from_to(int(own["n"].min()), int(own["n"].max())) + max(own["mark"])
+                ranks = _p_values(results.nulls, str(model), str(directions), str(regime), dataset)
+                ax.set_title(f"{SHORT[dataset]}, {directions}→{regime}, n {n}\n{ranks}", size=6)
             line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")
         for ax in axes[-1]:
             ax.set_xlabel("dose in class gaps | nulls", size=7)
@@ -238,6 +252,18 @@ def doses_among_nulls(results: Results) -> Figure:
         ]
         figure.legend(handles=handles, loc="outside lower center", ncols=5)
     return figure
+
+
+def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dataset: str) -> str:
+    """The p of a direction among each of its nulls at the largest dose, by side."""
+    of = nulls.loc[(nulls["model"] == model) & (nulls["directions"] == directions) & (nulls["regime"] == regime)]
+    of = of.loc[(of["target"] == dataset) & (of["unit"] == "gap")]
+    said: list[str] = []
+    for side, sign in (("control", "+"), ("void", "−")):
+        rows = of.loc[of["side"] == side].sort_values("dose").drop_duplicates("null", keep="last")
+        known = {str(row["null"]): f"{row['p']:.2f}".removeprefix("0") for row in rows.to_dict("records")}
+        said += [f"{sign} {' '.join(known.get(null, '–') for null in NULLS)}"] if known else []
+    return f"p {', '.join(said)}" if said else ""
 
 
 def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:

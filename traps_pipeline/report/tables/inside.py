@@ -9,14 +9,14 @@ from traps_pipeline.mechanism.paths import path_name, probed_taxonomy
 from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT
 from traps_pipeline.partitions import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.mechanism import DIRECTIONS, INFERENCE, why
+from traps_pipeline.report.tables.beside import SHORTCUTS, against
+from traps_pipeline.report.tables.mechanism import DIRECTIONS, FEW, INFERENCE, few, why
 from traps_pipeline.report.tables.shared import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:
     import pandas as pd
 
-FEW = 10  # items of a side below which a value is marked
 FEW_NOTE = f"† fewer than {FEW} controls or voids: the value says little"
 DRAWS = "± standard deviation over draws of noise"
 LAYER = Column("layer", "Layer", "count")
@@ -24,17 +24,8 @@ DOSE = Column("step", "Dose")
 SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "− everywhere"}
 
 
-def few(rows: pd.DataFrame, *counts: str) -> list[str]:
-    """The mark of each row: a dagger where one of the counts is below FEW; none where a count is not known."""
-    import pandas as pd
-
-    numbers = [pd.to_numeric(rows[name], errors="coerce") for name in counts]
-    return ["†" if any(value < FEW for value in values) else "" for values in zip(*numbers, strict=True)]
-
-
 # --- probes and their baselines ---------------------------------------------------------------------------------------
 
-SHORTCUTS = ("question words", "first frame", "all frames", "length", "time stamps")
 WHAT = {
     "occlusion_answerable": "void clip, answerable question",
     "decoy": "decoy: a panel that hides nothing",
@@ -247,7 +238,7 @@ _GATED = (
     Column("plain_pecs", "PECS, plain", "fraction"), Column("pecs", "PECS, gated", "fraction", mark="mark"),
     Column("pecs_low", "from", "fraction"), Column("pecs_high", "to", "fraction"),
     Column("acc", "Acc %", "percent"), Column("abs_rec", "AbsRec %", "percent"),
-    Column("false_abs", "FalseAbs %", "percent"), Column("expected_false_abs", "expected %", "percent"),
+    Column("false_abs", "FalseAbs %", "percent"), Column("expected_false_abs", "expected %", "percent"), *_SIDES,
 )  # fmt: skip
 _GATE_NOTES = (
     "a gated answer becomes an abstention and every other answer keeps its verdict; no gate has seen the scenario that "
@@ -297,6 +288,7 @@ def _gate_controls(results: Results) -> PrintedTable:
         "gates from other datasets at the mid threshold, mean over the four datasets",
         "a gate on states shows what states add only as far as it is above gates on raw inputs, on the output margin "
         "and on an untrained model’s states",
+        *([FEW_NOTE] if "†" in set(rows["mark"]) else []),
     ]
     absent = why(results) if results.is_study else "the paper gates nothing"
     return PrintedTable("gate_controls", "The gate beside its controls", rows, columns, notes, absent)
@@ -324,7 +316,8 @@ def _gate_answerable(results: Results) -> PrintedTable:
 def prompts(results: Results) -> pd.DataFrame:
     """One row per model and dataset: AbsRec under standard and guided, in shares, their difference, and for both
     prompts the AUROC of the probe (at the dataset's own layer, fitted without the scored scenario) and of the output
-    margin; n_answered, the fewest voids that were answered under either prompt, n_voids and n_controls of the probe."""
+    margin; those of the best raw input and of noise; n_answered, the fewest voids that were answered under either
+    prompt, n_voids and n_controls of the probe."""
     import pandas as pd
 
     keys = ["model", "dataset"]
@@ -345,7 +338,9 @@ def prompts(results: Results) -> pd.DataFrame:
             counted |= {count: (rows, count) for count in ("n_voids", "n_controls")}
     for name, (rows, count) in counted.items():
         table[name] = rows.groupby(keys)[count].min().reindex(table.index)
-    return table.reset_index()
+    floor = against(results, "held_out")
+    floor = floor.loc[floor["source"] == floor["target"]].rename(columns={"target": "dataset"})
+    return table.reset_index().merge(floor[[*keys, "raw", "raw_value", "noise", "noise_spread"]], on=keys, how="left")
 
 
 PROMPTED = ("standard", "guided")
@@ -364,11 +359,14 @@ def _prompts(results: Results) -> PrintedTable:
         Column("change", "guided − standard", "percent", mark="said_mark"),
         *(Column(f"{kind}_{prompt}", f"{label}, {prompt}", "fraction", mark="probe_mark")
           for kind, label in (("probe", "Probe"), ("margin", "Output margin")) for prompt in PROMPTED),
+        Column("raw", "Best raw input"), Column("raw_value", "its AUROC", "fraction"),
+        Column("noise", "Noise", "fraction", spread="noise_spread"),
         Column("n_answered", "Voids answered about", "count"), *_SIDES,
     ]  # fmt: skip
     notes = [
         "what the prompt changes: the answers (AbsRec), or what is represented (AUROC of voids against controls, "
-        "states under the VQA prompt of that name, fitted without the scored scenario)",
+        "states under the VQA prompt of that name, fitted without the scored scenario); the best raw input and noise "
+        "are the same under both prompts",
         *([FEW_NOTE] if "†" in {*rows["said_mark"], *rows["probe_mark"]} else []),
     ]
     absent = why(results) if results.is_study else "the paper prints no such figures"

@@ -20,12 +20,22 @@ PATH, TYPE = Column("path", "Path"), Column("transfer_type", "Transfer")
 DIRECTIONS, INFERENCE = Column("directions", "Directions"), Column("regime", "Inference")
 KIND, SET = Column("kind", "Direction"), Column("path_set", "Path set")
 NO_MECHANISM = "the experiment has no `mechanism` section, so no local model's states were read"
+FEW = 10  # items of a side, or answers of a cell, below which a value is marked
+CELLS_NOTE = f"† and means of such cells: fewer than {FEW} answers in a cell, whose share says little"
 SETS = {"transfer": "transfer", "within_domain": "within domain"}
 
 
 def why(results: Results) -> str:
     """The reason why a frame of what is found inside models has no rows."""
     return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
+
+
+def few(rows: pd.DataFrame, *counts: str) -> list[str]:
+    """The mark of each row: a dagger where one of the counts is below FEW; none where a count is not known."""
+    import pandas as pd
+
+    numbers = [pd.to_numeric(rows[name], errors="coerce") for name in counts]
+    return ["†" if any(value < FEW for value in values) else "" for values in zip(*numbers, strict=True)]
 
 
 # --- directions -------------------------------------------------------------------------------------------------------
@@ -123,7 +133,7 @@ def _regimes(results: Results, name: str, title: str) -> PrintedTable:
         Column("control_top", "Control, α, %", "percent"), Column("void_0", "Void, α 0, %", "percent"),
         Column("void_top", "Void, α, %", "percent"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
-    notes = ["mean over the paths of a set; +α on controls, −α on voids"]
+    notes = ["mean over the paths of a set; +α on controls, −α on voids", *_cell_notes(results)]
     absent = why(results)
     if name.endswith("families") and len(results.effects):
         absent = "no directions of the guided prompt were steered under guided inference"
@@ -139,6 +149,7 @@ def _domains(results: Results) -> PrintedTable:
         Column("cross", "Cross domain, controls %", "percent"),
     ]  # fmt: skip
     notes = ["abstention on the well-posed dataset of the source’s own taxonomy (same) and of the other (cross)"]
+    notes += _cell_notes(results)
     if results.is_study:
         notes.append(
             "judged by the panel; the paper judged its two same-domain figures by keywords, which it does not print: "
@@ -151,24 +162,25 @@ def _top(results: Results) -> PrintedTable:
     rows = effects.paths(results.effects)
     rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
     rows = _named(rows)
-    columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, Column("alpha", "α", "count"), *_SIDES]
-    return PrintedTable("steering_top", "Steering at the largest α", rows, columns, [], why(results))
+    columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, Column("alpha", "α", "count"), *_in_gaps(results)]
+    columns += [*_SIDES, *_counts(results)]
+    return PrintedTable("steering_top", "Steering at the largest α", rows, columns, _cell_notes(results), why(results))
 
 
 def _dose(results: Results) -> PrintedTable:
     rows = _named(effects.paths(results.effects))
     columns = [MODEL, DIRECTIONS, INFERENCE, KIND, PATH, Column("layer", "Layer", "count")]
-    columns += [Column("alpha", "α", "count")]
+    columns += [Column("alpha", "α", "count"), *_in_gaps(results)]
     for side in _SIDES:
         columns += [side]
         if results.is_study:
             columns += [
                 Column(f"{side.field}_{end}", word, "percent") for end, word in (("low", "from"), ("high", "to"))
             ]
-    counts = results.effects["n"].dropna()
+    columns += _counts(results)
     notes = [
         epochs(results.effects),
-        f"n = {counts.max():.0f} answers per cell at most, one per scenario" if len(counts) else "",
+        *_cell_notes(results),
         "from, to: 95 % Wilson interval" if results.is_study else "",
     ]
     return PrintedTable("steering_dose", "Dose and response", rows, columns, [n for n in notes if n], why(results))
@@ -180,18 +192,46 @@ def _layers(results: Results) -> PrintedTable:
         MODEL, DIRECTIONS, INFERENCE, Column("layer", "Layer", "count"), Column("alpha", "α", "count"),
         Column("control", "Controls abstained on %", "percent"), Column("n_splits", "Splits", "count"),
     ]  # fmt: skip
-    notes = ["each dataset’s direction on its own controls, mean over the four splits"]
+    notes = ["each dataset’s direction on its own controls, mean over the four splits", *_cell_notes(results)]
     absent = "only one layer was steered" if len(results.effects) else why(results)
     table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, absent)
     return rightly_empty(table, results.is_study and bool(len(results.effects)))
 
 
-_SIDES = (Column("control", "Controls abstained on %", "percent"), Column("void", "Voids abstained on %", "percent"))
+_SIDES = (
+    Column("control", "Controls abstained on %", "percent", mark="control_mark"),
+    Column("void", "Voids abstained on %", "percent", mark="void_mark"),
+)
+
+
+def _in_gaps(results: Results) -> list[Column]:
+    """The dose in units of the class gap of the direction's own dataset; the paper does not print its gaps."""
+    return [Column("control_gaps", "in class gaps", "ratio", 2)] if results.is_study else []
+
+
+def _counts(results: Results) -> list[Column]:
+    """What stands behind a cell's two shares; the paper prints neither."""
+    if not results.is_study:
+        return []
+    return [
+        Column("control_broken", "Degenerate %, controls", "percent"), Column("void_broken", "voids", "percent"),
+        Column("control_n", "Controls", "count"), Column("void_n", "Voids", "count"),
+    ]  # fmt: skip
+
+
+def _cell_notes(results: Results) -> list[str]:
+    """How many answers a cell has at most, and what that says of all figures made of cells."""
+    counts = results.effects["n"].dropna()
+    if not len(counts):
+        return []
+    said = [f"n = {counts.max():.0f} answers per cell at most, one per scenario"]
+    return said + [CELLS_NOTE] * bool(results.is_study and counts.min() < FEW)
 
 
 def _named(rows: pd.DataFrame) -> pd.DataFrame:
     names = [path_name(s, t) for s, t in zip(rows["source"], rows["target"], strict=True)]
-    return rows.assign(path=names).reset_index(drop=True)
+    counted = {f"{side}_mark": f"{side}_n" for side in ("control", "void") if f"{side}_n" in rows}
+    return rows.assign(path=names, **{mark: few(rows, n) for mark, n in counted.items()}).reset_index(drop=True)
 
 
 def short_names(names: Iterable[str]) -> list[str]:

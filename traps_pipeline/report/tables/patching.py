@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from traps_pipeline.partitions import SHORT
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.inside import FEW_NOTE, LAYER, few
+from traps_pipeline.report.tables.inside import FEW_NOTE, LAYER
+from traps_pipeline.report.tables.mechanism import few
 from traps_pipeline.report.tables.shared import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 

@@ -11,13 +11,14 @@ import numpy as np
 from traps_pipeline.mechanism.paths import TRANSFER_PAIRS, path_name
 from traps_pipeline.partitions import ANSWERABLE, transfer_type
 from traps_pipeline.report.results import Results
-from traps_pipeline.report.tables.inside import DRAWS, FEW_NOTE, SHORTCUTS, few
-from traps_pipeline.report.tables.mechanism import PATH, TYPE, short_names, why
+from traps_pipeline.report.tables import beside
+from traps_pipeline.report.tables.inside import DRAWS, FEW_NOTE
+from traps_pipeline.report.tables.mechanism import PATH, TYPE, few, short_names, why
 from traps_pipeline.report.tables.shared import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     import pandas as pd
 
@@ -29,65 +30,7 @@ def probes(results: Results) -> list[PrintedTable]:
     return [*tables, _catch(results), _answerable(results)]
 
 
-# --- what stands beside a probe ---------------------------------------------------------------------------------------
-
-KEYS = ["model", "source", "target"]
 APART = "not computed; held out: these datasets share no controls and no scenarios"
-NO_RAW = "none above .5"
-BESIDE = ("raw", "raw_value", "margin", "noise", "noise_spread")
-_BESIDE_NOTES = (
-    "best raw input: the one of question words, first frame, all frames, length and time stamps with the highest "
-    "AUROC, by the same protocol; output margin: log-odds that the first answer token begins an abstention; noise: "
-    "random vectors as wide as states, mean ± deviation over draws",
-    "a probe says nothing about understanding where a raw input is as high, and nothing about a gap between states and "
-    "output where the margin is",
-)
-
-
-def against(results: Results, analysis: str, prefix: str = "") -> pd.DataFrame:
-    """One row per model, source and target: the best raw input (its name, its AUROC), the output margin and noise under
-    an analysis of `probe_baselines`, as BESIDE with a prefix."""
-    import pandas as pd
-
-    rows = results.baselines
-    rows = rows.loc[rows["analysis"] == analysis].astype(dict.fromkeys(KEYS, object))
-    wide = rows.pivot_table(index=KEYS, columns="features", values="value", observed=True)
-    wide = wide.reindex(columns=pd.Index([*SHORTCUTS, "output margin", "noise"]))
-    raw = wide[[*SHORTCUTS]].astype(float)
-    table = pd.DataFrame(
-        {
-            "raw": [best_name(row) for row in raw.to_dict("records")],
-            "raw_value": raw.max(axis=1),
-            "margin": wide["output margin"],
-            "noise": wide["noise"],
-        },
-        index=wide.index,
-    )
-    spread = rows.loc[rows["features"] == "noise"].set_index(KEYS)["spread"]
-    return table.join(spread.rename("noise_spread")).add_prefix(prefix).reset_index()
-
-
-def best_name(values: Mapping[Any, float]) -> str:
-    """The feature with the highest AUROC, the first of equals; NO_RAW where none is above chance, empty where there is
-    none at all."""
-    known = {str(name): value for name, value in values.items() if value == value}
-    best = max(known, key=lambda name: known[name], default="")
-    return NO_RAW if best and known[best] <= 0.5 else best
-
-
-def _beside(results: Results, prefix: str = "", head: str = "") -> list[Column]:
-    """The columns of BESIDE; none for the paper, which has no baselines."""
-    if not results.is_study:
-        return []
-    return [
-        Column(f"{prefix}raw", f"{head}Best raw input"), Column(f"{prefix}raw_value", f"{head}its AUROC", "fraction"),
-        Column(f"{prefix}margin", f"{head}Output margin", "fraction"),
-        Column(f"{prefix}noise", f"{head}Noise", "fraction", spread=f"{prefix}noise_spread"),
-    ]  # fmt: skip
-
-
-def _beside_notes(results: Results) -> list[str]:
-    return [*_BESIDE_NOTES] if results.is_study else []
 
 
 def _few_note(marks: Sequence[str]) -> list[str]:
@@ -136,8 +79,10 @@ def _pairs(results: Results) -> pd.DataFrame:
     rows = best_layers(results.probes)
     if not len(rows):
         return rows
-    for analysis, prefix in (("transfer", ""), ("confabulated", "cf_")):
-        rows = rows.merge(against(results, analysis, prefix), on=KEYS, how="left")
+    for analysis, prefix in (
+        ("transfer", ""), ("confabulated", "cf_"), ("held_out", "held_"), ("confabulated_held_out", "cf_held_"),
+    ):  # fmt: skip
+        rows = rows.merge(beside.against(results, analysis, prefix), on=beside.KEYS, how="left")
     marks = {"mark": few(rows, "best_n_voids", "best_n_controls"), "cf_mark": few(rows, "cf_n_voids", "cf_n_controls")}
     return rows.assign(**marks)
 
@@ -153,7 +98,7 @@ def _transfer(results: Results) -> PrintedTable:
         Column("best_value", "AUROC", "fraction", mark="mark"),
         Column("best_low", "from", "fraction"), Column("best_high", "to", "fraction"),
         Column("source_layer", "Source’s layer", "count"), Column("source_value", "AUROC there", "fraction"),
-        *_held_out(results), *_beside(results), *([] if results.is_study else cf),
+        *_held_out(results), *beside.columns(results), *([] if results.is_study else cf),
         Column("best_n_voids", "Voids", "count"), Column("best_n_controls", "Controls", "count"),
     ]  # fmt: skip
     notes = [
@@ -161,7 +106,7 @@ def _transfer(results: Results) -> PrintedTable:
         "own grouped cross-validation, which uses no label of a target",
         *_shared_controls(results),
         "from, to: 95 % interval from resampled scenarios of the target, with the probe held fixed",
-        *_beside_notes(results),
+        *beside.notes(results),
         *_few_note([] if not len(rows) else rows["mark"].tolist()),
     ]
     title = "Probe transfer: AUROC by ordered pair"
@@ -177,9 +122,9 @@ def _confabulated(results: Results) -> PrintedTable:
     columns = [
         MODEL, PATH, TYPE, Column("cf_layer", "Best layer", "count"),
         Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"), Column("cf_low", "from", "fraction"),
-        Column("cf_high", "to", "fraction"), Column("cf_held_out_value", "Held out", "fraction"),
+        Column("cf_high", "to", "fraction"), *_held_out(results, "cf_"),
         Column("cf_own_layer", "Cf’s own layer", "count"), Column("cf_own_value", "Cf→Cf there", "fraction"),
-        *_beside(results, "cf_"), Column("cf_n_voids", "Cf voids", "count"),
+        *beside.columns(results, "cf_"), Column("cf_n_voids", "Cf voids", "count"),
         Column("cf_n_controls", "Controls", "count"),
     ]  # fmt: skip
     notes = [
@@ -187,7 +132,7 @@ def _confabulated(results: Results) -> PrintedTable:
         "control; best layer: that of all samples",
         *_shared_controls(results),
         *silent,
-        *_beside_notes(results),
+        *beside.notes(results),
         *_few_note([] if not len(rows) else rows["cf_mark"].tolist()),
     ]
     absent = why(results) if results.is_study else "the paper has these figures in its table of probe transfer"
@@ -203,22 +148,38 @@ def _means(results: Results) -> PrintedTable:
     if len(rows):
         figures = ["best_value", "source_value", "held_out_value", "cf_value", "cf_own_value", "cf_held_out_value"]
         figures += [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
+        figures += ["held_noise", "cf_held_noise"]
         grouped = rows.groupby(["model", "transfer_type"], sort=False)
         means = {name: (name, "mean") for name in figures}
         names = {f"{prefix}raw": (f"{prefix}raw", _listed) for prefix in ("", "cf_")}
-        rows = grouped.agg(**means, **names, n_paths=("path", "count")).reset_index()
+        sides = {name: (name, "min") for name in ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")}
+        rows = grouped.agg(**means, **names, **sides, n_paths=("path", "count")).reset_index()
+        rows = rows.assign(mark=few(rows, "best_n_voids", "best_n_controls"))
+        rows = rows.assign(cf_mark=few(rows, "cf_n_voids", "cf_n_controls"))
     columns = [
-        MODEL, TYPE, Column("best_value", "AUROC", "fraction"), Column("source_value", "Source’s layer", "fraction"),
-        *_held_out(results), *_beside(results),
-        Column("cf_value", "Cf→Cf", "fraction"), Column("cf_own_value", "Cf→Cf, own layer", "fraction"),
-        *([Column("cf_held_out_value", "Cf→Cf, held out", "fraction")] if results.is_study else []),
-        *_beside(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"),
+        MODEL, TYPE, Column("best_value", "AUROC", "fraction", mark="mark"),
+        Column("source_value", "Source’s layer", "fraction", mark="mark"),
+        *_held_out(results), *beside.columns(results),
+        Column("cf_value", "Cf→Cf", "fraction", mark="cf_mark"),
+        Column("cf_own_value", "Cf→Cf, own layer", "fraction", mark="cf_mark"), *_held_out(results, "cf_", "Cf→Cf: "),
+        *beside.columns(results, "cf_", "Cf→Cf: "), Column("n_paths", "Paths", "count"), *_fewest(results),
     ]  # fmt: skip
-    notes = [*_shared_controls(results), *_beside_notes(results)]
+    notes = [*_shared_controls(results), *beside.notes(results)]
+    notes += _few_note([] if not len(rows) else [*rows["mark"], *rows["cf_mark"]])
     if results.is_study:
         notes.append("best raw inputs are the best of each path, and their AUROC is the mean over these")
     title = "Probe transfer: means over paths"
     return PrintedTable("probe_means", title, rows, columns, notes, why(results), dash=APART, deviation=DRAWS)
+
+
+def _fewest(results: Results) -> list[Column]:
+    """Items of a side in the path that has the fewest."""
+    if not results.is_study:
+        return []
+    return [
+        Column("best_n_voids", "Fewest voids", "count"), Column("best_n_controls", "Fewest controls", "count"),
+        Column("cf_n_voids", "Fewest Cf voids", "count"),
+    ]  # fmt: skip
 
 
 def _listed(names: pd.Series) -> str:
@@ -226,8 +187,15 @@ def _listed(names: pd.Series) -> str:
     return ", ".join(name for name, _ in Counter(str(name) for name in names if name).most_common())
 
 
-def _held_out(results: Results) -> list[Column]:
-    return [Column("held_out_value", "Held out", "fraction")] if results.is_study else []
+def _held_out(results: Results, prefix: str = "", head: str = "") -> list[Column]:
+    """The figure without the scored scenario, and the floor of noise under that split."""
+    if not results.is_study:
+        return []
+    noise, spread = f"{prefix}held_noise", f"{prefix}held_noise_spread"
+    return [
+        Column(f"{prefix}held_out_value", f"{head}Held out", "fraction"),
+        Column(noise, f"{head}Noise, held out", "fraction", spread=spread),
+    ]
 
 
 def _shared_controls(results: Results) -> list[str]:
@@ -235,7 +203,8 @@ def _shared_controls(results: Results) -> list[str]:
     notes = [
         "cross-modality: both datasets have the same control items, so half of the target’s rows were used in the fit"
     ]
-    return notes + ["held out: at the best layer, fitted without the scored scenario"] * results.is_study
+    held = "held out: at the best layer, fitted without the scored scenario, beside the floor of noise under that split"
+    return notes + [held] * results.is_study
 
 
 # --- within a dataset, centroids, what is only hidden -----------------------------------------------------------------
@@ -250,7 +219,7 @@ def _within(results: Results) -> PrintedTable:
     itself = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"]) & rows["source_best"]]
     itself = itself[["model", "source", "target", "value", "low", "high", "n_voids", "n_controls"]]
     table = table.merge(itself.rename(columns={"value": "pooled"}), on=["model", "source"], how="left")
-    table = table.merge(against(results, "held_out"), on=KEYS, how="left")
+    table = table.merge(beside.against(results, "held_out"), on=beside.KEYS, how="left")
     table = table.assign(dataset=short_names(table["source"]), mark=few(table, "n_voids", "n_controls"))
     columns = [
         MODEL, Column("dataset", "Dataset"), Column("layer", "Best layer", "count"),
@@ -261,13 +230,13 @@ def _within(results: Results) -> PrintedTable:
     if results.is_study:
         columns += [
             Column("pooled", "Over all folds", "fraction"), Column("low", "from", "fraction"),
-            Column("high", "to", "fraction"), *_beside(results), Column("n_voids", "Voids", "count"),
+            Column("high", "to", "fraction"), *beside.columns(results), Column("n_voids", "Voids", "count"),
             Column("n_controls", "Controls", "count"),
         ]  # fmt: skip
         notes += [
             "AUROC: mean over folds; over all folds: of the scores of all folds together, with its 95 % interval from "
             "resampled scenarios; baselines are to be compared with it",
-            *_BESIDE_NOTES,
+            *beside.NOTES,
         ]
     notes += _few_note(table["mark"].tolist())
     title, over = "Probes within a dataset", "± standard deviation over shuffles of labels, or over draws of noise"
@@ -327,7 +296,7 @@ def _caught_beside(results: Results) -> pd.DataFrame:
     wide = rows.pivot_table(index=[*keys, "features"], columns="analysis", values="value", observed=True)
     wide = wide.reindex(columns=pd.Index(["centroid_void", "centroid_control"])).reset_index()
     wide = wide.assign(above=wide["centroid_void"] - wide["centroid_control"])
-    raw = wide.loc[wide["features"].isin(SHORTCUTS)].sort_values("above", ascending=False, kind="stable")
+    raw = wide.loc[wide["features"].isin(beside.SHORTCUTS)].sort_values("above", ascending=False, kind="stable")
     kinds = {"raw": raw.drop_duplicates(keys), "margin": wide.loc[wide["features"] == "output margin"]}
     kinds["noise"] = wide.loc[wide["features"] == "noise"]
     table = kinds["raw"].rename(columns={"features": "raw"})[[*keys, "raw"]]
@@ -342,21 +311,21 @@ def _answerable(results: Results) -> PrintedTable:
     own = (rows["target"] == ANSWERABLE) & rows["source_best"].eq(True)
     table: pd.DataFrame | None = None
     for analysis in ("answerable_void", "answerable_control"):
-        part = rows.loc[own & (rows["analysis"] == analysis), [*KEYS, "layer", "value", "n_voids", "n_controls"]]
+        part = rows.loc[own & (rows["analysis"] == analysis), [*beside.KEYS, "layer", "value", "n_voids", "n_controls"]]
         part = part.assign(mark=few(part, "n_voids", "n_controls")).merge(
-            against(results, analysis, f"{analysis}_"), on=KEYS, how="left"
+            beside.against(results, analysis, f"{analysis}_"), on=beside.KEYS, how="left"
         )
         part = part.rename(columns={name: f"{analysis}_{name}" for name in ("value", "mark", "n_voids", "n_controls")})
-        table = part if table is None else table.merge(part, on=[*KEYS, "layer"], how="outer")
+        table = part if table is None else table.merge(part, on=[*beside.KEYS, "layer"], how="outer")
     assert table is not None
     table = table.assign(dataset=short_names(table["source"]))
     columns = [
         MODEL, Column("dataset", "Source"), Column("layer", "Source’s layer", "count"),
         Column("answerable_void_value", "Unanswerable against answerable", "fraction", mark="answerable_void_mark"),
-        *_beside(results, "answerable_void_"),
+        *beside.columns(results, "answerable_void_"),
         Column("answerable_control_value", "Answerable void against control", "fraction",
                mark="answerable_control_mark"),
-        *_beside(results, "answerable_control_", "Second: "),
+        *beside.columns(results, "answerable_control_", "Second: "),
         Column("answerable_void_n_controls", "Answerable", "count"),
         Column("answerable_void_n_voids", "Voids", "count"),
         Column("answerable_control_n_controls", "Controls", "count"),
@@ -364,7 +333,7 @@ def _answerable(results: Results) -> PrintedTable:
     notes = [
         "answerable: void clips of occlusion with a question that they answer. First column: the same clips with both "
         "questions; 0.5 if a probe detects a hidden object, 1 if it detects an unknowable answer. Second: the reverse",
-        *_beside_notes(results),
+        *beside.notes(results),
         *_few_note([*table["answerable_void_mark"].dropna(), *table["answerable_control_mark"].dropna()]),
     ]
     absent = why(results) if results.is_study else "the paper has no such control"

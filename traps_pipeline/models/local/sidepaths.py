@@ -1,0 +1,62 @@
+"""What blocks read of earlier ones besides the residual stream and their own keys and values.
+
+Gemma 4 has two such paths, both of them arguments of its blocks. Its upper blocks make no keys and values: each reads
+those of the last lower block with its kind of attention (`shared_kv_states`, a mapping by kind). And every block adds a
+vector of its own that is made of the token and its embedding (`per_layer_input`). So a state at block l does not say
+what blocks behind l make of it; whoever puts another state there, or goes on from it, gives them both as well.
+
+Qwen3-VL's deepstack features, which are added between blocks, are inputs of its decoder: `mechanism.patching` and
+`prefixes` see to them there.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from torch.nn import Module
+
+Argument = Literal["shared_kv_states", "per_layer_input"]
+SHARED: Argument = "shared_kv_states"
+PER_LAYER: Argument = "per_layer_input"
+# By field of a configuration: the argument in which its blocks are given what it stands for, and that in words.
+_FIELDS: dict[str, tuple[Argument | None, str]] = {
+    "num_kv_shared_layers": (SHARED, "later blocks reuse keys and values of earlier ones"),
+    "hidden_size_per_layer_input": (PER_LAYER, "every block reads the token's own embedding again"),
+    "altup_num_inputs": (None, "blocks hand on several residual streams"),  # Gemma 3n
+}
+
+
+def unknown_path(config: Any, block: Module) -> str | None:
+    """Which path of a language model's configuration is in none of its blocks' known arguments, in words and by the
+    name of its field; None if there is no such path."""
+    for field, (argument, what) in _FIELDS.items():
+        if getattr(config, field, 0) and argument not in _arguments(type(block)):
+            return f"{what} ({field})"
+    return None
+
+
+def given(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """What a call of a block gives it as an argument; None if it has no such argument or is given none."""
+    names = _arguments(type(block))
+    place = names.index(name) if name in names else len(args)
+    return args[place] if place < len(args) else kwargs.get(name)
+
+
+def giving(
+    block: Module, name: Argument, value: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """The arguments of a call of a block with another value for one of them."""
+    place = _arguments(type(block)).index(name)
+    if place < len(args):
+        return (*args[:place], value, *args[place + 1 :]), kwargs
+    return args, kwargs | {name: value}
+
+
+@cache
+def _arguments(kind: type[Module]) -> tuple[str, ...]:
+    forward: Callable[..., Any] = kind.forward
+    return tuple(inspect.signature(forward).parameters)[1:]  # without self
