@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Hashable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,7 +29,9 @@ MOST_YAML_BYTES, MOST_LINE_BYTES = 4 * 2**20, 4 * 2**20
 MOST_DEPTH, MOST_NODES, MOST_ALIASES = 40, 200_000, 200
 MOST_SAID = 300  # characters of a complaint
 _TAG = "tag:yaml.org,2002:"
-_STRINGS, _BRACKETS = re.compile(r'"(?:[^"\\]|\\.)*"'), re.compile(r"[\[{]+|[\]}]+")
+_STRINGS = re.compile(r'"(?:[^"\\]|\\.)*"')
+_STEPS = {ord("["): 1, ord("{"): 1, ord("]"): -1, ord("}"): -1}
+_NO_BRACKETS = bytes({*range(256)} - {*_STEPS})
 
 
 if yaml.__with_libyaml__:
@@ -170,7 +173,7 @@ def _check_line(line: str, where: str) -> None:
     try:
         if len(line) > MOST_LINE_BYTES or _depth(line) > MOST_DEPTH:
             raise _Odd("too large, or nested too deeply")
-        json.dumps(json.loads(line, object_pairs_hook=_once, parse_constant=_finite, parse_float=_finite)).encode()
+        json.loads(line, object_pairs_hook=_once, parse_constant=_finite, parse_float=_finite)
         if re.search(r"\\u[dD][89a-fA-F]", line):
             json.dumps(json.loads(line), ensure_ascii=False).encode()
     except UnicodeEncodeError:
@@ -202,15 +205,10 @@ def _finite(text: str) -> float:
 
 
 def _depth(line: str) -> int:
-    """How deep brackets are nested at most; those inside strings do not count."""
-    depth = most = 0
-    for run in _BRACKETS.findall(_STRINGS.sub("", line)):
-        if run[0] in "[{":
-            depth += len(run)
-            most = max(most, depth)
-        else:
-            depth -= len(run)
-    return most
+    """How deep brackets are nested at most; those inside strings do not count. Every command reads some megabytes."""
+    outside = _STRINGS.sub("", line) if "\\" in line else "".join(line.split('"')[::2])
+    brackets = outside.encode().translate(None, _NO_BRACKETS)
+    return max(accumulate(map(_STEPS.__getitem__, brackets)), default=0)
 
 
 def parse_yaml_model(
