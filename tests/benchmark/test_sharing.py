@@ -62,7 +62,9 @@ def made(store: Store, told: Path, *, stops: bool = False) -> int:
         return None if clip(row).is_file() else Drawing(row, clip(row), told, here)
 
     of = Filming("videos/made", missing, lambda row: [clip(row)], job, draw)
-    return share(store, ROWS, of, lambda done: None)
+    drawn, is_whole = share(store, ROWS, of, lambda done: None)
+    assert is_whole
+    return drawn
 
 
 @contextmanager
@@ -114,3 +116,14 @@ def test_what_lies_on_this_host_alone_is_handed_over_and_not_drawn(where: Sequen
     assert made(store, tmp_path / "told") == len(ROWS) - len(begun)
     assert list(contents(where).values()).count(b"made before a kill") == len(begun)
     assert made(opened(*where, "other"), tmp_path / "told") == 0
+
+
+def test_who_does_not_wait_makes_what_is_free_and_says_that_others_are_at_the_rest(where: Sequence[str]) -> None:
+    one, other, done = opened(*where, "one"), opened(*where, "other"), list[int]()
+    theirs = other.lease("videos/made/000001")
+    assert theirs is not None
+    of = Filming("videos/made", lambda rows: rows, lambda row: [], lambda row: None, draw)
+    assert share(one, ROWS, of, done.append, wait=False) == (0, False)
+    assert done[-1] == len(ROWS) - CHUNK
+    theirs.close()
+    assert share(one, ROWS, of, done.append, wait=False) == (0, True)

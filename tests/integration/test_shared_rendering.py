@@ -12,9 +12,12 @@ import time
 from pathlib import Path
 
 import pytest
+from dagster import AssetKey, DagsterInstance
 
 from tests.conftest import Checkout, make_checkout
 from traps_pipeline.benchmark.sharing import CHUNK
+from traps_pipeline.benchmark.tables import VIDEOS
+from traps_pipeline.orchestration.step import TAKEN
 
 pytestmark = pytest.mark.slow
 SCENARIOS = 2 * CHUNK + 1  # three chunks
@@ -49,10 +52,13 @@ def notes(study: Path) -> dict[str, int]:
 
 def contents(study: Path) -> dict[str, bytes]:
     paths = [*(study / "clips").rglob("*"), *(study / "tables").rglob("*")]
-    return {str(path.relative_to(study)): path.read_bytes() for path in paths if path.is_file()}
+    whole = (path for path in paths if path.is_file() and not path.name.startswith("."))  # a kill leaves a hidden part
+    return {str(path.relative_to(study)): path.read_bytes() for path in whole}
 
 
-def test_two_share_what_a_killed_one_has_left_and_it_is_what_one_alone_makes(tmp_path: Path) -> None:
+def test_two_share_what_a_killed_one_has_left_and_it_is_what_one_alone_makes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     root = make_checkout(tmp_path / "checkout")
     (root / "shared.yaml").write_text(EXPERIMENT)
     study, alone = Checkout(root, tmp_path / "study"), Checkout(root, tmp_path / "alone")
@@ -69,4 +75,10 @@ def test_two_share_what_a_killed_one_has_left_and_it_is_what_one_alone_makes(tmp
     drawn = [count for name, count in left.items() if "/void-" not in name]
     assert min(shares) > 0 and 0 <= sum(shares) + sum(drawn) - whole <= max(drawn)
     assert contents(study.workspace) == contents(alone.workspace)
+    monkeypatch.setenv("DAGSTER_HOME", str(study.workspace / "dagster"))
+    with DagsterInstance.get() as instance:
+        told = instance.fetch_materializations(AssetKey(VIDEOS.name), limit=10).records
+    assert sorted(TAKEN in one.asset_materialization.metadata for one in told if one.asset_materialization) == [
+        False, True
+    ]  # fmt: skip
     assert len(notes(alone.workspace)) == 3 * SCENARIOS

@@ -70,9 +70,9 @@ def asked_arms(workspace: Workspace, category: str) -> list[str]:
     return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in asked]
 
 
-def film_arms(workspace: Workspace, category: str) -> int:
-    """Film and certify what is missing of a category's arms, beside whoever else does so; the frames that were drawn
-    here. Raises TrapsError."""
+def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
+    """Film and certify what is missing of a category's arms, beside whoever else does so; what `share` returns. Raises
+    TrapsError."""
     specs, arms = _specs(workspace, category), asked_arms(workspace, category)
 
     def files(row: Row) -> list[Path]:
@@ -94,7 +94,8 @@ def film_arms(workspace: Workspace, category: str) -> int:
     def tick(done: int) -> None:
         progress.current().tick("arms", f"{category}, scenarios", done, len(specs))
 
-    return share(workspace.store, specs, Filming(f"arms/{category}", missing, files, job, film), tick)
+    filming = Filming(f"arms/{category}", missing, files, job, film)
+    return share(workspace.store, specs, filming, tick, wait=wait)
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:

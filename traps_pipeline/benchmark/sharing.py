@@ -21,7 +21,7 @@ from traps_pipeline.scenes.workers import run_in_order
 from traps_pipeline.storage.leases import POLL_S
 from traps_pipeline.storage.store import Lease, Store
 
-CHUNK = 8  # scenarios: about half a minute of one core, so that nobody waits long for the last one
+CHUNK = 4  # scenarios: a quarter of a minute of one core, so that nobody waits long for the last one
 Row = Mapping[str, Any]
 Job = TypeVar("Job")
 
@@ -52,11 +52,14 @@ class _Chunk:
     jobs: int = 0
 
 
-def share(store: Store, rows: Sequence[Row], of: Filming[Job], tick: Callable[[int], None]) -> int:
-    """Make what is missing of rows, beside whoever else does so, and return when nothing is; the frames that were drawn
-    here. tick: gets the number of rows that are there. Raises TrapsError, also for a damaged clip."""
+def share(
+    store: Store, rows: Sequence[Row], of: Filming[Job], tick: Callable[[int], None], *, wait: bool = True
+) -> tuple[int, bool]:
+    """Make what is missing of rows, beside whoever else does so: the frames that were drawn here, and whether all is
+    there. wait: return only then; else as soon as others are at all that is missing. tick: gets the number of rows that
+    are there. Raises TrapsError, also for a damaged clip."""
     try:
-        return _Sharing(store, rows, of, tick).work()
+        return _Sharing(store, rows, of, tick).work(wait=wait)
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
 
@@ -73,7 +76,7 @@ class _Sharing(Generic[Job]):
         self._mine = list[_Chunk]()
         self._drawing = deque[_Chunk]()  # that of each job, in the order of the jobs
 
-    def work(self) -> int:
+    def work(self, *, wait: bool) -> tuple[int, bool]:
         drawn = 0
         try:
             while self._left:
@@ -84,13 +87,15 @@ class _Sharing(Generic[Job]):
                     self._tell(1)
                     if not chunk.jobs:
                         self._finish(chunk)
+                if not wait:
+                    break
                 if self._left:  # nothing of one's own is under way, or two might wait for one another
                     time.sleep(POLL_S)
         finally:
             for chunk in self._mine:
                 if chunk.lease is not None:
                     chunk.lease.close()
-        return drawn
+        return drawn, not self._left
 
     def _jobs(self) -> Iterator[Job]:
         """Jobs of the chunks that nobody else has, each leased when its first job is asked for."""

@@ -23,9 +23,9 @@ CLIPS = ("control", "void", "twin")
 SECONDS_A_CLIP = 1.4  # of one core, measured (docs/cluster.md)
 
 
-def render_videos(workspace: Workspace, category: str) -> int:
-    """Render what is missing of a category's clips (three a scenario), beside whoever else does so; returns how many
-    frames were drawn here. Raises TrapsError."""
+def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
+    """Render what is missing of a category's clips (three a scenario), beside whoever else does so; what `share`
+    returns. Raises TrapsError."""
     specs = _specs(workspace, category)
 
     def missing(rows: Sequence[Row]) -> list[Row]:
@@ -37,7 +37,7 @@ def render_videos(workspace: Workspace, category: str) -> int:
 
     tick = partial(_tick, category, len(specs))
     rendering = Filming(f"videos/{category}", missing, partial(_files, workspace), job, render_pair)
-    return share(workspace.store, specs, rendering, tick)
+    return share(workspace.store, specs, rendering, tick, wait=wait)
 
 
 def seconds_left(workspace: Workspace, category: str) -> float:

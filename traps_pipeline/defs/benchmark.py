@@ -113,10 +113,11 @@ def _make_videos(workspace: Workspace, category: str) -> Made:
     return Made(rows, shown={"megabytes": round(sum(row.size_bytes for row in rows) / 1e6, 2)}, beside=leaks)
 
 
-def _render(workspace: Workspace, category: str) -> Tally:
+def _render(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
     from traps_pipeline.benchmark.videos import render_videos
 
-    return Tally(frames=render_videos(workspace, category))
+    frames, is_whole = render_videos(workspace, category, wait=wait)
+    return Tally(frames=frames), is_whole
 
 
 def _to_render_s(workspace: Workspace, category: str) -> float:
@@ -161,10 +162,11 @@ def _make_arms(workspace: Workspace, category: str) -> Made:
     return Made(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
 
 
-def _film(workspace: Workspace, category: str) -> Tally:
+def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
     from traps_pipeline.benchmark.arms import film_arms
 
-    return Tally(frames=film_arms(workspace, category))
+    frames, is_whole = film_arms(workspace, category, wait=wait)
+    return Tally(frames=frames), is_whole
 
 
 def _to_film_s(workspace: Workspace, category: str) -> float:

@@ -72,18 +72,18 @@ class Takes:
     each_gb: float = 0.0
 
 
-def _nothing(_: Workspace, __: Any) -> Tally:
-    return Tally()
+def _nothing(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
+    return Tally(), True
 
 
 @dataclass(frozen=True)
 class Shared:
     """How several runs make one partition: the files that it names beside one another, and then one of them the
-    partition, which the others take over as made. files: makes what is missing of them, and returns when nothing is,
-    what was done here; seconds: about how long one core works at what is missing, as far as that is known before
-    anything above is made."""
+    partition, which the others take over as made. files: makes what nobody else is at, then waits, if it is told to,
+    until nothing is missing; what was done here, and whether all is there. seconds: about how long one core works at
+    what is missing, as far as that is known before anything above is made."""
 
-    files: Callable[[Workspace, Any], Tally] = _nothing
+    files: Callable[[Workspace, Any, bool], tuple[Tally, bool]] = _nothing
     seconds: Callable[[Workspace, Any], float] = lambda workspace, key: 0.0
 
 

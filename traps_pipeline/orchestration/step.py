@@ -185,27 +185,36 @@ class Step:
         """What is left for this run to make, where others may make the same, each once all files that it names are
         there, with what was done for them here: first what no other run is at. It is had alone until the next one is
         asked for."""
-        shared, store, later = self.stage.shared, self.workspace.store, dict[str | None, Tally]()
-        if shared is None:
+        if self.stage.shared is None:
             yield from ((key, Tally()) for key in todo)
             return
+        store, later = self.workspace.store, dict[str | None, Tally]()
         for key in todo:
-            try:
-                tally = shared.files(self.workspace, key)
-            except TrapsError as error:
-                self.unmade[key] = error
-                continue
-            lease = store.lease(f"{self.stage.name}/{key}")
+            done = Tally()
+            is_whole = self._make_files(key, done, wait=False)
+            lease = store.lease(f"{self.stage.name}/{key}") if is_whole else None
             if lease is None:
-                later[key] = tally
+                later[key] = done
                 continue
             with closing(lease):
-                if not self._takes_over(key, inputs[key], tally):
-                    yield key, tally
-        for key, tally in later.items():
-            with alone(store, f"{self.stage.name}/{key}"):
-                if not self._takes_over(key, inputs[key], tally):
-                    yield key, tally
+                if not self._takes_over(key, inputs[key], done):
+                    yield key, done
+        for key, done in later.items():
+            if key not in self.unmade and self._make_files(key, done, wait=True):
+                with alone(store, f"{self.stage.name}/{key}"):
+                    if not self._takes_over(key, inputs[key], done):
+                        yield key, done
+
+    def _make_files(self, key: str | None, done: Tally, *, wait: bool) -> bool:
+        """Make files that a partition names, and whether all are there. done: is told what was done here."""
+        assert self.stage.shared is not None, "others may make the same"
+        try:
+            made, is_whole = self.stage.shared.files(self.workspace, key, wait)
+        except TrapsError as error:
+            self.unmade[key] = error
+            return False
+        done.add(made)
+        return is_whole
 
     def _takes_over(self, key: str | None, inputs: Mapping[str, str], done: Tally) -> bool:
         """Whether another run has made a partition of the same inputs since this step began, and has told Dagster of it
