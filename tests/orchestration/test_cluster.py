@@ -15,6 +15,7 @@ from typing import Any
 import dagster as dg
 import pytest
 import yaml
+from dagster._core.events import StepMaterializationData
 from dagster._daemon.monitoring.run_monitoring import RESUME_RUN_LOG_MESSAGE
 
 from tests.postgres import Postgres
@@ -38,8 +39,8 @@ from traps_pipeline.orchestration.runs import broke_off, range_tags
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, installed, require_same_code
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET
 from traps_pipeline.orchestration.shared_history import SharedHistory
-from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, end_if_resumed
-from traps_pipeline.progress import Progress, reporting
+from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, TAKEN, TALLY, end_if_resumed
+from traps_pipeline.progress import Progress, Tally, reporting
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 
@@ -125,6 +126,12 @@ class Shown(Progress):
     def __init__(self) -> None:
         super().__init__()
         self.notes, self.stages = list[str](), list[tuple[str, int]]()
+        self.partitions = list[tuple[str, str]]()
+
+    def partition(self, stage: str, key: str, tally: Tally) -> None:
+        """See `Progress`."""
+        super().partition(stage, key, tally)
+        self.partitions.append((stage, key))
 
     def stage(self, name: str, partitions: int) -> None:
         """See `Progress`."""
@@ -133,6 +140,26 @@ class Shown(Progress):
     def note(self, text: str) -> None:
         """See `Progress`."""
         self.notes.append(text)
+
+
+def test_what_runs_did_for_one_partition_is_told_once_and_added_up(workspace: Workspace) -> None:
+    shown, of_both = Shown(), list[str]()
+    with dg.DagsterInstance.ephemeral() as instance, reporting(shown):
+        for about in ({}, {TAKEN: "made by another run meanwhile"}):
+            metadata = {**about, TALLY: json.dumps(vars(Tally(frames=50)))}
+            told = dg.AssetMaterialization("videos", partition="plinko", metadata=metadata)
+            run = instance.create_run_for_job(_nothing)
+            event = dg.DagsterEvent(
+                event_type_value=dg.DagsterEventType.ASSET_MATERIALIZATION.value,
+                job_name="_nothing",
+                event_specific_data=StepMaterializationData(told),
+            )
+            instance.report_dagster_event(event, run.run_id)
+            of_both.append(run.run_id)
+        watching = RayRuns(instance, workspace, 1, 0.0, "leave")
+        for run_id in of_both:
+            watching._tell(run_id)
+    assert shown.partitions == [("videos", "plinko")] and shown.totals["videos"].frames == 100
 
 
 def test_a_host_with_other_code_refuses_a_run_and_names_both(workspace: Workspace) -> None:
