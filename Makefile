@@ -45,7 +45,7 @@ test-cluster: cluster-setup ## two studies on two nodes of Ray, one killed in mi
 	$(BIN)/python -m pytest tests/orchestration/test_cluster.py tests/remedies/test_cluster.py
 
 test-cluster-kills: cluster-setup ## a study on a cluster while this and that is killed, in about half an hour (docs/cluster.md)
-	$(BIN)/python -m bench.cluster_kills run node stopped postgres network head store together
+	$(BIN)/python -m bench.cluster_kills run cap node stopped postgres network head store together
 
 test-cluster-gate: cluster-setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
 	$(BIN)/python bench/cluster_gate.py

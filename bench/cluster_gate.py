@@ -48,8 +48,15 @@ class Cluster:
     """A Ray head and two nodes of this machine, each recognised by its scratch folder in the environment of its
     processes: a machine may have several clusters."""
 
-    def __init__(self, folder: Path, environment: dict[str, str], own: dict[str, dict[str, str]] | None = None) -> None:
-        self.folder, self.environment, self.own = folder, environment, own or {}
+    def __init__(
+        self,
+        folder: Path,
+        environment: dict[str, str],
+        own: dict[str, dict[str, str]] | None = None,
+        within: dict[str, list[str]] | None = None,
+    ) -> None:
+        """own: variables of a node; within: words before the command that starts it."""
+        self.folder, self.environment, self.own, self.within = folder, environment, own or {}, within or {}
         self.port, self.dashboard = free_port(), free_port()
 
     def start_head(self) -> None:
@@ -74,7 +81,7 @@ class Cluster:
         ports = ("--dashboard-agent-listen-port", "--metrics-export-port", "--runtime-env-agent-port")
         fixed = ["--node-ip-address=127.0.0.1", "--disable-usage-stats", "--object-store-memory=80000000"]
         fixed += [f"{port}={free_port()}" for port in ports]
-        command = [sys.executable, "-m", "ray.scripts.scripts", "start", *fixed, *options]
+        command = [*self.within.get(name, []), sys.executable, "-m", "ray.scripts.scripts", "start", *fixed, *options]
         own = {"TRAPS_NODE": name, "TRAPS_SCRATCH": str(scratch)} | HEALTH | self.own.get(name, {})
         began = time.monotonic()
         with (self.folder / f"{name}.log").open("ab") as log:

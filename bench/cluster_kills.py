@@ -32,12 +32,14 @@ from bench.cluster_watch import Opened, Orphans, Proxy, executing
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.providers.server import Provider
+from traps_pipeline.cli.command import OVER_BUDGET
 from traps_pipeline.storage.objects import ObjectStore
 from traps_pipeline.storage.place import scratch_of
 from traps_pipeline.storage.purse import Purse
 
 MODELS, CONNECTIONS = ("seer-a", "seer-b"), 2
 BUDGET_USD = 6.0  # two dead blocks of 16 worst cases are $2.84
+CAP_USD = 1.2  # half for each model: enough for its 32 calls, but all of it is the block of a process, which may die
 CUT_S, STOP_S, DOWN_S = 45, 90, 5
 CODE = "traps_pipeline.definitions"
 LATE_S = 60  # no run may be STARTED for longer without a process that executes it
@@ -104,6 +106,12 @@ def kill_run(scene: Scene) -> None:
     for pid in scene.busy()[1]:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
+
+
+def kill_at_cap(scene: Scene) -> None:
+    """kill -9 of the process that executes a run, under a budget that its death uses up: calls to its model stop, and
+    the command ends with 4. A second one with a higher budget asks what is missing."""
+    kill_run(scene)
 
 
 def kill_node(scene: Scene) -> None:
@@ -178,7 +186,7 @@ def want_together(scene: Scene) -> None:
         pages = subprocess.Popen(command, stdout=log, stderr=log, cwd=study.root, env=environment)
     try:
         began = time.monotonic()
-        second = other.start_run("--no-preflight", "--budget-usd", f"{BUDGET_USD}")
+        second = other.start_run(*paying(BUDGET_USD))
         said = _launched(port, name_of(study))
         print(f"  {time.monotonic() - began:6.1f} s  the page says {said}", flush=True)
         asked_by_now = scene.provider.stats()["answered_in_full"]
@@ -211,7 +219,8 @@ def _launched(port: int, study: str) -> str:
 
 
 KILLS: dict[str, Callable[[Scene], None]] = {
-    "run": kill_run, "node": kill_node, "head": kill_head, "postgres": kill_postgres, "stopped": stop_node,
+    "run": kill_run, "cap": kill_at_cap, "node": kill_node, "head": kill_head, "postgres": kill_postgres,
+    "stopped": stop_node,
     "network": cut_network, "silent": silence_network, "store": empty_store, "together": want_together,
 }  # fmt: skip
 SEGMENTS = """
@@ -222,14 +231,20 @@ left join traps.segments s on s.evaluation = e.id where t.name = %s group by t.i
 """
 
 
-def spent_usd(study: Study) -> float:
-    """What the study has spent by its own count: rows, and blocks that are out."""
+def spent_usd(study: Study) -> dict[str, float]:
+    """What the study has spent by its own count on each model: rows, and blocks that are out."""
     with study.opened() as workspace:
         assert workspace.session is not None
         purse = Purse(workspace.session)
         standing = purse.open()
         purse.close()
-        return sum(standing.spent.values()) + sum(standing.out.values())
+        return {model: standing.spent.get(model, 0.0) + standing.out.get(model, 0.0) for model in MODELS}
+
+
+def paying(usd: float, *, each: bool = False) -> list[str]:
+    """Options of `traps run`: a budget, and with `each` an equal part of it for each model."""
+    parts = [f"{usd}", *(f"{model}={usd / len(MODELS)}" for model in MODELS if each)]
+    return ["--no-preflight", *(word for part in parts for word in ("--budget-usd", part))]
 
 
 def lose_clips(study: Study) -> int:
@@ -320,8 +335,7 @@ def kill_each(
 
 def _alone(study: Study, provider: Provider, size: Size) -> None:
     began = time.monotonic()
-    made = study.traps("run", str(study.experiment), "--until", size.until, "--no-preflight",
-                       "--budget-usd", f"{BUDGET_USD}")  # fmt: skip
+    made = study.traps("run", str(study.experiment), "--until", size.until, *paying(BUDGET_USD))
     if made.returncode:
         raise SystemExit(made.stdout + made.stderr)
     sent = provider.stats()["answered_in_full"]
@@ -341,8 +355,8 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     provider.reset()
     orphans = Orphans(scene.database.address())
     orphans.start()
-    began = time.monotonic()
-    run = study.start_run("--no-preflight", "--budget-usd", f"{BUDGET_USD}")
+    began, is_capped = time.monotonic(), kind == "cap"
+    run = study.start_run(*paying(CAP_USD if is_capped else BUDGET_USD, each=is_capped))
     out = list[str]()
     reading = threading.Thread(target=lambda: out.extend(_shown(run, began)), daemon=True)
     reading.start()
@@ -358,9 +372,12 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
         KILLS[kind](scene)
         print(f"  {time.monotonic() - began:6.1f} s  over", flush=True)
     code, tries = run.wait(), 1
+    reading.join()
+    if is_capped:
+        _look_at_cap(study, provider, code, out, wanted)
     while code and tries < 4:
         tries += 1
-        again = study.start_run("--no-preflight", "--budget-usd", f"{BUDGET_USD}")
+        again = study.start_run(*paying(BUDGET_USD, each=is_capped))
         code = (_shown(again, began), again.wait())[1]
     orphans.ended.set()
     seconds, stats = time.monotonic() - began, provider.stats()
@@ -368,7 +385,7 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     study.require(code == 0, f"the study is made, with {tries} command(s), in {seconds:.0f} s")
     most = wanted + (CONNECTIONS * len(MODELS) if kind not in ("store", "together") else 0)
     study.require(wanted <= calls <= most, f"{calls} calls at the provider, {wanted} wanted, at most {most}")
-    counted = spent_usd(study)
+    counted = sum(spent_usd(study).values())
     study.require(
         billed - 1e-9 <= counted <= BUDGET_USD, f"${billed:.4f} billed, ${counted:.4f} counted, ${BUDGET_USD} allowed"
     )
@@ -377,14 +394,14 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     if kind == "store":
         before = fetch(study, study.folder / f"before-{kind}")
         print(f"  {lose_clips(study)} clips and notes removed from the store", flush=True)
-        made = study.run_to_end("--no-preflight", "--budget-usd", f"{BUDGET_USD}")
+        made = study.run_to_end(*paying(BUDGET_USD))
         study.require(made.returncode == 0, "the study is made again")
         after = fetch(study, study.folder / f"after-{kind}")
         same = {p.relative_to(before): p.read_bytes() for p in before.rglob("*.mp4")} == {
             p.relative_to(after): p.read_bytes() for p in after.rglob("*.mp4")
         }  # fmt: skip
         study.require(same, "every clip was made again with the same bytes")
-    made = study.run_to_end("--no-preflight", "--budget-usd", f"{BUDGET_USD}")
+    made = study.run_to_end(*paying(BUDGET_USD))
     study.require(asked(made.stdout) == 0, "a second run asks nothing")
     study.require(provider.stats()["answered_in_full"] == calls, "and the provider saw no other call")
     tables_are_equal(study, alone, fetch(study, study.folder / f"fetched-{kind}"))
@@ -399,6 +416,20 @@ def _one(kind: str, scene: Scene, provider: Provider, alone: Path) -> None:
     with psycopg.connect(scene.database.address(), autocommit=True) as connection:
         (found,) = connection.execute(SEGMENTS, [name_of(study)]).fetchall()
     study.require(found[0] > 0 and found[2] == 0, f"{found[0]} segments hold {found[1]} rows, the database {found[2]}")
+
+
+def _look_at_cap(study: Study, provider: Provider, code: int, said: Sequence[str], wanted: int) -> None:
+    """Look whether a command ended at its budget, and no more was spent."""
+    stats, counted = provider.stats(), spent_usd(study)
+    calls, billed, each = stats["answered_in_full"], stats["billed_usd"], CAP_USD / len(MODELS)
+    reached = [line.strip()[:160] for line in said if "budget" in line and "is reached" in line]
+    study.require(code == OVER_BUDGET and bool(reached), f"the command ends with {code} and says {reached[:1]}")
+    study.require(calls < wanted, f"{calls} calls by then, {wanted} wanted")
+    shown = ", ".join(f"${usd:.4f} of {model}" for model, usd in counted.items())
+    least = billed - 1e-9 <= sum(counted.values())
+    study.require(
+        least and max(counted.values()) <= each + 1e-9, f"${billed:.4f} billed, {shown}, ${each} allowed each"
+    )
 
 
 def _shown(run: subprocess.Popen[str], began: float) -> list[str]:

@@ -95,7 +95,12 @@ def try_lock(path: Path) -> int | None:
     while another one holds it. Missing folders are made. Raises OSError."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        except FileNotFoundError:
+            if path.parent.is_dir():
+                raise
+            continue  # who gave a lock back has removed the folder
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -126,3 +131,23 @@ def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text as `replacing` does."""
     write_bytes(path, text.encode())
+
+
+def is_same_file(one: Path, other: Path) -> bool:
+    """Whether two names stand for one file, which is there."""
+    try:
+        return one.samefile(other)
+    except FileNotFoundError:
+        return False
+
+
+def link(existing: Path, path: Path) -> None:
+    """Give a file another name, in the place of what has it. Nobody writes into a file that has a name: they are
+    replaced as a whole (`files.py`)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        os.link(existing, part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

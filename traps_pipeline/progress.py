@@ -94,6 +94,10 @@ class Progress:
         """A partition is done."""
         self.totals.setdefault(stage, Tally()).add(tally)
 
+    def helped(self, stage: str, tally: Tally) -> None:
+        """So much was done for a partition that another run has made."""
+        self.totals.setdefault(stage, Tally()).add(tally)
+
     def tick(self, stage: str, what: str, done: int, total: int) -> None:
         """A unit of a partition (a clip, a call) is done."""
 

@@ -24,6 +24,7 @@ from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism.hidden_states import Item, clip_item, damage, extract, read_layer, read_record
 from traps_pipeline.models.local.adapter import LocalModel, Prompt
 from traps_pipeline.models.local.capture import pool
+from traps_pipeline.storage.store import LEASES
 
 pytestmark = pytest.mark.slow
 
@@ -102,7 +103,7 @@ def test_what_is_read_back_is_what_the_model_gave(family: Family, tmp_path: Path
     assert (read_layer(tmp_path, "normed")[1] == np.stack([one.normed for one in expected])).all()
     with safe_open(tmp_path / "shard-00000.safetensors", framework="np") as shard:
         assert sorted(shard.keys()) == [*(f"layer_{layer:03d}" for layer in range(of.n_layers + 1)), "normed"]
-    assert [path.name for path in tmp_path.glob(".*")] == [".lock"]
+    assert [path.name for path in tmp_path.glob(".*")] == []
 
 
 def test_a_second_extraction_makes_no_pass_and_a_corrected_item_one(tmp_path: Path) -> None:
@@ -184,7 +185,7 @@ def test_processes_at_one_folder_share_the_items_and_each_is_made_once(tmp_path:
     assert list(ids["item_id"]) == [item.item_id for item in work(of, 40)]
     for i in (0, 1, 20, 39):
         assert (states[i] == of.forward_states(work(of, 40)[i].prompt()).raw[2]).all()
-    assert not (tmp_path / "leases").exists()
+    assert not (tmp_path / LEASES).exists()
 
 
 def test_the_chunk_of_a_process_that_is_killed_is_made_by_another_one(tmp_path: Path) -> None:

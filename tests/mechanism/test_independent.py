@@ -34,6 +34,7 @@ from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.storage.media import Frames, MediaSpec, sample
+from traps_pipeline.storage.store import FolderStore
 
 pytestmark = pytest.mark.slow
 POCKET = "pocket"
@@ -196,7 +197,7 @@ def test_a_sheet_of_steered_answers_is_what_a_plain_hook_gives_row_by_row(name: 
         )
         for number, steering in rows
     ]  # fmt: skip
-    backend = SteeredBackend(of.entry, vectors, MadeAnswers(tmp_path, len(requests)), {})
+    backend = SteeredBackend(of.entry, vectors, MadeAnswers(FolderStore(tmp_path), tmp_path, len(requests)), {})
     before = of.of.prefixes.used, of.of.clips.used
     found = [outcome.text or "" for outcome in backend.generate(requests, lambda: False)]
     assert of.of.prefixes.used >= before[0] + len(sheet) - 3

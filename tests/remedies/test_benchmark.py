@@ -21,7 +21,7 @@ from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.records import RELEASED, load_released
 from traps_pipeline.benchmark.specs import build_specs, resolve_scenario
-from traps_pipeline.benchmark.tables import ARMS, SCENE_SPECS, VIDEOS, ArmRow, VideoRow
+from traps_pipeline.benchmark.tables import ARMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.scenes.encode import DamagedClip, decode, encode
 from traps_pipeline.scenes.spec import load_trajectory
 from traps_pipeline.storage.study import Asked, Study
@@ -217,15 +217,14 @@ def test_clips_arms_and_items_are_made_once_what_they_are_of_is(tmp_path: Path) 
     workspace, part = Workspace.create(tmp_path / "study", study), {"category": "plinko"}
     tables = workspace.tables
     tables.write(SCENE_SPECS, part, build_specs(workspace, "plinko")[0], {})
-    (row,) = tables.read(SCENE_SPECS, part).to_dict("records")
-    row = {str(name): value for name, value in row.items()}
-    filmed = list[VideoRow]()
-    rendered = remedied(
-        lambda: list(videos._rows(workspace, row, videos._job(workspace, row), "1")),
+    assert videos.seconds_left(workspace, "plinko") == 3 * videos.SECONDS_A_CLIP
+    filmed = remedied(
+        lambda: videos.build_videos(workspace, "plinko")[0],
         "benchmark/videos.py | {}: was not rendered; run again",
-        lambda: filmed.extend(videos.build_videos(workspace, "plinko")[0]),
+        lambda: videos.render_videos(workspace, "plinko"),
     )
-    assert [each.side for each in rendered] == [each.side for each in filmed] == ["control", "void", "twin"]
+    assert videos.seconds_left(workspace, "plinko") == 0
+    assert [each.side for each in filmed] == ["control", "void", "twin"]
 
     tables.write(VIDEOS, part, [replace(each, scene_hash="another") for each in filmed], {})
     remedied(
@@ -234,12 +233,13 @@ def test_clips_arms_and_items_are_made_once_what_they_are_of_is(tmp_path: Path) 
         lambda: tables.write(VIDEOS, part, filmed, {}),
     )
 
-    made = list[ArmRow]()
-    remedied(
-        lambda: list(arms._rows(workspace, row, "length_matched", {}, "1")),
+    assert arms.seconds_left(workspace, "plinko") == arms.SECONDS_AN_ARM
+    made = remedied(
+        lambda: arms.build_arms(workspace, "plinko"),
         "benchmark/arms.py | {}: was not filmed; run again",
-        lambda: made.extend(arms.build_arms(workspace, "plinko")[0]),
+        lambda: arms.film_arms(workspace, "plinko"),
     )
+    assert arms.seconds_left(workspace, "plinko") == 0
     tables.write(ARMS, part, [replace(each, refused="its outcome is settled too late") for each in made], {})
     items = remedied(
         lambda: build_items(workspace, "length_matched"),

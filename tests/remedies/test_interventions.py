@@ -146,7 +146,7 @@ def test_steered_positions_are_ones_that_prompts_have(
     )
     along = {"standard": stages.saved_directions(own, STANDARD)}
     vectors = {vector_digest(v): v for of in along["standard"].values() for v in of.void}
-    backend = SteeredBackend(entry, vectors, MadeAnswers(own.root / "made", 1), {})
+    backend = SteeredBackend(entry, vectors, MadeAnswers(own.store, own.root / "made", 1), {})
     wanted = {
         part: [q.request for q in wanted_steered(acting(own, positions=part), entry, CELL, along["standard"], {})][-1:]
         for part in ("stamps", "question")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from tests.conftest import ROOT
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.storage.test_parquet import clip
@@ -16,9 +19,10 @@ from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.database import Session
+from traps_pipeline.storage.leases import alone, leased
 from traps_pipeline.storage.objects import OBJECTS, Bucket, ObjectStore
 from traps_pipeline.storage.parquet import TableStore
-from traps_pipeline.storage.store import FolderStore, Store
+from traps_pipeline.storage.store import LEASES, FolderStore, Store
 
 PLINKO = {"category": "plinko"}
 
@@ -43,16 +47,31 @@ def bucket_hosts(request: pytest.FixtureRequest, tmp_path: Path) -> Hosts:
     return Hosts(_hosts_of_bucket(request, tmp_path))
 
 
-def _hosts_of_bucket(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[str], ObjectStore]:
+def _hosts_of_bucket(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[str], Store]:
     request.getfixturevalue("s3")
     postgres: Postgres = request.getfixturevalue("postgres")
     study = f"study-{secrets.token_hex(4)}"
+    return lambda name: opened(str(tmp_path), postgres.address(), study, name)
 
-    def opened(name: str) -> ObjectStore:
-        session = Session(postgres.address(), "TRAPS_TEST_DATABASE", study)
-        return ObjectStore(tmp_path / name, Bucket(f"s3://lab/{study}"), session)
 
-    return opened
+@pytest.fixture(params=["folder", "objects"])
+def where(request: pytest.FixtureRequest, tmp_path: Path) -> Sequence[str]:
+    """What `opened` is told of a study."""
+    if request.param == "folder":
+        return [str(tmp_path)]
+    request.getfixturevalue("s3")
+    return [str(tmp_path), request.getfixturevalue("postgres").address(), f"study-{secrets.token_hex(4)}"]
+
+
+def opened(folder: str, *of_database: str) -> Store:
+    """A study's files below a folder, as the host of the last name sees them; with the address of a database and the
+    study's name before that, in a bucket."""
+    *database, host = of_database
+    if not database:
+        return FolderStore(Path(folder) / "study")
+    address, study = database
+    session = Session(address, "TRAPS_TEST_DATABASE", study)
+    return ObjectStore(Path(folder) / host, Bucket(f"s3://lab/{study}"), session)
 
 
 def put(store: Store, name: str, content: bytes) -> Path:
@@ -134,6 +153,64 @@ def test_the_bytes_of_a_table_are_the_same_wherever_it_lies(hosts: Hosts, tmp_pa
         each.write(VIDEOS, PLINKO, [clip("plinko-0001")], {})
     path = tables.path(VIDEOS, PLINKO)
     assert store.here(path).read_bytes() == alone.path(VIDEOS, PLINKO).read_bytes()
+
+
+def test_what_is_there_and_its_digests_are_known_without_its_contents(hosts: Hosts) -> None:
+    one, other = hosts.open("one"), hosts.open("other")
+    put(one, "clips/a/void.mp4", b"frames")
+    other.look()
+    there, none = other.root / "clips/a/void.mp4", other.root / "clips/a/none.mp4"
+    assert other.there([there, none]) == {there}
+    # printf frames | sha256sum
+    assert other.digests([there, none]) == {there: "594cfd2607d4f09e1ce6241203e418cacfed545063792bc5eab7afaadbf0c4e0"}
+    assert other.root == one.root or not there.exists()
+
+
+def test_a_piece_of_work_is_one_processs_until_it_is_given_back(hosts: Hosts) -> None:
+    one, other = hosts.open("one"), hosts.open("other")
+    lease = one.lease("videos/plinko/000001")
+    assert lease is not None and one.lease("videos/plinko/000001") is other.lease("videos/plinko/000001") is None
+    beside = other.lease("videos/plinko/000002")
+    assert beside is not None
+    lease.close()
+    again = other.lease("videos/plinko/000001")
+    assert again is not None and one.lease("videos/plinko/000001") is None
+    for held in (beside, again):
+        held.close()
+    assert not (one.root / LEASES).exists()
+
+
+HOLDING = """
+import os, sys, time
+from pathlib import Path
+from tests.storage.test_store import opened
+store = opened(*sys.argv[1:])
+lease = store.lease("work")
+print("held" if lease else "not held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_what_a_killed_process_held_is_free_again(where: Sequence[str]) -> None:
+    store = opened(*where, "other")
+    command = [sys.executable, "-c", HOLDING, *where, "one"]
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "held\n"
+        assert store.lease("work") is None
+        process.kill()
+        process.wait()
+        with alone(store, "work"):
+            assert store.lease("work") is None
+
+
+def test_ranges_are_shared_and_those_that_others_have_come_last(hosts: Hosts) -> None:
+    one, other = hosts.open("one"), hosts.open("other")
+    theirs = leased(other, "items", 10, 4)
+    assert next(theirs) == range(4)
+    mine = leased(one, "items", 10, 4)
+    assert [next(mine), next(mine)] == [range(4, 8), range(8, 10)]
+    theirs.close()
+    assert [*mine] == [range(4)]
 
 
 # --- of an object store alone -----------------------------------------------------------------------------------------

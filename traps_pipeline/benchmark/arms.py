@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from traps_pipeline import progress
+from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
 from traps_pipeline.benchmark.tables import ARMS, SCENE_SPECS, VIDEOS, ArmRow
 from traps_pipeline.benchmark.versions import clip_content, version_of
@@ -28,10 +29,11 @@ from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.scenes.outcome import Rejected
 from traps_pipeline.scenes.spec import SceneSpec
 from traps_pipeline.scenes.variations import VARIATIONS
-from traps_pipeline.scenes.workers import run_in_order
 from traps_pipeline.storage.workspace import Workspace
 
 KNOWN: Mapping[str, Arm] = {**OF_SHORTCUTS, **VARIATIONS}
+SECONDS_AN_ARM = 2.0  # of one core, in the mean: one is a clip, or two questions, or a proof that it is refused
+_FOUND = ".arm.json"  # how the files end that say what came of an arm
 
 
 @dataclass(frozen=True)
@@ -68,44 +70,85 @@ def asked_arms(workspace: Workspace, category: str) -> list[str]:
     return [arm for arm in beside_of(taxonomy_of_category(category)) if arm in asked]
 
 
-def build_arms(workspace: Workspace, category: str) -> tuple[list[ArmRow], int]:
-    """Rows of the category's arms, and the frames drawn for them. Raises TrapsError for a damaged clip."""
-    rows: list[dict[str, Any]] = workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
-    arms = asked_arms(workspace, category)
+def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
+    """Film and certify what is missing of a category's arms, beside whoever else does so; what `share` returns. Raises
+    TrapsError."""
+    specs, arms = _specs(workspace, category), asked_arms(workspace, category)
+
+    def files(row: Row) -> list[Path]:
+        return [file for clip in _clips(workspace, row, arms).values() for file in _files(clip)]
+
+    def missing(rows: Sequence[Row]) -> list[Row]:
+        every = [file for row in rows for file in files(row)]
+        workspace.store.bring(file for file in every if file.name.endswith(_FOUND))
+        there = workspace.store.there(every)
+        return [row for row in rows if _missing(row, _clips(workspace, row, arms), there)]
+
+    def job(row: Row) -> Job | None:
+        spec, clips = spec_of(row), _clips(workspace, row, arms)
+        unmade = {arm: clip for arm, clip in clips.items() if not _is_made(spec, arm, clip)}
+        if not unmade:
+            return None
+        return Job(spec, trajectory_of(workspace, row), trajectory_of(workspace, row, "twin"), unmade)
+
+    def tick(done: int) -> None:
+        progress.current().tick("arms", f"{category}, scenarios", done, len(specs))
+
+    filming = Filming(f"arms/{category}", missing, files, job, film)
+    return share(workspace.store, specs, filming, tick, wait=wait)
+
+
+def seconds_left(workspace: Workspace, category: str) -> float:
+    """About how long one core films what is missing of a category's arms, as far as released records tell."""
+    found = [
+        _finding_of(workspace.clip(id_, arm, spec.scene_hash))
+        for id_, spec in released_in_study(workspace, category).items()
+        for arm in asked_arms(workspace, category)
+    ]
+    return SECONDS_AN_ARM * (len(found) - len(workspace.store.there(found)))
+
+
+def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
+    """Rows of the category's arms, all of which were filmed. Raises TrapsError for one that was not, and for a damaged
+    clip."""
+    specs, arms = _specs(workspace, category), asked_arms(workspace, category)
     of_pairs = {
         (row["scenario_id"], row["side"]): row
         for row in workspace.tables.read(VIDEOS, {"category": category}).to_dict("records")
     }
-    films = [workspace.clip(row["scenario_id"], arm, row["scene_hash"]) for row in rows for arm in arms]
-    workspace.store.bring(file for film in films for file in _files(film))
-    drawn = 0
+    films = [clip for row in specs for clip in _clips(workspace, row, arms).values()]
+    workspace.store.bring(map(_finding_of, films))
     try:
-        jobs = [job for row in rows if (job := _job(workspace, row, arms)) is not None]
-        for done, (_, frames) in enumerate(run_in_order(film, jobs), start=1):
-            drawn += frames
-            progress.current().tick("arms", f"{category}, scenarios", done, len(jobs))
-        workspace.store.keep(file for film in films for file in _files(film) if file.is_file())
-        version = version_of(
-            (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
-            (clip_content(row["scenario_id"], row["scene_hash"]) for row in rows),
-        )
-        made = [one for row in rows for arm in arms for one in _rows(workspace, row, arm, of_pairs, version)]
+        known = known_clips(workspace.store, films)
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
-    return made, drawn
+    version = version_of(
+        (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
+        (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
+    )
+    return [one for row in specs for arm in arms for one in _rows(workspace, row, arm, of_pairs, known, version)]
 
 
-def _job(workspace: Workspace, row: dict[str, Any], arms: Sequence[str]) -> Job | None:
+def _specs(workspace: Workspace, category: str) -> list[dict[str, Any]]:
+    return workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
+
+
+def _clips(workspace: Workspace, row: Row, arms: Sequence[str]) -> dict[str, Path]:
+    return {arm: workspace.clip(row["scenario_id"], arm, row["scene_hash"]) for arm in arms}
+
+
+def _missing(row: Row, clips: Mapping[str, Path], there: set[Path]) -> bool:
+    """Whether the study lacks something of these arms of a scenario."""
     spec = spec_of(row)
-    clips = {arm: workspace.clip(spec.scenario_id, arm, row["scene_hash"]) for arm in arms}
-    missing = {arm: clip for arm, clip in clips.items() if _found(spec, arm, clip) is None}
-    if not missing:
-        return None
-    return Job(spec, trajectory_of(workspace, row), trajectory_of(workspace, row, "twin"), missing)
+    for arm, clip in clips.items():
+        found = Finding.read(_finding_of(clip), _of(spec, arm)) if _finding_of(clip) in there else None
+        if found is None or (found.frames and not {clip, note_of(clip)} <= there):
+            return True
+    return False
 
 
 def _finding_of(clip: Path) -> Path:
-    return clip.with_suffix(".arm.json")
+    return clip.with_suffix(_FOUND)
 
 
 def _files(clip: Path) -> tuple[Path, ...]:
@@ -124,10 +167,10 @@ def _of(spec: SceneSpec, arm: str) -> str:
     return digest([spec.spec_hash, arm, _code(arm)])[:24]
 
 
-def _found(spec: SceneSpec, arm: str, clip: Path) -> Finding | None:
-    """What is known of an arm; None if nothing is, or its clip is gone. Raises DamagedClip."""
+def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
+    """Whether an arm lies here as it was made, with its clip where it has one. Raises DamagedClip."""
     found = Finding.read(_finding_of(clip), _of(spec, arm))
-    return None if found is None or (found.frames and read_clip(clip) is None) else found
+    return found is not None and (not found.frames or read_clip(clip) is not None)
 
 
 def film(job: Job) -> int:
@@ -149,15 +192,16 @@ def film(job: Job) -> int:
 
 def _rows(
     workspace: Workspace,
-    row: dict[str, Any],
+    row: Row,
     arm: str,
-    of_pairs: Mapping[tuple[str, str], Mapping[str, Any]],
+    of_pairs: Mapping[tuple[str, str], Row],
+    known: Mapping[Path, Clip],
     version: str,
 ) -> Iterator[ArmRow]:
     spec = spec_of(row)
     path = workspace.clip(spec.scenario_id, arm, row["scene_hash"])
-    finding = _found(spec, arm, path)
-    if finding is None:
+    finding, clip = Finding.read(_finding_of(path), _of(spec, arm)), known.get(path)
+    if finding is None or (finding.frames and clip is None):
         raise TrapsError(f"{path}: was not filmed; run again")
     empty = ArmRow(
         scenario_id=spec.scenario_id,
@@ -181,7 +225,11 @@ def _rows(
         return
     for question in KNOWN[arm].ask(spec):
         of_pair = question.clip
-        shown = _shown(workspace, path) if of_pair is None else _shown_in_pair(of_pairs[spec.scenario_id, of_pair])
+        if of_pair is not None:
+            shown = _shown_in_pair(of_pairs[spec.scenario_id, of_pair])
+        else:
+            assert clip is not None, "what shows a clip of its own has frames"
+            shown = _shown(workspace.relative(path), clip)
         yield replace(empty, **shown, **_asked(question, spec))
 
 
@@ -190,19 +238,16 @@ def _asked(question: Question, spec: SceneSpec) -> dict[str, Any]:
     return {"side": question.side, "question": question.text, "labels": labels, "ground_truth": question.answer}
 
 
-def _shown(workspace: Workspace, path: Path) -> dict[str, Any]:
-    clip: Clip | None = read_clip(path)
-    if clip is None:
-        raise TrapsError(f"{path}: was not filmed; run again")
+def _shown(path: str, clip: Clip) -> dict[str, Any]:
     return {
-        "clip": workspace.relative(path),
+        "clip": path,
         "media_digest": clip.file_sha256,
         "n_frames": clip.n_frames,
         "duration_s": clip.duration_s,
     }
 
 
-def _shown_in_pair(row: Mapping[str, Any]) -> dict[str, Any]:
+def _shown_in_pair(row: Row) -> dict[str, Any]:
     return {
         "clip": row["path"],
         "media_digest": row["file_sha256"],

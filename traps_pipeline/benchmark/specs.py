@@ -24,6 +24,8 @@ from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory
 from traps_pipeline.storage.workspace import Workspace
 
+SECONDS_A_RECORD = 0.04  # of one core, measured: its trajectories are read, and its evidence is measured again
+
 
 @dataclass(frozen=True)
 class Resolved:
@@ -134,6 +136,11 @@ def _simulate(scenario: Scenario) -> tuple[SceneSpec, np.ndarray, np.ndarray]:
         ) from error
 
 
+def seconds_left(workspace: Workspace, category: str) -> float:
+    """About how long one core builds a category's table."""
+    return SECONDS_A_RECORD * sum(one.category == category for one in load_scenarios(workspace.study).values())
+
+
 def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[Resolved]]:
     """Rows of scene_specs of a category, and the resolved records behind them. Trajectories are checked by digest."""
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
@@ -199,7 +206,7 @@ def _relative(path: Path, *roots: Path) -> str:
     return (path.relative_to(root) if root else path).as_posix()
 
 
-def spec_of(row: dict[str, Any]) -> SceneSpec:
+def spec_of(row: Mapping[str, Any]) -> SceneSpec:
     """A row of scene_specs back to its record."""
     record = {name: row[name] for name in SceneSpec.model_fields}
     for name in (*_AS_JSON, "evidence"):
@@ -208,7 +215,7 @@ def spec_of(row: dict[str, Any]) -> SceneSpec:
     return SceneSpec.model_validate(record)
 
 
-def trajectory_of(workspace: Workspace, row: dict[str, Any], world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
+def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: Literal["qpos", "twin"] = "qpos") -> np.ndarray:
     """The frozen qpos (F, nq) of a row of scene_specs, or its twin's. Raises TrapsError."""
     candidates: Sequence[Path] = (ROOT / row["trajectory"], workspace.resolve(row["trajectory"]))
     path = next((p for p in candidates if p.is_file()), candidates[0])

@@ -2,55 +2,97 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from traps_pipeline import progress
+from traps_pipeline.benchmark.sharing import Filming, Row, known_clips, share
 from traps_pipeline.benchmark.specs import released_in_study, spec_of, trajectory_of
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, VideoRow
 from traps_pipeline.benchmark.versions import clip_content, version_of
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.scenes.clips import Job, note_of, read_clip, render_pairs
+from traps_pipeline.scenes.clips import Clip, Job, note_of, read_clip, render_pair
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.scenes.look import frame_size
 from traps_pipeline.storage.workspace import Workspace
 
 CLIPS = ("control", "void", "twin")
+SECONDS_A_CLIP = 1.4  # of one core, measured (docs/cluster.md)
 
 
-def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], int, dict[str, float]]:
-    """Rows of the category's clips (three a scenario), frames drawn for them, leaked pixels of each occluded void."""
-    specs: list[dict[str, Any]] = workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
-    jobs = [_job(workspace, row) for row in specs]
-    files = [file for job in jobs for clip in job.clips for file in (clip, note_of(clip))]
-    workspace.store.bring(files)
-    drawn = 0
+def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
+    """Render what is missing of a category's clips (three a scenario), beside whoever else does so; what `share`
+    returns. Raises TrapsError."""
+    specs = _specs(workspace, category)
+
+    def missing(rows: Sequence[Row]) -> list[Row]:
+        there = workspace.store.there(file for row in rows for file in _files(workspace, row))
+        return [row for row in rows if not there.issuperset(_files(workspace, row))]
+
+    def job(row: Row) -> Job | None:
+        return None if all(map(read_clip, _clips(workspace, row))) else _job(workspace, row)
+
+    tick = partial(_tick, category, len(specs))
+    rendering = Filming(f"videos/{category}", missing, partial(_files, workspace), job, render_pair)
+    return share(workspace.store, specs, rendering, tick, wait=wait)
+
+
+def seconds_left(workspace: Workspace, category: str) -> float:
+    """About how long one core renders what is missing of a category, as far as released records tell."""
+    clips = [
+        workspace.clip(id_, side, spec.scene_hash)
+        for id_, spec in released_in_study(workspace, category).items()
+        for side in CLIPS
+    ]
+    return SECONDS_A_CLIP * (len(clips) - len(workspace.store.there(clips)))
+
+
+def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], dict[str, float]]:
+    """Rows of the category's clips, which are all there, and the leaked pixels of each occluded void. Raises
+    TrapsError for a clip that is not."""
+    specs = _specs(workspace, category)
     try:
-        for done, (_, frames) in enumerate(render_pairs(jobs), start=1):
-            drawn += frames
-            progress.current().tick("videos", f"{category}, scenarios", done, len(jobs))
-        workspace.store.keep(files)
-        version = version_of(
-            (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
-            (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
-        )
-        rows = [row for spec, job in zip(specs, jobs, strict=True) for row in _rows(workspace, spec, job, version)]
-        leaks = {job.spec.scenario_id: clip.leaked_pixels for job in jobs if (clip := read_clip(job.void))}
+        known = known_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row)))
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
-    return rows, drawn, {id_: pixels for id_, pixels in leaks.items() if pixels is not None}
+    version = version_of(
+        (clip_content(id_, spec.scene_hash) for id_, spec in released_in_study(workspace, category).items()),
+        (clip_content(row["scenario_id"], row["scene_hash"]) for row in specs),
+    )
+    rows = [row for spec in specs for row in _rows(workspace, spec, known, version)]
+    voids = {row["scenario_id"]: known[_clips(workspace, row)[1]].leaked_pixels for row in specs}
+    return rows, {id_: pixels for id_, pixels in voids.items() if pixels is not None}
 
 
-def _job(workspace: Workspace, row: dict[str, Any]) -> Job:
-    spec = spec_of(row)
-    control, void, twin = (workspace.clip(spec.scenario_id, side, row["scene_hash"]) for side in CLIPS)
-    return Job(spec, trajectory_of(workspace, row), trajectory_of(workspace, row, "twin"), control, void, twin)
+def _specs(workspace: Workspace, category: str) -> list[dict[str, Any]]:
+    return workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
 
 
-def _rows(workspace: Workspace, spec: dict[str, Any], job: Job, version: str) -> list[VideoRow]:
-    rows, (width, height) = [], frame_size(job.spec.params)
-    for side, path in zip(CLIPS, job.clips, strict=True):
-        clip = read_clip(path)
+def _tick(category: str, total: int, done: int) -> None:
+    progress.current().tick("videos", f"{category}, scenarios", done, total)
+
+
+def _clips(workspace: Workspace, row: Row) -> tuple[Path, Path, Path]:
+    control, void, twin = (workspace.clip(row["scenario_id"], side, row["scene_hash"]) for side in CLIPS)
+    return control, void, twin
+
+
+def _files(workspace: Workspace, row: Row) -> list[Path]:
+    return [file for clip in _clips(workspace, row) for file in (clip, note_of(clip))]
+
+
+def _job(workspace: Workspace, row: Row) -> Job:
+    trajectories = trajectory_of(workspace, row), trajectory_of(workspace, row, "twin")
+    return Job(spec_of(row), *trajectories, *_clips(workspace, row))
+
+
+def _rows(workspace: Workspace, spec: Row, known: Mapping[Path, Clip], version: str) -> list[VideoRow]:
+    rows, (width, height) = [], frame_size(json.loads(spec["params"]))
+    for side, path in zip(CLIPS, _clips(workspace, spec), strict=True):
+        clip = known.get(path)
         if clip is None:
             raise TrapsError(f"{path}: was not rendered; run again")
         rows.append(

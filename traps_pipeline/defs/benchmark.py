@@ -1,15 +1,16 @@
 """The benchmark group: specs, clips, items."""
 
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 import dagster as dg
 
 from traps_pipeline.benchmark.composition import problems
-from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, unsettled
+from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, seconds_left, unsettled
 from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.videos import missing_clips
-from traps_pipeline.orchestration.graph import Check, Takes
+from traps_pipeline.orchestration.graph import Check, Shared, Takes
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.orchestration.stage import key_of, shown, source, stage
 from traps_pipeline.partitions import all_datasets_of, beside_of, sides_of, taxonomy_of_category
@@ -63,6 +64,7 @@ scene_specs = stage(
     scheme=CATEGORY,
     code="3",
     kinds=["parquet", "mujoco"],
+    shared=Shared(seconds=seconds_left),
     checks=[
         Check(
             "outcome_settled",
@@ -103,18 +105,30 @@ scene_specs = stage(
 
 
 def _make_videos(workspace: Workspace, category: str) -> Made:
-    """Control and void clips of a category, one row each; each is rendered once, from its frozen trajectory."""
+    """Control and void clips of a category, one row each; each is rendered once, from its frozen trajectory, by
+    whichever of the processes that are at it."""
     from traps_pipeline.benchmark.videos import build_videos
 
-    rows, drawn, leaks = build_videos(workspace, category)
-    size = sum(row.size_bytes for row in rows) / 1e6
-    shown = {"frames rendered": drawn, "megabytes": round(size, 2)}
-    return Made(rows, Tally(frames=drawn), shown, beside=leaks)
+    rows, leaks = build_videos(workspace, category)
+    return Made(rows, shown={"megabytes": round(sum(row.size_bytes for row in rows) / 1e6, 2)}, beside=leaks)
+
+
+def _render(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
+    from traps_pipeline.benchmark.videos import render_videos
+
+    frames, is_whole = render_videos(workspace, category, wait=wait)
+    return Tally(frames=frames), is_whole
+
+
+def _to_render_s(workspace: Workspace, category: str) -> float:
+    from traps_pipeline.benchmark.videos import seconds_left
+
+    return seconds_left(workspace, category)
 
 
 def _alike(workspace: Workspace, key: str | None, made: Made) -> list[str]:
-    shown = [(row.side, row.frames_sha256) for row in made.rows(VIDEOS)]
-    return [row.path for row, one in zip(made.rows(VIDEOS), shown, strict=True) if shown.count(one) > 1]
+    shown = Counter((row.side, row.frames_sha256) for row in made.rows(VIDEOS))
+    return [row.path for row in made.rows(VIDEOS) if shown[row.side, row.frames_sha256] > 1]
 
 
 videos = stage(
@@ -125,6 +139,7 @@ videos = stage(
     scheme=CATEGORY,
     kinds=["parquet", "mp4"],
     takes=RENDERS,
+    shared=Shared(_render, _to_render_s),
     lost=lambda workspace, key: [f"clip {path} is gone or damaged" for path in missing_clips(workspace, str(key))],
     columns={name: [f"scene_specs.{name}"] for name in ("scenario_id", "scene_hash")},
     checks=[
@@ -142,11 +157,22 @@ def _make_arms(workspace: Workspace, category: str) -> Made:
     """The arms and variations of a category's scenarios that the study asks: clips and questions beside the pairs."""
     from traps_pipeline.benchmark.arms import build_arms
 
-    rows, drawn = build_arms(workspace, category)
+    rows = build_arms(workspace, category)
     admitted = sum(row.refused is None for row in rows)
-    return Made(
-        rows, Tally(frames=drawn), {"frames rendered": drawn, "admitted": admitted, "refused": len(rows) - admitted}
-    )
+    return Made(rows, shown={"admitted": admitted, "refused": len(rows) - admitted})
+
+
+def _film(workspace: Workspace, category: str, wait: bool) -> tuple[Tally, bool]:
+    from traps_pipeline.benchmark.arms import film_arms
+
+    frames, is_whole = film_arms(workspace, category, wait=wait)
+    return Tally(frames=frames), is_whole
+
+
+def _to_film_s(workspace: Workspace, category: str) -> float:
+    from traps_pipeline.benchmark.arms import seconds_left
+
+    return seconds_left(workspace, category)
 
 
 def _unmade_arms(workspace: Workspace, category: str) -> list[str]:
@@ -164,6 +190,7 @@ arms = stage(
     code="2",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
+    shared=Shared(_film, _to_film_s),
     wants=lambda wanted, key: bool({*wanted.arms} & {*beside_of(taxonomy_of_category(str(key)))}),
     lost=lambda workspace, key: _unmade_arms(workspace, str(key)),
     columns={name: [f"scene_specs.{name}"] for name in ("scenario_id", "scene_hash")},

@@ -31,11 +31,12 @@ from traps_pipeline import progress
 from traps_pipeline.digests import digest
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.files import write_bytes
-from traps_pipeline.mechanism.chunks import alone, end_leases, leased
 from traps_pipeline.models.local.capture import OF_PAIRS, OF_PARTS, ONE_TOKEN, Pooling
 from traps_pipeline.models.local.spans import changed_tokens, spans
+from traps_pipeline.storage.leases import alone, leased
 from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
 from traps_pipeline.storage.parquet import read_sealed, write_sealed
+from traps_pipeline.storage.store import FolderStore
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,6 +48,7 @@ SHARD_SIZE = 64  # items of a chunk and its shard: 20 MB at the 8B size; a kill 
 PREPARED_AHEAD = 2  # prompts that are decoded while the model works
 NORMED = "normed"
 _IDS = "ids.parquet"
+_WRITING = "shards"  # the lease of whoever writes into a folder
 _RECORD = b"traps"
 _COLUMNS = ("item_id", "side", "key", "shard", "row", "device")
 _NOT_RECORDED = "not recorded"  # the device in shards of earlier versions
@@ -134,21 +136,20 @@ def extract(
     disk cannot be written.
     """
     keys = [states_key(model, item, pooling) for item in items]
-    known, made = dict[str, _Place](), 0
-    with alone(folder):
+    known, made, here = dict[str, _Place](), 0, FolderStore(folder)
+    with alone(here, _WRITING):
         _look_for(folder, known)
     total = sum(key not in known for key in keys)
-    for chunk in leased(folder, len(items), shard_size):
+    for chunk in leased(here, "chunks", len(items), shard_size):
         if any(keys[n] not in known for n in chunk):
             _look_for(folder, known)  # another process may have had this chunk
         missing = [(items[n], keys[n]) for n in chunk if keys[n] not in known]
         if missing:
             tick = partial(_tick, what, made, total)
             made += _make(model, missing, folder, pooling, tick, known)
-    with alone(folder):
+    with alone(here, _WRITING):
         _write_ids(folder, items, keys, known, _record(model, pooling))
         _sweep(folder, {known[key][0] for key in keys})
-        end_leases(folder)
     _note_devices(folder, sorted({known[key][2] for key in keys}))
     version = digest([[item.item_id, item.side, key] for item, key in zip(items, keys, strict=True)])
     return Extracted(folder, len(items), made, version)
@@ -211,7 +212,7 @@ def _make(
             shard.append((item, key, item_states(model, item, prompt, pooling)))
             tick(done)
     finally:
-        with alone(folder):
+        with alone(FolderStore(folder), _WRITING):
             _flush(folder, shard, model, pooling, known)
     return len(missing)
 

@@ -1,29 +1,25 @@
 """Answers that several processes make for one evaluation, of which one alone may write the ledger.
 
-Who may not write makes answers in the meantime, chunk by chunk of its calls and from their end, and leaves them in a
-folder; who writes takes what is there and makes the rest. A chunk is leased as it is made, so nobody makes it twice,
-and a process that dies gives it back.
+Who may not write makes answers in the meantime, chunk by chunk of its calls and from their end, and leaves them in the
+study; who writes takes what is there and makes the rest. A chunk is leased as it is made, so nobody makes it twice, and
+a process that dies gives it back.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-import os
-import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from traps_pipeline.digests import digest
-from traps_pipeline.files import try_lock, write_text
-from traps_pipeline.mechanism.chunks import writable
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.storage.leases import POLL_S
 from traps_pipeline.storage.ledger import Ledger, LockGivenUp
-
-POLL_S = 0.2
+from traps_pipeline.storage.store import Lease, Store
 
 Make = Callable[[Sequence[Request], Callable[[], bool]], list[Outcome]]  # calls; whether to stop; their outcomes
 
@@ -37,10 +33,10 @@ class Chunk:
 
 
 class MadeAnswers:
-    """The answers in a folder, and the chunks of the calls that are wanted here."""
+    """The answers in a folder of a study, and the chunks of the calls that are wanted here."""
 
-    def __init__(self, folder: Path, size: int) -> None:
-        self._folder, self._size = folder, size
+    def __init__(self, store: Store, folder: Path, size: int) -> None:
+        self._store, self._folder, self._size = store, folder, size
         self._of: dict[str, Chunk] = {}
 
     def chunks(self, wanted: Sequence[Request]) -> list[Chunk]:
@@ -59,8 +55,10 @@ class MadeAnswers:
         with ExitStack() as leases:
             found: dict[str, Outcome] = {}
             for chunk in chunks.values():
-                while not leases.enter_context(self._lease(chunk)) and not stopped():
+                while (lease := self._lease(chunk)) is None and not stopped():
                     time.sleep(POLL_S)
+                if lease is not None:
+                    leases.enter_context(closing(lease))
                 found |= self._read(chunk)
             missing = [request for request in requests if request.key not in found]
             if missing:
@@ -69,49 +67,44 @@ class MadeAnswers:
 
     def fill(self, chunk: Chunk, known: Callable[[Sequence[str]], set[str]], make: Make) -> int | None:
         """Make the answers of a chunk that are not known, unless another process is at it (None); their number."""
-        with self._lease(chunk) as mine:
-            if not mine:
-                return None
+        lease = self._lease(chunk)
+        if lease is None:
+            return None
+        with closing(lease):
             made = self._read(chunk)
             settled = known(list(chunk.calls)) | {*made}
             missing = [request for key, request in chunk.calls.items() if key not in settled]
             if missing:
                 outcomes = make(missing, lambda: False)
                 made |= zip([each.key for each in missing], outcomes, strict=True)
-                with writable(self._folder):
-                    write_text(self._path(chunk), json.dumps({key: asdict(each) for key, each in made.items()}))
+                written = json.dumps({key: asdict(each) for key, each in made.items()})
+                self._store.write({self._path(chunk): written.encode()})
             return len(missing)
 
     def forget(self, wanted: Sequence[Request]) -> None:
         """Remove the answers to calls that the ledger holds now."""
-        for name in {chunk.name for request in wanted if (chunk := self._of.get(request.key))}:
-            for path in (self._folder / f"{name}.json", self._folder / f"{name}.lock"):
-                path.unlink(missing_ok=True)
-        if self._folder.is_dir() and not any(self._folder.iterdir()):
-            shutil.rmtree(self._folder, ignore_errors=True)  # another process may do so at the same time
+        chunks = {chunk.name: chunk for request in wanted if (chunk := self._of.get(request.key))}
+        self._store.remove(map(self._path, chunks.values()))
+        with suppress(OSError):  # unless there are others
+            self._folder.rmdir()
 
     def _path(self, chunk: Chunk) -> Path:
         return self._folder / f"{chunk.name}.json"
 
     def _read(self, chunk: Chunk) -> dict[str, Outcome]:
         try:
-            rows = json.loads(self._path(chunk).read_text(encoding="utf-8"))
+            rows = json.loads(self._store.here(self._path(chunk)).read_text(encoding="utf-8"))
             return {key: Outcome(**row) for key, row in rows.items() if key in chunk.calls}
         except FileNotFoundError:
             return {}
         except (ValueError, TypeError, AttributeError):  # not what was written: made again
             return {}
 
-    @contextmanager
-    def _lease(self, chunk: Chunk) -> Iterator[bool]:
-        """Whether the chunk is this process's until the end of the block."""
-        with writable(self._folder):
-            held = try_lock(self._folder / f"{chunk.name}.lock")
-        try:
-            yield held is not None
-        finally:
-            if held is not None:
-                os.close(held)
+    def _lease(self, chunk: Chunk) -> Lease | None:
+        lease = self._store.lease(f"{self._folder.name}/{chunk.name}")
+        if lease is not None:
+            self._store.look()  # what whoever had it before has left
+        return lease
 
 
 def is_written(ledger: Ledger, evaluation: str) -> bool:

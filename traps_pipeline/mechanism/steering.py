@@ -277,8 +277,8 @@ def collect_steered(
     """Generate the missing answers; yields the STEERING rows of each finished cell. directions: by VQA prompt, then by
     source.
 
-    Several processes may do so at once, on one machine: one writes the answers of an evaluation, and whoever waits for
-    it makes answers in the meantime (`made_answers`).
+    Several processes may do so at once: one writes the answers of an evaluation, and whoever waits for it makes answers
+    in the meantime (`made_answers`).
     """
     assert workspace.mechanism.steering is not None, "an experiment without steering has no steering cells"
     place = place_of(workspace.mechanism.steering)
@@ -292,7 +292,7 @@ def collect_steered(
     }
 
     gates = {prompt: conditions(workspace, Extraction(entry.id, prompt)) for prompt in directions}
-    made = MadeAnswers(workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
+    made = MadeAnswers(workspace.store, workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
 
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
         wanted = wanted_steered(workspace, entry, cell, directions[cell.directions], gates[cell.directions])

@@ -24,11 +24,10 @@ from traps_pipeline.extras import missing
 from traps_pipeline.models.registry import LOCAL, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Stage, the_graph
+from traps_pipeline.orchestration.ranges import Range, cut, shared_out
 from traps_pipeline.orchestration.runs import (
     Ran,
-    Range,
     Runs,
-    batches,
     broke_off,
     problems_of,
     range_of,
@@ -36,8 +35,8 @@ from traps_pipeline.orchestration.runs import (
     reason,
 )
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
-from traps_pipeline.orchestration.schemes import Scheme
 from traps_pipeline.orchestration.shared_history import unusable
+from traps_pipeline.orchestration.step import TAKEN, TALLY
 from traps_pipeline.partitions import Cell
 from traps_pipeline.storage.database import PATIENCE_S
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
@@ -129,9 +128,8 @@ def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
 
 
 class RayRuns(Runs):
-    """Runs of a study in Dagster's queue. most: into which a group of stages is cut, besides what cannot stand in one
-    rectangle of cells. gpus: of each run that loads a local model. cpus: of each run that works on as many as it is
-    given."""
+    """Runs of a study in Dagster's queue. most: into which a group of stages is cut. gpus: of each run that loads a
+    local model. cpus: of each run that works on as many as it is given."""
 
     def __init__(
         self,
@@ -145,7 +143,7 @@ class RayRuns(Runs):
         self._instance, self._workspace, self._on_interrupt = instance, workspace, on_interrupt
         self._most, self._gpus, self._cpus = most, gpus, cpus
         self._idle_since, self._told_idle = float("inf"), False  # while all runs wait for a host
-        self._stack, self._n_keys = ExitStack(), 0
+        self._stack, self._keys = ExitStack(), frozenset[str | None]()
         self._cursors: dict[str, str | None] = {}
         self._retries: dict[str, tuple[Sequence[Stage], Range, Mapping[str, str]]] = {}  # once, what broke off
         self._failures: dict[str, list[dg.DagsterEvent]] = {}  # steps of runs that failed
@@ -175,16 +173,22 @@ class RayRuns(Runs):
         )
         return context.create_request_context()
 
-    def ranges(self, scheme: Scheme | None, keys: Sequence[str | None]) -> list[Range]:
+    def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> list[Range]:
         """Ranges for several hosts: so many that all have work, and so few that starting them costs little. What one
-        model is asked stays together, so that it is loaded in few runs."""
-        self._n_keys = len(keys)
-        return [*batches(scheme, keys, self._most)]
+        model is asked stays together, so that it is loaded in few runs. Runs that share what they make may have the
+        same range."""
+        self._keys = frozenset(keys)
+        scheme = stages[0].scheme if stages else None
+        shared = [stage.shared for stage in stages if stage.shared is not None]
+        if not shared:
+            return cut(scheme, keys, self._most)
+        seconds = {key: sum(one.seconds(self._workspace, key) for one in shared) / self._cpus for key in keys}
+        return shared_out(scheme, keys, seconds, self._most)
 
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
         """See `Runs`."""
         if ranges:
-            progress.current().stage(", ".join(stage.name for stage in stages), self._n_keys * len(stages))
+            progress.current().stage(", ".join(stage.name for stage in stages), len(self._keys) * len(stages))
             self._retries = {self._submit(stages, one, tags): (stages, one, tags) for one in ranges}
             yield from self._watch([*self._retries])
 
@@ -198,7 +202,8 @@ class RayRuns(Runs):
         job = location.get_job(selector)
         plan = location.get_execution_plan(job, {}, None, None, instance=self._instance)
         place = str(self._workspace.place)
-        own = own_tags(self._workspace.study.name, place, stages, keys_in(stages, of), self._cpus, self._gpus)
+        keys = [key for key in keys_in(stages, of) if key in self._keys]
+        own = own_tags(self._workspace.study.name, place, stages, keys, self._cpus, self._gpus)
         run = self._instance.create_run(
             job_name=job.name,
             run_id=None,
@@ -281,9 +286,12 @@ class RayRuns(Runs):
                 event = record.event_log_entry.get_dagster_event()
                 if event.is_step_failure:
                     self._failures.setdefault(run_id, []).append(event)
-                elif (made := event.step_materialization_data.materialization).metadata.get("tally") is not None:
-                    tally = progress.Tally(**json.loads(str(made.metadata["tally"].value)))
-                    progress.current().partition(made.asset_key.path[-1], made.partition or "", tally)
+                elif TALLY in (made := event.step_materialization_data.materialization).metadata:
+                    tally = progress.Tally(**json.loads(str(made.metadata[TALLY].value)))
+                    if TAKEN in made.metadata:
+                        progress.current().helped(made.asset_key.path[-1], tally)
+                    else:
+                        progress.current().partition(made.asset_key.path[-1], made.partition or "", tally)
             if not found.has_more:
                 return
 

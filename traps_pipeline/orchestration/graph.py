@@ -15,6 +15,7 @@ import dagster as dg
 
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
@@ -71,6 +72,21 @@ class Takes:
     each_gb: float = 0.0
 
 
+def _nothing(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
+    return Tally(), True
+
+
+@dataclass(frozen=True)
+class Shared:
+    """How several runs make one partition: the files that it names beside one another, and then one of them the
+    partition, which the others take over as made. files: makes what nobody else is at, then waits, if it is told to,
+    until nothing is missing; what was done here, and whether all is there. seconds: about how long one core works at
+    what is missing, as far as that is known before anything above is made."""
+
+    files: Callable[[Workspace, Any, bool], tuple[Tally, bool]] = _nothing
+    seconds: Callable[[Workspace, Any], float] = lambda workspace, key: 0.0
+
+
 @dataclass(frozen=True)
 class Stage:
     """Something that is made: a table, or files for people (table: None).
@@ -79,6 +95,7 @@ class Stage:
     parent must be there, by name (default: every partition that the study wants). code: raise it when the formula
     changes, and what was made before is stale. cost: what making it takes besides seconds. wants: whether a study wants
     a key at all. lost: what is missing of the files that a partition names. takes: what a run of it takes of a host.
+    shared: how several runs make a partition at once, where they may.
     """
 
     spec: dg.AssetSpec
@@ -93,6 +110,7 @@ class Stage:
     wants: Callable[[Wanted, Any], bool]
     lost: Callable[[Workspace, Any], list[str]]
     takes: Takes = Takes()
+    shared: Shared | None = None
 
     @property
     def name(self) -> str:

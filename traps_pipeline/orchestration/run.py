@@ -135,7 +135,8 @@ def walk(
                 if keys or graph.parents_of[stage.name].keys() & todo.keys():
                     todo[stage.name] = keys
             keys = [key for key in graph.keys(block[0].name) if any(key in of for of in todo.values())]
-            for ran in runs.make([graph[name] for name in todo], runs.ranges(block[0].scheme, keys), tags):
+            made = [graph[name] for name in todo]
+            for ran in runs.make(made, runs.ranges(made, keys), tags):
                 outcome.problems += ran.problems
                 outcome.over_budget |= ran.over_budget
     outcome.problems = [*dict.fromkeys(outcome.problems)]

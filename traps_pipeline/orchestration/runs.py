@@ -8,7 +8,6 @@ import socket
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,10 @@ import dagster as dg
 from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Stage
-from traps_pipeline.orchestration.schemes import Scheme
+from traps_pipeline.orchestration.ranges import Range, batches
 from traps_pipeline.orchestration.step import close_dropped
 
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
-Range = tuple[str | None, str | None]  # first and last key
 _RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"
 _SENTENCES = (TrapsError.__name__, BudgetReached.__name__)  # errors whose message is for people
 _INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
@@ -40,8 +38,9 @@ class Runs(ABC):
     """Who makes runs of stages that share their partitions."""
 
     @abstractmethod
-    def ranges(self, scheme: Scheme | None, keys: Sequence[str | None]) -> Sequence[Range]:
-        """The keys, cut into ranges that are made in one run each."""
+    def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
+        """The keys, cut into ranges that are made in one run each. A range may hold other keys too, which a run leaves
+        alone, and runs may have the same one, where they share what is to be made."""
 
     @abstractmethod
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterable[Ran]:
@@ -54,9 +53,9 @@ class RunsHere(Runs):
     def __init__(self, instance: dg.DagsterInstance, job: dg.JobDefinition) -> None:
         self._instance, self._job = instance, job
 
-    def ranges(self, scheme: Scheme | None, keys: Sequence[str | None]) -> Sequence[Range]:
-        """See `Runs`: as few as there can be."""
-        return [*batches(scheme, keys)]
+    def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
+        """See `Runs`: as few as there can be of these keys alone."""
+        return [*batches(stages[0].scheme if stages else None, keys)]
 
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
         """See `Runs`."""
@@ -83,85 +82,6 @@ def this_host() -> str:
     """Where process numbers mean what they mean here: the machine and its namespace of processes."""
     namespace = Path("/proc/self/ns/pid")
     return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
-
-
-def batches(
-    scheme: Scheme | None, keys: Sequence[str | None], at_least: int = 1
-) -> Iterator[tuple[str | None, str | None]]:
-    """Ranges (first key, last key) that together are exactly the keys: one run each. Of two dimensions a range is a
-    rectangle of neighbours. at_least: into about how many of equal size they are cut, where there are so many keys."""
-    if scheme is None or not keys:
-        yield from ((key, key) for key in keys)
-        return
-    if isinstance(scheme.definition, dg.MultiPartitionsDefinition):
-        rows, columns = (
-            [str(k) for k in d.partitions_def.get_partition_keys()] for d in scheme.definition.partitions_defs
-        )
-        pairs = [(row, column) for row, _, column in (str(key).partition("|") for key in keys)]
-    else:
-        rows, columns = [""], [str(key) for key in scheme.definition.get_partition_keys()]
-        pairs = [("", str(key)) for key in keys]
-    fewest = _rectangles(rows, columns, pairs)
-    for whole in fewest:
-        share = round(at_least * whole.size / len(keys)) if len(fewest) < at_least else 1
-        for part in _parts(whole, max(1, share), columns):
-            first, last = (rows[part.top], columns[part.left]), (rows[part.bottom], columns[part.right])
-            yield "|".join(filter(None, first)), "|".join(filter(None, last))
-
-
-@dataclass(frozen=True, order=True)
-class _Rectangle:
-    """Cells of two dimensions, by their numbers; both ends belong to it."""
-
-    left: int
-    right: int
-    top: int
-    bottom: int
-
-    @property
-    def size(self) -> int:
-        return (self.right - self.left + 1) * (self.bottom - self.top + 1)
-
-
-def _rectangles(rows: Sequence[str], columns: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[_Rectangle]:
-    """Cells (row, column) in rectangles: neighbours of a row, of as many rows as have the same ones."""
-    row_of, column_of = ({name: number for number, name in enumerate(names)} for names in (rows, columns))
-    by_row: dict[int, list[int]] = {}
-    for row, column in pairs:
-        by_row.setdefault(row_of[row], []).append(column_of[column])
-    spans = sorted((span, row) for row, numbers in by_row.items() for span in _spans(numbers))
-    return [
-        _Rectangle(*span, top, bottom)
-        for span, group in groupby(spans, key=lambda pair: pair[0])
-        for top, bottom in _spans([row for _, row in group])
-    ]
-
-
-def _parts(whole: _Rectangle, count: int, columns: Sequence[str]) -> Iterator[_Rectangle]:
-    """A rectangle in about so many of one size: whole columns as far as there are enough, and between models where
-    there are fewer parts than models, since each run loads its models anew."""
-    width, height = whole.right - whole.left + 1, whole.bottom - whole.top + 1
-    heads = [name.partition("__")[0] for name in columns[whole.left : whole.right + 1]]
-    models = [0, *(n for n in range(1, width) if heads[n] != heads[n - 1]), width]
-    across, down = min(count, width), min(max(1, round(count / width)), height)
-    cuts = {width * n // across for n in range(across + 1)}
-    if across < len(models):
-        cuts = {min(models, key=lambda model, cut=cut: abs(model - cut)) for cut in cuts}
-    lines = [height * n // down for n in range(down + 1)]
-    for left, right in pairwise(sorted(cuts)):
-        for top, bottom in pairwise(lines):
-            yield _Rectangle(whole.left + left, whole.left + right - 1, whole.top + top, whole.top + bottom - 1)
-
-
-def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """Maximal runs of neighbouring numbers, as (first, last)."""
-    spans: list[tuple[int, int]] = []
-    for number in sorted(numbers):
-        if spans and spans[-1][1] == number - 1:
-            spans[-1] = spans[-1][0], number
-        else:
-            spans.append((number, number))
-    return spans
 
 
 def _execute(

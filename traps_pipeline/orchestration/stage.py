@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import dagster as dg
 
-from traps_pipeline.orchestration.graph import DECLARED, Check, Cost, Need, Source, Stage, Takes
+from traps_pipeline.orchestration.graph import DECLARED, Check, Cost, Need, Shared, Source, Stage, Takes
 from traps_pipeline.orchestration.schemes import LEFT_OUT, Scheme, study_here
 from traps_pipeline.orchestration.step import CURRENT, CURRENT_DOC, Event, Step
 from traps_pipeline.orchestration.wanted import Wanted
@@ -109,6 +109,7 @@ def stage(
     lost: Callable[[Workspace, Any], list[str]] = lambda workspace, key: [],
     columns: Mapping[str, Collection[str]] | None = None,
     takes: Takes | None = None,
+    shared: Shared | None = None,
 ) -> dg.AssetsDefinition:
     """The asset of a table, or of files for people where only a name is given (see `graph.Stage` for the parameters).
 
@@ -131,7 +132,7 @@ def stage(
     )
     content = None if isinstance(table, str) else table
     declared = Stage(
-        spec, content, make, collect, scheme, needs or {}, checks, code, cost, wants, lost, takes or Takes()
+        spec, content, make, collect, scheme, needs or {}, checks, code, cost, wants, lost, takes or Takes(), shared
     )
     _declare(name, declared)
     specs = [(CURRENT, CURRENT_DOC, False), *((check.name, check.doc, check.blocks) for check in checks)]

@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict
 from typing import Any, cast
 
@@ -24,6 +25,8 @@ from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
 from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.progress import Tally
+from traps_pipeline.storage.leases import alone
 from traps_pipeline.storage.parquet import Made, State
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
@@ -35,6 +38,7 @@ STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is th
 REACHED = "a budget is reached"  # in a check's metadata
 STILL = "still failing"  # in a check's metadata: of a partition that the run did not touch
 PREVIEWED = 5  # rows
+TALLY, TAKEN = "tally", "taken over"  # in an event's metadata: what this run did for it; that another run has made it
 _ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process began with it
 RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another one goes on with
 SHOWN = 12  # unmade partitions named in an error
@@ -65,6 +69,8 @@ class Step:
         if context.run_id not in _ATTEMPTS:
             _ATTEMPTS[context.run_id] = context.instance.count_resume_run_attempts(context.run_id)
         self.unmade: dict[str | None, TrapsError] = {}
+        self.made_at: dict[str | None, int] = {}  # when partitions that other runs make, too, had been written
+        self.taken: dict[str | None, tuple[str, Tally]] = {}  # made by others: version, and what was done here
         self.failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}  # checks, with what is wrong
 
     def run(self) -> Iterator[Event]:
@@ -96,17 +102,23 @@ class Step:
         if todo:
             progress.current().stage(name, len(todo))
         inputs = {key: lineage.inputs(name, key) for key in todo}  # noted before anything is read
-        for key, made in self._make(todo):
+        if stage.shared is not None:
+            self.made_at = {key: lineage.made_at(name, key) for key in todo}
+        for key, made in self._make(todo, inputs):
             version = self._write(key, made, inputs[key])
             yield from self._checks(key, made)
             progress.current().partition(name, key or "", made.tally)
             yield self.history.event(stage, key, version, provenance, self._metadata(made))
+        for key, (version, tally) in self.taken.items():
+            progress.current().partition(name, key or "", tally)
+            about = {TAKEN: "made by another run meanwhile", TALLY: json.dumps(vars(tally))}
+            yield self.history.event(stage, key, version, provenance, about)
         if self.unmade:
             end_if_resumed(self.context.instance, self.context.run_id, _ATTEMPTS[self.context.run_id])
         for key, error in self.unmade.items():
             reached = isinstance(error, BudgetReached)
             yield self._evaluation(CURRENT, key, {"not made": str(error), REACHED: reached})
-        yield from self._still_failing(lineage, {*todo, *self.unmade})
+        yield from self._still_failing(lineage, {*todo, *self.unmade} - self.taken.keys())
         for output in self.context.op_def.output_dict:
             if output != "result":
                 yield dg.Output(None, output_name=output)
@@ -144,14 +156,19 @@ class Step:
 
     # --- making it ----------------------------------------------------------------------------------------------------
 
-    def _make(self, todo: Sequence[str | None]) -> Iterator[tuple[str | None, Made]]:
+    def _make(
+        self, todo: Sequence[str | None], inputs: Mapping[str | None, Mapping[str, str]]
+    ) -> Iterator[tuple[str | None, Made]]:
         """Each partition as it is done. One that ends in a sentence leaves the others to be made."""
         if self.stage.make is not None:
-            for key in todo:
+            for key, done in self._beside_others(todo, inputs):
                 try:
-                    yield key, self.stage.make(self.workspace, key)
+                    made = self.stage.make(self.workspace, key)
                 except TrapsError as error:
                     self.unmade[key] = error
+                    continue
+                made.tally.add(done)
+                yield key, made
             return
         assert self.stage.collect is not None, "a stage makes or collects"
         left = [*todo]
@@ -161,6 +178,55 @@ class Step:
                 yield key, made
         except TrapsError as error:
             self.unmade |= dict.fromkeys(left, error)
+
+    def _beside_others(
+        self, todo: Sequence[str | None], inputs: Mapping[str | None, Mapping[str, str]]
+    ) -> Iterator[tuple[str | None, Tally]]:
+        """What is left for this run to make, where others may make the same, each once all files that it names are
+        there, with what was done for them here: first what no other run is at. It is had alone until the next one is
+        asked for."""
+        if self.stage.shared is None:
+            yield from ((key, Tally()) for key in todo)
+            return
+        store, later = self.workspace.store, dict[str | None, Tally]()
+        for key in todo:
+            done = Tally()
+            is_whole = self._make_files(key, done, wait=False)
+            lease = store.lease(f"{self.stage.name}/{key}") if is_whole else None
+            if lease is None:
+                later[key] = done
+                continue
+            with closing(lease):
+                if not self._takes_over(key, inputs[key], done):
+                    yield key, done
+        for key, done in later.items():
+            if key not in self.unmade and self._make_files(key, done, wait=True):
+                with alone(store, f"{self.stage.name}/{key}"):
+                    if not self._takes_over(key, inputs[key], done):
+                        yield key, done
+
+    def _make_files(self, key: str | None, done: Tally, *, wait: bool) -> bool:
+        """Make files that a partition names, and whether all are there. done: is told what was done here."""
+        assert self.stage.shared is not None, "others may make the same"
+        try:
+            made, is_whole = self.stage.shared.files(self.workspace, key, wait)
+        except TrapsError as error:
+            self.unmade[key] = error
+            return False
+        done.add(made)
+        return is_whole
+
+    def _takes_over(self, key: str | None, inputs: Mapping[str, str], done: Tally) -> bool:
+        """Whether another run has made a partition of the same inputs since this step began, and has told Dagster of it
+        when it was checked, too. done: what was done for it here."""
+        stage, lineage = self.stage, Lineage(self.workspace)
+        state = lineage.state(stage.name, key)
+        if state is None or lineage.made_at(stage.name, key) == self.made_at[key]:
+            return False
+        is_told = self.history.recorded(stage.name).get(key) == state.version
+        if is_told and state.inputs == inputs and state.code == stage.code and not state.failed:
+            self.taken[key] = state.version, done
+        return key in self.taken
 
     def _write(self, key: str | None, made: Made, inputs: Mapping[str, str]) -> str:
         """Write what was made; returns its data version."""
@@ -219,7 +285,7 @@ class Step:
 
     def _metadata(self, made: Made) -> dict[str, Any]:
         """What Dagster shows of a partition."""
-        shown: dict[str, Any] = {**made.shown, "tally": json.dumps(vars(made.tally))}
+        shown: dict[str, Any] = {**made.shown, TALLY: json.dumps(vars(made.tally))}
         if self.stage.table is None:
             files = cast(Mapping[str, bytes], made.content)
             paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in files}

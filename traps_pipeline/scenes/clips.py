@@ -7,13 +7,12 @@ control that closes has a panel in its last frames; the twin's clip never has on
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.cores import cores
 from traps_pipeline.digests import digest, file_digest
 from traps_pipeline.files import write_text
 from traps_pipeline.scenes import checks
@@ -24,7 +23,6 @@ from traps_pipeline.scenes.outcome import compile_scene, decisive_geoms
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.render import Renderer
 from traps_pipeline.scenes.spec import SceneSpec
-from traps_pipeline.scenes.workers import run_in_order
 from traps_pipeline.scenes.world import closing_of
 
 ABLATION_FRAMES = 5  # evenly spaced void frames that are drawn once more without what they must not show
@@ -79,7 +77,15 @@ def note_of(clip: Path) -> Path:
 
 def read_clip(path: Path) -> Clip | None:
     """The clip if it is rendered; None if not. Raises DamagedClip when the file is not what its note says."""
-    if not path.is_file() or not note_of(path).is_file():
+    clip = read_note(path) if path.is_file() else None
+    if clip is not None:
+        check_clip(path, clip.file_sha256, clip.size_bytes)
+    return clip
+
+
+def read_note(path: Path) -> Clip | None:
+    """What the note of a clip says, wherever the clip is; None where there is none. Raises DamagedClip."""
+    if not note_of(path).is_file():
         return None
     try:
         note = json.loads(note_of(path).read_text(encoding="utf-8"))
@@ -89,7 +95,6 @@ def read_clip(path: Path) -> Clip | None:
             raise ValueError("it was altered")
     except (ValueError, TypeError, AttributeError) as error:
         raise DamagedClip(f"{note_of(path)}: is not what was written ({error}); delete it and run again") from error
-    check_clip(path, clip.file_sha256, clip.size_bytes)
     return clip
 
 
@@ -168,13 +173,3 @@ def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels:
     clip = Clip(file_digest(path), frames_digest(frames), len(frames), fps, path.stat().st_size, leaked_pixels)
     write_text(note_of(path), json.dumps(asdict(clip) | {_SEAL: _seal_of(clip)}))
     return len(frames)
-
-
-# --- many pairs -------------------------------------------------------------------------------------------------------
-
-
-def render_pairs(jobs: Sequence[Job], workers: int | None = None) -> Iterator[tuple[Job, int]]:
-    """Render pairs with one process a core; yields each job with its frames drawn as it is done."""
-    todo = [job for job in jobs if any(read_clip(path) is None for path in job.clips)]
-    yield from ((job, 0) for job in jobs if job not in todo)
-    yield from run_in_order(render_pair, todo, min(workers or cores(), max(1, len(todo))))

@@ -109,6 +109,7 @@ class Session:
         self.id = secrets.token_hex(8)
         self.study, self._address, self._variable, self._idle_s = study, address, variable, idle_s
         self.claims: dict[int, Claim] = {}
+        self._leases = set[int]()  # locks of pieces of work that were taken
         self.guard, self.closed, self.patience_s = threading.RLock(), False, PATIENCE_S
         self.has_blocks, self.purse = False, threading.Lock()  # of the study's budget; one purse at a time
         self._sharers: dict[str, int] = {}  # by account that is asked through: how many processes ask through it
@@ -174,13 +175,14 @@ class Session:
         own = "select pg_terminate_backend(pid) from pg_stat_activity where application_name = %s and pid <> %s"
         connection.execute(own, [f"traps {self.id}", connection.info.backend_pid])
         until = time.monotonic() + 5  # the old connection takes a moment to end
-        for claim in (None, *self.claims.values()):
-            while not (taken := self.try_lock(connection, claim.lock if claim else self._lock)):
+        claimed = {claim.lock: claim for claim in self.claims.values()}
+        for lock in (self._lock, *claimed, *self._leases):
+            while not (taken := self.try_lock(connection, lock)):
                 if time.monotonic() > until:
                     break
                 time.sleep(0.05)
-            if claim and not taken:
-                claim.lost = True
+            if lock in claimed and not taken:
+                claimed[lock].lost = True
         for account in self._sharers:
             connection.execute("select pg_advisory_lock_shared(%s)", [lock_number(f"account {account}")])
         if self.claims:
@@ -193,6 +195,23 @@ class Session:
                   and objsubid = 1 and classid::bigint = %s and objid::bigint = %s)"""
         high, low = divmod(lock % 2**64, 2**32)
         return _value(connection, held, high, low) or _value(connection, "select pg_try_advisory_lock(%s)", lock)
+
+    def take(self, lock: int) -> bool:
+        """Take an advisory lock for a piece of work, until it is given back; False where it is taken. Where another
+        session takes it while this one has no connection, nobody is told. Raises TrapsError when the server stays
+        away."""
+        with self.guard:
+            if lock in self._leases or not self.run(lambda connection: self.try_lock(connection, lock)):
+                return False
+            self._leases.add(lock)
+            return True
+
+    def give_back(self, lock: int) -> None:
+        """Give back what was taken."""
+        with self.guard:
+            self._leases.discard(lock)
+            with suppress(TrapsError):  # a connection that is gone holds no locks
+                self.run(lambda c: c.execute("select pg_advisory_unlock(%s)", [lock]), patience_s=0.0)
 
     def _told(self, error: Exception) -> str:
         said = " ".join(f"{error}".split()) or type(error).__name__
@@ -321,7 +340,7 @@ class Session:
     @property
     def is_held(self) -> bool:
         """Whether anything is held that is lost when this process is silent."""
-        return bool(self.claims) or self.has_blocks
+        return bool(self.claims) or bool(self._leases) or self.has_blocks
 
     def close(self) -> None:
         """End the connection, and with it its locks."""

@@ -8,9 +8,7 @@ is read has the size and the digest that the row says.
 
 from __future__ import annotations
 
-import os
 import re
-import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,11 +19,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, LiteralString, TypeVar
 
 from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes
+from traps_pipeline.files import is_same_file, link, write_bytes
 from traps_pipeline.storage.bucket import Bucket, object_name
 from traps_pipeline.storage.database import Session, lock_number
 from traps_pipeline.storage.removal import SCHEMA, forget, removed
-from traps_pipeline.storage.store import Store, is_hidden
+from traps_pipeline.storage.store import Lease, Store, is_hidden
+from traps_pipeline.storage.stream import stream_of
 
 if TYPE_CHECKING:
     from psycopg import Connection
@@ -227,13 +226,13 @@ class ObjectStore(Store):
 
         def one(path: Path) -> None:
             row = self._current(path)
-            if row is None or (_is_same_file(path, self._cached(row.digest)) and self._is_cached(row.digest)):
+            if row is None or (is_same_file(path, self._cached(row.digest)) and self._is_cached(row.digest)):
                 return
             if not self._is_cached(row.digest) and path.is_file() and sha256(path.read_bytes()).digest() == row.digest:
-                _link(path, self._cached(row.digest))
+                link(path, self._cached(row.digest))
                 return
             try:
-                _link(self._fetched(row, self._name(path)), path)
+                link(self._fetched(row, self._name(path)), path)
             except TrapsError:
                 if self._current(path) is not None:
                     raise  # the store cannot be reached; where it has no such object, nobody has
@@ -247,11 +246,11 @@ class ObjectStore(Store):
 
         def one(path: Path) -> tuple[str, bytes | None, int | None, str | None] | None:
             row = self._current(path)
-            if row is not None and row.digest in self._there and _is_same_file(path, self._cached(row.digest)):
+            if row is not None and row.digest in self._there and is_same_file(path, self._cached(row.digest)):
                 return None
             content = path.read_bytes()
             digest = self._put(content, None if row is None else row.digest)
-            _link(path, self._cached(digest))
+            link(path, self._cached(digest))
             self._whole.add(digest)
             is_known = row is not None and row.digest == digest
             return None if is_known else (self._name(path), digest, len(content), None)
@@ -299,9 +298,7 @@ class ObjectStore(Store):
 
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
         """See `Store`. Each object is looked for in the store, once a process."""
-        wanted = {*paths}
-        self._ask(wanted)
-        rows = {path: row for path in wanted if (row := self._current(path)) is not None}
+        rows = self._known(paths)
         unseen = {row.digest: row for row in rows.values() if row.digest not in self._there}
         found = dict(_side_by_side(lambda digest: (digest, self.bucket.size(object_name(digest))), {*unseen}))
         lost = {digest for digest, size in found.items() if size != unseen[digest].size}
@@ -310,6 +307,28 @@ class ObjectStore(Store):
             self.bucket.get(object_name(next(iter(lost))))  # tells a bucket that is gone from one without this object
             self._withdraw(lost)
         return {path: row.size for path, row in rows.items() if row.digest not in lost}
+
+    def there(self, paths: Iterable[Path]) -> set[Path]:
+        """See `Store`."""
+        return {*self._known(paths)}
+
+    def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
+        """See `Store`. They are those of the rows."""
+        return {path: row.digest.hex() for path, row in self._known(paths).items()}
+
+    def _known(self, paths: Iterable[Path]) -> dict[Path, Current]:
+        wanted = {*paths}
+        self._ask(wanted)
+        self._refresh()
+        return {path: row for path in wanted if (row := self._rows.get(self._name(path))) is not None}
+
+    def lease(self, name: str) -> Lease | None:
+        """See `Store`. An advisory lock of this process's session."""
+        lock = lock_number(f"{self.session.study}/lease/{name}")
+        if not self.session.take(lock):
+            return None
+        stream_of(self.session).start()  # whose thread keeps the session alive while something is held
+        return Lease(lambda: self.session.give_back(lock))
 
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
         """See `Store`."""
@@ -364,22 +383,3 @@ def _side_by_side(work: Callable[[T], R], of: Iterable[T]) -> list[R]:
         return [work(one) for one in each]
     with ThreadPoolExecutor(min(AT_ONCE, len(each))) as pool:
         return list(pool.map(work, each))
-
-
-def _is_same_file(one: Path, other: Path) -> bool:
-    try:
-        return one.samefile(other)
-    except FileNotFoundError:
-        return False
-
-
-def _link(existing: Path, path: Path) -> None:
-    """Give a file another name, in the place of what has it. Nobody writes into a file that has a name: they are
-    replaced as a whole (`files.py`)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        os.link(existing, part)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -8,11 +8,25 @@ before it reads files that another host may have made, it asks for them with `br
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
-from traps_pipeline.files import write_bytes
+from traps_pipeline.digests import file_digest
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.files import remedy, try_lock, write_bytes
+
+LEASES = ".leases"  # in a study's folder: the files of pieces of work that are under way
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The right to a piece of work, which no other process has until `close` or the end of this process."""
+
+    close: Callable[[], None]
 
 
 class Store(ABC):
@@ -53,6 +67,20 @@ class Store(ABC):
     @abstractmethod
     def sizes(self, paths: Iterable[Path]) -> dict[Path, int]:
         """The sizes, in bytes, of those files that are really there."""
+
+    @abstractmethod
+    def there(self, paths: Iterable[Path]) -> set[Path]:
+        """Those of these paths under which something is current. No content is looked for."""
+
+    @abstractmethod
+    def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
+        """The SHA-256, in hex, of what is current under these paths, as far as something is. No content is fetched."""
+
+    @abstractmethod
+    def lease(self, name: str) -> Lease | None:
+        """Take a piece of work of the study; None where another process, on whatever host, has it, or this one. It is
+        free again when the lease is closed, and soon after its process or host is dead. A host that is cut off may lose
+        it and not know, so what is made under a lease must be such that twice is as good as once. Raises TrapsError."""
 
     @abstractmethod
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
@@ -108,6 +136,30 @@ class FolderStore(Store):
                 continue
         return found
 
+    def there(self, paths: Iterable[Path]) -> set[Path]:
+        """See `Store`."""
+        return {path for path in paths if path.is_file()}
+
+    def digests(self, paths: Iterable[Path]) -> dict[Path, str]:
+        """See `Store`."""
+        return {path: file_digest(path) for path in self.there(paths)}
+
+    def lease(self, name: str) -> Lease | None:
+        """See `Store`. A lock on a file, which is there while it is held."""
+        folder = self.root / LEASES
+        path = folder / name.replace("/", "-")
+        with writable(folder):
+            held = try_lock(path)
+
+        def close() -> None:
+            assert held is not None, "only what is held is closed"
+            path.unlink(missing_ok=True)  # first: who opened it meanwhile sees that it holds no lock any more
+            os.close(held)
+            with suppress(OSError):
+                folder.rmdir()  # unless there are others
+
+        return None if held is None else Lease(close)
+
     def below(self, folder: Path, pattern: str = "**/*") -> list[Path]:
         """See `Store`."""
         found = (path for path in folder.glob(pattern) if path.is_file())
@@ -123,6 +175,15 @@ class FolderStore(Store):
 
     def look(self) -> None:
         """See `Store`."""
+
+
+@contextmanager
+def writable(folder: Path) -> Iterator[None]:
+    """Raises TrapsError where nothing can be written in a folder."""
+    try:
+        yield
+    except OSError as error:
+        raise TrapsError(f"{folder}: cannot be written ({error.strerror or error}); {remedy(error)}") from error
 
 
 def is_hidden(relative: Path) -> bool:

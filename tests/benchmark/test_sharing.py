@@ -1,0 +1,129 @@
+"""Processes that make clips of one category beside one another, wherever the study's files lie."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.conftest import ROOT
+from tests.storage.test_store import opened, where
+from traps_pipeline.benchmark.sharing import CHUNK, Filming, Row, share
+from traps_pipeline.files import write_bytes
+from traps_pipeline.storage.store import LEASES, Store
+
+__all__ = ["where"]  # the fixture
+ROWS = [{"scenario_id": f"made-{n:04d}"} for n in range(5 * CHUNK + 3)]
+STOPS_AT = 2 * CHUNK + 3  # the row in whose drawing a process can be stopped
+MAKE = """
+import sys
+from pathlib import Path
+from tests.benchmark.test_sharing import made
+from tests.storage.test_store import opened
+print(made(opened(*sys.argv[3:]), Path(sys.argv[1]), stops=sys.argv[2] == "stops"))
+"""
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A row that is drawn into a file, and told in another one; where a process stops, it does not come back."""
+
+    row: Row
+    clip: Path
+    told: Path
+    stops: bool
+
+
+def draw(job: Drawing) -> int:
+    with job.told.open("a") as told:
+        told.write(f"{job.row['scenario_id']}\n")
+    if job.stops:
+        Path(f"{job.told}.stop").read_text()  # a pipe: as long as the test has it open
+    write_bytes(job.clip, f"frames of {job.row['scenario_id']}".encode())
+    return 1
+
+
+def made(store: Store, told: Path, *, stops: bool = False) -> int:
+    """Make what is missing; how much was drawn here."""
+
+    def clip(row: Row) -> Path:
+        return store.root / "clips" / f"{row['scenario_id']}.mp4"
+
+    def missing(rows: Sequence[Row]) -> list[Row]:
+        return [row for row in rows if clip(row) not in store.there([clip(row)])]
+
+    def job(row: Row) -> Drawing | None:
+        here = stops and row["scenario_id"] == ROWS[STOPS_AT]["scenario_id"]
+        return None if clip(row).is_file() else Drawing(row, clip(row), told, here)
+
+    of = Filming("videos/made", missing, lambda row: [clip(row)], job, draw)
+    drawn, is_whole = share(store, ROWS, of, lambda done: None)
+    assert is_whole
+    return drawn
+
+
+@contextmanager
+def process(told: Path, where: Sequence[str], host: str, how: str = "goes on") -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-c", MAKE, str(told), how, *where, host]
+    environment = {**os.environ, "TRAPS_CORES": "1"}
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env=environment) as started:
+        yield started
+
+
+def contents(where: Sequence[str]) -> dict[str, bytes]:
+    """What the study has."""
+    store = opened(*where, "reader")
+    clips = [store.root / "clips" / f"{row['scenario_id']}.mp4" for row in ROWS]
+    return {path.name: store.here(path).read_bytes() for path in clips}
+
+
+def test_two_processes_draw_each_row_once(where: Sequence[str], tmp_path: Path) -> None:
+    told = tmp_path / "told"
+    with process(told, where, "one") as one, process(told, where, "other") as other:
+        drawn = [int(each.communicate()[0]) for each in (one, other)]
+    assert sum(drawn) == len(ROWS) and Counter(told.read_text().split()) == {row["scenario_id"]: 1 for row in ROWS}
+    assert contents(where) == {f"{row['scenario_id']}.mp4": f"frames of {row['scenario_id']}".encode() for row in ROWS}
+    assert not list(tmp_path.rglob(LEASES))
+
+
+def test_what_a_process_that_is_killed_has_finished_is_kept_and_its_chunk_is_made_by_another(
+    where: Sequence[str], tmp_path: Path
+) -> None:
+    told = tmp_path / "told"
+    os.mkfifo(f"{told}.stop")
+    # The pipe opens when it is read from: in the middle of the third chunk.
+    with process(told, where, "one", "stops") as one, Path(f"{told}.stop").open("w"):
+        one.kill()
+        one.wait()
+        drawn = made(opened(*where, "other"), told)
+    counts = Counter(told.read_text().split())
+    open_chunk = {row["scenario_id"] for row in ROWS[2 * CHUNK : STOPS_AT + 1]}
+    assert {name for name, count in counts.items() if count > 1} <= open_chunk and max(counts.values()) == 2
+    kept = 2 * CHUNK  # in a folder also what was finished of the open chunk
+    assert drawn in (len(ROWS) - kept, len(ROWS) - kept - (STOPS_AT - kept))
+    assert contents(where).keys() == {f"{row['scenario_id']}.mp4" for row in ROWS}
+
+
+def test_what_lies_on_this_host_alone_is_handed_over_and_not_drawn(where: Sequence[str], tmp_path: Path) -> None:
+    store, begun = opened(*where, "one"), ROWS[: CHUNK + 1]
+    for row in begun:
+        write_bytes(store.root / "clips" / f"{row['scenario_id']}.mp4", b"made before a kill")
+    assert made(store, tmp_path / "told") == len(ROWS) - len(begun)
+    assert list(contents(where).values()).count(b"made before a kill") == len(begun)
+    assert made(opened(*where, "other"), tmp_path / "told") == 0
+
+
+def test_who_does_not_wait_makes_what_is_free_and_says_that_others_are_at_the_rest(where: Sequence[str]) -> None:
+    one, other, done = opened(*where, "one"), opened(*where, "other"), list[int]()
+    theirs = other.lease("videos/made/000001")
+    assert theirs is not None
+    of = Filming("videos/made", lambda rows: rows, lambda row: [], lambda row: None, draw)
+    assert share(one, ROWS, of, done.append, wait=False) == (0, False)
+    assert done[-1] == len(ROWS) - CHUNK
+    theirs.close()
+    assert share(one, ROWS, of, done.append, wait=False) == (0, True)

@@ -1,0 +1,143 @@
+"""Clips of a category that several processes make beside one another, on one host or on many, in leased chunks.
+
+All go through the same chunks of the same rows. Each leases one that nobody has, makes what is missing of it, hands it
+over to the study and goes on to the next; whoever dies gives its chunk back. Nobody is
+done before all clips are there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from traps_pipeline.errors import TrapsError
+from traps_pipeline.scenes.clips import Clip, check_clip, note_of, read_note
+from traps_pipeline.scenes.encode import DamagedClip
+from traps_pipeline.scenes.workers import run_in_order
+from traps_pipeline.storage.leases import POLL_S
+from traps_pipeline.storage.store import Lease, Store
+
+CHUNK = 4  # scenarios: a quarter of a minute of one core, so that nobody waits long for the last one
+Row = Mapping[str, Any]
+Job = TypeVar("Job")
+
+
+@dataclass(frozen=True)
+class Filming(Generic[Job]):
+    """What is made of rows of scene_specs.
+
+    name: of the work, the same wherever it is done. missing: those rows of which the study lacks something. files: what
+    the study has of a row once it is made. job: what must be drawn of a row (None: nothing), once what there is of it
+    was brought here. draw: draws it, in a process of its own; returns how many frames are new.
+    """
+
+    name: str
+    missing: Callable[[Sequence[Row]], Sequence[Row]]
+    files: Callable[[Row], Iterable[Path]]
+    job: Callable[[Row], Job | None]
+    draw: Callable[[Job], int]
+
+
+@dataclass
+class _Chunk:
+    """Rows that one process makes. missing: how many of them were, when it was looked; jobs: not finished yet."""
+
+    rows: Sequence[Row]
+    missing: int
+    lease: Lease | None = None
+    jobs: int = 0
+
+
+def share(
+    store: Store, rows: Sequence[Row], of: Filming[Job], tick: Callable[[int], None], *, wait: bool = True
+) -> tuple[int, bool]:
+    """Make what is missing of rows, beside whoever else does so: the frames that were drawn here, and whether all is
+    there. wait: return only then; else as soon as others are at all that is missing. tick: gets the number of rows that
+    are there. Raises TrapsError, also for a damaged clip."""
+    try:
+        return _Sharing(store, rows, of, tick).work(wait=wait)
+    except DamagedClip as error:
+        raise TrapsError(str(error)) from error
+
+
+class _Sharing(Generic[Job]):
+    def __init__(self, store: Store, rows: Sequence[Row], of: Filming[Job], tick: Callable[[int], None]) -> None:
+        self._store, self._of, self._tick = store, of, tick
+        missing = {id(row) for row in of.missing(rows)}
+        self._done = len(rows) - len(missing)
+        parts = (rows[first : first + CHUNK] for first in range(0, len(rows), CHUNK))
+        chunks = {number: _Chunk(part, sum(id(row) in missing for row in part)) for number, part in enumerate(parts)}
+        # By number, which is the same for everybody.
+        self._left = {number: chunk for number, chunk in chunks.items() if chunk.missing}
+        self._mine = list[_Chunk]()
+        self._drawing = deque[_Chunk]()  # that of each job, in the order of the jobs
+
+    def work(self, *, wait: bool) -> tuple[int, bool]:
+        drawn = 0
+        try:
+            while self._left:
+                for _, frames in run_in_order(self._of.draw, self._jobs()):
+                    drawn += frames
+                    chunk = self._drawing.popleft()
+                    chunk.jobs, chunk.missing = chunk.jobs - 1, chunk.missing - 1
+                    self._tell(1)
+                    if not chunk.jobs:
+                        self._finish(chunk)
+                if not wait:
+                    break
+                if self._left:  # nothing of one's own is under way, or two might wait for one another
+                    time.sleep(POLL_S)
+        finally:
+            for chunk in self._mine:
+                if chunk.lease is not None:
+                    chunk.lease.close()
+        return drawn, not self._left
+
+    def _jobs(self) -> Iterator[Job]:
+        """Jobs of the chunks that nobody else has, each leased when its first job is asked for."""
+        for number in [*self._left]:
+            lease = self._store.lease(f"{self._of.name}/{number:06d}")
+            if lease is None:
+                continue
+            chunk = self._left.pop(number)
+            chunk.lease = lease
+            self._mine.append(chunk)
+            self._store.look()  # another process may have made it
+            chunk.rows = self._of.missing(chunk.rows)
+            self._store.bring(file for row in chunk.rows for file in self._of.files(row))
+            jobs = [job for row in chunk.rows if (job := self._of.job(row)) is not None]
+            chunk.jobs = len(jobs)
+            self._drawing.extend([chunk] * len(jobs))
+            if not jobs:
+                self._finish(chunk)
+            yield from jobs
+
+    def _finish(self, chunk: _Chunk) -> None:
+        """Hand a chunk over to the study, and give it back."""
+        self._store.keep(file for row in chunk.rows for file in self._of.files(row) if file.is_file())
+        self._mine.remove(chunk)
+        if chunk.lease is not None:
+            chunk.lease.close()
+        self._tell(chunk.missing)
+
+    def _tell(self, more: int) -> None:
+        self._done += more
+        self._tick(self._done)
+
+
+def known_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
+    """What is known of those clips that are there; none of them is fetched for it. Raises DamagedClip where one is not
+    what its note says."""
+    wanted = [*clips]
+    store.bring(map(note_of, wanted))
+    digests = store.digests(wanted)
+    known = {path: note for path in digests if (note := read_note(path)) is not None}
+    for path, note in known.items():
+        if digests[path] != note.file_sha256:
+            store.bring([path])
+            check_clip(path, note.file_sha256, note.size_bytes)
+    return known
