@@ -60,7 +60,7 @@ def tokens(answers: list[adapter.Generated]) -> list[tuple[int, ...]]:
 def test_a_saved_checkpoint_reloads_through_the_auto_classes_and_answers_a_real_clip(family: Family) -> None:
     transformers = load_transformers()
     folder = checkpoint(family)
-    assert sum(file.stat().st_size for file in folder.iterdir()) < 2e6
+    assert sum(file.stat().st_size for file in folder.iterdir()) < 2.1e6
     assert type(transformers.AutoModelForImageTextToText.from_pretrained(folder)).__name__ == CLASSES[family]
     of = model(family)
     blocks = 6 if family == "gemma-4" else 4  # of which two read keys and values of two others
@@ -351,8 +351,9 @@ def test_a_chat_template_that_loses_the_system_prompt_is_refused(tmp_path: Path)
 
 @each_family
 def test_a_layer_out_of_range_is_refused(family: Family) -> None:
-    for layer in (0, 5, -1):
-        with pytest.raises(TrapsError, match=rf"no block {layer}; it has blocks 1 to 4"):
+    blocks = model(family).n_layers
+    for layer in (0, blocks + 1, -1):
+        with pytest.raises(TrapsError, match=rf"no block {layer}; it has blocks 1 to {blocks} "):
             model(family).block(layer)
 
 

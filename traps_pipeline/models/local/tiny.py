@@ -2,7 +2,7 @@
 downloaded. For tests, for `traps doctor --local`, and, with larger sizes and a tokenizer of its own, the skeleton of a
 model that is trained from scratch.
 
-    build_tiny("qwen3-vl", folder)                       # about 1 MB, bytes as tokens
+    build_tiny("qwen3-vl", folder)                       # 1 to 2 MB, bytes as tokens
     build_tiny("qwen3-vl", folder, text={"hidden_size": 128, "num_hidden_layers": 8}, tokenizer=word_level)
 
 The folder loads with `AutoProcessor` and `AutoModelForImageTextToText`, and as `checkpoint:` of an entry.
