@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from itertools import product
+from itertools import pairwise, product
 from types import SimpleNamespace
 from typing import ClassVar, cast
 
@@ -20,6 +20,7 @@ from traps_pipeline.mechanism.control_tables import (
     STEERING_NULLS,
     STEERING_PECS,
 )
+from traps_pipeline.mechanism.directions import NULLS
 from traps_pipeline.mechanism.effects import own_effects
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS
 from traps_pipeline.partitions import DATASETS
@@ -256,7 +257,20 @@ def test_figures_say_from_how_many_items_they_are_and_how_a_direction_ranks() ->
     assert axes["probe_baselines"].get_title(loc="left") == "m, 9 to 16 items a side"
     assert [label.get_text() for label in axes["probe_baselines"].get_xticklabels()] == ["ch †", "ch→oc †"]
     title = axes["doses_among_nulls"].get_title(loc="left")
-    assert title.splitlines() == ["ch, standard→guided, n 5†", "p + .05 – –"]  # of isotropic nulls on controls alone
+    assert title.splitlines() == ["ch, standard→guided", "n 5†", "p + .05 – –"]  # of isotropic nulls on controls alone
+
+
+def test_titles_of_neighbours_do_not_overlap() -> None:
+    made = Made()
+    of = [effects().assign(source=name, target=name, directions="standard", regime="standard") for name in DATASETS]
+    ranks = [nulls().assign(target=name, regime="standard", null=null, side=side)
+             for name, null, side in product(DATASETS, NULLS, ("control", "void"))]  # fmt: skip
+    made.made["own_effects"], made.made["nulls"] = own_effects(pd.concat(of)), pd.concat(ranks)
+    figure = next(report for report in FIGURES if report.name == "doses_among_nulls").make(made)
+    figure.draw_without_rendering()
+    boxes = [ax._left_title.get_window_extent() for ax in figure.axes]
+    assert len(boxes) == 4 and all("p − .05 .05 .05" in ax.get_title(loc="left") for ax in figure.axes)
+    assert not any(a.overlaps(b) for a, b in pairwise(boxes))
 
 
 def test_doses_in_alpha_do_not_set_the_scale_of_the_figure_of_class_gaps() -> None:
@@ -332,7 +346,7 @@ def test_gates_on_states_at_the_mid_threshold_come_first() -> None:
 
 
 def test_the_deviation_of_noise_is_not_said_to_be_over_runs() -> None:
-    for table in inside.probe_baselines(Made()):
+    for table in (*inside.probe_baselines(Made()), inside.gate(Made())[-1]):
         assert "± standard deviation over draws of noise" in table.remarks
         assert any("log-odds that the first answer token" in note for note in table.notes)
 

@@ -229,7 +229,7 @@ def doses_among_nulls(results: Results) -> Figure:
     cells = list(dict.fromkeys(zip(rows["model"], rows["directions"], rows["regime"], strict=True)))
     datasets, colour = datasets_of(rows.assign(dataset=rows["target"])), _colours(NULLS)
     with figure_style():
-        figure = new_figure(PAGE_IN, 0.7 + 1.7 * len(cells))
+        figure = new_figure(PAGE_IN, 0.7 + 2.0 * len(cells))
         axes = figure.subplots(len(cells), len(datasets), squeeze=False, sharey=True, sharex=True)
         for line, (model, directions, regime) in zip(axes, cells, strict=True):
             of = rows.loc[(rows["model"] == model) & (rows["directions"] == directions) & (rows["regime"] == regime)]
@@ -239,7 +239,7 @@ def doses_among_nulls(results: Results) -> Figure:
                 own = part.loc[part["kind"] == "void"].assign(mark=few(part.loc[part["kind"] == "void"], "n"))
                 n = _from_to(int(own["n"].min()), int(own["n"].max())) + max(own["mark"])
                 ranks = _p_values(results.nulls, str(model), str(directions), str(regime), dataset)
-                ax.set_title(f"{SHORT[dataset]}, {directions}→{regime}, n {n}\n{ranks}", size=6)
+                ax.set_title("\n".join([f"{SHORT[dataset]}, {directions}→{regime}", f"n {n}", *ranks]), size=6)
             line[0].set_ylabel(f"{plain(str(model))[:14]}\nabstained, %")
         for ax in axes[-1]:
             ax.set_xlabel("dose in class gaps | nulls", size=7)
@@ -254,16 +254,16 @@ def doses_among_nulls(results: Results) -> Figure:
     return figure
 
 
-def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dataset: str) -> str:
-    """The p of a direction among each of its nulls at the largest dose, by side."""
+def _p_values(nulls: pd.DataFrame, model: str, directions: str, regime: str, dataset: str) -> list[str]:
+    """The p of a direction among each of its nulls at the largest dose, a line a side."""
     of = nulls.loc[(nulls["model"] == model) & (nulls["directions"] == directions) & (nulls["regime"] == regime)]
     of = of.loc[(of["target"] == dataset) & (of["unit"] == "gap")]
     said: list[str] = []
     for side, sign in (("control", "+"), ("void", "−")):
         rows = of.loc[of["side"] == side].sort_values("dose").drop_duplicates("null", keep="last")
         known = {str(row["null"]): f"{row['p']:.2f}".removeprefix("0") for row in rows.to_dict("records")}
-        said += [f"{sign} {' '.join(known.get(null, '–') for null in NULLS)}"] if known else []
-    return f"p {', '.join(said)}" if said else ""
+        said += [f"p {sign} {' '.join(known.get(null, '–') for null in NULLS)}"] if known else []
+    return said
 
 
 def _dose(ax: Axes, rows: pd.DataFrame, colour: dict[str, str]) -> None:

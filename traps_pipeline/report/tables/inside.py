@@ -367,9 +367,9 @@ def _prompts(results: Results) -> PrintedTable:
         "what the prompt changes: the answers (AbsRec), or what is represented (AUROC of voids against controls, "
         "states under the VQA prompt of that name, fitted without the scored scenario); the best raw input and noise "
         "are the same under both prompts",
+        _NOTES[1],
         *([FEW_NOTE] if "†" in {*rows["said_mark"], *rows["probe_mark"]} else []),
     ]
     absent = why(results) if results.is_study else "the paper prints no such figures"
-    return PrintedTable(
-        "prompt_gate", "What the prompt changes, in answers and in states", rows, columns, notes, absent
-    )
+    title = "What the prompt changes, in answers and in states"
+    return PrintedTable("prompt_gate", title, rows, columns, notes, absent, deviation=DRAWS)
