@@ -1,4 +1,4 @@
-"""Puts the repository's data folders into the wheel, below the package, where `traps_pipeline/paths.py` looks for them.
+"""Puts the repository's data folders into the wheel, below the package, where `base/paths.py` looks for them.
 
 An editable installation gets none of them: it reads the checkout's own.
 """

@@ -57,10 +57,10 @@ class Version:
 def work() -> None:
     """What a `Version` does, with the package of its folder, which may be an old one: records by id, one a line."""
     import traps_pipeline
+    from traps_pipeline.base.digests import digest
+    from traps_pipeline.base.paths import RELEASED
     from traps_pipeline.benchmark.composition import load_composition
     from traps_pipeline.benchmark.records import load_released
-    from traps_pipeline.digests import digest
-    from traps_pipeline.paths import RELEASED
     from traps_pipeline.scenes.certify import certify
     from traps_pipeline.scenes.clips import Job, read_clip, render_pair
     from traps_pipeline.scenes.spec import load_trajectory

@@ -24,6 +24,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from traps_pipeline.base.partitions import CATEGORIES, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.specs import build_specs
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, VideoRow
@@ -31,7 +32,6 @@ from traps_pipeline.explorer.site import write_site
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.judging.verdicts import ITEM_COLUMNS, RESPONSE_COLUMNS, decide
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import CATEGORIES, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.scenes.encode import encode, frames_digest
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts, regime_tests

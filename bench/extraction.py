@@ -23,14 +23,14 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.progress import Progress, reporting
 from traps_pipeline.mechanism.hidden_states import Item, extract
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local import adapter
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.registry import LOCAL, ModelEntry, load_models
-from traps_pipeline.paths import ASSETS
-from traps_pipeline.progress import Progress, reporting
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import MediaSpec, pick
 

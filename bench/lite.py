@@ -16,10 +16,10 @@ from collections import defaultdict
 import numpy as np
 from scipy.stats import kendalltau
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.partitions import DATASETS, datasets_of_category, taxonomy_of
+from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.digests import digest
-from traps_pipeline.partitions import DATASETS, datasets_of_category, taxonomy_of
-from traps_pipeline.paths import ASSETS
 from traps_pipeline.scoring.published import published_cells
 
 FULL, RUNS = {"occlusion": 202, "chaotic": 500}, 3

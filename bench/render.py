@@ -19,8 +19,8 @@ os.environ.setdefault("MUJOCO_GL", "osmesa")  # MuJoCo reads it when it is first
 import mujoco
 import numpy as np
 
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera
 from traps_pipeline.scenes.clips import Job, render_pair
 from traps_pipeline.scenes.kit import Physics

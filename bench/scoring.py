@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.base.partitions import DATASETS, REGIMES, taxonomy_of
 from traps_pipeline.judging.verdicts import decide
-from traps_pipeline.partitions import DATASETS, REGIMES, taxonomy_of
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.contrasts import contrasts
 from traps_pipeline.scoring.leaderboard import leaderboard

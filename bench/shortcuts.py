@@ -30,9 +30,9 @@ import mujoco
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.foretelling import foretold
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.certificates import CLOSING, REFERENTS, Certificate, stored_evidence
 from traps_pipeline.scenes.certify import state_at_cut
 from traps_pipeline.scenes.checks import control_frames

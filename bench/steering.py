@@ -27,13 +27,13 @@ from typing import TypeVar
 
 import numpy as np
 
+from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local.adapter import Generated, LocalModel, load_local_model
 from traps_pipeline.models.local.clips import ClipMemory
 from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.models.prompts import system_prompt, vqa_prompt
 from traps_pipeline.models.registry import LOCAL, ModelEntry, get_model
-from traps_pipeline.paths import ASSETS
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH
 from traps_pipeline.storage.media import MediaSpec, pick, resized
 

@@ -46,5 +46,5 @@ def test_its_end_is_told_whatever_ended_it_and_the_next_one_is_forked(tmp_path: 
 
 
 def test_a_command_is_of_the_checkout_that_it_is_run_in(small: Checkout) -> None:
-    code = "import traps_pipeline.paths as p, pandas; print(p.ROOT)"
+    code = "import traps_pipeline.base.paths as p, pandas; print(p.ROOT)"
     assert small.python("-c", code).out.strip() == str(ROOT)

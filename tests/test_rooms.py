@@ -16,17 +16,7 @@ PACKAGE = Path(traps_pipeline.__file__).parent
 # From bottom to top. A room imports rooms that stand before it here, and none that stands behind it: neither at the top
 # of a file nor inside a function nor for types alone.
 ROOMS = (
-    "errors",
-    "files",
-    "digests",
-    "paths",
-    "cores",
-    "extras",
-    "terminal",
-    "yamlfile",
-    "partitions",
-    "progress",
-    "webguard",
+    "base",
     "scenes",
     "storage",
     "benchmark",

@@ -153,7 +153,7 @@ def test_a_command_that_wants_more_is_one_sentence(installed: Installed, command
 @carries_out("copy {} to a folder of your own, set {} to it, and decide there")
 def test_the_shipped_benchmark_is_not_changed_and_a_copy_of_it_is(installed: Installed) -> None:
     code = (
-        "from datetime import date; from traps_pipeline.errors import TrapsError\n"
+        "from datetime import date; from traps_pipeline.base.errors import TrapsError\n"
         "from traps_pipeline.benchmark.decisions import Correction, decide\n"
         "kept = Correction(scenario_id='plinko-0001', action='keep', who='jd', when=date(2026, 11, 22), why='test')\n"
         "try: decide(kept, 0)\n"

@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.digests import digest
+from traps_pipeline.base.digests import digest
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 _BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)

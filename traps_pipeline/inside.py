@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Cell, Evaluation, Extraction
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.mechanism.contrast import ccs as ccs
 from traps_pipeline.mechanism.contrast import contrast_states
@@ -36,7 +37,6 @@ from traps_pipeline.mechanism.sites import Site, changing, check_head, head_slic
 from traps_pipeline.mechanism.stages import saved_directions
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.models.registry import get_model
-from traps_pipeline.partitions import Cell, Evaluation, Extraction
 from traps_pipeline.storage.study import ProbeSettings
 from traps_pipeline.storage.workspace import Workspace
 

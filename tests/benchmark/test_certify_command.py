@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import ROOT, Checkout, Finished
-from traps_pipeline.paths import RELEASED
+from traps_pipeline.base.paths import RELEASED
 
 pytestmark = pytest.mark.slow
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import Scenario, categories_of, fold, read_corrections, subset
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.storage.study import Study
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import Correction, fold, read_corrections
 from traps_pipeline.benchmark.decisions import FILE, DecidedMeanwhile, decide, decisions_on, is_reviewed, undo
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.registry import get_family
 
 RELEASED = load_released()

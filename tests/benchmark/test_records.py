@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_release, load_released
 from traps_pipeline.benchmark.versions import item_content, spec_content, spec_record, version_of
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.spec import load_trajectory
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from tests.conftest import ROOT
 from tests.storage.test_store import opened, where
+from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.sharing import CHUNK, Filming, Row, share
-from traps_pipeline.files import write_bytes
 from traps_pipeline.storage.store import LEASES, Store
 
 __all__ = ["where"]  # the fixture

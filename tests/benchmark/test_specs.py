@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import Correction, Scenario, fold
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.specs import resolve_scenario
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

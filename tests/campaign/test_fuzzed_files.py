@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from tests.campaign.readers import Reader, readers
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 
 pytestmark = pytest.mark.slow
 TRIES = int(os.environ.get("TRAPS_CAMPAIGN", "1200"))

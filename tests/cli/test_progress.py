@@ -7,8 +7,8 @@ import time
 
 import pytest
 
+from traps_pipeline.base.progress import Tally
 from traps_pipeline.cli.progress import LIVE_SECONDS, TerminalProgress
-from traps_pipeline.progress import Tally
 
 
 def test_each_partition_is_a_line_with_its_counts_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from tests.judging.test_validation import MODEL, labelled_study
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.webguard import personal_tokens, public_name
 from traps_pipeline.cli import main
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.explorer.annotate import Annotation, Sent
 from traps_pipeline.explorer.server import Listening
 from traps_pipeline.judging.confabulation import AXES
 from traps_pipeline.judging.tables import JUDGE_VALIDATION
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.webguard import personal_tokens, public_name
 
 TEXTS = ["It goes left.", 'He said "left",\nthen stopped.', "Right, <b>surely</b>."]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.explorer.labelstore import DATABASE, LabelStore, NotWaiting
 from traps_pipeline.judging.labels import label_lines
 from traps_pipeline.judging.people_tables import LABELS_FILE

@@ -227,5 +227,5 @@ def _released(study: Checkout, scenario_id: str) -> str:
 
 
 def test_copies_of_the_package_are_what_runs(study: Checkout) -> None:
-    finished = study.run(sys.executable, "-c", "import traps_pipeline.paths as p; print(p.ROOT)")
+    finished = study.run(sys.executable, "-c", "import traps_pipeline.base.paths as p; print(p.ROOT)")
     assert Path(finished.out.strip()) == study.root

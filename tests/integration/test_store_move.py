@@ -13,7 +13,7 @@ from tests.conftest import SMALL, Checkout, copied
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 from traps_pipeline.study.store_move import LEFT, move_to_store
 

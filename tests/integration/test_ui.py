@@ -21,8 +21,8 @@ from playwright.sync_api import Page, expect, sync_playwright
 from tests.conftest import EXPERIMENT, Checkout, copied
 from tests.foreign_page import CHROMIUM, QUIET, attack
 from tests.pages import patient
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.automation import INTERVAL_S
 from traps_pipeline.storage.tables import Table

@@ -15,12 +15,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
+from traps_pipeline.base.terminal import text_table
+from traps_pipeline.base.yamlfile import read_yaml
 from traps_pipeline.judging.panel import parse_vote, render
 from traps_pipeline.judging.rules import RuleJudge
 from traps_pipeline.models.judges import Task
 from traps_pipeline.models.request import Request
-from traps_pipeline.terminal import text_table
-from traps_pipeline.yamlfile import read_yaml
 
 FILE = Path(__file__).parent / "data" / "plain_sentences.yaml"
 KINDS = ("answer", "hedge", "blind", "declines", "premise", "neither")

@@ -15,7 +15,8 @@ from statsmodels.stats.proportion import proportion_confint
 
 from tests.judging.conftest import answered_study
 from tests.providers.server import Provider
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.judging import confabulation
 from traps_pipeline.judging.confabulation import (
     AXES,
@@ -35,7 +36,6 @@ from traps_pipeline.judging.panel import parse_judgement
 from traps_pipeline.judging.tables import CONFABULATION, VERDICTS, VerdictRow
 from traps_pipeline.models.judges import JudgeEntry
 from traps_pipeline.models.prompts import prompt
-from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.scoring.prevalence import prevalence
 from traps_pipeline.scoring.tables import CONFABULATION_PREVALENCE
 from traps_pipeline.storage.workspace import Workspace

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.judging.labels import (
     confabulation_rows,

@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 from tests.providers.server import Provider
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.ratings import PANEL
 from traps_pipeline.judging.robustness import ATTACKS_FILE, check_panel, load_attacks, result, summary
 from traps_pipeline.judging.tables import JUDGE_ROBUSTNESS

@@ -14,9 +14,10 @@ from sklearn.metrics import accuracy_score, cohen_kappa_score, precision_recall_
 from statsmodels.stats.inter_rater import cohens_kappa
 
 from tests.judging.conftest import answered_study
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.cli import main
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import AXES, sample_id
 from traps_pipeline.judging.tables import CONFABULATION, JUDGE_VALIDATION, ConfabulationRow
 from traps_pipeline.judging.validation import (
@@ -27,7 +28,6 @@ from traps_pipeline.judging.validation import (
     read_labels,
 )
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
 
 MODEL = "qwen3-vl-think"

@@ -14,7 +14,7 @@ import pytest
 from tests.local_models import FAMILIES, Family, model
 from tests.models.local import check_table
 from tests.remedies.remedied import carries_out
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import patching
 from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
 from traps_pipeline.mechanism.hook import Steering

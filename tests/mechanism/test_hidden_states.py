@@ -19,8 +19,8 @@ import torch
 from safetensors import safe_open
 
 from tests.local_models import FAMILIES, SIX_FRAMES, SYSTEM, Family, ask, clip, model, three_prompts
-from traps_pipeline.digests import file_digest
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hidden_states import Item, clip_item, damage, extract, read_layer, read_record
 from traps_pipeline.models.local.adapter import LocalModel, Prompt
 from traps_pipeline.models.local.capture import pool

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.local_models import FAMILIES, Family, ask, direction, model, three_prompts
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local.adapter import LocalModel
 

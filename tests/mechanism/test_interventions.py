@@ -15,9 +15,10 @@ import torch
 from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family, direction, model, three_prompts
 from tests.mechanism.study import make_study, register, tiny_entry
 from traps_pipeline import inside
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Extraction, StatesCell, SteeringCell
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.mechanism import stages, steering
 from traps_pipeline.mechanism.deciding import conditions
 from traps_pipeline.mechanism.directions import steered_scenarios
@@ -31,7 +32,6 @@ from traps_pipeline.models.local.prefixes import PrefixMemory
 from traps_pipeline.models.local.spans import spans
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.partitions import Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.media import profile_digest, sample
 from traps_pipeline.storage.study import ACTING, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace

@@ -14,7 +14,7 @@ import torch
 
 from tests import local_models
 from tests.local_models import QUESTIONS, SYSTEM, Family, ask, clip, model
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching import SITES, Patch, Recorded, Site, patched_changes, record, require_patchable

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
+from traps_pipeline.base.partitions import DATASETS, taxonomy_of
 from traps_pipeline.mechanism.paths import STEERING_PATHS
 from traps_pipeline.mechanism.shares import effect_rows, share_rows
 from traps_pipeline.mechanism.steering import UNSTEERED, shared_item
-from traps_pipeline.partitions import DATASETS, taxonomy_of
 
 ABSTAINS = "s0"  # of two scenarios the one on whose void the model always abstains
 

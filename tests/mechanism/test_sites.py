@@ -11,7 +11,7 @@ import torch
 
 from tests.local_models import FAMILIES, Family, direction, model, three_prompts
 from traps_pipeline import inside
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.local.adapter import LocalModel
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.registry import get_model

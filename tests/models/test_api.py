@@ -15,7 +15,7 @@ import pytest
 
 from tests.conftest import KEY, ROOT, SECRET
 from tests.providers.server import Provider, answer_to
-from traps_pipeline import progress
+from traps_pipeline.base import progress
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError

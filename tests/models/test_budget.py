@@ -17,7 +17,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.models.ask import Call, Work, run_work
 from traps_pipeline.models.budget import (
     Budget,
@@ -31,7 +32,6 @@ from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.models.spending import spending
-from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -151,7 +151,7 @@ def test_a_journal_that_takes_half_a_line_takes_none(tmp_path: Path) -> None:
     filling = """
 import resource, sys
 from pathlib import Path
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.budget import Journal
 journal = Journal(Path(sys.argv[1]))
 journal.add("m", 0.5)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models import own
 from traps_pipeline.models.judges import load_panel, panel_id
 from traps_pipeline.models.registry import account_of, get_model, load_models

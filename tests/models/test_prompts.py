@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.prompts import FIELDS, PROMPTS, prompt, prompt_version, system_prompt
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import REGIMES, Evaluation
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import get_model, load_models
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.partitions import REGIMES, Evaluation
 
 GROUPS = "groups: {family: f, access: none, input: none, group: g}"
 

@@ -150,7 +150,7 @@ def test_more_than_ten_errors_in_a_hundred_calls_stop_a_model() -> None:
 def test_connections_that_a_shell_does_not_allow_are_refused_before_anything_is_sent() -> None:
     asking = """
 import resource
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.participants import allow_connections
 resource.setrlimit(resource.RLIMIT_NOFILE, (180, 400))
 allow_connections(100)

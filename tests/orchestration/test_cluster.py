@@ -19,12 +19,13 @@ from dagster._core.events import StepMaterializationData
 from dagster._daemon.monitoring.run_monitoring import RESUME_RUN_LOG_MESSAGE
 
 from tests.postgres import Postgres
+from traps_pipeline.base.cores import cores
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.progress import Progress, Tally, reporting
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.benchmark.videos import CLIPS
-from traps_pipeline.cores import cores
 from traps_pipeline.defs import benchmark
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.cluster import (
     RESOURCES_TAG,
@@ -40,7 +41,6 @@ from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, installe
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET
 from traps_pipeline.orchestration.shared_history import SharedHistory
 from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, TAKEN, TALLY, end_if_resumed
-from traps_pipeline.progress import Progress, Tally, reporting
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 

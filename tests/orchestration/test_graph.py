@@ -8,8 +8,8 @@ import dagster as dg
 import pytest
 
 from tests.tables import TABLES
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.definitions import defs
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.graph import the_graph
 
 DAGSTER = defs.get_repository_def().asset_graph

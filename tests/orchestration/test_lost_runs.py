@@ -20,7 +20,7 @@ from dagster._core.launcher import LaunchRunContext
 from dagster._utils.error import serializable_error_info_from_exc_info
 
 from tests.remedies.remedied import remedied
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.orchestration.cluster import STUDY_TAG, RayRuns, dagster_yaml
 from traps_pipeline.orchestration.lost_runs import fail_lost_runs
 from traps_pipeline.storage.study import Study

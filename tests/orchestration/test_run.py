@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 from dagster import AssetObservation, PartitionKeyRange
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, Cell
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.ranges import batches
 from traps_pipeline.orchestration.run import dagster_history
 from traps_pipeline.orchestration.schemes import CELL, DATASET
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.partitions import DATASETS, Cell
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 

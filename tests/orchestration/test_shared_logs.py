@@ -10,7 +10,7 @@ import yaml
 from dagster._core.storage.compute_log_manager import ComputeIOType
 
 from tests.objectstore import S3
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.orchestration.cluster import dagster_yaml
 from traps_pipeline.orchestration.shared_logs import SharedLogs
 from traps_pipeline.storage.bucket import Bucket

@@ -19,10 +19,10 @@ import pytest
 import uvicorn
 
 from tests.foreign_page import CHROMIUM, attack
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.webguard import Guard, token_for
 from traps_pipeline.cli import main
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.webserver import DANGER, TOKEN_VARIABLE
-from traps_pipeline.webguard import Guard, token_for
 
 TOKEN = "a-token-of-a-test-0123"
 JSON = {"Content-Type": "application/json"}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.mechanism.study import filled
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.mechanism.control_tables import GATE, PATCHING, STEERING_NULLS
 from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
-from traps_pipeline.digests import digest, file_digest
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.rules import judge_abstention, judge_correctness
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pocket.commands import CARD, FACTS, WEIGHTS

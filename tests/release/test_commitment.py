@@ -11,9 +11,9 @@ import pytest
 
 from tests.conftest import Checkout, make_checkout, once
 from tests.remedies.remedied import carries_out
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.release.commitment import (
     broken_seals,
     commit,

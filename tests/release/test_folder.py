@@ -14,11 +14,11 @@ import yaml
 from tests.conftest import Checkout
 from tests.release.environments import run_in
 from tests.remedies.remedied import carries_out
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import held_out_key
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.digests import file_digest
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import content_of, item_rows
@@ -233,7 +233,7 @@ def test_mlcroissant_validates_its_description_and_reads_every_record(released: 
 SIGN = """
 import sys
 from pathlib import Path
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.release.signing import check_signature, sign
 folder, private, public, other = map(Path, sys.argv[1:])
 for refused in (lambda: sign(folder, public), lambda: check_signature(folder, public)):

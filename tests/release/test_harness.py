@@ -13,9 +13,9 @@ import pytest
 
 from tests.conftest import EXPERIMENT, Checkout, once
 from tests.release.environments import run_in
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.release.harness.scoring import FIGURES, figures, judge

@@ -11,7 +11,7 @@ import yaml
 
 from tests.conftest import Checkout
 from tests.release.environments import run_in
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.release.results import Who, write_results
 from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.conftest import Checkout
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release

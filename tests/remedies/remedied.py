@@ -13,8 +13,8 @@ from typing import TypeVar
 
 import pytest
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.storage.workspace import VARIABLE
 
 T = TypeVar("T")

@@ -21,8 +21,8 @@ from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import carries_out, remedied
 from tests.remedies.test_money import paid
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.defs import benchmark
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.cluster import RayRuns, require_cluster
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.run import dagster_history
@@ -270,7 +270,7 @@ def of_another_host(checkout: Checkout) -> Callable[[], Mapping[str, str]]:
 
 def test_a_run_of_a_host_is_taken_once_it_has_the_same_version(tmp_path: Path) -> None:
     checkout = Checkout(make_checkout(tmp_path / "checkout"), tmp_path / "study")
-    file, tags = checkout.root / "traps_pipeline" / "digests.py", of_another_host(checkout)
+    file, tags = checkout.root / "traps_pipeline" / "base" / "digests.py", of_another_host(checkout)
     ours = file.read_text()
     file.write_text(ours + "# altered on that host\n")
     remedied(

@@ -17,9 +17,9 @@ from tests.conftest import EXPERIMENT, KEY, ROOT, Checkout, make_checkout
 from tests.providers.server import Provider
 from tests.remedies.remedied import carries_out, command, refused, remedied
 from tests.remedies.test_models import nobodys_own
-from traps_pipeline import paths
+from traps_pipeline.base import paths
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.orchestration.run import stages_until
 from traps_pipeline.storage.workspace import Workspace

@@ -15,8 +15,8 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.remedies.remedied import carries_out, remedied
-from traps_pipeline.files import require_in_place, try_lock, write_text
-from traps_pipeline.yamlfile import read_lines, read_mapping, read_yaml
+from traps_pipeline.base.files import require_in_place, try_lock, write_text
+from traps_pipeline.base.yamlfile import read_lines, read_mapping, read_yaml
 
 
 def written(path: Path, text: str = "x") -> Callable[[], str]:
@@ -55,13 +55,13 @@ def another_user(*folders: Path) -> Iterator[None]:
         os.seteuid(0)
 
 
-@carries_out("files.py | {}: cannot be written ({}); {} and run the same command again")
+@carries_out("base/files.py | {}: cannot be written ({}); {} and run the same command again")
 def test_a_full_disk_is_written_to_once_some_space_is_freed(tiny_disk: Path) -> None:
     filler = tiny_disk / "filler"
     filler.write_bytes(b"0" * 60_000)
     text = "x" * 30_000
     call = written(tiny_disk / "a.txt", text)
-    assert remedied(call, "files.py | free some space", filler.unlink) == text
+    assert remedied(call, "base/files.py | free some space", filler.unlink) == text
 
 
 def test_a_file_beyond_the_limit_is_written_once_that_is_raised(tmp_path: Path) -> None:
@@ -153,12 +153,16 @@ def test_whatever_else_is_wrong_with_a_file_is_seen_to(tmp_path: Path) -> None:
     remedied(written(loop / "deeper" / "a.txt"), "see to the file or its disk", loop.unlink)
 
 
-WRITE = (
-    "import sys, pathlib; from traps_pipeline.files import write_bytes; from traps_pipeline.errors import TrapsError\n"
-)
-WRITE += (
-    "try: write_bytes(pathlib.Path(sys.argv[1]), b'x', durable=True)\nexcept TrapsError as error: sys.exit(str(error))"
-)
+WRITE = """
+import sys, pathlib
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_bytes
+
+try:
+    write_bytes(pathlib.Path(sys.argv[1]), b"x", durable=True)
+except TrapsError as error:
+    sys.exit(str(error))
+"""
 
 
 @pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed (make test installs it)")
@@ -232,8 +236,8 @@ def test_a_yaml_file_is_read_once_it_is_corrected(tmp_path: Path, wrong: bytes, 
     ("wrong", "sentence"),
     [
         (r'{"a": "\ud800"}', "half of a surrogate pair stands in it; correct that line"),
-        ('{"a": 1, "a": 2}', "yamlfile.py | {}: {}; correct that line"),
-        ('{"a": NaN}', "yamlfile.py | {}: {}; correct that line"),
+        ('{"a": 1, "a": 2}', "base/yamlfile.py | {}: {}; correct that line"),
+        ('{"a": NaN}', "base/yamlfile.py | {}: {}; correct that line"),
         ('{"a": ' + "9" * 5000 + "}", "a number of thousands of digits; correct that line"),
     ],
 )
@@ -251,7 +255,7 @@ def test_lines_are_read_once_the_file_is_restored(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe")
     lines = remedied(
         lambda: list(read_lines(path)),
-        "yamlfile.py | {}: cannot be read ({}); restore it from git",
+        "base/yamlfile.py | {}: cannot be read ({}); restore it from git",
         lambda: shutil.copy(kept, path),
     )
     assert lines == [(1, "{}")]

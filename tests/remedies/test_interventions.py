@@ -15,6 +15,7 @@ from tests.mechanism.test_interventions import CELL, acting
 from tests.mechanism.test_stages import STANDARD, entry, own, patch, study
 from tests.remedies.remedied import remedied
 from traps_pipeline import inside
+from traps_pipeline.base.partitions import DATASETS, StatesCell
 from traps_pipeline.benchmark.tables import VIDEOS, VideoRow
 from traps_pipeline.mechanism import stages, steered_backend
 from traps_pipeline.mechanism.deciding import conditions, fitted_gate
@@ -27,7 +28,6 @@ from traps_pipeline.mechanism.steering import wanted_steered
 from traps_pipeline.mechanism.tables import HIDDEN_STATES
 from traps_pipeline.models.local.capture import Pooling
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.partitions import DATASETS, StatesCell
 from traps_pipeline.storage.study import SteeringSettings
 from traps_pipeline.storage.workspace import Workspace
 

@@ -6,12 +6,12 @@ import socket
 
 import pytest
 
+from tests.base.test_webguard import PEOPLE, ask
 from tests.conftest import KEY
 from tests.providers.server import Provider
 from tests.remedies.remedied import carries_out, remedied
 from tests.study.test_live_check import NAME, Check, check
-from tests.test_webguard import PEOPLE, ask
-from traps_pipeline.webguard import public_name, token_for
+from traps_pipeline.base.webguard import public_name, token_for
 
 __all__ = ["check"]  # the fixture
 

@@ -20,6 +20,7 @@ from tests.mechanism.test_probes import study as probed
 from tests.mechanism.test_stages import STANDARD, entry, own, patch, study
 from tests.remedies.remedied import carries_out, remedied
 from traps_pipeline import inside
+from traps_pipeline.base.partitions import DATASETS, Extraction, StatesCell
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.mechanism import margin, stages
 from traps_pipeline.mechanism.baselines import output_margins, probed_items
@@ -39,7 +40,6 @@ from traps_pipeline.mechanism.tables import DIRECTIONS, HIDDEN_STATES, PROBE_ITE
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry import ModelEntry
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.partitions import DATASETS, Extraction, StatesCell
 from traps_pipeline.storage.study import Asked, MechanismSettings, PatchingSettings, ProbeSettings
 from traps_pipeline.storage.workspace import Workspace
 
@@ -142,7 +142,7 @@ def test_directions_of_more_scenarios_are_made_and_damaged_files_are_written_aga
     remedied(lambda: load_directions(path), "{}: damaged ({}); delete it, then `traps run` makes it again", made_again)
     from safetensors.numpy import load_file, save_file
 
-    from traps_pipeline.digests import file_digest
+    from traps_pipeline.base.digests import file_digest
 
     save_file({"void": load_file(path)["void"]}, path)
     note = json.loads(path.with_suffix(".json").read_text())

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tests.scenes.released import SAMPLED, Released, load
+from traps_pipeline.base.digests import canonical_json
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.digests import canonical_json
 from traps_pipeline.scenes.certificates import legible_groups
 from traps_pipeline.scenes.encode import decode_sampled, encode
 from traps_pipeline.scenes.kit import Family, Scene, params_to_dict

@@ -13,8 +13,8 @@ os.environ.setdefault("MUJOCO_GL", "osmesa")
 
 import numpy as np
 
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.camera import Camera, Panel
 from traps_pipeline.scenes.checks import control_frames
 from traps_pipeline.scenes.kit import Family, Physics

@@ -10,8 +10,8 @@ import pytest
 
 from tests.scenes import arm_table
 from tests.scenes.released import load
+from traps_pipeline.base.partitions import ARMS, arms_of, sides_of
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.partitions import ARMS, arms_of, sides_of
 from traps_pipeline.scenes import arms
 from traps_pipeline.scenes.camera import Panel
 from traps_pipeline.scenes.offers import with_choices, without_choices

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.digests import file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.camera import Camera
 from traps_pipeline.scenes.clips import check_clip, note_of, read_clip, save_clip
 from traps_pipeline.scenes.encode import DamagedClip, decode, encode, frames_digest

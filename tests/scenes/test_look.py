@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from tests.scenes.released import load
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli.benchmark import LOOKS
-from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.certificates import ABLATION, HIDDEN, TWIN_BEHIND_PANEL, pair_of
 from traps_pipeline.scenes.certify import certify
 from traps_pipeline.scenes.kit import params_to_dict

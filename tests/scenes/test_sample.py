@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.scenes.registry import family_names, get_family
 from traps_pipeline.scenes.relook import draw_again
 from traps_pipeline.scenes.sample import (

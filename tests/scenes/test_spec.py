@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.paths import RELEASED
 from traps_pipeline.scenes.spec import load_trajectory, save_trajectory, trajectory_digest
 
 QPOS = np.arange(12, dtype=np.float32).reshape(4, 3) / 8

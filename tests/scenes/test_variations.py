@@ -7,8 +7,8 @@ import pytest
 
 from tests.scenes.released import load
 from tests.scenes.variation_table import written
+from traps_pipeline.base.partitions import FRAMINGS, LABEL_DOSES, PANEL_DOSES, SCHEMAS, VARIATIONS, beside_of, sides_of
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.partitions import FRAMINGS, LABEL_DOSES, PANEL_DOSES, SCHEMAS, VARIATIONS, beside_of, sides_of
 from traps_pipeline.scenes import variations
 from traps_pipeline.scenes.arms import SEEN_PX, Scenario
 from traps_pipeline.scenes.observe import family_asking

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from traps_pipeline.partitions import DATASETS
+from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.scoring.bootstrap import ENTRY, INTERVAL_COLUMNS, intervals, resample, scenario_weights
 
 

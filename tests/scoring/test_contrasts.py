@@ -12,11 +12,11 @@ from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
 
 from tests.judging.conftest import item_row
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS, ItemRow
 from traps_pipeline.cli import main
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS
-from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
     figures_of,

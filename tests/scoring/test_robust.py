@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 
 from tests.scoring.test_arms import of_arm, write
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.defs import scoring
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.robust import robust, wrong_rows
 from traps_pipeline.scoring.tables import ROBUST

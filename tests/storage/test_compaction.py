@@ -19,7 +19,7 @@ from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
 from tests.storage.conftest import VARIABLE
 from tests.storage.test_ledger import answer, paid, write
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage import compaction
 from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.compaction import Segment, segments_of

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.storage.conftest import Place
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.ledger import Ledger, LockGivenUp, Totals
 from traps_pipeline.storage.lines import checked_line
 from traps_pipeline.storage.segments import SegmentLedger

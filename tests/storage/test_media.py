@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from traps_pipeline.digests import file_digest
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.registry import load_models
 from traps_pipeline.scenes.encode import DamagedClip, decode, decode_sampled, encode
 from traps_pipeline.scenes.policies import POLICIES, FramePolicy

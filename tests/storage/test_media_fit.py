@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from traps_pipeline.digests import digest
+from traps_pipeline.base.digests import digest
 from traps_pipeline.models.framing import framed
 from traps_pipeline.storage.media import MediaSpec, pick, profile_digest, resized
 

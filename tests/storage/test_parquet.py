@@ -12,8 +12,8 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import VIDEOS, VideoRow
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.tables import RESPONSES, ResponseRow
 from traps_pipeline.storage.parquet import State, TableStore
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.ledger import Ledger, Totals
 from traps_pipeline.storage.lines import checked_line
 from traps_pipeline.storage.segments import SegmentLedger
@@ -21,7 +21,7 @@ from traps_pipeline.storage.segments import SegmentLedger
 FILL = """
 import resource, sys
 from pathlib import Path
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.segments import SegmentLedger
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))

@@ -22,7 +22,7 @@ from tests.conftest import ROOT
 from tests.postgres import Postgres
 from tests.storage.conftest import VARIABLE, Place, in_database, opened
 from tests.storage.test_ledger import answer, write
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.database import Claim, Session, session_of
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.stream import Stream, encoded
@@ -30,7 +30,7 @@ from traps_pipeline.storage.stream import Stream, encoded
 # Asks as a run does: looks whether it may, makes the call (a byte in a file, which the provider counts), keeps the row.
 ASK = """
 import asyncio, itertools, sys
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 async def ask():
     async with ledger.writing("m", print) as writer:
         for n in itertools.count():

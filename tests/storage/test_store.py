@@ -15,8 +15,8 @@ from tests.conftest import ROOT
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.storage.test_parquet import clip
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.tables import VIDEOS
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.database import Session
 from traps_pipeline.storage.leases import alone, leased

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
 from traps_pipeline.storage.workspace import Workspace
 

@@ -15,7 +15,7 @@ import pytest
 
 from tests.conftest import KEY, SECRET
 from tests.providers.server import Provider
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models import api
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.judges import JudgeEntry

@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from traps_pipeline.base.digests import file_digest
 from traps_pipeline.cli import main
-from traps_pipeline.digests import file_digest
 from traps_pipeline.models.budget import Journal
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.scoring.tables import LEADERBOARD

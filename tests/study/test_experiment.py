@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, REGIMES, datasets_of_category
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import DATASETS, REGIMES, datasets_of_category
 from traps_pipeline.scoring.hypotheses import DATASETS_READ, RULES
 from traps_pipeline.storage.study import Study
 from traps_pipeline.study.experiment import load_experiment

@@ -11,8 +11,8 @@ import pytest
 from tests.models.test_budget import PRICED
 from tests.postgres import Postgres
 from tests.storage.conftest import VARIABLE
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.budget import Journal
 from traps_pipeline.models.spending import spending
 from traps_pipeline.storage.study import Study

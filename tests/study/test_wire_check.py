@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.models import api
 from traps_pipeline.models.registry import JSON_ANSWER, ModelEntry, get_model, load_models
 from traps_pipeline.storage.media import Media, MediaSpec, data_uris, payload

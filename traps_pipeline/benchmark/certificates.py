@@ -11,18 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.paths import PACKAGE
+from traps_pipeline.base.terminal import text_table
 from traps_pipeline.benchmark.composition import load_composition, problems
 from traps_pipeline.benchmark.foretelling import AT_MOST, FEWEST, foretold
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.digests import digest, file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
-from traps_pipeline.paths import PACKAGE
 from traps_pipeline.scenes.certify import Verdict, certify
 from traps_pipeline.scenes.sample import Tally, load_tallies
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
 from traps_pipeline.scenes.workers import run_in_order
-from traps_pipeline.terminal import text_table
 
 
 @dataclass(frozen=True)

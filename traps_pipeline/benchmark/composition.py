@@ -10,13 +10,13 @@ from pathlib import Path
 import yaml
 from pydantic import RootModel, ValidationError
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.paths import SCENE_SPECS
+from traps_pipeline.base.yamlfile import explain, read_yaml
 from traps_pipeline.benchmark.items import commonest_answers
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
-from traps_pipeline.paths import SCENE_SPECS
 from traps_pipeline.scenes.sample import answer_quota, ill_posed_quota, sample_family
 from traps_pipeline.scenes.spec import SceneSpec
-from traps_pipeline.yamlfile import explain, read_yaml
 
 PRIOR_AT_MOST = 0.55  # accuracy of the commonest answer, occlusion and chaotic weighted equally
 

@@ -16,11 +16,11 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import sync_folder
+from traps_pipeline.base.paths import CORRECTIONS, require_own_corrections
 from traps_pipeline.benchmark.corrections import Correction, Scenario, fold, folded, read_corrections
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import sync_folder
-from traps_pipeline.paths import CORRECTIONS, require_own_corrections
 
 FILE = "review.jsonl"
 Signed = Callable[..., Correction]

@@ -7,8 +7,8 @@ import re
 import secrets
 from pathlib import Path
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
 
 KEY_BYTES = 32
 

@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import ALL_CATEGORIES, BESIDE, SIDES, all_datasets_of, is_ill_posed
 from traps_pipeline.benchmark.specs import released_in_study
 from traps_pipeline.benchmark.tables import ARMS as ARMS_TABLE
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import ALL_CATEGORIES, BESIDE, SIDES, all_datasets_of, is_ill_posed
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.storage.workspace import Workspace

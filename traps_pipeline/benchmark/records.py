@@ -8,12 +8,12 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import ALL_CATEGORIES
-from traps_pipeline.paths import RELEASED, SCENE_SPECS
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import ALL_CATEGORIES
+from traps_pipeline.base.paths import RELEASED, SCENE_SPECS
+from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_lines, read_yaml
 from traps_pipeline.scenes.registry import family_names
 from traps_pipeline.scenes.spec import SceneSpec
-from traps_pipeline.yamlfile import explain, parse_yaml_model, read_lines, read_yaml
 
 
 class Release(BaseModel):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.scenes.clips import Clip, check_clip, note_of, read_note
 from traps_pipeline.scenes.encode import DamagedClip
 from traps_pipeline.scenes.workers import run_in_order

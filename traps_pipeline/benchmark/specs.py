@@ -10,15 +10,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from traps_pipeline import progress
+from traps_pipeline.base import progress
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.paths import CORRECTIONS, RELEASED, ROOT
 from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, fold, load_scenarios, subset
 from traps_pipeline.benchmark.records import load_released, parse_record
 from traps_pipeline.benchmark.tables import SceneSpecRow
 from traps_pipeline.benchmark.versions import spec_content, version_of
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
-from traps_pipeline.paths import CORRECTIONS, RELEASED, ROOT
 from traps_pipeline.scenes.kit import Physics, Wording
 from traps_pipeline.scenes.registry import get_family
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory

@@ -10,9 +10,9 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.partitions import is_ill_posed
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.digests import digest
-from traps_pipeline.partitions import is_ill_posed
 from traps_pipeline.scenes.spec import SceneSpec
 
 

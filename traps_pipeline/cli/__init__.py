@@ -12,6 +12,10 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import sentence_of
+from traps_pipeline.base.files import remedy
+from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli import (
     annotate,
     benchmark,
@@ -34,10 +38,6 @@ from traps_pipeline.cli import (
     ui,
 )
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, Run
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import sentence_of
-from traps_pipeline.files import remedy
-from traps_pipeline.terminal import plain
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -6,9 +6,9 @@ import argparse
 import os
 import re
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import require
 from traps_pipeline.cli.command import OK, Commands, add_listening, listening_of, open_workspace
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
 
 TOKEN_VARIABLE = "TRAPS_ANNOTATE_TOKEN"
 

@@ -6,8 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import FAILED, OK, Commands, number, whole
-from traps_pipeline.errors import TrapsError
 
 LOOKS = (
     "floor",
@@ -59,8 +59,8 @@ def add(commands: Commands) -> None:
 
 def certify(arguments: argparse.Namespace) -> int:
     """See `traps certify --help`."""
+    from traps_pipeline.base.paths import SCENE_SPECS, WORKSPACES
     from traps_pipeline.benchmark.certificates import certify_all, family_table
-    from traps_pipeline.paths import SCENE_SPECS, WORKSPACES
 
     folder = (arguments.specs or SCENE_SPECS).absolute()
     kept = WORKSPACES / "certificates"

@@ -86,8 +86,8 @@ def listening_of(
 ) -> Listening:
     """Where such a command listens and whom it lets in: who has the token, or each person with a token of their own.
     danger: what everybody who reaches the address could do. Raises TrapsError."""
+    from traps_pipeline.base.webguard import personal_tokens, public_name, token_for
     from traps_pipeline.explorer.server import Listening
-    from traps_pipeline.webguard import personal_tokens, public_name, token_for
 
     if arguments.behind:
         public_name(arguments.behind)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from traps_pipeline.base.extras import require
+from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli.command import FAILED, OK, Commands, place_of
-from traps_pipeline.extras import require
-from traps_pipeline.terminal import plain
 
 
 def add(commands: Commands) -> None:

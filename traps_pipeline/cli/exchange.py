@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import OK, Commands, experiment_of, open_workspace, whole
-from traps_pipeline.errors import TrapsError
 
 if TYPE_CHECKING:
     from traps_pipeline.study.exchange import Imported

@@ -19,8 +19,8 @@ def add(commands: Commands) -> None:
 
 def move(arguments: argparse.Namespace) -> int:
     """See `traps ledger move --help`."""
+    from traps_pipeline.base.progress import reporting
     from traps_pipeline.cli.progress import TerminalProgress
-    from traps_pipeline.progress import reporting
     from traps_pipeline.storage.place import place_of
     from traps_pipeline.storage.workspace import VARIABLE
     from traps_pipeline.study.ledger_move import move_back, move_to_database

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import FAILED, OK, Commands, entered, place_of
-from traps_pipeline.errors import TrapsError
 
 
 def add(commands: Commands) -> None:

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from traps_pipeline.base.terminal import text_table
 from traps_pipeline.cli.command import (
     OK,
     Commands,
@@ -15,7 +16,6 @@ from traps_pipeline.cli.command import (
     open_workspace,
     place_of,
 )
-from traps_pipeline.terminal import text_table
 
 if TYPE_CHECKING:
     from traps_pipeline.models.forecast import Forecast

@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from traps_pipeline.progress import Progress, Tally, clock
-from traps_pipeline.terminal import plain
+from traps_pipeline.base.progress import Progress, Tally, clock
+from traps_pipeline.base.terminal import plain
 
 if TYPE_CHECKING:
     from rich.live import Live

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import OK, Commands, open_workspace, whole
 from traps_pipeline.cli.submission import verify_file
-from traps_pipeline.errors import TrapsError
 
 if TYPE_CHECKING:
     from traps_pipeline.release.commitment import Commitment
@@ -63,7 +63,7 @@ def add(commands: Commands) -> None:
 
 def release(arguments: argparse.Namespace) -> int:
     """See `traps release --help`."""
-    from traps_pipeline.extras import require
+    from traps_pipeline.base.extras import require
     from traps_pipeline.release.content import content_of
     from traps_pipeline.release.folder import CARD, Options, write_release
     from traps_pipeline.release.signing import sign

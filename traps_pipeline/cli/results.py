@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from traps_pipeline.base.terminal import text_table
 from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of
-from traps_pipeline.terminal import text_table
 
 
 def add(commands: Commands) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import os
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import require
 from traps_pipeline.cli.command import OK, Commands, add_listening, listening_of, open_workspace
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
 
 TOKEN_VARIABLE = "TRAPS_REVIEW_TOKEN"
 
@@ -22,9 +22,9 @@ def add(commands: Commands) -> None:
 def review(arguments: argparse.Namespace) -> int:
     """See `traps review --help`."""
     require("web")
+    from traps_pipeline.base.paths import require_own_corrections
     from traps_pipeline.explorer.review import Review, review_app
     from traps_pipeline.explorer.server import serve
-    from traps_pipeline.paths import require_own_corrections
 
     if not arguments.who.strip():
         raise TrapsError("--who: say whose decisions these are, e.g. --who jd")

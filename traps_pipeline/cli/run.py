@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import require
+from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli.command import FAILED, OK, OVER_BUDGET, Commands, add_panel, experiment_of, number, whole
 from traps_pipeline.cli.init import create
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
-from traps_pipeline.terminal import plain
 
 if TYPE_CHECKING:
     from dagster import DagsterInstance
@@ -77,8 +77,8 @@ def add(commands: Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """See `traps run --help`."""
+    from traps_pipeline.base.progress import Tally, clock, reporting
     from traps_pipeline.cli.progress import TerminalProgress
-    from traps_pipeline.progress import Tally, clock, reporting
 
     experiment = experiment_of(arguments)
     workspace = _allow(create(arguments, experiment), experiment, arguments)
@@ -162,11 +162,11 @@ class _Participants:
 
 def _still_to_ask(workspace: Workspace, experiment: Experiment, stages: Collection[str]) -> _Participants:
     """Who is asked over the network or on this machine, as far as the ledger does not hold all of their answers."""
+    from traps_pipeline.base.partitions import Cell
     from traps_pipeline.models.judges import load_panel
     from traps_pipeline.models.registry import LOCAL, NETWORK, get_model
     from traps_pipeline.orchestration.lineage import Lineage
     from traps_pipeline.orchestration.wanted import Wanted
-    from traps_pipeline.partitions import Cell
 
     lineage, cells = Lineage(workspace), Wanted(workspace, experiment.name).cells
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.terminal import plain, text_table
 from traps_pipeline.cli.command import OK, Commands, experiment_of, load_definitions, open_workspace
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.terminal import plain, text_table
 
 SHOWN = 8  # stale partitions that are listed for a stage
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli.command import FAILED, OK, Commands, open_workspace
-from traps_pipeline.terminal import plain
 
 
 def add(commands: Commands) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import os
 
+from traps_pipeline.base.extras import require
 from traps_pipeline.cli.command import OK, Commands, number, open_workspace, whole
-from traps_pipeline.extras import require
 
 CLUSTER = "of a study on a cluster"
 
@@ -28,10 +28,10 @@ def add(commands: Commands) -> None:
 def ui(arguments: argparse.Namespace) -> int:
     """See `traps ui --help`."""
     require("ui")
+    from traps_pipeline.base.webguard import token_for
     from traps_pipeline.orchestration.cluster import RUN_CPUS, RUN_GPUS
     from traps_pipeline.orchestration.run import dagster_history
     from traps_pipeline.orchestration.webserver import DANGER, TOKEN_VARIABLE, serve_with_dagster
-    from traps_pipeline.webguard import token_for
 
     for variable, value in ((RUN_CPUS, arguments.cpus), (RUN_GPUS, arguments.gpus)):
         if value is not None:

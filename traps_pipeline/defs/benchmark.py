@@ -6,6 +6,8 @@ from typing import Any
 
 import dagster as dg
 
+from traps_pipeline.base.partitions import all_datasets_of, beside_of, sides_of, taxonomy_of_category
+from traps_pipeline.base.progress import Tally
 from traps_pipeline.benchmark.composition import problems
 from traps_pipeline.benchmark.specs import build_specs, corrections_version, released_version, seconds_left, unsettled
 from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
@@ -13,8 +15,6 @@ from traps_pipeline.benchmark.videos import missing_clips
 from traps_pipeline.orchestration.graph import Check, Shared, Takes
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.orchestration.stage import key_of, shown, source, stage
-from traps_pipeline.partitions import all_datasets_of, beside_of, sides_of, taxonomy_of_category
-from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import dagster as dg
 
+from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.judging.panel import collect_votes
@@ -19,7 +20,6 @@ from traps_pipeline.models.tables import RESPONSES, ResponseRow
 from traps_pipeline.orchestration.graph import Check
 from traps_pipeline.orchestration.schemes import CELL, EVALUATION, by_dataset, by_evaluation
 from traps_pipeline.orchestration.stage import source, stage
-from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

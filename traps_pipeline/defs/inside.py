@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import dagster as dg
 
+from traps_pipeline.base.partitions import DATASETS, PROBE_PROMPT, PROBED_ARMS, Cell, Evaluation, Extraction
 from traps_pipeline.defs.evaluation import verdicts
 from traps_pipeline.defs.mechanism import (
     ANSWERED,
@@ -31,7 +32,6 @@ from traps_pipeline.orchestration.graph import Need
 from traps_pipeline.orchestration.schemes import CELL, EXTRACTION, by_extraction, these_keys
 from traps_pipeline.orchestration.stage import source, stage
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.partitions import DATASETS, PROBE_PROMPT, PROBED_ARMS, Cell, Evaluation, Extraction
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING
 
 import dagster as dg
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import MAX_INVALID_SHARE, judges, responses, verdicts, votes
 from traps_pipeline.defs.scoring import leaderboard
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import load_protocol, protocol_digest
 from traps_pipeline.judging.tables import AGREEMENT, CONFABULATION, JUDGE_BIAS, JUDGE_VALIDATION, VERDICTS, VOTES
 from traps_pipeline.orchestration.graph import Check, Need

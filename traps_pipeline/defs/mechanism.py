@@ -5,6 +5,18 @@ from typing import TYPE_CHECKING
 
 import dagster as dg
 
+from traps_pipeline.base.partitions import (
+    ANSWERABLE,
+    DATASETS,
+    TIME_SWAPPED,
+    Cell,
+    Evaluation,
+    Extraction,
+    StatesCell,
+    SteeringCell,
+    taxonomy_of_category,
+)
+from traps_pipeline.base.progress import Tally
 from traps_pipeline.defs.benchmark import items, scene_specs, videos
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
@@ -46,18 +58,6 @@ from traps_pipeline.orchestration.schemes import (
 )
 from traps_pipeline.orchestration.stage import source, stage
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.partitions import (
-    ANSWERABLE,
-    DATASETS,
-    TIME_SWAPPED,
-    Cell,
-    Evaluation,
-    Extraction,
-    StatesCell,
-    SteeringCell,
-    taxonomy_of_category,
-)
-from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 

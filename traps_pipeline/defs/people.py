@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import dagster as dg
 
+from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import judges, responses, verdicts
 from traps_pipeline.defs.judging import confabulation
@@ -12,7 +13,6 @@ from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT, HUMAN_LABELS, 
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.orchestration.graph import Need
 from traps_pipeline.orchestration.stage import source, stage
-from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.people_tables import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
@@ -24,7 +24,7 @@ GROUP = "people"
 
 
 def _protocol_version(workspace: Workspace, key: None) -> str:
-    from traps_pipeline.digests import file_digest
+    from traps_pipeline.base.digests import file_digest
 
     return file_digest(PROTOCOL_FILE)[:16]
 

@@ -5,13 +5,13 @@ from typing import Any
 
 import dagster as dg
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.defs import inside, judging, mechanism, people, scoring
 from traps_pipeline.defs.shown import thumbnail
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.orchestration.graph import Need
 from traps_pipeline.orchestration.stage import key_of, shown, source, stage
-from traps_pipeline.partitions import DATASETS
 from traps_pipeline.report.catalogue import OF_PAPER, OF_STUDY, PRINTED, Report, TableReport, workspace_files
 from traps_pipeline.report.results import Results
 from traps_pipeline.scoring.published import published_digest

@@ -4,15 +4,15 @@ from typing import TYPE_CHECKING
 
 import dagster as dg
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import ARMS, DATASETS
 from traps_pipeline.defs.benchmark import items
 from traps_pipeline.defs.evaluation import judges, verdicts
 from traps_pipeline.defs.shown import rows_shown
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.orchestration.graph import Check, Need
 from traps_pipeline.orchestration.schemes import DATASET, by_dataset
 from traps_pipeline.orchestration.stage import stage
-from traps_pipeline.partitions import ARMS, DATASETS
 from traps_pipeline.scoring.tables import CONTRASTS, HYPOTHESES, LEADERBOARD, METRICS, REGIME_TESTS, ROBUST
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace

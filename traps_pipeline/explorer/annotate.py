@@ -17,18 +17,18 @@ from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, Response
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation
+from traps_pipeline.base.webguard import WHO
+from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.benchmark.tables import ITEMS, VIDEOS
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.explorer.labelstore import LabelStore, NotWaiting
 from traps_pipeline.explorer.server import Conflict, NotThere, Refused, new_app, page, script, study_file
 from traps_pipeline.judging.labels import LABELS
 from traps_pipeline.judging.people import TASKS, TaskName, annotation_protocol, queue_of, require_task, sample
 from traps_pipeline.judging.validation import sheet_rows
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.webguard import WHO
-from traps_pipeline.yamlfile import explain
 
 SCRIPTS = ("dom.js", "player.js", "listening.js", "annotate.js")
 TITLES: Mapping[TaskName, str] = {

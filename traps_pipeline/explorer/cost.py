@@ -8,15 +8,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, SIDES, Cell, is_ill_posed, taxonomy_of
 from traps_pipeline.benchmark.corrections import Correction
 from traps_pipeline.benchmark.specs import wording_of
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.forecast import Experience, forecast
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import NETWORK, load_models
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.partitions import DATASETS, SIDES, Cell, is_ill_posed, taxonomy_of
 from traps_pipeline.storage.workspace import Workspace
 
 

@@ -21,8 +21,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import sync_folder
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import sync_folder
 from traps_pipeline.judging.labels import label_lines
 from traps_pipeline.judging.people_tables import LABELS_FILE
 from traps_pipeline.storage.lines import append_whole, checked_line

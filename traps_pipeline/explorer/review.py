@@ -16,11 +16,12 @@ from fastapi import FastAPI
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.benchmark.corrections import WORDS, Correction, load_scenarios, read_corrections
 from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decide, decisions_on, is_reviewed, undo
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.explorer.cost import Touched, touched
 from traps_pipeline.explorer.duplicates import Comparison
 from traps_pipeline.explorer.queue import MEANINGS, QUEUES, QueueName, flags, queue
@@ -29,7 +30,6 @@ from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.report.gallery import answer_of_control, certificate_phrases, intervention
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import EXPERIMENTS
-from traps_pipeline.yamlfile import explain
 
 SCRIPTS = ("dom.js", "player.js", "listening.js", "review.js")
 STRIP_FRAMES, STRIP_WIDTH = 8, 200  # frames of a side in the contact strip, and their width in pixels

@@ -20,9 +20,9 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.webguard import Guard
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.webguard import Guard
 
 WEB = Path(__file__).parent / "web"
 

@@ -16,10 +16,14 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool
 
-from traps_pipeline import progress
+from traps_pipeline.base import progress
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation, is_ill_posed
+from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.progress import Tally
+from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import about_answer, ask_judges, judge_request, parse_judgement, quoted
 from traps_pipeline.judging.tables import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.models.ask import Call, Settled
@@ -29,12 +33,8 @@ from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, get_model, structured
 from traps_pipeline.models.request import Request
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import DATASETS, Cell, Evaluation, is_ill_posed
-from traps_pipeline.paths import ASSETS
-from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.yamlfile import parse_yaml_model, read_yaml, within
 
 PROTOCOL_FILE = ASSETS / "confabulation.yaml"
 TASK = "confabulation"

@@ -17,18 +17,18 @@ import numpy as np
 import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.judging.answers import is_correct
 from traps_pipeline.judging.confabulation import AXES
 from traps_pipeline.judging.people import ABOUT_ANSWERS, TASKS, TaskName, strata, units
 from traps_pipeline.judging.people_tables import HUMAN_AGREEMENT, HUMAN_LABELS, LABELS_FILE
 from traps_pipeline.judging.ratings import INVALID, NO, YES
-from traps_pipeline.partitions import DATASETS
 from traps_pipeline.storage.lines import NOT_WHOLE, read_checked
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.yamlfile import explain
 
 MOST_CHARACTERS = 200  # of an answer
 DECISIONS: Mapping[TaskName, tuple[str, ...]] = {

@@ -15,8 +15,10 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, StrictBool, StrictFloat, StrictInt, StrictStr, ValidationError
 
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Cell
+from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.judging.answers import is_correct, strip_fence
 from traps_pipeline.judging.tables import VoteRow
 from traps_pipeline.models.answers import answer_request, asked_items
@@ -28,11 +30,9 @@ from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import Cell
 from traps_pipeline.storage.parquet import Made, joined
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.yamlfile import explain
 
 PART = 4_000  # answers whose votes are collected at a time
 _ANSWERED = ("item_id", "outcome", "text", "request_key")

@@ -16,9 +16,11 @@ import numpy as np
 import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import load_protocol
 from traps_pipeline.judging.people_tables import PROTOCOL_FILE
 from traps_pipeline.judging.tables import CONFABULATION, VERDICTS
@@ -26,9 +28,7 @@ from traps_pipeline.judging.validation import sheet_rows
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.judges import panel_id
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import DATASETS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 TaskName = Literal["answerability", "confabulation", "abstention", "correctness"]
 TASKS: tuple[TaskName, ...] = get_args(TaskName)

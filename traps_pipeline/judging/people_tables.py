@@ -5,8 +5,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
-from traps_pipeline.digests import file_digest
-from traps_pipeline.paths import ASSETS
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 

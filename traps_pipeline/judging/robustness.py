@@ -16,17 +16,17 @@ import numpy as np
 import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Cell, Evaluation
+from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.terminal import text_table
+from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.judging.panel import Ballot, Vote, ask_judges, tasks_for, vote_requests
 from traps_pipeline.judging.ratings import INVALID, NO, PANEL, YES, majority
 from traps_pipeline.judging.tables import JUDGE_ROBUSTNESS
 from traps_pipeline.models.ask import Settled
 from traps_pipeline.models.judges import JudgeEntry, Task
-from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.terminal import text_table
-from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 ATTACKS_FILE = ASSETS / "injected_answers.yaml"
 CELL = Cell("occlusion", Evaluation("injected-answers", "standard", 1))  # names the folder of the votes, not a model

@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Cell, Evaluation
+from traps_pipeline.base.terminal import text_table
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.digests import file_digest
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.agreement import cohen_kappa
 from traps_pipeline.judging.confabulation import (
     AXES,
@@ -29,9 +31,7 @@ from traps_pipeline.judging.confabulation import (
 )
 from traps_pipeline.judging.tables import CONFABULATION, JUDGE_VALIDATION
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.terminal import text_table
 
 LABEL_COLUMNS = ("annotator", "sample_id", *AXES)
 SHEET_COLUMNS = (*LABEL_COLUMNS, "question", "why_unanswerable", "reasoning_trace", "response")

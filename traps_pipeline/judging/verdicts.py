@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, Cell
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.ratings import (
     ABSTENTION,
     ANSWER,
@@ -23,7 +24,6 @@ from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.judges import PANEL_SIZES, panel_id
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import DATASETS, Cell
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 

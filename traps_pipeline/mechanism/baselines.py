@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline import progress
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.contrast import contrast_states
 from traps_pipeline.mechanism.control_tables import ProbeBaselineRow
 from traps_pipeline.mechanism.other_probes import OF_PAIRS, fit_named

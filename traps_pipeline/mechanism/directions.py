@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.digests import digest, file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
-from traps_pipeline.files import write_bytes, write_text
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import require
+from traps_pipeline.base.files import write_bytes, write_text
 
 VOID = "void"
 NULLS = ("isotropic", "covariance", "shuffled")

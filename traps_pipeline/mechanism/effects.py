@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from traps_pipeline.base.partitions import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.mechanism.directions import KINDS
 from traps_pipeline.mechanism.paths import FAMILIES, PATH_SETS
-from traps_pipeline.partitions import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 
 if TYPE_CHECKING:
     import pandas as pd

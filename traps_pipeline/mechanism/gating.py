@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline import progress
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.mechanism.baselines import MARGIN, NoMargin, output_margins, probed_items, raw_features
 from traps_pipeline.mechanism.control_tables import GateRow, RiskCoverageRow
@@ -36,7 +37,6 @@ from traps_pipeline.mechanism.probes import swapped_labels
 from traps_pipeline.mechanism.stored import StoredStates
 from traps_pipeline.mechanism.tables import PROBES
 from traps_pipeline.models.registry import ModelEntry
-from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.scoring.bootstrap import TAXONOMIES, percentiles, scenario_weights
 from traps_pipeline.storage.workspace import Workspace
 

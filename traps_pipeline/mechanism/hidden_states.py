@@ -27,10 +27,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from traps_pipeline import progress
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes
+from traps_pipeline.base import progress
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_bytes
 from traps_pipeline.models.local.capture import OF_PAIRS, OF_PARTS, ONE_TOKEN, Pooling
 from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.storage.leases import alone, leased

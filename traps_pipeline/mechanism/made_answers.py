@@ -15,7 +15,7 @@ from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from traps_pipeline.digests import digest
+from traps_pipeline.base.digests import digest
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.storage.leases import POLL_S
 from traps_pipeline.storage.ledger import Ledger, LockGivenUp

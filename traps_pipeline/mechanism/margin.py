@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 
 if TYPE_CHECKING:
     from torch import Tensor

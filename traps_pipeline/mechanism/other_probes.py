@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.contrast import ccs
 from traps_pipeline.mechanism.probes import Fit, Probe, Scorer, fit_probe, standardiser
 

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.margin import first_token_margins
 from traps_pipeline.mechanism.sites import Site
 from traps_pipeline.models.local.capture import first_tensor

@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 
 Solver = Literal["exact", "sklearn"]
 PENALTY = 1.0  # scikit-learn's C: the weight of the loss against half the squared norm of the coefficients

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.deciding import Gate
 from traps_pipeline.mechanism.made_answers import MadeAnswers
 from traps_pipeline.models.local.backend import LocalBackend, outcome

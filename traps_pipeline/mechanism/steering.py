@@ -20,9 +20,10 @@ from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
-from traps_pipeline import progress
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import SIDES, Extraction, SteeringCell, taxonomy_of
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
 from traps_pipeline.mechanism.deciding import Gate, conditions
 from traps_pipeline.mechanism.degeneracy import degeneracy
@@ -39,7 +40,6 @@ from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import Entry, ModelEntry
 from traps_pipeline.models.request import Request
-from traps_pipeline.partitions import SIDES, Extraction, SteeringCell, taxonomy_of
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.study import Layers, MechanismSettings, SteeringSettings
 from traps_pipeline.storage.workspace import Workspace

@@ -17,10 +17,10 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import is_in_place, remedy, write_bytes
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import is_in_place, remedy, write_bytes
+from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, is_whole
-from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 CAP, SPENT = "budget.yaml", "spent.jsonl"
 _COMPACTED = 2**20  # bytes of lines from which on they are summed up when a run begins

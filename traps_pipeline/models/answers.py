@@ -9,10 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline import progress
+from traps_pipeline.base import progress
+from traps_pipeline.base.cores import cores
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Cell, Evaluation, dataset_of
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.cores import cores
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.framing import framed
 from traps_pipeline.models.participants import Row, when_asked
@@ -21,7 +22,6 @@ from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import ModelEntry, effective_params, get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.models.tables import ResponseRow
-from traps_pipeline.partitions import Cell, Evaluation, dataset_of
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace

@@ -16,8 +16,9 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-from traps_pipeline import progress
-from traps_pipeline.extras import require
+from traps_pipeline.base import progress
+from traps_pipeline.base.extras import require
+from traps_pipeline.base.terminal import plain
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import (
     MALFORMED,
@@ -32,7 +33,6 @@ from traps_pipeline.models.request import (
 from traps_pipeline.models.transport import WATCHED, Exchange, watch
 from traps_pipeline.models.usage import Sizes, Usage, read_usage
 from traps_pipeline.storage.media import Media, data_uris
-from traps_pipeline.terminal import plain
 
 UNREADABLE = 422  # what litellm makes of a page that is no JSON; no provider here sends it
 MOST_KEPT = 4000  # characters of an answer that is out of order

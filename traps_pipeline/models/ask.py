@@ -16,16 +16,16 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, ClassVar, Generic, TypeVar
 
-from traps_pipeline import progress
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Cell, Evaluation
+from traps_pipeline.base.progress import Tally
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.participants import Allowed, Participant, Participants, Row, attempt, ledger_row
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
 from traps_pipeline.models.spending import sharing, spending
-from traps_pipeline.partitions import Cell, Evaluation
-from traps_pipeline.progress import Tally
 from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, Writer, settles
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace

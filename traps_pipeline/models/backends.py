@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import require
 from traps_pipeline.models.registry import LOCAL, NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Backend
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline import progress
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, write_bytes
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import remedy, write_bytes
 from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.registry import NETWORK, Entry, ModelEntry
 from traps_pipeline.models.request import Request

@@ -11,8 +11,10 @@ from typing import Any, Literal
 
 from pydantic import model_validator
 
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.yamlfile import read_mapping
 from traps_pipeline.models import own
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import (
@@ -25,8 +27,6 @@ from traps_pipeline.models.registry import (
     structured,
     with_own,
 )
-from traps_pipeline.paths import ASSETS
-from traps_pipeline.yamlfile import read_mapping
 
 JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZES = (1, 3)

@@ -16,9 +16,9 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.yamlfile import explain, read_yaml
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
-from traps_pipeline.yamlfile import explain, read_yaml
 
 FILE = "own.yaml"
 HOW_MEDIA = (

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import Any
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
 from traps_pipeline.models.registry import NETWORK, Account, Entry, load_accounts
 from traps_pipeline.models.request import (

@@ -13,15 +13,15 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Evaluation, check_slug
+from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
 from traps_pipeline.models import own
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
 from traps_pipeline.models.prompts import FIELDS, fields_of
-from traps_pipeline.partitions import Evaluation, check_slug
-from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.media import MediaSpec, profile_digest
-from traps_pipeline.yamlfile import explain, parse_yaml_model, read_yaml
 
 MODELS_VARIABLE = "TRAPS_MODELS"  # names another registry
 MODELS_FILE = Path(os.environ.get(MODELS_VARIABLE) or ASSETS / "models.yaml").absolute()

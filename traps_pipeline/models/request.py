@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from traps_pipeline.digests import digest
+from traps_pipeline.base.digests import digest
 
 if TYPE_CHECKING:
     from traps_pipeline.storage.media import Media

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from traps_pipeline import progress
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import require_in_place, try_lock
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import require_in_place, try_lock
 from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.budget import Budget, Journal
 from traps_pipeline.models.judges import load_judges

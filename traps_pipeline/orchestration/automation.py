@@ -9,10 +9,10 @@ from collections.abc import Collection
 
 import dagster as dg
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import folded
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.confabulation import load_protocol
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.prompts import prompt, system_prompt, vqa_prompt

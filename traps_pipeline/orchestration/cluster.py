@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import dagster as dg
 
-from traps_pipeline import progress
-from traps_pipeline.cores import CORES
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import missing
+from traps_pipeline.base import progress
+from traps_pipeline.base.cores import CORES
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import missing
+from traps_pipeline.base.partitions import Cell
 from traps_pipeline.models.registry import LOCAL, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.graph import Stage, the_graph
@@ -37,7 +38,6 @@ from traps_pipeline.orchestration.runs import (
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here
 from traps_pipeline.orchestration.shared_history import unusable
 from traps_pipeline.orchestration.step import TAKEN, TALLY
-from traps_pipeline.partitions import Cell
 from traps_pipeline.storage.database import PATIENCE_S
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
 

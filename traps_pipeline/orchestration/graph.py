@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import dagster as dg
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.progress import Tally
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.progress import Tally
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.orchestration.graph import Graph, Stage, name_of, the_graph
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.parquet import State

@@ -10,7 +10,7 @@ from typing import Any
 
 from dagster_ray import RayRunLauncher  # pyright: ignore[reportMissingImports] - of the extra `cluster`
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.cluster import RUN_CPUS, RUN_GPUS, STUDY_TAG, keys_in, own_tags
 from traps_pipeline.orchestration.graph import DECLARED, Stage, the_graph

@@ -13,9 +13,9 @@ from pathlib import Path
 import dagster as dg
 import yaml
 
-from traps_pipeline import progress
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, write_text
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import remedy, write_text
 from traps_pipeline.models.traffic import remembering_stops
 from traps_pipeline.orchestration.graph import name_of, the_graph
 from traps_pipeline.orchestration.history import History

@@ -13,7 +13,7 @@ from typing import Any
 
 import dagster as dg
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Stage
 from traps_pipeline.orchestration.ranges import Range, batches

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
-from traps_pipeline.digests import digest, file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.paths import ASSETS, PACKAGE, SCENE_SPECS, SHIPPED
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import ASSETS, PACKAGE, SCENE_SPECS, SHIPPED
 
 CODE_TAG = "traps/code"  # of runs: the code of the host that submitted them
 DISTRIBUTION = "traps-pipeline"

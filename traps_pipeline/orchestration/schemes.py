@@ -11,8 +11,8 @@ from typing import Any
 
 import dagster as dg
 
+from traps_pipeline.base.partitions import Cell, Extraction, StatesCell, SteeringCell
 from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.partitions import Cell, Extraction, StatesCell, SteeringCell
 from traps_pipeline.storage.workspace import Workspace
 
 # Partition mappings over one dimension, observable sources and backfill policies are in beta, partitioned checks in

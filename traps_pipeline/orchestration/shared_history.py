@@ -13,7 +13,7 @@ from dagster import StringSource
 from dagster._core.storage.base_storage import DagsterStorage
 from dagster._serdes import ConfigurableClassData
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.database import KEEPALIVE
 from traps_pipeline.storage.workspace import VARIABLE
 

@@ -19,8 +19,8 @@ from dagster._core.storage.compute_log_manager import ComputeIOType
 from dagster._core.storage.local_compute_log_manager import IO_TYPE_EXTENSION, LocalComputeLogManager
 from dagster._serdes import ConfigurableClass, ConfigurableClassData
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_bytes
 from traps_pipeline.storage.bucket import Bucket
 from traps_pipeline.storage.place import scratch_of
 

@@ -10,10 +10,7 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import product
 
-from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
-from traps_pipeline.benchmark.tables import SCENE_SPECS
-from traps_pipeline.models.registry import get_model, load_models, local_models
-from traps_pipeline.partitions import (
+from traps_pipeline.base.partitions import (
     ALL_CATEGORIES,
     ANSWERABLE,
     BESIDE,
@@ -32,6 +29,9 @@ from traps_pipeline.partitions import (
     SteeringCell,
     all_datasets_of,
 )
+from traps_pipeline.benchmark.corrections import categories_of, load_scenarios
+from traps_pipeline.benchmark.tables import SCENE_SPECS
+from traps_pipeline.models.registry import get_model, load_models, local_models
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
 

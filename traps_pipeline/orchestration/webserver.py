@@ -10,7 +10,7 @@ import os
 import sys
 from typing import Any
 
-from traps_pipeline.webguard import Guard
+from traps_pipeline.base.webguard import Guard
 
 TOKEN_VARIABLE = "TRAPS_UI_TOKEN"
 DANGER = "launch runs, which spend this study's budget"

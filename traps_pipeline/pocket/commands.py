@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from traps_pipeline.digests import digest, file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
-from traps_pipeline.paths import require_own
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.paths import require_own
 from traps_pipeline.pocket import evaluate as evaluation
 from traps_pipeline.pocket import inside
 from traps_pipeline.pocket.data import data_digest, render

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.digests import canonical_json, digest, file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import replacing, write_text
+from traps_pipeline.base.digests import canonical_json, digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import replacing, write_text
 from traps_pipeline.pocket.recipe import Recipe, Split
 from traps_pipeline.pocket.shots import Shot, draw_shot, render_decoy, render_shot
 from traps_pipeline.pocket.words import guess

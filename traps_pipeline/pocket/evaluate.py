@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import REGIMES
 from traps_pipeline.judging.answers import is_correct
 from traps_pipeline.judging.rules import judge_abstention, judge_correctness
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
-from traps_pipeline.partitions import REGIMES
 from traps_pipeline.pocket.data import SceneRecord, read_shards
 from traps_pipeline.pocket.recipe import Recipe
 from traps_pipeline.pocket.seeds import write_seeds

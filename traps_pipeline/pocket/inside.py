@@ -9,12 +9,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import ANSWERABLE, transfer_type
 from traps_pipeline.mechanism.paths import TRANSFER_TYPES
 from traps_pipeline.mechanism.shares import ALL
 from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.models.local.checkpoint import as_folder, folder_digest
-from traps_pipeline.partitions import ANSWERABLE, transfer_type
 from traps_pipeline.pocket.evaluate import MODEL
 from traps_pipeline.pocket.planted import TRUTHS, planted
 from traps_pipeline.pocket.seeds import write_seeds

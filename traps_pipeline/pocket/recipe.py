@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from traps_pipeline.paths import ASSETS
+from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.pocket.words import PROMPTS
 from traps_pipeline.scenes.registry import family_names
 from traps_pipeline.storage.media import MediaSpec
-from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 POCKET = ASSETS / "pocket"
 RECIPE = POCKET / "recipe.yaml"

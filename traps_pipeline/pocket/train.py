@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import replacing
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import replacing
 from traps_pipeline.pocket.batches import IGNORED, Batch, Batches, Scenes, name_tokens
 from traps_pipeline.pocket.data import data_digest
 from traps_pipeline.pocket.model import make_model, save, train_tokenizer

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from traps_pipeline.digests import file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
 
 CHECKSUMS = "SHA256SUMS"
 SIGNATURE = "signature.sig.json"

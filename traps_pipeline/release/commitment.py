@@ -17,14 +17,14 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import load_release, load_released, parse_record
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
 from traps_pipeline.scenes.sample import load_tallies, sample_family
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
-from traps_pipeline.terminal import plain
-from traps_pipeline.yamlfile import explain, read_lines
 
 _HEX = r"^[0-9a-f]{64}$"
 # What a record says of arithmetic: another CPU or another version of the simulator may draw the same scene otherwise.

@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import ARMS, DATASETS, REGIMES
+from traps_pipeline.base.yamlfile import read_yaml
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.benchmark.specs import spec_of
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS
-from traps_pipeline.digests import digest, file_digest
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.prompts import prompt, system_prompt
-from traps_pipeline.partitions import ARMS, DATASETS, REGIMES
 from traps_pipeline.release.tables import (
     CertificateRow,
     HeldOutItemRow,
@@ -31,7 +32,6 @@ from traps_pipeline.scenes.evidence import Claim
 from traps_pipeline.scenes.spec import SceneSpec
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import LITE_FILE
-from traps_pipeline.yamlfile import read_yaml
 
 CLIPS = "clips"
 DATA_LICENCE, PROMPT_LICENCE = "CC-BY-4.0", "CC-BY-NC-4.0"

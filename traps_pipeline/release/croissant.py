@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.digests import file_digest
+from traps_pipeline.base.digests import file_digest
 from traps_pipeline.storage.tables import StoredColumn, Table
 
 CONFORMS_TO = ["http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0"]

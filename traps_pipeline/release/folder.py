@@ -11,10 +11,10 @@ from typing import Any
 
 import yaml
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_bytes, write_text
+from traps_pipeline.base.paths import ASSETS, ROOT
 from traps_pipeline.benchmark.held_out import held_out_key, opaque
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes, write_text
-from traps_pipeline.paths import ASSETS, ROOT
 from traps_pipeline.release import content as rows_of
 from traps_pipeline.release.card import card, dictionary
 from traps_pipeline.release.checksums import CHECKSUMS, SIGNATURE, write_checksums

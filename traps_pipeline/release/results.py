@@ -14,10 +14,10 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.benchmark.records import Release, load_release
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes, write_text
 from traps_pipeline.judging.verdicts import current
 from traps_pipeline.models.registry import is_reference
 from traps_pipeline.models.tables import RESPONSES

@@ -10,10 +10,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import require
+from traps_pipeline.base.terminal import plain
 from traps_pipeline.release.checksums import SIGNATURE
-from traps_pipeline.terminal import plain
 
 
 def _library() -> Any:

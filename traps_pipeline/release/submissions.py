@@ -10,10 +10,10 @@ from typing import Any
 
 import pandas as pd
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes, write_text
 from traps_pipeline.models.judges import id_of_seats
 from traps_pipeline.release.submission import Submission, read_submission, table_bytes
 from traps_pipeline.release.tables import SUBMITTED

@@ -15,9 +15,11 @@ from typing import Any
 
 import pandas as pd
 
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, REGIMES, Cell, Evaluation
+from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.benchmark.items import item_hash
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.answers import is_correct
 from traps_pipeline.judging.panel import parse_vote, tasks_for, vote_request
 from traps_pipeline.judging.rules import RuleJudge
@@ -29,12 +31,10 @@ from traps_pipeline.models.reading import degenerate
 from traps_pipeline.models.registry import is_reference
 from traps_pipeline.models.request import JUDGED, Outcome, Request
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.release.submission import Submission
 from traps_pipeline.scoring.board import Scored, score
 from traps_pipeline.scoring.tables import LEADERBOARD, METRICS
 from traps_pipeline.storage.tables import Table
-from traps_pipeline.yamlfile import read_lines
 
 SHOWN = 10  # sentences of one kind; the others are counted
 CLOSE = 1e-9  # figures of another machine's linear algebra may differ in their last digits

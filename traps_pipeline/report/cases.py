@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation, is_ill_posed, taxonomy_of
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.tables import VERDICTS
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import DATASETS, Cell, Evaluation, is_ill_posed, taxonomy_of
 from traps_pipeline.report.writing import environment
 from traps_pipeline.scoring.analyses import REASONING_PAIRS
 

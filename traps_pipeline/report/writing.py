@@ -17,8 +17,8 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from traps_pipeline.paths import ASSETS
-from traps_pipeline.terminal import plain, text_table
+from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.terminal import plain, text_table
 
 if TYPE_CHECKING:
     import jinja2

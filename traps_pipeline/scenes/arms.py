@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.partitions import arms_of, sides_of
+from traps_pipeline.base.partitions import arms_of, sides_of
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import HEIGHT, PANEL_HALF_THICKNESS, WIDTH, Camera, Panel, fit_camera
 from traps_pipeline.scenes.certificates import (

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.digests import digest, file_digest
-from traps_pipeline.files import write_text
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.files import write_text
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.camera import Camera, Panel
 from traps_pipeline.scenes.encode import DamagedClip, encode, frames_digest

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.files import replacing
+from traps_pipeline.base.files import replacing
 from traps_pipeline.scenes.policies import SAMPLED, FramePolicy
 
 # veryfast: 3 % larger than medium at the same quality, in half the time. mbtree is off since it is not deterministic in

@@ -13,9 +13,9 @@ import re
 from functools import cache
 from pathlib import Path
 
-from traps_pipeline.digests import file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import CHAOTIC_CATEGORIES, EXTENSION_CATEGORIES, OCCLUSION_CATEGORIES
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import CHAOTIC_CATEGORIES, EXTENSION_CATEGORIES, OCCLUSION_CATEGORIES
 from traps_pipeline.scenes import families as package
 from traps_pipeline.scenes.independence import dependence
 from traps_pipeline.scenes.kit import Family

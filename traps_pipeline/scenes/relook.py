@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.files import write_text
+from traps_pipeline.base.files import write_text
 from traps_pipeline.scenes.certificates import certificates_for, pair_of
 from traps_pipeline.scenes.kit import params_to_dict
 from traps_pipeline.scenes.look import Look, look_of_draw

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.files import write_text
+from traps_pipeline.base.files import write_text
 from traps_pipeline.scenes.certificates import settled_outcome
 from traps_pipeline.scenes.kit import Family
 from traps_pipeline.scenes.look import look_of_draw

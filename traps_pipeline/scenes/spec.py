@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from traps_pipeline.digests import digest
-from traps_pipeline.files import replacing
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.files import replacing
 
 Slug = r"^[a-z0-9_]+-[a-z0-9]+$"
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from traps_pipeline.digests import digest
-from traps_pipeline.partitions import FRAMINGS, PANEL_DOSES, PANEL_LOOKS, SCHEMAS
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.partitions import FRAMINGS, PANEL_DOSES, PANEL_LOOKS, SCHEMAS
 from traps_pipeline.scenes import checks
 from traps_pipeline.scenes.arms import SEEN_PX, Arm, Question, Scenario, Take, must_abstain, must_answer
 from traps_pipeline.scenes.certificates import legible_groups

@@ -13,7 +13,7 @@ from itertools import islice
 from multiprocessing import get_context
 from typing import TypeVar
 
-from traps_pipeline.cores import cores
+from traps_pipeline.base.cores import cores
 
 JOBS_A_WORKER = 100  # GL drivers leak: a worker does so many jobs, then another takes over
 Job = TypeVar("Job")

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.partitions import DATASETS
 from traps_pipeline.scoring.epochs import require_one_epoch
 from traps_pipeline.scoring.metrics import joined_epochs, mean
 

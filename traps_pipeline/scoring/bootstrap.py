@@ -17,7 +17,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.partitions import DATASETS, taxonomy_of
+from traps_pipeline.base.partitions import DATASETS, taxonomy_of
 from traps_pipeline.scoring.metrics import COUNTS, decision_counts, pecs_of
 
 TAXONOMIES = ("occlusion", "chaotic")

@@ -8,8 +8,8 @@ from typing import Any
 
 import pandas as pd
 
+from traps_pipeline.base.partitions import REGIMES
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.partitions import REGIMES
 from traps_pipeline.scoring.analyses import (
     hidden_against_others,
     models_of,

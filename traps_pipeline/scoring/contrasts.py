@@ -16,8 +16,8 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, REGIMES
 from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED, RESAMPLES, Resampled, percentiles, resample
 from traps_pipeline.scoring.epochs import answered, origins_of, refusal
 from traps_pipeline.scoring.leaderboard import means_over_runs, standings

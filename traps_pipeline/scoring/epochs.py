@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.partitions import DATASETS
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.scoring.metrics import joined_epochs
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.bucket import Bucket
 from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.objects import ObjectStore

@@ -6,8 +6,8 @@ import socket
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import require
 
 # What a host exports for a store of each kind: names that obstore reads.
 KEYS = {

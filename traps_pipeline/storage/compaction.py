@@ -13,7 +13,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.database import Claim, Session
 from traps_pipeline.storage.ledger import ASIDES

@@ -22,8 +22,8 @@ from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, LiteralString, TypeVar
 from urllib.parse import urlsplit
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import require
 
 if TYPE_CHECKING:
     from psycopg import Connection

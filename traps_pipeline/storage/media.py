@@ -25,9 +25,9 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from traps_pipeline.digests import digest, file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, write_bytes
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import remedy, write_bytes
 from traps_pipeline.scenes.encode import ENCODER, DamagedClip, decode, encode
 from traps_pipeline.scenes.policies import FramePolicy
 from traps_pipeline.storage.lines import NOT_WHOLE, checked_line, read_checked

@@ -18,8 +18,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, LiteralString, TypeVar
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import is_same_file, link, write_bytes
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import is_same_file, link, write_bytes
 from traps_pipeline.storage.bucket import Bucket, object_name
 from traps_pipeline.storage.database import Session, lock_number
 from traps_pipeline.storage.removal import SCHEMA, forget, removed

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from zlib import crc32
 
-from traps_pipeline.digests import digest_of_list
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes
-from traps_pipeline.progress import Tally
+from traps_pipeline.base.digests import digest_of_list
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_bytes
+from traps_pipeline.base.progress import Tally
 from traps_pipeline.storage.store import FolderStore, Store
 from traps_pipeline.storage.tables import VOLATILE, Row, Table
 

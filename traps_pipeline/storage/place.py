@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
 
 STUDY = "study.yaml"
 SCRATCH = "TRAPS_SCRATCH"  # names the folder in which the files of object stores are while they are used

@@ -20,8 +20,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, require_in_place, sync_folder, try_lock, write_bytes
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import remedy, require_in_place, sync_folder, try_lock, write_bytes
 from traps_pipeline.storage.ledger import (
     ASIDES,
     SYNC_ROWS,

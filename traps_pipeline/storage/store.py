@@ -15,9 +15,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from traps_pipeline.digests import file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import remedy, try_lock, write_bytes
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import remedy, try_lock, write_bytes
 
 LEASES = ".leases"  # in a study's folder: the files of pieces of work that are under way
 

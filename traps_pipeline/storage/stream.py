@@ -18,7 +18,7 @@ from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.database import BEAT_S, Claim, Session
 from traps_pipeline.storage.ledger import ASIDES, AVERAGED, FAILED, SYNC_ROWS, Stored, Totals, participant_of
 from traps_pipeline.storage.lines import checked_line

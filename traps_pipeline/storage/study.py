@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from traps_pipeline.partitions import PROBE_PROMPT, VQA_PROMPTS, check_slug
+from traps_pipeline.base.partitions import PROBE_PROMPT, VQA_PROMPTS, check_slug
 
 FORMAT = 1  # of a workspace
 Regime = Literal["standard", "guided"]

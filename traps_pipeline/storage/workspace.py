@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_text
-from traps_pipeline.paths import ROOT, WORKSPACES, require_root
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.paths import ROOT, WORKSPACES, require_root
+from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.storage.anchor import anchor_of, file_at, store_of, write_anchor
 from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.ledger import Ledger
@@ -27,7 +28,6 @@ from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.store import FolderStore, Store
 from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
-from traps_pipeline.yamlfile import parse_yaml_model, read_yaml
 
 if TYPE_CHECKING:
     from traps_pipeline.storage.media import MediaStore

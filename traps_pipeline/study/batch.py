@@ -15,16 +15,16 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import replacing
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import replacing
+from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.study.loopback import render, replay
 from traps_pipeline.study.references import FOLDER as MEDIA
 from traps_pipeline.study.references import References
 from traps_pipeline.study.wire_body import Api, WireBody
-from traps_pipeline.terminal import plain
-from traps_pipeline.yamlfile import read_lines
 
 FOLDER = "batches"
 AT_ONCE = 200  # bodies in memory

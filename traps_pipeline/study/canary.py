@@ -14,20 +14,20 @@ from typing import Annotated, Any
 
 import pandas as pd
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation
+from traps_pipeline.base.terminal import text_table
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
 from traps_pipeline.judging.rules import judge_abstention, judge_correctness
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.registry import NETWORK, ModelEntry, get_model
-from traps_pipeline.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.storage import columns as shared
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.terminal import text_table
 
 N_ITEMS = 20
 CELL = Cell("occlusion", Evaluation("canary", "standard", 1))  # names the folder of the calls, not a model

@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import PART
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import PART
 from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.place import Place, scratch_of
 
@@ -231,10 +231,10 @@ def _python() -> str:
 
 
 def _checkout() -> str:
+    from traps_pipeline.base.paths import require_root
     from traps_pipeline.benchmark.corrections import read_corrections
     from traps_pipeline.benchmark.records import load_release, load_released
     from traps_pipeline.models.registry import load_models
-    from traps_pipeline.paths import require_root
 
     root, release = require_root(), load_release()
     counts = f"{len(load_released())} scenarios, {len(read_corrections())} corrections, {len(load_models())} models"

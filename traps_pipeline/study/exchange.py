@@ -15,11 +15,14 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from traps_pipeline import progress
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import replacing, write_bytes
+from traps_pipeline.base.partitions import Cell, Evaluation
+from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import replacing, write_bytes
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.models.answers import prepare_media, wanted_questions
 from traps_pipeline.models.judges import load_judges, load_panel
@@ -27,15 +30,12 @@ from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import Entry, ModelEntry, account_of, get_model, load_models
 from traps_pipeline.models.request import WITH_TEXT, Outcome, OutcomeKind, Request
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.storage.ledger import Ledger, Stored
 from traps_pipeline.storage.rows import MOST_TOKENS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.study.experiment import Experiment
 from traps_pipeline.study.harness_logs import LOG, Given, reader_of
-from traps_pipeline.terminal import plain
-from traps_pipeline.yamlfile import explain, read_lines
 
 REQUESTS, MEDIA = "requests.jsonl", "media"
 SHOWN = 5  # number of wrong lines that an error names

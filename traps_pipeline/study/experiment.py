@@ -7,14 +7,14 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import BESIDE, DATASETS, REGIMES, SCHEMAS, Cell, Evaluation
+from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.models.judges import require_panel
 from traps_pipeline.models.own import Own, use
 from traps_pipeline.models.registry import LOCAL, get_model, local_models
-from traps_pipeline.partitions import BESIDE, DATASETS, REGIMES, SCHEMAS, Cell, Evaluation
-from traps_pipeline.paths import ASSETS
 from traps_pipeline.storage.study import Asked, MechanismSettings, Study
-from traps_pipeline.yamlfile import parse_yaml_model, read_yaml, within
 
 EXPERIMENTS = ASSETS / "experiments"
 LITE = "lite"  # the name of the set of 200 scenarios in LITE_FILE

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.terminal import plain
+from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.models.request import WITH_TEXT
-from traps_pipeline.terminal import plain
-from traps_pipeline.yamlfile import read_lines
 
 MOST_SAMPLE_BYTES, MOST_LOG_BYTES, MOST_SAMPLES = 2**28, 2 * 2**30, 1_000_000
 _OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_filter": "refused"}

@@ -17,9 +17,9 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from traps_pipeline import progress
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import sync_folder
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import sync_folder
 from traps_pipeline.models.budget import Journal
 from traps_pipeline.models.spending import alone, spent_usd
 from traps_pipeline.storage.database import Session, session_of

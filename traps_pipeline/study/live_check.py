@@ -19,8 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.digests import file_digest
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.digests import file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.partitions import Cell, Evaluation
+from traps_pipeline.base.terminal import plain
 from traps_pipeline.judging.panel import parse_vote, vote_request
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.backends import make_backend
@@ -31,11 +33,9 @@ from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.reading import THINKS, degenerate, read_answer
 from traps_pipeline.models.registry import NETWORK, Account, Entry, ModelEntry, account_of, effective_params
 from traps_pipeline.models.request import WITH_TEXT, Outcome, Request, TransientError
-from traps_pipeline.partitions import Cell, Evaluation
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.storage.media import Media, MediaSpec, MediaStore
 from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.terminal import plain
 
 CELL = Cell("occlusion", Evaluation("preflight", "standard", 1))  # names the folder of the calls, not a model
 TIMEOUT_S = 25.0  # of a call; what is wrong is named within half a minute

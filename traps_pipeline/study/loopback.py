@@ -13,10 +13,10 @@ from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
+from traps_pipeline.base.progress import Progress, reporting
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import MALFORMED, Outcome, Request, TransientError
-from traps_pipeline.progress import Progress, reporting
 from traps_pipeline.study.wire_body import WireBody
 
 PLACEHOLDER_KEY = "placeholder-of-a-key"

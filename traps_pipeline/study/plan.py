@@ -7,6 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from traps_pipeline.base.partitions import (
+    BESIDE,
+    DATASETS,
+    Cell,
+    Evaluation,
+    SteeredEvaluation,
+    all_datasets_of,
+    datasets_of_category,
+    sides_of,
+)
 from traps_pipeline.benchmark.corrections import load_scenarios
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.confabulation import load_protocol, sample_failures
@@ -19,16 +29,6 @@ from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.lineage import Lineage
-from traps_pipeline.partitions import (
-    BESIDE,
-    DATASETS,
-    Cell,
-    Evaluation,
-    SteeredEvaluation,
-    all_datasets_of,
-    datasets_of_category,
-    sides_of,
-)
 from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.tables import Table

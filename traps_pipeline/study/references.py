@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.files import write_bytes
+from traps_pipeline.base.files import write_bytes
 
 FOLDER = "media"
 SUFFIX = {"image/jpeg": ".jpg", "video/mp4": ".mp4"}

@@ -11,8 +11,8 @@ import shutil
 from itertools import islice
 from pathlib import Path
 
-from traps_pipeline import progress
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.anchor import write_anchor
 from traps_pipeline.storage.database import session_of
 from traps_pipeline.storage.parquet import note_of

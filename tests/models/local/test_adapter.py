@@ -28,7 +28,7 @@ from tests.local_models import (
     model,
     three_prompts,
 )
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.versions import loaded_params
 from traps_pipeline.models.local import adapter

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family, ask, model
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hidden_states import Item, item_states
 from traps_pipeline.models.local.adapter import LocalModel, Prompt
 from traps_pipeline.models.local.spans import changed_tokens, spans

@@ -15,9 +15,9 @@ from __future__ import annotations
 from threading import Lock
 from typing import Any
 
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import require
 from traps_pipeline.models.local.checkpoint import Checkpoint, find_checkpoint, require_memory, require_no_code
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import Generated, LocalModel, States

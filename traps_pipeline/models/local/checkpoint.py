@@ -13,11 +13,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.digests import digest, file_digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import require
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import require
+from traps_pipeline.base.paths import ROOT
 from traps_pipeline.models.local.settings import Dtype, LocalParams, Quantisation
-from traps_pipeline.paths import ROOT
 
 _FILES = (".json", ".jinja", ".model", ".safetensors", ".txt")  # of a folder, what decides what the model says
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.extras import require
+from traps_pipeline.base.extras import require
 
 
 @cache

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.extras import install_line, missing
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.extras import install_line, missing
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
 from traps_pipeline.models.local.checkpoint import download_command, find_checkpoint
 from traps_pipeline.models.local.library import load_transformers

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt

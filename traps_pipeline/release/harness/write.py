@@ -10,24 +10,24 @@ from typing import Any, Literal
 
 import yaml
 
-from traps_pipeline.digests import digest
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import write_bytes, write_text
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import write_bytes, write_text
+from traps_pipeline.base.partitions import DATASETS, REGIMES
+from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.models.judges import RULES_PANEL, panel_id
 from traps_pipeline.models.registry import PROTOCOL
-from traps_pipeline.partitions import DATASETS, REGIMES
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import CLIPS, SYSTEM
 from traps_pipeline.release.folder import MANIFEST
 from traps_pipeline.release.harness.items import ABOUT, ITEMS, MEDIA
 from traps_pipeline.storage.media import MediaSpec, MediaStore, payload
-from traps_pipeline.yamlfile import read_lines
 
 PACKAGE, LMMS = "traps_harness", "lmms"
 _CODE = Path(__file__).parents[2]
 # Modules that are copied, by their name in the package of the harness. They import each other and the standard library.
 _COPIED = {
-    "digests.py": "digests.py",
+    "base/digests.py": "digests.py",
     "models/request.py": "request.py",
     "models/reading.py": "reading.py",
     "judging/answers.py": "answers.py",

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.partitions import taxonomy_of
+from traps_pipeline.base.partitions import taxonomy_of
 from traps_pipeline.report.figures.looks import families, family_colour, family_of, looks
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES

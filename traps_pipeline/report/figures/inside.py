@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.base.partitions import DATASETS, SHORT
 from traps_pipeline.mechanism.directions import NULLS
-from traps_pipeline.partitions import DATASETS, SHORT
 from traps_pipeline.report.figures.looks import arrow, frame_plane
 from traps_pipeline.report.results import Results, datasets_of
 from traps_pipeline.report.tables.beside import SHORTCUTS

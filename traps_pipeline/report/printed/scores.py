@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.partitions import DATASETS
+from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.report.printed.shared import figures, in_text, of_paper, with_spread
 from traps_pipeline.report.tables.shared import DATASET, MODEL, titled
 from traps_pipeline.report.terms import TITLES

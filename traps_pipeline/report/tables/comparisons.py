@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.base.partitions import DATASETS, REGIMES
 from traps_pipeline.models.registry import load_models
-from traps_pipeline.partitions import DATASETS, REGIMES
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
     COUNTED,

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from traps_pipeline.base.partitions import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.mechanism.paths import path_name, probed_taxonomy
 from traps_pipeline.mechanism.tables import CLAMP, PROJECT_OUT
-from traps_pipeline.partitions import DATASETS, SHORT, taxonomy_of
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.beside import SHORTCUTS, against
 from traps_pipeline.report.tables.mechanism import DIRECTIONS, FEW, INFERENCE, few, why

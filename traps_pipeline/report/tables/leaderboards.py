@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from traps_pipeline.partitions import DATASETS, REGIMES
+from traps_pipeline.base.partitions import DATASETS, REGIMES
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import (
     COUNTS,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from traps_pipeline.base.partitions import SHORT
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.directions import KINDS
 from traps_pipeline.mechanism.paths import path_name
-from traps_pipeline.partitions import SHORT
 from traps_pipeline.report.results import Results
 from traps_pipeline.report.tables.shared import MODEL, epochs, rightly_empty
 from traps_pipeline.report.writing import Column, PrintedTable

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.files import replacing, write_bytes, write_text
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import replacing, write_bytes, write_text
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_an_error_or_ctrl_c_in_the_middle_leaves_the_former_content_and_nothing_
 
 def test_a_kill_in_the_middle_leaves_the_former_content_and_the_next_write_goes_through(file: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from traps_pipeline.files import replacing\n"
+        "import sys, time; from pathlib import Path; from traps_pipeline.base.files import replacing\n"
         "with replacing(Path(sys.argv[1])) as part, part.open('w') as stream:\n"
         "    stream.write('half of what'); stream.flush(); print('writing', flush=True); time.sleep(600)"
     )

@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from tests.conftest import ROOT
-from traps_pipeline.terminal import text_table
+from traps_pipeline.base.terminal import text_table
 
 HEADINGS = ("model", "n", "what was refused")
 REFUSED = "[red]calls[/red] " + "after a time-out " * 8 + "end"
@@ -43,7 +43,7 @@ def test_wide_characters_keep_the_columns_below_each_other() -> None:
 
 
 def test_a_terminal_gets_bold_headings_and_a_rule_and_every_cell_whole() -> None:
-    code = f"from traps_pipeline.terminal import text_table; print(text_table({HEADINGS!r}, {ROWS!r}, (0, 2)))"
+    code = f"from traps_pipeline.base.terminal import text_table; print(text_table({HEADINGS!r}, {ROWS!r}, (0, 2)))"
     ours, theirs = pty.openpty()
     environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "40"}
     environment.pop("NO_COLOR", None)

@@ -16,7 +16,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode, urlsplit
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 
 LEAST_TOKEN = 16  # characters
 WHO = "traps.who"  # key of a request's scope: whose token it brought

@@ -10,11 +10,11 @@ import pytest
 import yaml
 
 from tests.conftest import ROOT
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.yamlfile import parse_yaml_model, read_lines, read_yaml
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.experiment import load_experiment
-from traps_pipeline.yamlfile import parse_yaml_model, read_lines, read_yaml
 
 
 @pytest.fixture

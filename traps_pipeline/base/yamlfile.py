@@ -21,8 +21,8 @@ from yaml.reader import Reader
 from yaml.resolver import Resolver
 from yaml.scanner import Scanner
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.terminal import plain
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.terminal import plain
 
 Model = TypeVar("Model", bound=BaseModel)
 MOST_YAML_BYTES, MOST_LINE_BYTES = 4 * 2**20, 4 * 2**20

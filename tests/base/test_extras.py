@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from traps_pipeline.extras import EXTRAS, ExtraName, missing, require
+from traps_pipeline.base.extras import EXTRAS, ExtraName, missing, require
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # Of modules whose package has another name.
@@ -99,7 +99,7 @@ def test_nothing_is_missing_where_everything_is_installed_but_nf4_and_signatures
     ],
 )
 def test_a_missing_extra_is_one_sentence_with_the_line_to_type(name: ExtraName, blocked: list[str], said: str) -> None:
-    code = f"{BLOCK.format(blocked=blocked)}\nfrom traps_pipeline.extras import require; require({name!r})"
+    code = f"{BLOCK.format(blocked=blocked)}\nfrom traps_pipeline.base.extras import require; require({name!r})"
     finished = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert finished.returncode == 1
     assert said in finished.stderr.splitlines()[-1]

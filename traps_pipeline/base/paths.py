@@ -9,9 +9,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 
-PACKAGE = Path(__file__).resolve().parent
+PACKAGE = Path(__file__).resolve().parents[1]
 SHIPPED = PACKAGE / "shipped"  # only in an installed wheel; hatch_build.py puts it there
 IS_INSTALLED = SHIPPED.is_dir()
 ROOT = SHIPPED if IS_INSTALLED else PACKAGE.parent

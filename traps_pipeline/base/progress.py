@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from traps_pipeline.terminal import plain
+from traps_pipeline.base.terminal import plain
 
 
 @dataclass

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from traps_pipeline.errors import TrapsError
+from traps_pipeline.base.errors import TrapsError
 
 PART = ".part"  # how the hidden names of unfinished files end
 _REMEDIES = {
@@ -143,7 +143,7 @@ def is_same_file(one: Path, other: Path) -> bool:
 
 def link(existing: Path, path: Path) -> None:
     """Give a file another name, in the place of what has it. Nobody writes into a file that has a name: they are
-    replaced as a whole (`files.py`)."""
+    replaced as a whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline import progress
-from traps_pipeline.progress import Progress, clock, reporting
+from traps_pipeline.base import progress
+from traps_pipeline.base.progress import Progress, clock, reporting
 
 
 def test_a_progress_holds_for_its_block_even_when_it_fails() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-from traps_pipeline.webguard import WHO, Guard, personal_tokens
+from traps_pipeline.base.webguard import WHO, Guard, personal_tokens
 
 PEOPLE = {who: token for token, who in personal_tokens("one secret of sixteen", ["jd", "ab"]).items()}
 NAME = "labels.example.org"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.orchestration.wanted import Wanted
-from traps_pipeline.partitions import (
+from traps_pipeline.base.partitions import (
     ALL_CATEGORIES,
     BESIDE,
     CATEGORIES,
@@ -22,6 +21,7 @@ from traps_pipeline.partitions import (
     taxonomy_of,
     transfer_type,
 )
+from traps_pipeline.orchestration.wanted import Wanted
 
 
 def test_every_key_of_the_registry_is_parsed_back_and_legal_in_dagster() -> None:

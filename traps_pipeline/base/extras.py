@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Literal, get_args
 
-from traps_pipeline.errors import TrapsError
-from traps_pipeline.paths import IS_INSTALLED
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import IS_INSTALLED
 
 ExtraName = Literal["api", "local", "nf4", "sign", "cluster", "ui", "web"]
 
