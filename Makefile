@@ -74,6 +74,8 @@ bench-cluster: cluster-setup ## what a cluster costs and gains, against one mach
 explorer-vendor:
 	cd traps_pipeline/explorer/web/vendor && npm ci --ignore-scripts --no-audit --no-fund && npm run bundle && rm -rf node_modules
 
+# With more room for what is new, node searches for garbage less often: an eighth of pyright's time, on a core that tests want.
+lint: export NODE_OPTIONS := $(strip $(NODE_OPTIONS) --max-semi-space-size=64)
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
