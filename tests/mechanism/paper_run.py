@@ -1,6 +1,6 @@
 """The paper's mechanistic experiment on tiny checkpoints of its three families.
 
-The section `mechanism` is that of `assets/experiments/paper.yaml` but for four things: layers are those of four blocks
+The section `mechanism` is that of `assets/experiments/paper.yaml` but for four things: layers are those of a few blocks
 at the same share of the depth, the scenarios are too few for five folds, one pair a cell is steered, and answers are
 short, since a random model never ends one.
 """
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from tokenizers import Tokenizer
 
 NEW_TOKENS = 2
-BLOCKS = 4  # of a tiny checkpoint; with all blocks of the paper's models the run takes four times as long
+# Blocks of the tiny checkpoints; with all blocks of the paper's models the run takes four times as long.
+BLOCKS: Mapping[str, int] = {"qwen3-vl-8b": 4, "gemma-4-e4b": 6, "llava-next-video-7b": 4}
 # Model of the paper -> family and its blocks: with the embeddings, 37, 43 and 33 layers (docs/spec.md 7.1).
 DEPTHS: Mapping[str, tuple[Family, int]] = {
     "qwen3-vl-8b": ("qwen3-vl", 36),
@@ -36,19 +37,19 @@ def paper() -> dict[str, Any]:
     return yaml.safe_load((EXPERIMENTS / "paper.yaml").read_text(encoding="utf-8"))
 
 
-def shallow(layer: int, blocks: int) -> int:
-    """The layer of a tiny checkpoint at the same share of the depth: 20 of 36 is 2 of 4."""
-    return max(1, round(layer * BLOCKS / blocks))
+def shallow(layer: int, model: str) -> int:
+    """The layer of a model's tiny checkpoint at the same share of the depth: 20 of 36 is 2 of 4."""
+    return max(1, round(layer * BLOCKS[model] / DEPTHS[model][1]))
 
 
 def mechanism() -> dict[str, Any]:
     """The section `mechanism` for the tiny checkpoints."""
     section = paper()["mechanism"]
-    for model, (_, blocks) in DEPTHS.items():
+    for model in DEPTHS:
         layers = section["models"][model]
         for name, layer in layers.items():
             deep = layer if isinstance(layer, list) else [layer]
-            found = sorted({shallow(one, blocks) for one in deep})
+            found = sorted({shallow(one, model) for one in deep})
             layers[name] = found if isinstance(layer, list) else found[0]
     section["probes"]["folds"] = 2
     section["steering"] |= {"max_new_tokens": NEW_TOKENS, "pairs": 1}

@@ -22,8 +22,8 @@ def test_the_tiny_checkpoints_are_asked_what_the_papers_models_are() -> None:
     differ = {name for name in real["steering"] if tiny["steering"][name] != real["steering"][name]}
     assert differ == {"pairs", "max_new_tokens"}
     layers = {model: (each["steering"], each.get("sweep")) for model, each in tiny["models"].items()}
-    # 20 of 36, 35 of 42 with 1 and 17, and 28 of 32 blocks, each of four: 2.2, 3.3 with 0.1 and 1.6, 3.5.
-    assert layers == {"qwen3-vl-8b": (2, None), "gemma-4-e4b": (3, [1, 2]), "llava-next-video-7b": (4, None)}
+    # 20 of 36 blocks, of four: 2.2; 35 of 42 with 1 and 17, of six: 5 with 0.1 and 2.4; 28 of 32, of four: 3.5.
+    assert layers == {"qwen3-vl-8b": (2, None), "gemma-4-e4b": (5, [1, 2]), "llava-next-video-7b": (4, None)}
 
 
 @pytest.mark.slow
@@ -43,7 +43,7 @@ def test_the_papers_layers_sweep_doses_and_paths_are_run_on_all_three_families(s
         layers = settings["models"][model]
         mine = effects.loc[effects["model"] == model]
         transfer = probes.loc[(probes["model"] == model) & (probes["analysis"] == "transfer")]
-        assert set(transfer["layer"]) == {*range(BLOCKS + 1)}  # the embeddings, then every block's output
+        assert set(transfer["layer"]) == {*range(BLOCKS[model] + 1)}  # the embeddings, then every block's output
         assert len(transfer[["source", "target"]].drop_duplicates()) == 12
         assert set(mine["layer"]) == {layers["steering"], *layers.get("sweep", [])}  # of Gemma also the sweep
         assert set(mine["alpha"]) >= {0, *settings["steering"]["alphas"]}
