@@ -1,8 +1,7 @@
 """Clips of a category that several processes make beside one another, on one host or on many, in leased chunks.
 
 All go through the same chunks of the same rows. Each leases one that nobody has, makes what is missing of it, hands it
-over to the study and goes on to the next; whoever dies gives its chunk back. Nobody is
-done before all clips are there.
+over to the study and goes on to the next; whoever dies gives its chunk back. Nobody is done before all clips are there.
 """
 
 from __future__ import annotations

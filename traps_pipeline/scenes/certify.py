@@ -83,7 +83,8 @@ def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
 
 def state_at_cut(qpos: np.ndarray, cut_frame: int) -> np.ndarray:
     """Poses in the last frame that a cut void shows, and how they changed since the frame before, (2 nq,)."""
-    return np.concatenate([qpos[cut_frame - 1], qpos[cut_frame - 1] - qpos[cut_frame - 2]])
+    last, before = qpos[cut_frame - 1], qpos[max(cut_frame - 2, 0)]  # a void of one frame shows no change
+    return np.concatenate([last, last - before])
 
 
 def _same_physics(pair: Pair) -> bool:
