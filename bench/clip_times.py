@@ -9,6 +9,7 @@ python bench/clip_times.py --against ../traps-0.1.0
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import statistics
@@ -57,8 +58,10 @@ class Version:
 def work() -> None:
     """What a `Version` does, with the package of its folder, which may be an old one: records by id, one a line."""
     import traps_pipeline
-    from traps_pipeline.base.digests import digest
-    from traps_pipeline.base.paths import RELEASED
+
+    base = "traps_pipeline.base" if importlib.util.find_spec("traps_pipeline.base") else "traps_pipeline"  # of old ones
+    digest = importlib.import_module(f"{base}.digests").digest
+    released = importlib.import_module(f"{base}.paths").RELEASED
     from traps_pipeline.benchmark.composition import load_composition
     from traps_pipeline.benchmark.records import load_released
     from traps_pipeline.scenes.certify import certify
@@ -69,7 +72,7 @@ def work() -> None:
     print(json.dumps({"package": str(package), "scenarios": load_composition()}), flush=True)
     for line in sys.stdin:
         spec = specs[line.strip()]
-        path = RELEASED / "trajectories" / f"{spec.scenario_id}.npz"
+        path = released / "trajectories" / f"{spec.scenario_id}.npz"
         qpos, twin = (
             load_trajectory(path, spec.trajectory_sha256),
             load_trajectory(path, spec.twin.trajectory_sha256, "twin"),

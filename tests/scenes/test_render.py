@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.scenes.released import load
+from traps_pipeline.scenes import render
 from traps_pipeline.scenes.certificates import ABLATION, CLOSING, HIDDEN, TWIN_BEHIND_PANEL, pair_of
 from traps_pipeline.scenes.outcome import moving_geoms
 from traps_pipeline.scenes.world import World
@@ -69,3 +70,19 @@ def test_the_end_of_a_closed_control_is_looked_at_without_drawing_the_void_again
         found = CLOSING.measured(pair)
         assert drawn.call_count == already
     assert (found["closed_px"], found["closed_change_px"]) == (0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario_id", ["balance-0001", "tumbling_dice-0001"])  # one with a horizon
+def test_a_finite_floor_looks_as_an_infinite_one_with_haze_and_texture(scenario_id: str) -> None:
+    case = load(scenario_id)
+    with World.of_record(case.spec, case.qpos).renderer() as renderer:
+        (finite,) = renderer.frames(case.qpos[-1:])
+    infinite = World.of_record(case.spec, case.qpos)
+    plane = infinite.model.geom("floor").id
+    assert not infinite.model.geom_size[plane, :2].any()
+    with patch.object(render, "_make_floors_finite"), infinite.renderer() as renderer:
+        (wanted,) = renderer.frames(case.qpos[-1:])
+    assert not infinite.model.geom_size[plane, :2].any()  # as MuJoCo draws it by itself
+    apart = np.abs(finite.astype(int) - wanted).max(axis=-1)
+    assert (apart > 0).mean() < 0.01 and (apart > 2).mean() < 0.0005

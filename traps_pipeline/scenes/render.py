@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera
-from traps_pipeline.scenes.kit import PANEL_GROUP, REMOVED_GROUP
+from traps_pipeline.scenes.kit import FLOOR_GROUP, PANEL_GROUP, REMOVED_GROUP
 from traps_pipeline.scenes.soft import flexes
 
 if TYPE_CHECKING:
@@ -53,6 +53,22 @@ def gl_version() -> str:
     return said.decode(errors="replace") if isinstance(said, bytes) else "an unknown OpenGL"
 
 
+def _make_floors_finite(model: mujoco.MjModel, camera: Camera) -> None:
+    """Give each plane a size that reaches beyond what the camera sees. An infinite one is drawn as a grid of 200 x 200
+    cells in each pass, a third of a frame's time in some scenes; a finite one as 2 x 2. Collisions know no difference.
+    Its texture lies where that of the infinite one does: by its centre where the half size is an odd number of repeats
+    (`settexture` and `makePlane` of MuJoCo)."""
+    import mujoco
+
+    reach = 1.05 * model.vis.map.zfar * camera.extent
+    for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
+        material = model.geom_matid[plane]
+        repeats_a_metre = model.mat_texrepeat[material] if material >= 0 else np.ones(2)
+        wanted_m = reach + float(np.abs(camera.position() - model.geom_pos[plane]).max())
+        halves = (np.ceil(wanted_m * repeats_a_metre / 2) * 2 + 1) / repeats_a_metre
+        model.geom_size[plane] = [*halves, halves.max()]  # at last the spacing of the grid
+
+
 class Renderer:
     """Draws one model from one camera. Use as a context manager; every frame is (360, 480, 3) uint8 RGB, or
     (720, 960, 3) of a model whose look is as fine as that."""
@@ -70,6 +86,7 @@ class Renderer:
         model.vis.global_.fovy = camera.fovy_deg
         model.stat.extent = camera.extent
         model.stat.center[:] = camera.centre
+        _make_floors_finite(model, camera)
         self._pixels = np.empty((self._height, self._width, 4), np.uint8)
         self._drawn: tuple[object, ...] | None = None  # what the picture in `_pixels` is of
         self._model, self._data, self._soft = model, mujoco.MjData(model), flexes(model)
@@ -144,16 +161,21 @@ class Renderer:
         option = mujoco.MjvOption()
         option.geomgroup[:] = 1
         option.geomgroup[PANEL_GROUP] = int(panel)
-        option.geomgroup[REMOVED_GROUP] = option.flexgroup[REMOVED_GROUP] = 0
+        option.geomgroup[FLOOR_GROUP] = option.geomgroup[REMOVED_GROUP] = option.flexgroup[REMOVED_GROUP] = 0
+        everything, unmoved = mujoco.mjtCatBit.mjCAT_ALL, mujoco.MjvPerturb()
         groups, soft_groups = self._model.geom_group.copy(), self._model.flex_group.copy()
+        self._model.geom_group[self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = FLOOR_GROUP
         for name in without:
             of = self._model.flex_group if self._is_soft(name) else self._model.geom_group
             of[self._number(name)] = REMOVED_GROUP
         try:
-            everything = mujoco.mjtCatBit.mjCAT_ALL
-            mujoco.mjv_updateScene(
-                self._model, self._data, option, mujoco.MjvPerturb(), self._camera, everything, self._scene
-            )
+            mujoco.mjv_updateScene(self._model, self._data, option, unmoved, self._camera, everything, self._scene)
+            # The floor last: what stands before it is not painted over. The same picture, up to a fifth sooner.
+            for of in (option.geomgroup, option.flexgroup, option.sitegroup, option.tendongroup, option.skingroup):
+                of[:] = 0
+            option.geomgroup[FLOOR_GROUP] = 1
+            mujoco.mjv_addGeoms(self._model, self._data, option, unmoved, everything, self._scene)
+            self._add_haze()
         finally:
             self._model.geom_group[:], self._model.flex_group[:] = groups, soft_groups
         viewport = mujoco.MjrRect(0, 0, self._width, self._height)
@@ -161,6 +183,17 @@ class Renderer:
         self._read()
         self._drawn = wanted
         return self._pixels
+
+    def _add_haze(self) -> None:
+        """Let the far end of the floor fade: MuJoCo draws that haze where it finds an infinite plane, for which it
+        takes this one, which has no area."""
+        import mujoco
+
+        for plane in np.flatnonzero(self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[:1]:
+            place, turn = self._data.geom_xpos[plane], self._data.geom_xmat[plane]
+            unseen = self._scene.geoms[self._scene.ngeom]
+            mujoco.mjv_initGeom(unseen, mujoco.mjtGeom.mjGEOM_PLANE, np.zeros(3), place, turn, np.ones(4, np.float32))
+            self._scene.ngeom += 1
 
     def _is_soft(self, name: str) -> bool:
         return name in self._soft
