@@ -34,6 +34,7 @@ TRANSIENT = {
     "timeout_status": 0.01,
     "conflict": 0.01,
 }
+OUTCOMES = {"empty": "empty", "length": "truncated", "thinking_exhausted": "truncated", "content_filter": "refused"}
 ENDINGS = dict.fromkeys(("empty", "length", "content_filter", "thinking_exhausted", "invalid_json"), 0.01)
 
 
@@ -95,8 +96,11 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_
     assert (
         len(rows) == len({(r["item_id"], r["model"], r["regime"], r["run"]) for r in rows}) == 2 * ITEMS * 3 * len(runs)
     )
-    outcomes = Counter(row["outcome"] for row in rows)
-    assert outcomes.keys() == {"answer", "truncated", "empty", "refused"}
+    # Which calls end badly depends on the bytes of the clips: what was sent is what counts.
+    outcomes, ends = Counter(row["outcome"] for row in rows), Counter[str]()
+    for fault, count in stats["answered_by_fault"].items():
+        ends[OUTCOMES.get(fault, "answer")] += count
+    assert outcomes == ends and len(ends) > 2
     assert outcomes["answer"] > 0.9 * len(rows)
     for row in rows:
         assert (row["text"] is not None) == (row["outcome"] == "answer")
