@@ -25,7 +25,6 @@ from tempfile import TemporaryDirectory
 
 os.environ.setdefault("MUJOCO_GL", "osmesa")
 
-import cv2
 import mujoco
 import numpy as np
 import pandas as pd
@@ -38,6 +37,7 @@ from traps_pipeline.scenes.certify import state_at_cut
 from traps_pipeline.scenes.checks import control_frames
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.scenes.evidence import Claim
+from traps_pipeline.scenes.likeness import NEAR_BITS, perceptual_hash
 from traps_pipeline.scenes.observe import observe
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
 from traps_pipeline.scenes.world import World
@@ -45,7 +45,6 @@ from traps_pipeline.scoring.tables import LEADERBOARD, ROBUST
 from traps_pipeline.storage.workspace import Workspace
 
 STEP = 2  # every second frame is shown: 5 of 10 a second
-NEAR_BITS = 8  # of 64: two pictures whose hashes differ in so few look alike
 TURN_DEG = 10.0
 SETTLED = 0.3, 0.8  # wanted: outcomes settle between these shares of the clip
 
@@ -144,13 +143,6 @@ def read_whole(world: World, spec: SceneSpec, qpos: np.ndarray) -> str | None:
         clip = Path(folder) / "control.mp4"
         encode(list(control_frames(renderer, qpos, world.open_frames)), clip, world.physics.fps)
         return observe(clip, spec.question)
-
-
-def perceptual_hash(frame: np.ndarray) -> int:
-    """64 bits: which of the 8 x 8 lowest cosine frequencies of the 32 x 32 grey picture lie above their median."""
-    grey = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), (32, 32), interpolation=cv2.INTER_AREA)
-    low = cv2.dct(grey.astype(np.float32))[:8, :8].ravel()
-    return int("".join("1" if value > np.median(low) else "0" for value in low), 2)
 
 
 def turned_deg(model: mujoco.MjModel, qpos: np.ndarray) -> float:

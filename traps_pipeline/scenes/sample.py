@@ -21,13 +21,14 @@ import numpy as np
 from traps_pipeline.base.files import write_text
 from traps_pipeline.scenes.certificates import settled_outcome
 from traps_pipeline.scenes.kit import Family
+from traps_pipeline.scenes.likeness import first_look, too_alike
 from traps_pipeline.scenes.look import look_of_draw
 from traps_pipeline.scenes.outcome import Rejected, compile_scene, simulated
 from traps_pipeline.scenes.pace import LATEST_SHARE, out_of_pace, settles_share
 from traps_pipeline.scenes.registry import family_digest, fit_to_sample, get_family
 from traps_pipeline.scenes.resolve import Resolved, resolve
 from traps_pipeline.scenes.simulate import replay
-from traps_pipeline.scenes.spec import SceneSpec, save_trajectory
+from traps_pipeline.scenes.spec import SceneSpec, load_trajectory, save_trajectory
 from traps_pipeline.scenes.wording import draw_ill_posed
 from traps_pipeline.scenes.workers import run_in_order
 
@@ -115,6 +116,7 @@ def sample_family(
     specs = records.read(tally)
     answers = Counter(spec.ground_truth for spec in specs)
     texts = Counter(spec.ill_posed_question for spec in specs)
+    looks = {} if len(specs) == count else {spec.scenario_id: first_look(spec, records.qpos(spec)) for spec in specs}
     taken = {int(spec.scenario_id.rpartition("-")[2]) for spec in specs}
     places = [place for place in range(1, count + 1) if place not in taken]
     if not places:
@@ -132,6 +134,9 @@ def sample_family(
             tally.draws += 1
             if isinstance(found, Resolved) and found.spec.ground_truth in _closed(answers, count, family):
                 found = f"answer {found.spec.ground_truth!r} has its quota"
+            picture = first_look(found.spec, found.qpos) if isinstance(found, Resolved) else 0
+            if isinstance(found, Resolved) and (other := too_alike(looks, picture, count)):
+                found = f"its first frame looks like that of another: {other}"
             if isinstance(found, str):
                 tally.rejected[found.split(":")[0]] += 1
                 if kind_of(found) not in said:  # so that a family that never passes says why at once
@@ -139,6 +144,7 @@ def sample_family(
                     report(f"{name}: draw {draw.number + 1} is rejected: {found}")
                 continue
             placed = _named(family, found, draw, places.pop(0), texts, count)
+            looks[placed.spec.scenario_id] = picture
             answers[placed.spec.ground_truth] += 1
             texts[placed.spec.ill_posed_question] += 1
             records.append(placed, tally)
@@ -184,6 +190,10 @@ class Records:
         kept = [spec for spec in specs if spec.seed < tally.draws]
         write_text(self._lines, "".join(record_line(spec) for spec in kept))
         return kept
+
+    def qpos(self, spec: SceneSpec) -> np.ndarray:
+        """The trajectory of a record that was read."""
+        return load_trajectory(self._released / "trajectories" / f"{spec.scenario_id}.npz", spec.trajectory_sha256)
 
     def sort(self) -> None:
         """Put the records in the order of their ids: those that fill a place were added last."""
