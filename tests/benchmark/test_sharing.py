@@ -19,7 +19,7 @@ from traps_pipeline.storage.store import LEASES, Store
 
 __all__ = ["where"]  # the fixture
 ROWS = [{"scenario_id": f"made-{n:04d}"} for n in range(5 * CHUNK + 3)]
-STOPS_AT = 2 * CHUNK + 3  # the row in whose drawing a process can be stopped
+STOPS_AT = 3 * CHUNK - 1  # the row in whose drawing a process can be stopped, the last one of the third chunk
 MAKE = """
 import sys
 from pathlib import Path
@@ -96,7 +96,7 @@ def test_what_a_process_that_is_killed_has_finished_is_kept_and_its_chunk_is_mad
 ) -> None:
     told = tmp_path / "told"
     os.mkfifo(f"{told}.stop")
-    # The pipe opens when it is read from: in the middle of the third chunk.
+    # The pipe opens when it is read from: at the end of the third chunk.
     with process(told, where, "one", "stops") as one, Path(f"{told}.stop").open("w"):
         one.kill()
         one.wait()

@@ -20,7 +20,7 @@ from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.orchestration.step import TAKEN
 
 pytestmark = pytest.mark.slow
-SCENARIOS = 2 * CHUNK + 1  # three chunks
+SCENARIOS = 3 * CHUNK + 1  # four chunks
 EXPERIMENT = f"""
 name: shared
 description: One category.

@@ -20,7 +20,7 @@ from traps_pipeline.scenes.workers import run_in_order
 from traps_pipeline.storage.leases import POLL_S
 from traps_pipeline.storage.store import Lease, Store
 
-CHUNK = 4  # scenarios: a quarter of a minute of one core, so that nobody waits long for the last one
+CHUNK = 2  # scenarios: seconds of one core, so that nobody waits long for the last one
 Row = Mapping[str, Any]
 Job = TypeVar("Job")
 

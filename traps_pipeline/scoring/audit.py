@@ -148,7 +148,9 @@ def _line(table: str) -> str:
 
 def overall_means() -> Iterator[Finding]:
     """The overall leaderboard against the equal-weight means of the per-dataset table, cell by cell."""
-    ours = overall(published_cells()).set_index(["model", "regime"]).to_dict("index")
+    cells = published_cells()
+    ours = overall(cells).set_index(["model", "regime"]).to_dict("index")
+    of_entry = dict(iter(cells.groupby(["model", "regime"])))
     for row in published_overall().to_dict("records"):
         model, regime = row["model"], row["regime"]
         for share in SHARES:
@@ -158,7 +160,7 @@ def overall_means() -> Iterator[Finding]:
             verdict: Verdict = (
                 AGREES if off <= half + _SLACK else ROUNDING if off <= half + unit / 2 + _SLACK else DIFFERS
             )
-            parts = published_cells().query("model == @model and regime == @regime")[share] * scale
+            parts = of_entry[model, regime][share] * scale
             sums = " + ".join(f"{part:.{3 if share == 'pecs' else 1}f}" for part in parts)
             reason = "" if verdict == AGREES else f"({sums}) / 4 = {value:.5g}, off by {value - theirs:+.2g}"
             name = f"overall {share} of {model}, {regime}"

@@ -88,6 +88,10 @@ class Table(Generic[Row]):
 
     def arrow_schema(self) -> pa.Schema:
         """The schema that a written file has."""
+        return self._schema
+
+    @cached_property
+    def _schema(self) -> pa.Schema:
         import pyarrow as pa
 
         arrow = (pa.string(), pa.int64(), pa.float64(), pa.bool_(), pa.timestamp("us", tz="UTC"), pa.list_(pa.string()))
