@@ -14,12 +14,12 @@ from pathlib import Path
 from tests.conftest import ROOT
 from tests.storage.test_store import opened, where
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.sharing import CHUNK, Filming, Row, share
+from traps_pipeline.benchmark.sharing import Filming, Row, share
 from traps_pipeline.storage.store import LEASES, Store
 
 __all__ = ["where"]  # the fixture
-ROWS = [{"scenario_id": f"made-{n:04d}"} for n in range(5 * CHUNK + 3)]
-STOPS_AT = 3 * CHUNK - 1  # the row in whose drawing a process can be stopped, the last one of the third chunk
+ROWS = [{"scenario_id": f"made-{n:04d}"} for n in range(9)]
+STOPS_AT = 4  # the row in whose drawing a process can be stopped
 MAKE = """
 import sys
 from pathlib import Path
@@ -91,26 +91,25 @@ def test_two_processes_draw_each_row_once(where: Sequence[str], tmp_path: Path) 
     assert not list(tmp_path.rglob(LEASES))
 
 
-def test_what_a_process_that_is_killed_has_finished_is_kept_and_its_chunk_is_made_by_another(
+def test_what_a_process_that_is_killed_has_finished_is_kept_and_its_row_is_made_by_another(
     where: Sequence[str], tmp_path: Path
 ) -> None:
     told = tmp_path / "told"
     os.mkfifo(f"{told}.stop")
-    # The pipe opens when it is read from: at the end of the third chunk.
+    # The pipe opens when it is read from: the row before may not have been handed over yet.
     with process(told, where, "one", "stops") as one, Path(f"{told}.stop").open("w"):
         one.kill()
         one.wait()
         drawn = made(opened(*where, "other"), told)
-    counts = Counter(told.read_text().split())
-    open_chunk = {row["scenario_id"] for row in ROWS[2 * CHUNK : STOPS_AT + 1]}
-    assert {name for name, count in counts.items() if count > 1} <= open_chunk and max(counts.values()) == 2
-    kept = 2 * CHUNK  # in a folder also what was finished of the open chunk
-    assert drawn in (len(ROWS) - kept, len(ROWS) - kept - (STOPS_AT - kept))
+    counts, rows = Counter(told.read_text().split()), [row["scenario_id"] for row in ROWS]
+    assert counts[rows[STOPS_AT]] == 2
+    assert {name for name, count in counts.items() if count > 1} <= {*rows[STOPS_AT - 1 : STOPS_AT + 1]}
+    assert counts.total() == STOPS_AT + 1 + drawn and drawn in (len(ROWS) - STOPS_AT, len(ROWS) - STOPS_AT + 1)
     assert contents(where).keys() == {f"{row['scenario_id']}.mp4" for row in ROWS}
 
 
 def test_what_lies_on_this_host_alone_is_handed_over_and_not_drawn(where: Sequence[str], tmp_path: Path) -> None:
-    store, begun = opened(*where, "one"), ROWS[: CHUNK + 1]
+    store, begun = opened(*where, "one"), ROWS[:2]
     for row in begun:
         write_bytes(store.root / "clips" / f"{row['scenario_id']}.mp4", b"made before a kill")
     assert made(store, tmp_path / "told") == len(ROWS) - len(begun)
@@ -124,6 +123,6 @@ def test_who_does_not_wait_makes_what_is_free_and_says_that_others_are_at_the_re
     assert theirs is not None
     of = Filming("videos/made", lambda rows: rows, lambda row: [], lambda row: None, draw)
     assert share(one, ROWS, of, done.append, wait=False) == (0, False)
-    assert done[-1] == len(ROWS) - CHUNK
+    assert done[-1] == len(ROWS) - 1
     theirs.close()
     assert share(one, ROWS, of, done.append, wait=False) == (0, True)

@@ -15,12 +15,11 @@ import pytest
 from dagster import AssetKey, DagsterInstance
 
 from tests.conftest import Checkout, make_checkout
-from traps_pipeline.benchmark.sharing import CHUNK
 from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.orchestration.step import TAKEN
 
 pytestmark = pytest.mark.slow
-SCENARIOS = 3 * CHUNK + 1  # four chunks
+SCENARIOS = 5
 EXPERIMENT = f"""
 name: shared
 description: One category.
@@ -63,7 +62,7 @@ def test_two_share_what_a_killed_one_has_left_and_it_is_what_one_alone_makes(
     (root / "shared.yaml").write_text(EXPERIMENT)
     study, alone = Checkout(root, tmp_path / "study"), Checkout(root, tmp_path / "alone")
     killed = start(study)
-    while len(notes(study.workspace)) < 4:  # in the middle of the second scenario of the first chunk
+    while len(notes(study.workspace)) < 4:  # in the middle of the second scenario
         assert killed.poll() is None, killed.communicate()
         time.sleep(0.02)
     os.killpg(killed.pid, signal.SIGKILL)

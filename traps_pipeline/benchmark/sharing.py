@@ -1,7 +1,7 @@
-"""Clips of a category that several processes make beside one another, on one host or on many, in leased chunks.
+"""Clips of a category that several processes make beside one another, on one host or on many, a scenario each.
 
-All go through the same chunks of the same rows. Each leases one that nobody has, makes what is missing of it, hands it
-over to the study and goes on to the next; whoever dies gives its chunk back. Nobody is done before all clips are there.
+All go through the same rows. Each leases one that nobody has, makes what is missing of it, hands it over to the study
+and goes on to the next; whoever dies gives its rows back. Nobody is done before all clips are there.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -20,7 +21,6 @@ from traps_pipeline.scenes.workers import run_in_order
 from traps_pipeline.storage.leases import POLL_S
 from traps_pipeline.storage.store import Lease, Store
 
-CHUNK = 2  # scenarios: seconds of one core, so that nobody waits long for the last one
 Row = Mapping[str, Any]
 Job = TypeVar("Job")
 
@@ -41,16 +41,6 @@ class Filming(Generic[Job]):
     draw: Callable[[Job], int]
 
 
-@dataclass
-class _Chunk:
-    """Rows that one process makes. missing: how many of them were, when it was looked; jobs: not finished yet."""
-
-    rows: Sequence[Row]
-    missing: int
-    lease: Lease | None = None
-    jobs: int = 0
-
-
 def share(
     store: Store, rows: Sequence[Row], of: Filming[Job], tick: Callable[[int], None], *, wait: bool = True
 ) -> tuple[int, bool]:
@@ -67,64 +57,51 @@ class _Sharing(Generic[Job]):
     def __init__(self, store: Store, rows: Sequence[Row], of: Filming[Job], tick: Callable[[int], None]) -> None:
         self._store, self._of, self._tick = store, of, tick
         missing = {id(row) for row in of.missing(rows)}
-        self._done = len(rows) - len(missing)
-        parts = (rows[first : first + CHUNK] for first in range(0, len(rows), CHUNK))
-        chunks = {number: _Chunk(part, sum(id(row) in missing for row in part)) for number, part in enumerate(parts)}
         # By number, which is the same for everybody.
-        self._left = {number: chunk for number, chunk in chunks.items() if chunk.missing}
-        self._mine = list[_Chunk]()
-        self._drawing = deque[_Chunk]()  # that of each job, in the order of the jobs
+        self._left = {number: row for number, row in enumerate(rows) if id(row) in missing}
+        self._done = len(rows) - len(self._left)
+        self._drawing = deque[tuple[Row, Lease]]()  # in the order of the jobs
 
     def work(self, *, wait: bool) -> tuple[int, bool]:
         drawn = 0
         try:
             while self._left:
-                for _, frames in run_in_order(self._of.draw, self._jobs()):
+                # The next row is drawn while files are handed over.
+                for _, frames in run_in_order(self._of.draw, self._jobs(), least=2):
                     drawn += frames
-                    chunk = self._drawing.popleft()
-                    chunk.jobs, chunk.missing = chunk.jobs - 1, chunk.missing - 1
-                    self._tell(1)
-                    if not chunk.jobs:
-                        self._finish(chunk)
+                    self._finish(*self._drawing.popleft())
                 if not wait:
                     break
                 if self._left:  # nothing of one's own is under way, or two might wait for one another
                     time.sleep(POLL_S)
         finally:
-            for chunk in self._mine:
-                if chunk.lease is not None:
-                    chunk.lease.close()
+            for _, lease in self._drawing:
+                lease.close()
         return drawn, not self._left
 
     def _jobs(self) -> Iterator[Job]:
-        """Jobs of the chunks that nobody else has, each leased when its first job is asked for."""
+        """Jobs of the rows that nobody else has, each leased when its job is asked for."""
         for number in [*self._left]:
             lease = self._store.lease(f"{self._of.name}/{number:06d}")
             if lease is None:
                 continue
-            chunk = self._left.pop(number)
-            chunk.lease = lease
-            self._mine.append(chunk)
+            row = self._left.pop(number)
+            self._drawing.append((row, lease))
             self._store.look()  # another process may have made it
-            chunk.rows = self._of.missing(chunk.rows)
-            self._store.bring(file for row in chunk.rows for file in self._of.files(row))
-            jobs = [job for row in chunk.rows if (job := self._of.job(row)) is not None]
-            chunk.jobs = len(jobs)
-            self._drawing.extend([chunk] * len(jobs))
-            if not jobs:
-                self._finish(chunk)
-            yield from jobs
+            job = None
+            if self._of.missing([row]):
+                self._store.bring(self._of.files(row))
+                job = self._of.job(row)
+            if job is None:
+                self._finish(*self._drawing.pop())
+            else:
+                yield job
 
-    def _finish(self, chunk: _Chunk) -> None:
-        """Hand a chunk over to the study, and give it back."""
-        self._store.keep(file for row in chunk.rows for file in self._of.files(row) if file.is_file())
-        self._mine.remove(chunk)
-        if chunk.lease is not None:
-            chunk.lease.close()
-        self._tell(chunk.missing)
-
-    def _tell(self, more: int) -> None:
-        self._done += more
+    def _finish(self, row: Row, lease: Lease) -> None:
+        """Hand a row's files over to the study, and give it back."""
+        with closing(lease):
+            self._store.keep(file for file in self._of.files(row) if file.is_file())
+        self._done += 1
         self._tick(self._done)
 
 

@@ -21,10 +21,16 @@ Result = TypeVar("Result")
 
 
 def run_in_order(
-    function: Callable[[Job], Result], jobs: Iterable[Job], workers: int | None = None, *, ahead: int | None = None
+    function: Callable[[Job], Result],
+    jobs: Iterable[Job],
+    workers: int | None = None,
+    *,
+    ahead: int | None = None,
+    least: int = 1,
 ) -> Iterator[tuple[Job, Result]]:
     """Results of a picklable function over jobs, in their order. Jobs are taken late: a few ahead of what is yielded,
-    and no more than `ahead` at a time, for who may want no further result soon.
+    and no more than `ahead` at a time, for who may want no further result soon. least: of 2, a single worker has its
+    next job already while the caller deals with a result.
 
     A GL context belongs to a process, so each worker keeps its own. Closing the iterator cancels what has not begun.
     """
@@ -33,13 +39,14 @@ def run_in_order(
     more = True
     while more:  # a fresh pool for each round: recycling inside a pool can deadlock (CPython 3.11)
         batch = islice(source, workers * JOBS_A_WORKER)
-        more = yield from _one_pool(function, batch, workers, min(2 * workers - 1, ahead or 2 * workers - 1))
+        most = max(least, 2 * workers - 1)
+        more = yield from _one_pool(function, batch, workers, min(most, ahead or most))
 
 
 def _one_pool(
     function: Callable[[Job], Result], batch: Iterator[Job], workers: int, ahead: int
 ) -> Iterator[tuple[Job, Result]]:
-    first = list(islice(batch, ahead))  # a job begun cannot be cancelled: one worker never runs ahead
+    first = list(islice(batch, ahead))  # a job begun cannot be cancelled: one worker runs ahead where that is asked for
     if not first:
         return False
     context = get_context("spawn")
