@@ -29,7 +29,7 @@ from tests.mechanism.test_stages_run import with_mechanism
 
 pytestmark = pytest.mark.slow
 MANY = os.environ.get("TRAPS_FAULTS")
-FAULTS = int(MANY or 6)
+FAULTS = int(MANY or 10)
 HELD_US = 10**9  # longer than any test
 # How a file gets its content, its name and its place on the disk; SQLite writes by pwrite64 and fdatasync.
 CALLS = "fsync,fdatasync,rename,ftruncate,pwrite64"

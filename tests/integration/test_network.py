@@ -230,7 +230,7 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
             time.sleep(0.05)
         process.send_signal(stop)
         stopped = time.monotonic()
-        time.sleep(0.1)
+        time.sleep(1.0)  # a call that was just sent may be on its way on a busy machine; the next one would be later
         requests = provider.stats()["requests"]
         out, err = process.communicate(timeout=540)
         assert (process.returncode, "Traceback" in err) == (130, False), err

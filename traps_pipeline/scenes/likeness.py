@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import combinations
 
-import cv2
 import numpy as np
 
 from traps_pipeline.scenes.spec import SceneSpec
@@ -18,6 +17,8 @@ NEAR_SHARE = 0.1  # of a family's records may have another one that looks like t
 def perceptual_hash(frame: np.ndarray) -> int:
     """64 bits: which of the 8 x 8 lowest cosine frequencies of the 32 x 32 grey picture lie above their median. frame:
     (H, W, 3) RGB. The pHash of Zauner, Implementation and Benchmarking of Perceptual Image Hash Functions, 2010."""
+    import cv2  # here, since the graph imports the sampler, and nothing heavy
+
     grey = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), (32, 32), interpolation=cv2.INTER_AREA)
     low = cv2.dct(grey.astype(np.float32))[:8, :8].ravel()
     return int("".join("1" if value > np.median(low) else "0" for value in low), 2)
