@@ -124,20 +124,17 @@ def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:
             dataset, model, run = cast(tuple[str, str, int], key)
             decisions = group.pivot(index="item_id", columns="regime", values=column).astype("boolean")
             origins = {regime: origins_of(rows) for regime, rows in group.groupby("regime", sort=False)}
-            # Plain arrays: of hundreds of comparisons of few items each, frames would take longest.
-            known, said = decisions.notna().to_numpy(), decisions.fillna(False).to_numpy(bool)
-            items, place = decisions.index.to_numpy(), {regime: k for k, regime in enumerate(decisions)}
-            for left, right in combinations([r for r in REGIMES if r in place], 2):
-                both = known[:, place[left]] & known[:, place[right]]
-                on_left, on_right = (said[both, place[regime]] for regime in (left, right))
+            for left, right in combinations([r for r in REGIMES if r in decisions], 2):
+                both = decisions[[left, right]].dropna().astype(bool)
+                on_left, on_right = (both[regime].to_numpy(bool) for regime in (left, right))
                 only_left = np.count_nonzero(on_left & ~on_right)
                 only_right = np.count_nonzero(on_right & ~on_left)
                 row = {"dataset": dataset, "model": model, "run": run, "decision": decision}
-                row |= {"left_regime": left, "right_regime": right, "n": len(on_left)}
+                row |= {"left_regime": left, "right_regime": right, "n": len(both)}
                 row |= {"only_left": only_left, "only_right": only_right}
-                of_both = [{item: origins[regime][item] for item in items[both]} for regime in (left, right)]
+                of_both = [{item: origins[regime][item] for item in both.index} for regime in (left, right)]
                 row["refused"] = refusal(*of_both)
-                if row["refused"] is None and len(on_left):
+                if row["refused"] is None and len(both):
                     discordant = only_left + only_right
                     row["p"] = binomtest(only_left, discordant, 0.5).pvalue if discordant else 1.0
                 rows.append(row)

@@ -32,8 +32,6 @@ _SUM, _MARK, _ZEROS = b"traps-sum", b"traps-sum:", b"0" * 8
 _ROWS_AT_ONCE = 1000  # of a table as Python values
 _WHOLE: dict[Path, str] = {}  # files whose bytes this process has held against the digest in them, by their stamp
 _SOUND: dict[Path, str] = {}  # files whose content this process has compared with their footer
-# What this process has read of files: stamp, footer and columns. A command asks for each state a dozen times.
-_FOOTERS: dict[Path, tuple[str, str, list[str]]] = {}
 
 
 @dataclass(frozen=True)
@@ -160,6 +158,7 @@ class TableStore:
         """What the footer of a partition says; None if it was never written, or by a version with other columns (it is
         then made anew). Raises TrapsError if it is unreadable."""
         import pyarrow as pa
+        import pyarrow.parquet as pq
 
         path = self.path(table, partition)
         if not self._store.has(path):
@@ -169,7 +168,8 @@ class TableStore:
                 noted = json.loads(note)
                 footer, names = noted["state"], noted["columns"]
             else:
-                footer, names = _footer(self._store.here(path))
+                schema = pq.ParquetFile(_sound_bytes(self._store.here(path))).schema_arrow
+                footer, names = (schema.metadata or {})[_FOOTER], schema.names
             return State(**json.loads(footer)) if names == table.arrow_schema().names else None
         except (pa.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
             raise _unreadable(path, table, error) from error
@@ -188,7 +188,7 @@ class TableStore:
         try:
             path = self._store.here(path)
             found = path.stat()
-            if _WHOLE.get(path) == _stamp(found) or _MARK in _sound_bytes(path).getvalue():
+            if _MARK in _sound_bytes(path).getvalue():
                 return ""
         except FileNotFoundError:
             return ""
@@ -295,26 +295,17 @@ def note_of(path: Path) -> str:
     """What a store notes of a partition: its footer, and its columns. Raises TrapsError where it is not what was
     written."""
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
     try:
-        return _note(*_footer(path))
+        schema = pq.ParquetFile(_sound_bytes(path)).schema_arrow
+        return _note((schema.metadata or {})[_FOOTER].decode(), schema.names)
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         raise TrapsError(f"{path}: is not a table as it was written ({error})") from error
 
 
 def _note(footer: str, names: Sequence[str]) -> str:
     return json.dumps({"state": footer, "columns": [*names]})
-
-
-def _footer(path: Path) -> tuple[str, list[str]]:
-    """A file's footer and the names of its columns. Raises as `_sound_bytes` does, and KeyError where it has none."""
-    import pyarrow.parquet as pq
-
-    stamp = _stamp(path.stat())
-    if _FOOTERS.get(path, ("",))[0] != stamp:
-        schema = pq.ParquetFile(_sound_bytes(path)).schema_arrow
-        _FOOTERS[path] = stamp, (schema.metadata or {})[_FOOTER].decode(), schema.names
-    return _FOOTERS[path][1:]
 
 
 def _sum_of(content: bytes) -> bytes:
