@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from traps_pipeline.scenes.likeness import alike, perceptual_hash, too_alike
+from traps_pipeline.base.paths import RELEASED
+from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.scenes.likeness import NEAR_SHARE, alike, first_look, perceptual_hash, too_alike
+from traps_pipeline.scenes.spec import load_trajectory
 
 
 def test_a_hash_tells_places_and_not_shades() -> None:
@@ -25,3 +29,11 @@ def test_a_tenth_of_a_family_may_have_a_neighbour() -> None:
     assert too_alike(looks, 0xFFFF0000 << 8, 19) is None
     assert too_alike({**looks, "x-9": 0xFFFF}, 0xFFFF0001, 39) == "x-1"  # two were alike, four are more than 3.9
     assert too_alike({**looks, "x-9": 0xFFFF}, 0xFFFF << 8, 19) is None  # it has no part in it
+
+
+@pytest.mark.slow
+def test_few_released_boards_of_plinko_look_like_another() -> None:  # of all families the one where most did
+    specs = {id_: spec for id_, spec in load_released().items() if spec.family == "plinko"}
+    files = {id_: RELEASED / "trajectories" / f"{id_}.npz" for id_ in specs}
+    looks = {id_: first_look(spec, load_trajectory(files[id_], spec.trajectory_sha256)) for id_, spec in specs.items()}
+    assert len(looks) == 50 and len(alike(looks)) <= NEAR_SHARE * 50

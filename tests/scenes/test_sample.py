@@ -135,6 +135,27 @@ def test_a_stopped_sampling_goes_on_and_gives_the_same_scenarios(tmp_path: Path,
         load_trajectory(path, spec.twin.trajectory_sha256, "twin")
 
 
+@pytest.mark.slow  # draws one scenario
+def test_a_draw_whose_first_frame_looks_like_that_of_another_is_rejected(tmp_path: Path, whole: Path) -> None:
+    folder = shutil.copytree(whole, tmp_path / "again")
+    lines, notes = folder / "hidden_race.jsonl", folder / "draws.json"
+    record, tallies = json.loads(lines.read_text(encoding="utf-8").splitlines()[0]), json.loads(notes.read_text())
+    # The drawing is set back to the draw that gave this record, which is there as one of an earlier draw.
+    tallies["hidden_race"] |= {"draws": record["seed"], "rejected": {}}
+    lines.write_text(json.dumps(record | {"seed": -1}) + "\n", encoding="utf-8")
+    notes.write_text(json.dumps(tallies))
+    said: list[str] = []
+
+    def stop(line: str) -> None:
+        said.append(line)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample_family("hidden_race", 2, 11, folder, workers=1, report=stop)
+    reason = "its first frame looks like that of another: hidden_race-0001"
+    assert said == [f"hidden_race: draw {record['seed'] + 1} is rejected: {reason}"]
+
+
 def test_another_seed_replaces_what_is_there(tmp_path: Path, whole: Path) -> None:
     shutil.copytree(whole, tmp_path / "released")
     sample_family("hidden_race", 1, 12, tmp_path / "released", workers=1)
