@@ -17,6 +17,7 @@ from traps_pipeline.base.yamlfile import explain, read_yaml
 from traps_pipeline.benchmark.items import commonest_answers
 from traps_pipeline.scenes.sample import answer_quota, ill_posed_quota, sample_family
 from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.workers import kept_workers
 
 PRIOR_AT_MOST = 0.55  # accuracy of the commonest answer, occlusion and chaotic weighted equally
 
@@ -48,13 +49,14 @@ def sample_benchmark(
     What is there of the same seed and numbers stays: a stopped sampling goes on. Raises TrapsError when a family cannot
     be filled.
     """
-    for family, count in counts.items():
-        try:
-            tally = sample_family(family, count, seed, out / "released", look=look, workers=workers, report=report)
-        except RuntimeError as error:
-            raise TrapsError(str(error)) from error
-        reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"
-        report(f"{family}: {count} of {tally.draws} draws; {reasons}")
+    with kept_workers():
+        for family, count in counts.items():
+            try:
+                tally = sample_family(family, count, seed, out / "released", look=look, workers=workers, report=report)
+            except RuntimeError as error:
+                raise TrapsError(str(error)) from error
+            reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"
+            report(f"{family}: {count} of {tally.draws} draws; {reasons}")
     if not (out / "benchmark.yaml").exists():
         release = {"name": name, "version": "1.0.0", "canary": f"{name.upper()}:CANARY:{uuid.uuid4()}"}
         write_text(out / "benchmark.yaml", yaml.safe_dump(release, sort_keys=False))

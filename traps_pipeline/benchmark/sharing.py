@@ -66,8 +66,8 @@ class _Sharing(Generic[Job]):
         drawn = 0
         try:
             while self._left:
-                # The next row is drawn while files are handed over.
-                for _, frames in run_in_order(self._of.draw, self._jobs(), least=2):
+                # The next row is drawn while files are handed over, and is leased no sooner.
+                for _, frames in run_in_order(self._of.draw, self._jobs(), at_once=True):
                     drawn += frames
                     self._finish(*self._drawing.popleft())
                 if not wait:

@@ -26,6 +26,7 @@ from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
 from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.wanted import Wanted
+from traps_pipeline.scenes.workers import kept_workers
 from traps_pipeline.storage.leases import alone
 from traps_pipeline.storage.parquet import Made, State
 from traps_pipeline.storage.tables import Table
@@ -189,21 +190,22 @@ class Step:
             yield from ((key, Tally()) for key in todo)
             return
         store, later = self.workspace.store, dict[str | None, Tally]()
-        for key in todo:
-            done = Tally()
-            is_whole = self._make_files(key, done, wait=False)
-            lease = store.lease(f"{self.stage.name}/{key}") if is_whole else None
-            if lease is None:
-                later[key] = done
-                continue
-            with closing(lease):
-                if not self._takes_over(key, inputs[key], done):
-                    yield key, done
-        for key, done in later.items():
-            if key not in self.unmade and self._make_files(key, done, wait=True):
-                with alone(store, f"{self.stage.name}/{key}"):
+        with kept_workers():
+            for key in todo:
+                done = Tally()
+                is_whole = self._make_files(key, done, wait=False)
+                lease = store.lease(f"{self.stage.name}/{key}") if is_whole else None
+                if lease is None:
+                    later[key] = done
+                    continue
+                with closing(lease):
                     if not self._takes_over(key, inputs[key], done):
                         yield key, done
+            for key, done in later.items():
+                if key not in self.unmade and self._make_files(key, done, wait=True):
+                    with alone(store, f"{self.stage.name}/{key}"):
+                        if not self._takes_over(key, inputs[key], done):
+                            yield key, done
 
     def _make_files(self, key: str | None, done: Tally, *, wait: bool) -> bool:
         """Make files that a partition names, and whether all are there. done: is told what was done here."""

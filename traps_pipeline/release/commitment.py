@@ -25,6 +25,7 @@ from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import load_release, load_released, parse_record
 from traps_pipeline.scenes.sample import load_tallies, sample_family
 from traps_pipeline.scenes.spec import SceneSpec, load_trajectory
+from traps_pipeline.scenes.workers import kept_workers
 
 _HEX = r"^[0-9a-f]{64}$"
 # What a record says of arithmetic: another CPU or another version of the simulator may draw the same scene otherwise.
@@ -166,12 +167,15 @@ def drawn_again(
 ) -> dict[str, SceneSpec]:
     """The records that the revealed seed gives here. Raises TrapsError where a family cannot be filled."""
     with TemporaryDirectory(prefix="traps-") as folder:
-        for family, count in commitment.draws.items():
-            report(f"drawing {count} of {family} again")
-            try:
-                sample_family(family, count, reveal.seed, Path(folder) / "released", workers=workers, report=report)
-            except (RuntimeError, KeyError) as error:
-                raise TrapsError(f"{family}: the seed does not give {count} scenarios here ({plain(error)})") from error
+        with kept_workers():
+            for family, count in commitment.draws.items():
+                report(f"drawing {count} of {family} again")
+                try:
+                    sample_family(family, count, reveal.seed, Path(folder) / "released", workers=workers, report=report)
+                except (RuntimeError, KeyError) as error:
+                    raise TrapsError(
+                        f"{family}: the seed does not give {count} scenarios here ({plain(error)})"
+                    ) from error
         return load_released(Path(folder) / "released")
 
 

@@ -8,8 +8,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from itertools import islice
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from itertools import chain, islice
 from multiprocessing import get_context
 from typing import TypeVar
 
@@ -20,46 +22,100 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
+class _Pool:
+    """Worker processes, and how many jobs they do before others take over."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers, self.left = workers, workers * JOBS_A_WORKER
+        self.executor = ProcessPoolExecutor(
+            workers, mp_context=get_context("spawn"), initializer=_begin_worker, initargs=(os.getpid(),)
+        )
+
+    def end(self) -> None:
+        self.executor.shutdown(wait=True, cancel_futures=True)
+
+
+_idle: list[_Pool] | None = None  # of `kept_workers`, what nobody uses now
+
+
+@contextmanager
+def kept_workers() -> Iterator[None]:
+    """Within, workers that one `run_in_order` has started do the next one's jobs, too. To start one takes as long as to
+    draw some twenty frames."""
+    global _idle
+    if _idle is not None:
+        yield
+        return
+    _idle = []
+    try:
+        yield
+    finally:
+        idle, _idle = _idle, None
+        for pool in idle:
+            pool.end()
+
+
 def run_in_order(
     function: Callable[[Job], Result],
     jobs: Iterable[Job],
     workers: int | None = None,
     *,
     ahead: int | None = None,
-    least: int = 1,
+    at_once: bool = False,
 ) -> Iterator[tuple[Job, Result]]:
     """Results of a picklable function over jobs, in their order. Jobs are taken late: a few ahead of what is yielded,
-    and no more than `ahead` at a time, for who may want no further result soon. least: of 2, a single worker has its
-    next job already while the caller deals with a result.
+    and no more than `ahead` at a time, for who may want no further result soon. at_once: the next job is taken before a
+    result is yielded, so that no worker waits for what the caller does with it.
 
     A GL context belongs to a process, so each worker keeps its own. Closing the iterator cancels what has not begun.
     """
     workers = workers or cores()
+    most = min(2 * workers - 1, ahead or 2 * workers)
     source = iter(jobs)
-    more = True
-    while more:  # a fresh pool for each round: recycling inside a pool can deadlock (CPython 3.11)
-        batch = islice(source, workers * JOBS_A_WORKER)
-        most = max(least, 2 * workers - 1)
-        more = yield from _one_pool(function, batch, workers, min(most, ahead or most))
+    for job in source:  # a fresh pool after so many: recycling inside a pool can deadlock (CPython 3.11)
+        with _pool(workers) as pool:
+            yield from _in_order(function, chain([job], source), pool, most, at_once=at_once)
 
 
-def _one_pool(
-    function: Callable[[Job], Result], batch: Iterator[Job], workers: int, ahead: int
-) -> Iterator[tuple[Job, Result]]:
-    first = list(islice(batch, ahead))  # a job begun cannot be cancelled: one worker runs ahead where that is asked for
-    if not first:
-        return False
-    context = get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker, initargs=(os.getpid(),))
+@contextmanager
+def _pool(workers: int) -> Iterator[_Pool]:
+    pool = _idle.pop() if _idle else None
+    if pool is not None and pool.workers != workers:
+        pool.end()
+        pool = None
+    pool = pool or _Pool(workers)
     try:
-        pending: deque[tuple[Job, Future[Result]]] = deque((job, pool.submit(function, job)) for job in first)
+        yield pool
+    except BrokenProcessPool:
+        pool.left = 0
+        raise
+    finally:
+        if pool.left and _idle is not None:
+            _idle.append(pool)
+        else:
+            pool.end()
+
+
+def _in_order(
+    function: Callable[[Job], Result], jobs: Iterator[Job], pool: _Pool, ahead: int, *, at_once: bool
+) -> Iterator[tuple[Job, Result]]:
+    batch, pending = islice(jobs, pool.left), deque[tuple[Job, Future[Result]]]()
+
+    def submit(count: int) -> None:
+        for job in islice(batch, count):
+            pool.left -= 1
+            pending.append((job, pool.executor.submit(function, job)))
+
+    try:
+        submit(ahead)  # a job that is begun cannot be cancelled
         while pending:
             job, future = pending.popleft()
-            yield job, future.result()
-            pending.extend((later, pool.submit(function, later)) for later in islice(batch, 1))
+            result = future.result()
+            submit(at_once)
+            yield job, result
+            submit(not at_once)
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-    return True
+        wait([future for _, future in pending if not future.cancel()])
 
 
 def _begin_worker(parent: int) -> None:
