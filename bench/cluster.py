@@ -113,7 +113,8 @@ def on_nodes(count: int, cores: Sequence[int], plain: Mapping[str, str], *, fixe
         }  # fmt: skip
         within = {node: opened.enter_context(of_cores(node, CORES)) for node in nodes if fixed}
         cluster = Cluster(folder, shared, within=within)
-        own = {"TRAPS_RAY": f"http://127.0.0.1:{cluster.dashboard}", "TRAPS_WORKSPACE": f"s3://lab/rendering-{count}"}
+        study_at = f"s3://lab/rendering-{count}-{'fixed' if fixed else 'plain'}"  # this process keeps each one's server
+        own = {"TRAPS_RAY": f"http://127.0.0.1:{cluster.dashboard}", "TRAPS_WORKSPACE": study_at}
         environment = shared | own | {"TRAPS_SCRATCH": str(folder / "here")}
         study = Study(folder, environment, folder / "rendering.yaml", until="videos")
         try:
