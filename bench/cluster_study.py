@@ -266,14 +266,33 @@ def main() -> None:
         sys.exit("\n".join(study.failures))
 
 
+# The database may hold the history of other studies, too.
+RUNS = """
+from dagster import DagsterEventType as T, DagsterInstance, RunsFilter
+from traps_pipeline.orchestration.cluster import STUDY_TAG
+from traps_pipeline.storage.workspace import Workspace
+workspace = Workspace.open()
+instance = DagsterInstance.from_config(str(workspace.dagster_home))
+runs = instance.get_runs(RunsFilter(tags={STUDY_TAG: workspace.study.name}))
+"""
+
+
 def runs_of(study: Study) -> list[str]:
     """What became of the study's runs."""
-    code = (
-        "from dagster import DagsterInstance\nfrom traps_pipeline.storage.workspace import Workspace\n"
-        "home = Workspace.open().dagster_home\n"
-        "print(*(run.status.value for run in DagsterInstance.from_config(str(home)).get_runs()))\n"
-    )
-    return study.python(code).split()
+    return study.python(f"{RUNS}print(*(run.status.value for run in runs))").split()
+
+
+def failures_of(study: Study) -> str:
+    """What the study's failed runs said, a line for each error."""
+    return study.python(f"""{RUNS}
+for run in runs:
+    if run.status.value == "FAILURE":
+        for entry in instance.all_logs(run.run_id, of_type={{T.STEP_FAILURE, T.RUN_FAILURE, T.ENGINE_EVENT}}):
+            error = getattr(entry.dagster_event.event_specific_data, "error", None)
+            while error is not None and error.cause is not None:
+                error = error.cause
+            print(run.run_id[:8], entry.dagster_event.message, error.to_string() if error else "")
+""")
 
 
 def nodes_are_apart(study: Study, opens: Opened, *, least: int = len(NODES)) -> None:
