@@ -266,14 +266,14 @@ def main() -> None:
         sys.exit("\n".join(study.failures))
 
 
-# The database may hold the history of other studies, too.
+# The database may hold the history of other studies, too. A run that a page launched has no tag of ours while it waits.
 RUNS = """
-from dagster import DagsterEventType as T, DagsterInstance, RunsFilter
-from traps_pipeline.orchestration.cluster import STUDY_TAG
+from dagster import DagsterEventType as T, DagsterInstance
 from traps_pipeline.storage.workspace import Workspace
 workspace = Workspace.open()
 instance = DagsterInstance.from_config(str(workspace.dagster_home))
-runs = instance.get_runs(RunsFilter(tags={STUDY_TAG: workspace.study.name}))
+mine = workspace.study.name
+runs = [run for run in instance.get_runs() if any(key.path[0] == mine for key in run.asset_selection or ())]
 """
 
 

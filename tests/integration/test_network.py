@@ -232,7 +232,9 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
         stopped, said = time.monotonic(), b""
         assert process.stdout is not None
         while b": stopping: " not in said:  # on a busy machine it may take a while until it knows of the signal
-            said += os.read(process.stdout.fileno(), 65536)
+            part = os.read(process.stdout.fileno(), 65536)
+            assert part, said  # it ended without a word
+            said += part
         time.sleep(0.1)
         requests = provider.stats()["requests"]
         out, err = process.communicate(timeout=540)
