@@ -197,7 +197,8 @@ def want_together(scene: Scene) -> None:
         while {"QUEUED", "STARTING", "STARTED", "NOT_STARTED"} & {*(ended := runs_of(study))}:
             time.sleep(2)
         failed = sum(one != "SUCCESS" for one in ended)
-        study.require(bool(ended) and not failed, f"all {len(ended)} runs end well, those of the backfill too ({failed} do not)")
+        said = f"all {len(ended)} runs end well, those of the backfill too ({failed} do not)"
+        study.require(bool(ended) and not failed, said)
         if failed:
             print(failures_of(study), flush=True)
     finally:
