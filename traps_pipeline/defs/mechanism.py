@@ -267,7 +267,7 @@ steering_votes = stage(
     STEERING_VOTES,
     collect=_collect_steering_votes,
     group=GROUP,
-    code="2",
+    code="3",
     deps=[dg.AssetDep(items, partition_mapping=by_dataset), steering, judges],
     scheme=STEERING,
     cost="money",

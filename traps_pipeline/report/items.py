@@ -34,7 +34,7 @@ _PER_CELL = (RESPONSES, VOTES, VERDICTS)
 _SHOWN = {
     ITEMS: ["item_id", "scenario_id", "sub_scenario", "side", "clip", "question", "ground_truth"],
     RESPONSES: ["item_id", "outcome", "text", "reasoning", "error"],
-    VERDICTS: ["item_id", "abstained", "correct"],
+    VERDICTS: ["item_id", "outcome", "abstained", "correct"],
     VOTES: [
         *("item_id", "task", "judge", "valid", "invalid_reason", "abstained", "confidence", "rationale"),
         *("correct", "extracted_value"),
