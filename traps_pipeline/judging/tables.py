@@ -94,7 +94,7 @@ class AgreementRow:
     n_items: Annotated[int, "answers put to these judges, over models, regimes and runs"]
     n_complete: Annotated[int, "answers on which every one of them cast a valid vote"]
     n_undecided: Annotated[int | None, "answers without a majority of the panel; null for two judges"]
-    invalid: Annotated[float, "share of their votes that break the schema"]
+    invalid: Annotated[float, "share of their votes that break the schema or are unread"]
     prevalence: Annotated[float | None, "share of yes (abstained, correct) among their valid votes"]
     agreement: Annotated[
         float | None,
@@ -119,7 +119,7 @@ class JudgeBiasRow:
     task: Decision
     judge: shared.Judge
     n_votes: Annotated[int, "votes of this judge, over models, regimes and runs"]
-    n_invalid: Annotated[int, "of these, votes that break the schema"]
+    n_invalid: Annotated[int, "of these, votes that break the schema or are unread"]
     n_decided: Annotated[int, "of these, valid votes on answers that have a majority"]
     yes: Annotated[float | None, "share of yes (abstained, correct) among n_decided"]
     panel_yes: Annotated[float | None, "share of yes among the majorities on the same answers"]
