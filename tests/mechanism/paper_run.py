@@ -67,8 +67,11 @@ def tiny(entry: dict[str, Any], checkpoint: Path) -> dict[str, Any]:
 
 
 def words() -> Tokenizer:
-    """A tokenizer with a token a word of the prompts: with one a byte, prompts are six times as long."""
-    from tokenizers import Tokenizer
+    """A tokenizer with a token a word of the prompts: with one a byte, prompts are six times as long.
+
+    Whatever tokens a random model writes, its text is `left`, so that the rule judges can read it.
+    """
+    from tokenizers import Regex, Tokenizer, decoders
     from tokenizers.models import WordLevel
     from tokenizers.pre_tokenizers import Whitespace
 
@@ -76,6 +79,7 @@ def words() -> Tokenizer:
     known = ["[unknown]", *sorted({*re.findall(r"\w+|[^\w\s]+", spoken)})]
     tokenizer = Tokenizer(WordLevel({word: k for k, word in enumerate(known)}, unk_token="[unknown]"))
     tokenizer.pre_tokenizer = Whitespace()
+    tokenizer.decoder = decoders.Sequence([decoders.Fuse(), decoders.Replace(Regex(r"[\s\S]+"), "left")])
     return tokenizer
 
 
