@@ -120,7 +120,7 @@ def _in_text(text: str, question: str) -> Statement | None:
         elif last == 0:
             statements[place] = _in_words(sentence, question)
         elif _in_words(sentence, question) == ABSTENTION:
-            before = _words(" ".join(sentences[:place])).split()
+            before = _words(" ".join(sentences[:last])).split() if place == last else []
             choices = [w for w in before if _LABEL.fullmatch(w) or f" {w} or " in asked or f" or {w} " in asked]
             statements[place] = None if choices else ABSTENTION
     explained = last > 0 and statements.get(0, ABSTENTION) != ABSTENTION and _EXPLAINS.match(sentences[1])
