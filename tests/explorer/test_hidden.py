@@ -39,7 +39,11 @@ def test_emoji_and_plain_text_stay_as_they_are() -> None:
 
 def test_metadata_for_dagster_holds_no_hidden_character() -> None:
     table = dg.MetadataValue.table([dg.TableRecord({"error": HOSTILE, "n": 1})])
-    values = visible_metadata({"md": dg.MetadataValue.md(HOSTILE), "table": table, "failing": [{HOSTILE: HOSTILE}, 2]})
+    path = dg.MetadataValue.path("/study")
+    values = visible_metadata(
+        {"md": dg.MetadataValue.md(HOSTILE), "table": table, "failing": [{HOSTILE: HOSTILE}, 2], "path": path}
+    )
+    assert values["path"] is path
     assert values["md"].md_str == VISIBLE
     assert values["table"].records[0].data == {"error": VISIBLE, "n": 1}
     assert values["failing"] == [{VISIBLE: VISIBLE}, 2]

@@ -19,6 +19,8 @@ def visible_metadata(value: Any) -> Any:
     if isinstance(value, dg.TableMetadataValue):
         records = [dg.TableRecord(visible_metadata(record.data)) for record in value.records]
         return dg.MetadataValue.table(records, value.schema)
+    if isinstance(value, dg.MetadataValue):  # a path, a number, an asset; some are tuples
+        return value
     if isinstance(value, Mapping):
         return {visible_metadata(key): visible_metadata(each) for key, each in value.items()}
     return [visible_metadata(each) for each in value] if isinstance(value, list | tuple) else value
