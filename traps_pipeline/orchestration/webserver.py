@@ -45,7 +45,9 @@ def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
             pid, code = process_tree.wait_for(started)
         finally:
             process_tree.stop_descendants(STOP_S)
-    raise TrapsError(f"Dagster's {started[pid]} ended (exit code {code}); see its lines above, then start again")
+    raise TrapsError(
+        f"Dagster's {started[pid]} ended by itself (exit code {code}), and all others with it: its lines stand above"
+    )
 
 
 def _start(module: str, *arguments: str, token: str | None = None) -> int:
