@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 
@@ -80,3 +81,18 @@ def test_a_plan_of_a_further_run_announces_what_it_asks(study: Checkout) -> None
     plan = announced(study, "further.yaml")
     assert min(plan) > 0
     assert asked(study, "further.yaml") == plan
+
+
+def test_a_scene_that_must_be_drawn_anew_counts_as_new_and_no_other_does(study: Checkout) -> None:
+    records = map(json.loads, (study.root / "scene_specs" / "released" / "domino_chain.jsonl").read_text().splitlines())
+    azimuth = next(r["params"]["azimuth_deg"] for r in records if r["scenario_id"] == "domino_chain-0002")
+    study.correct("domino_chain-0002", params={"azimuth_deg": azimuth + 2.0})
+    printed = study.traps("plan", EXPERIMENT).out
+    assert "items of occlusion, occlusion_ill_posed are still to be made" in printed
+    # Two items of two datasets, of three models under two regimes; three tasks a pair, three judges.
+    assert re.search(rf"^all +[\d,]+ +[\d,]+ +{4 * 6} +[\d,]+ +[\d,]+ +{2 * 3 * 3 * 6}$", printed, re.MULTILINE), (
+        printed
+    )
+    assert asked(study)[0] == 4 * 6
+    correct_one_void(study)  # with the other scene simulated once, the plan is exact
+    assert announced(study)[0] == 3 * 2
