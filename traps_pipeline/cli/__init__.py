@@ -39,6 +39,8 @@ from traps_pipeline.cli import (
 )
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, Run
 
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a subcommand; returns the exit code: 0 done, 1 something failed, 2 bad usage, 4 a budget is reached, 130
@@ -78,16 +80,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _stopped_alike() -> Iterator[None]:
-    """Within the block SIGTERM and SIGHUP do what Ctrl-C does at that moment. `nohup` keeps its meaning."""
+    """Let SIGTERM and SIGHUP do what Ctrl-C does at that moment, until the block ends.
+
+    A shell starts `command &` of a script with SIGINT ignored, in which case SIGTERM would do nothing either: both are
+    obeyed again. An ignored SIGHUP stays ignored, which is the meaning of `nohup`.
+    """
     replaced = {}
-    for each in (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ():
-        if signal.getsignal(each) == signal.SIG_DFL:
-            replaced[each] = signal.signal(each, lambda *_: signal.raise_signal(signal.SIGINT))
+    for each in STOPS if threading.current_thread() is threading.main_thread() else ():
+        former = signal.getsignal(each)
+        if former == signal.SIG_DFL or (former == signal.SIG_IGN and each != signal.SIGHUP):
+            interrupt = signal.default_int_handler if each == signal.SIGINT else _raise_interrupt
+            replaced[each] = signal.signal(each, interrupt)
     try:
         yield
     finally:
         for each, former in replaced.items():
             signal.signal(each, former)
+
+
+def _raise_interrupt(*_: object) -> None:
+    signal.raise_signal(signal.SIGINT)
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -14,6 +14,7 @@ import dagster as dg
 import yaml
 
 from traps_pipeline.base import progress
+from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_text
 from traps_pipeline.models.traffic import remembering_stops
@@ -59,10 +60,13 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
     except BrokenPipeError:
         raise  # of what is printed to
     except (OSError, *unusable()) as error:
-        what = remedy(error) if isinstance(error, OSError) else "free some space, or move that folder away"
+        if isinstance(error, OSError):
+            why, what = error.strerror or "its file cannot be used", remedy(error)
+        else:
+            why, what, _ = reason_and_remedy(error)
         raise TrapsError(
-            f"{home}: Dagster's history cannot be read or written ({' '.join(str(error).split())[:300]}); {what} and "
-            "run the same command again: tables are whole, no answer is lost"
+            f"{home}: Dagster's history cannot be read or written ({why}); {what} and run the same command again: "
+            "tables are whole, no answer is lost"
         ) from error
 
 

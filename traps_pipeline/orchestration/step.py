@@ -24,6 +24,7 @@ from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
+from traps_pipeline.orchestration.metadata import visible_metadata
 from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.scenes.workers import kept_workers
@@ -346,7 +347,7 @@ def to_make(
 
 def _evaluation(stage: Stage, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
     return dg.AssetCheckEvaluation(
-        asset_key=stage.spec.key, check_name=check, passed=not wrong, partition=key, metadata={**wrong}
+        asset_key=stage.spec.key, check_name=check, passed=not wrong, partition=key, metadata=visible_metadata(wrong)
     )
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.terminal import plain, text_table
+from traps_pipeline.base.terminal import finalized, plain, text_table
 
 if TYPE_CHECKING:
     import jinja2
@@ -287,6 +287,7 @@ def environment() -> jinja2.Environment:
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
+        finalize=finalized,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
