@@ -16,23 +16,31 @@ def read_key(variable: str) -> str:
 
     Raises TrapsError, which names the variable and never the value, where it is not set or `check_key` refuses it.
     """
+    value = optional_key(variable)
+    if value is None:
+        raise TrapsError(f"{variable} is not set; export the key, or leave the models that need it out")
+    return value
+
+
+def optional_key(variable: str) -> str | None:
+    """Return the key in an environment variable; None where it is not set. Raises as `read_key`."""
     value = os.environ.get(variable)
     if not value:
-        raise TrapsError(f"{variable} is not set; export the key, or leave the models that need it out")
+        return None
+    remember(value)
     check_key(variable, value)
     return value
 
 
 def check_key(variable: str, value: str) -> None:
-    """Check that a key consists of printable ASCII characters without white space, and hide it from every text.
+    """Check that a key, or an address with a password, consists of printable ASCII characters without white space.
 
-    A character too many is refused and not removed: the ledger would otherwise hold calls of a key that nobody has.
+    What is more is refused and not removed, so that every program reads the same key from the variable.
     Raises TrapsError, which names the variable and never the value.
     """
-    remember(value)
     problem = _problem(value)
     if problem:
-        raise TrapsError(f"{variable} {problem}: export the key again as its provider shows it, and nothing else")
+        raise TrapsError(f"{variable} {problem}: export it again, as printable ASCII characters without white space")
 
 
 def _problem(value: str) -> str:

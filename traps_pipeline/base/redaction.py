@@ -7,12 +7,17 @@ base64, and also where white space, quotes or line breaks split them.
 
 from __future__ import annotations
 
+import logging
 import os
 import re
+import sys
+import threading
+import traceback
 from base64 import b64encode
 from collections.abc import Iterator
 from functools import lru_cache
 from html import unescape
+from typing import Any
 
 MASK = "***"
 SHORTEST = 8  # characters: anything shorter could be an ordinary word
@@ -63,12 +68,43 @@ def redact(text: str) -> str:
     return text
 
 
+def redact_tracebacks() -> None:
+    """Redact what this process logs, and the tracebacks that it prints: an exception may quote a request's headers."""
+    make = logging.getLogRecordFactory()
+    if getattr(make, "__module__", "") == __name__:
+        return
+
+    def redacted_record(*args: Any, **named: Any) -> logging.LogRecord:
+        record = make(*args, **named)
+        try:
+            record.msg, record.args = redact(record.getMessage()), ()
+        except (TypeError, ValueError):
+            record.msg, record.args = redact(f"{record.msg} {record.args}"), ()
+        if record.exc_info and record.exc_info[0]:
+            record.exc_text = redact("".join(traceback.format_exception(*record.exc_info)).rstrip())
+        return record
+
+    logging.setLogRecordFactory(redacted_record)
+    sys.excepthook = lambda *error: print(redact("".join(traceback.format_exception(*error))), end="", file=sys.stderr)
+    threading.excepthook = lambda error: sys.excepthook(
+        error.exc_type, error.exc_value or error.exc_type(), error.exc_traceback
+    )
+
+
+def redacted(error: Exception) -> Exception:
+    """Return an exception to raise in the place of one whose traceback would show a key; else the exception itself."""
+    shown = "".join(traceback.format_exception(error))
+    without = redact(shown)
+    return error if without == shown else RuntimeError(without).with_traceback(error.__traceback__)
+
+
 def _secrets() -> Iterator[str]:
     yield from _values
     for name, value in os.environ.items():
-        if name in _variables or _NAMES.search(name):
+        is_address = "://" in value or "password=" in value
+        if not is_address and (name in _variables or _NAMES.search(name)):
             yield value
-        if "://" in value or "password=" in value:
+        if is_address:
             yield from (group for match in _PASSWORD.finditer(value) for group in match.groups() if group)
 
 

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import sentence_of
 from traps_pipeline.base.files import remedy
+from traps_pipeline.base.redaction import redact_tracebacks
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli import (
     annotate,
@@ -47,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a path or a word that this terminal cannot show
+    redact_tracebacks()
     arguments = build_parser().parse_args(argv)
     command: Run = arguments.command
     try:

@@ -6,6 +6,7 @@ import argparse
 import os
 
 from traps_pipeline.base.extras import require
+from traps_pipeline.base.keys import optional_key
 from traps_pipeline.cli.command import OK, Commands, number, open_workspace, whole
 
 CLUSTER = "of a study on a cluster"
@@ -36,7 +37,7 @@ def ui(arguments: argparse.Namespace) -> int:
     for variable, value in ((RUN_CPUS, arguments.cpus), (RUN_GPUS, arguments.gpus)):
         if value is not None:
             os.environ[variable] = str(value)  # for the daemon, which starts such runs
-    given = arguments.token or os.environ.get(TOKEN_VARIABLE)
+    given = arguments.token or optional_key(TOKEN_VARIABLE)
     token = token_for(arguments.host, given, danger=DANGER, variable=TOKEN_VARIABLE)
     workspace = open_workspace(arguments)
     with dagster_history(workspace):

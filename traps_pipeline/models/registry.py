@@ -15,8 +15,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationIn
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.keys import read_key
 from traps_pipeline.base.partitions import Evaluation, check_slug
 from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.redaction import hide
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
 from traps_pipeline.models import own
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
@@ -83,14 +85,15 @@ class Account(BaseModel):
     requests_per_minute: int | None = Field(default=None, ge=1)
     tokens_per_minute: int | None = Field(default=None, ge=1)
 
+    @model_validator(mode="after")
+    def _is_redacted(self) -> Account:
+        if self.key is not None:
+            hide(self.key)
+        return self
+
     def secret(self) -> str | None:
-        """The key from the environment; None if the account needs none. Raises TrapsError naming the variable."""
-        if self.key is None:
-            return None
-        value = os.environ.get(self.key)
-        if not value:
-            raise TrapsError(f"{self.key} is not set; export the key, or leave the models that need it out")
-        return value
+        """Return the key from the environment; None if the account needs none. Raises TrapsError."""
+        return read_key(self.key) if self.key is not None else None
 
 
 class Prices(BaseModel):

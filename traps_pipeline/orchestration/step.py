@@ -20,6 +20,7 @@ import dagster as dg
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
+from traps_pipeline.base.redaction import redacted
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
@@ -81,6 +82,10 @@ class Step:
         _BEGUN.append(events)
         try:
             yield from events
+        except Exception as error:  # Dagster stores its traceback
+            if (shown := redacted(error)) is error:
+                raise
+            raise shown from None
         finally:
             if events in _BEGUN:
                 _BEGUN.remove(events)
