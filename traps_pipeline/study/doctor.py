@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import PART
+from traps_pipeline.base.keys import optional_key
 from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.place import Place, scratch_of
 
@@ -296,10 +297,13 @@ def _workspace(place: Place) -> str:
 
 
 def _keys() -> str:
-    """The keys that are not set, and the models and judges that need them. The demo needs no key."""
+    """Return the keys that are not set, and the models and judges that need them. The demo needs no key. Raises
+    TrapsError for one that no header can carry."""
     from traps_pipeline.models.judges import load_judges
-    from traps_pipeline.models.registry import load_models, missing_keys
+    from traps_pipeline.models.registry import load_accounts, load_models, missing_keys
 
     entries = [*load_models().values(), *load_judges().values()]
+    for key in sorted({account.key for account in load_accounts().values() if account.key}):
+        optional_key(key)  # raises where it is set to what is no key
     missing = [f"{name} not set ({', '.join(who)} cannot be asked)" for name, who in missing_keys(entries).items()]
     return "; ".join(missing) or "all set"
