@@ -18,6 +18,7 @@ from typing import Any
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.extras import require
+from traps_pipeline.base.network import check_network
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.models.registry import Account, Entry, load_accounts
@@ -117,6 +118,7 @@ class ApiBackend:
 
     def __init__(self, entry: Entry, account: Account | None = None) -> None:
         account = account or load_accounts()[str(entry.account)]
+        check_network()
         self._entry = entry
         self._fixed: dict[str, Any] = {
             "model": entry.provider_id,

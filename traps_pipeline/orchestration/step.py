@@ -25,6 +25,7 @@ from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
+from traps_pipeline.orchestration.machine import require_machine
 from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.scenes.workers import kept_workers
@@ -93,6 +94,7 @@ class Step:
     def _events(self) -> Generator[Event, None, None]:
         stage, name = self.stage, self.stage.name
         require_same_code(self.context.run.tags, self.workspace.study.name)
+        require_machine(self.workspace, self._parts())
         lineage = Lineage(self.workspace, thorough=True)
         self.history.observe(lineage, [p for p in self.graph.parents_of[name] if self.graph.source(p)])
         provenance = self.history.provenance(stage)
@@ -131,6 +133,15 @@ class Step:
         if not self._below():
             self._raise_for_all()
         yield dg.MaterializeResult(metadata=_TOLD_ALREADY)
+
+    def _parts(self) -> dict[str, list[str | None]]:
+        """Return the stages of this run with its partitions, those that are not wanted left out."""
+        wanted = Wanted(self.workspace, self.context.run.tags.get(EXPERIMENT_TAG))
+        keys = {str(key) for key in self.context.partition_keys} if self.stage.scheme else {None}
+        selected = self.context.run.asset_selection or self.context.job_def.asset_layer.executable_asset_keys
+        names = {key.path[-1] for key in selected}
+        stages = [stage for stage in self.graph.stages if stage.name in names and stage.scheme is self.stage.scheme]
+        return {stage.name: [key for key in stage.wanted(wanted) if key in keys] for stage in stages}
 
     # --- what to make -------------------------------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.network import check_network
 from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
@@ -146,6 +147,7 @@ def reach(entry: Entry, account: Account) -> Reached:
     import httpx
 
     try:
+        check_network()
         secret = account.secret()
     except TrapsError as error:
         return Reached(str(error))
