@@ -85,9 +85,10 @@ def run(arguments: argparse.Namespace) -> int:
     import traps_pipeline.definitions  # noqa: F401 - declares the graph
     from traps_pipeline.models.backends import require_libraries
     from traps_pipeline.orchestration.machine import require_machine, wanted_parts
-    from traps_pipeline.orchestration.run import dagster_history, failed_checks, stages_until, walk
+    from traps_pipeline.orchestration.run import dagster_history, failed_checks, require_work, stages_until, walk
 
     stages = stages_until(arguments.until)
+    require_work(workspace, experiment.name, arguments.until)
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", flush=True)
     with reporting(TerminalProgress()) as progress, dagster_history(workspace) as instance:
         participants = _still_to_ask(workspace, experiment, stages)

@@ -8,19 +8,22 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
+import dagster as dg
+
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.network import check_network
 from traps_pipeline.base.partitions import Cell
 from traps_pipeline.models.judges import load_panel
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.orchestration.graph import Stage, the_graph
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.scenes.trial import OPENGL, check_rendering
 from traps_pipeline.storage.workspace import Workspace
 
 LEAST_GB = 0.1  # less is gone before a run has made its first tables
+SHOWN = 5  # partitions in a sentence
 CLIPS = "mp4"  # the kind of a stage that renders
 
 Parts = Mapping[str, Sequence[str | None]]  # by stage: the partitions that a run is to make
@@ -30,6 +33,23 @@ def wanted_parts(workspace: Workspace, stages: Collection[str], experiment: str 
     """Return what a study wants of these stages, or one experiment of it."""
     wanted = Wanted(workspace, experiment)
     return {stage.name: stage.wanted(wanted) for stage in the_graph().stages if stage.name in stages}
+
+
+def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, wanted: Wanted) -> Parts:
+    """Return the stages of a Dagster run that share a step's partitions, each with those that the study wants."""
+    keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
+    selected = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
+    names = {key.path[-1] for key in selected}
+    alike = [other for other in the_graph().stages if other.name in names and other.scheme is stage.scheme]
+    return {other.name: [key for key in other.wanted(wanted) if key in keys] for other in alike}
+
+
+def why_nothing(keys: Sequence[str | None], tags: Mapping[str, str], workspace: Workspace) -> str:
+    """Return in words why a run with these keys, none of which is wanted, has nothing to make."""
+    if keys:
+        return f"no experiment in {workspace.root / 'study.yaml'} asks for {', '.join(map(str, keys[:SHOWN]))}"
+    first, last = (tags.get(f"dagster/asset_partition_range_{end}", "its end") for end in ("start", "end"))
+    return f"no partition lies between {first} and {last}; exchange the two"
 
 
 def require_machine(workspace: Workspace, parts: Parts) -> None:
