@@ -28,6 +28,7 @@ def test_opengl_that_does_not_draw_ends_a_run_before_its_first_table_unless_the_
     experiment = tmp_path / "tiny.yaml"
     experiment.write_text(yaml.safe_dump(EXPERIMENT))
     study = Checkout(ROOT, tmp_path / "study")
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
     refused = study.traps("run", experiment)
     assert refused.code == 1
@@ -53,6 +54,31 @@ def test_opengl_that_does_not_draw_ends_a_run_before_its_first_table_unless_the_
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
     finished = study.traps("run", experiment, "--until", "responses")
     assert finished.code == 0, finished.err
+
+
+def test_a_run_for_which_nothing_matches_says_so_and_fails(tmp_path: Path) -> None:
+    study = Checkout(ROOT, tmp_path / "study")
+    for name, changes in {
+        "a": {"models": ["oracle"], "regimes": ["standard"]},
+        "b": {"models": ["always-abstain"], "regimes": ["guided"]},
+        "other-taxonomy": {"datasets": ["chaotic"]},
+        "no-such-run": {"runs": [9]},
+    }.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(EXPERIMENT | {"name": name} | changes))
+        assert study.traps("init", tmp_path / f"{name}.yaml").code == 0
+    for name in ("other-taxonomy", "no-such-run"):
+        ran = study.traps("run", tmp_path / f"{name}.yaml")
+        assert ran.code == 1
+        assert ran.err.startswith(f"traps: experiment {name} asks nothing: ")
+
+    materialize = ("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", "responses")
+    oracle, other = ("occlusion|oracle__guided__run1", "occlusion|always-abstain__standard__run1")
+    unwanted = study.dagster(*materialize, "--partition", oracle)
+    assert unwanted.code == 1
+    assert f"study.yaml asks for {oracle}" in unwanted.err
+    backwards = study.dagster(*materialize, "--partition-range", f"{other}...{oracle}")
+    assert backwards.code == 1
+    assert f"no partition lies between {other} and {oracle}" in backwards.err
 
 
 def test_proxies_and_certificates_are_looked_at_where_something_is_asked(
