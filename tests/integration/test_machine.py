@@ -59,26 +59,28 @@ def test_opengl_that_does_not_draw_ends_a_run_before_its_first_table_unless_the_
 def test_a_run_for_which_nothing_matches_says_so_and_fails(tmp_path: Path) -> None:
     study = Checkout(ROOT, tmp_path / "study")
     for name, changes in {
-        "a": {"models": ["oracle"], "regimes": ["standard"]},
-        "b": {"models": ["always-abstain"], "regimes": ["guided"]},
-        "other-taxonomy": {"datasets": ["chaotic"]},
+        "a": {"datasets": ["occlusion"]},
+        "b": {"datasets": ["chaotic"], "models": ["always-abstain"]},
         "no-such-run": {"runs": [9]},
+        "no-such-arm": {"datasets": ["predictable_cut"], "scenarios": ["domino_chain-0001"]},
     }.items():
-        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(EXPERIMENT | {"name": name} | changes))
-        assert study.traps("init", tmp_path / f"{name}.yaml").code == 0
-    for name in ("other-taxonomy", "no-such-run"):
-        ran = study.traps("run", tmp_path / f"{name}.yaml")
+        both = {"name": name, "scenarios": ["domino_chain-0001", "plinko-0001"]}
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(EXPERIMENT | both | changes))
+        place = "other" if name == "no-such-arm" else "study"
+        assert study.traps("init", tmp_path / f"{name}.yaml", "--workspace", tmp_path / place).code == 0
+    for name, place in (("no-such-run", "study"), ("no-such-arm", "other")):
+        ran = study.traps("run", tmp_path / f"{name}.yaml", "--workspace", tmp_path / place)
         assert ran.code == 1
         assert ran.err.startswith(f"traps: experiment {name} asks nothing: ")
 
     materialize = ("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", "responses")
-    oracle, other = ("occlusion|oracle__guided__run1", "occlusion|always-abstain__standard__run1")
-    unwanted = study.dagster(*materialize, "--partition", oracle)
-    assert unwanted.code == 1
-    assert f"study.yaml asks for {oracle}" in unwanted.err
-    backwards = study.dagster(*materialize, "--partition-range", f"{other}...{oracle}")
+    wanted, unwanted = "occlusion|oracle__standard__run1", "chaotic|oracle__standard__run1"
+    alone = study.dagster(*materialize, "--partition", unwanted)
+    assert alone.code == 1
+    assert f"study.yaml asks for {unwanted}" in alone.err
+    backwards = study.dagster(*materialize, "--partition-range", f"{unwanted}...{wanted}")
     assert backwards.code == 1
-    assert f"no partition lies between {other} and {oracle}" in backwards.err
+    assert f"no partition lies between {unwanted} and {wanted}" in backwards.err
 
 
 def test_proxies_and_certificates_are_looked_at_where_something_is_asked(
