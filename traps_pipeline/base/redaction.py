@@ -24,6 +24,7 @@ SHORTEST = 8  # characters: anything shorter could be an ordinary word
 _HEAD = 12  # characters of a secret that are looked for; what follows is compared, so that a cut secret is found too
 _NAMES = re.compile(r"(KEY|TOKEN|SECRET|PASSWORD|PASSWD)$", re.IGNORECASE)
 _PASSWORD = re.compile(r"://[^/\s:@]*:([^/\s@]+)@|\bpassword=([^\s&]+)")  # in an address of a database or a proxy
+_EXAMPLE = "PASSWORD"  # as our own sentences write addresses
 _ENCODED = re.compile(
     r"\\+(?:[abfnrtv0]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})|%[0-9a-f]{2}|&(?:amp|lt|gt|quot|apos|#\d{1,7}|#x[0-9a-f]{1,6});",
     re.IGNORECASE,
@@ -105,7 +106,12 @@ def _secrets() -> Iterator[str]:
         if not is_address and (name in _variables or _NAMES.search(name)):
             yield value
         if is_address:
-            yield from (group for match in _PASSWORD.finditer(value) for group in match.groups() if group)
+            yield from (
+                group
+                for match in _PASSWORD.finditer(value)
+                for group in match.groups()
+                if group not in (None, _EXAMPLE)
+            )
 
 
 @lru_cache(maxsize=64)
