@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import base64
 import json
+import os
+import subprocess
+import sys
 import textwrap
 from collections.abc import Callable
 from urllib.parse import quote, quote_plus
 
 import pytest
 
+from tests.conftest import ROOT
 from traps_pipeline.base import redaction
 from traps_pipeline.base.redaction import redact
 
@@ -108,3 +112,40 @@ def test_the_password_of_an_address_and_a_key_with_any_name_are_secrets(monkeypa
     monkeypatch.setenv("LAB", "token-of-the-lab")
     redaction.hide("LAB")
     assert redact("password s3cret/password of token-of-the-lab") == "password *** of ***"
+
+
+TRACEBACK = """
+import logging, threading
+from traps_pipeline.base.redaction import redact_tracebacks, redacted
+redact_tracebacks()
+redact_tracebacks()
+key = __import__("os").environ["MY_API_KEY"]
+def fail():
+    raise ValueError({"Authorization": f"Bearer {key}"})
+logging.error("sent %s", key)
+logging.error("sent %s", 1)
+try:
+    fail()
+except ValueError as error:
+    logging.exception("it failed")
+    print(redacted(error), redacted(KeyError("x")).__class__)
+thread = threading.Thread(target=fail)
+thread.start()
+thread.join()
+fail()
+"""
+
+
+def test_logs_and_tracebacks_of_a_process_hold_no_key() -> None:
+    environment = {**os.environ, "MY_API_KEY": KEY, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", TRACEBACK]
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 1
+    shown = ran.stdout + ran.stderr
+    assert KEY[:9] not in shown
+    assert ran.stderr.count("Traceback") == 3
+    assert ran.stderr.count("Bearer ***") == 3
+    assert "ERROR:root:sent ***" in ran.stderr
+    assert "ERROR:root:sent 1" in ran.stderr
+    assert "Bearer ***" in ran.stdout
+    assert "<class 'KeyError'>" in ran.stdout

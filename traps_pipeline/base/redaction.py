@@ -78,9 +78,11 @@ def redact_tracebacks() -> None:
     def redacted_record(*args: Any, **named: Any) -> logging.LogRecord:
         record = make(*args, **named)
         try:
-            record.msg, record.args = redact(record.getMessage()), ()
+            message = record.getMessage()
         except (TypeError, ValueError):
-            record.msg, record.args = redact(f"{record.msg} {record.args}"), ()
+            message = f"{record.msg} {record.args}"
+        if (without := redact(message)) != message:  # else it stays as it is: formatters read its arguments
+            record.msg, record.args = without, ()
         if record.exc_info and record.exc_info[0]:
             record.exc_text = redact("".join(traceback.format_exception(*record.exc_info)).rstrip())
         return record
