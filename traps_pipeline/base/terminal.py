@@ -8,6 +8,8 @@ import sys
 import unicodedata
 from collections.abc import Collection, Iterable, Sequence
 
+from traps_pipeline.base.redaction import redact
+
 _WIDE = 100_000  # columns: no table is wrapped or cut to the width of the screen
 
 
@@ -44,8 +46,12 @@ def finalized(value: object) -> object:
 
 
 def plain(text: object) -> str:
-    """Text on one line that cannot steer a terminal; what is not printable becomes `?`, which takes one column."""
-    return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in str(text))
+    """Return text on one line that cannot steer a terminal and holds no key."""
+    return _printable(redact(str(text)))
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in text)
 
 
 def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: Collection[int] = (0,)) -> str:
@@ -65,7 +71,7 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
     for place, heading in enumerate(headings):
         table.add_column(Text(plain(heading)), justify="left" if place in left else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*(Text(plain(cell)) for cell in row))
+        table.add_row(*(Text(_printable(str(cell))) for cell in row))
     lines = io.StringIO()
     Console(file=lines, width=_WIDE, force_terminal=styled).print(table)
-    return "\n".join(line.rstrip() for line in lines.getvalue().splitlines())
+    return redact("\n".join(line.rstrip() for line in lines.getvalue().splitlines()))

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import sentence_of
 from traps_pipeline.base.files import remedy
+from traps_pipeline.base.redaction import redact_tracebacks
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli import (
     annotate,
@@ -49,11 +50,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a path or a word that this terminal cannot show
-    arguments = build_parser().parse_args(argv)
-    command: Run = arguments.command
+    redact_tracebacks()
     try:
+        return _run(argv)
+    except BrokenPipeError:
+        # Nobody reads any more (`| head`); the interpreter's last flush must not complain of it either.
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return INTERRUPTED
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    """Run a subcommand. Raises BrokenPipeError where what it prints, or the end of it, is not read."""
+    try:
+        arguments = build_parser().parse_args(argv)
+        command: Run = arguments.command
         with _stopped_alike():
             return command(arguments)
+    except BrokenPipeError:
+        raise
     except TrapsError as error:
         print("\n".join(plain(line) for line in f"traps: {error}".splitlines()), file=sys.stderr)
         return FAILED
@@ -63,10 +78,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"traps: {sentence}", file=sys.stderr)
         return FAILED
     except OSError as error:
-        if isinstance(error, BrokenPipeError):
-            # Nobody reads any more (`| head`); the interpreter's last flush must not complain of it either.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return FAILED
         where = f"{plain(error.filename)[:200]}: " if error.filename else ""
         print(f"traps: {where}{error.strerror}; {remedy(error)} and run the same command again", file=sys.stderr)
         return FAILED
@@ -76,6 +87,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return INTERRUPTED
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:  # pyright: ignore[reportUnnecessaryComparison] - None where it was closed (`>&-`)
+                stream.flush()
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import argparse
 import os
 
 from traps_pipeline.base.extras import require
+from traps_pipeline.base.keys import optional_key
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, number, open_workspace, whole
 
 CLUSTER = "of a study on a cluster"
@@ -33,7 +34,7 @@ def ui(arguments: argparse.Namespace) -> int:
     from traps_pipeline.base.webguard import token_for
     from traps_pipeline.orchestration.webserver import DANGER, STOP_S, TOKEN_VARIABLE, serve_with_dagster
 
-    given = arguments.token or os.environ.get(TOKEN_VARIABLE)
+    given = arguments.token or optional_key(TOKEN_VARIABLE)
     token = token_for(arguments.host, given, danger=DANGER, variable=TOKEN_VARIABLE)
     if (code := split(STOP_S + _OWN_S)) is not None:  # before Dagster's imports, which a fork could break
         return code if code >= 0 else FAILED

@@ -159,6 +159,18 @@ def stages_until(until: str | None) -> set[str]:
     return graph.above(until.split(","))
 
 
+def require_work(workspace: Workspace, experiment: str, until: str | None) -> None:
+    """Check that an experiment wants something of the stages that are named, or of any stage. Raises TrapsError."""
+    wanted, graph = Wanted(workspace, experiment), the_graph()
+    if not wanted.cells and not wanted.states:
+        raise TrapsError(
+            f"experiment {experiment} asks nothing: none of its scenarios belongs to its datasets, or no model has its "
+            "runs; change `scenarios`, `datasets` or `runs`"
+        )
+    if empty := [name for name in until.split(",") if not graph[name].wanted(wanted)] if until else []:
+        raise TrapsError(f"--until {', '.join(empty)}: experiment {experiment} wants nothing of it; name another stage")
+
+
 def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:
     """Checks of what is wanted that do not pass, whichever run made it."""
     wanted, problems = Wanted(workspace, experiment), []
