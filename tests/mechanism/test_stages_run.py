@@ -108,6 +108,7 @@ from traps_pipeline.orchestration.graph import Source, name_of, the_graph
 from traps_pipeline.orchestration.lineage import Lineage, _report_state
 from traps_pipeline.orchestration.run import dagster_history
 from traps_pipeline.orchestration.runs import _execute
+from traps_pipeline.storage.parquet import write_sealed
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.orchestration.wanted import Wanted
 
@@ -126,7 +127,7 @@ def change(name, key):
     if table:
         data = pq.read_table(path)
         state = json.loads(data.schema.metadata[b"traps"]) | {"version": "0" * 16}
-        pq.write_table(data.replace_schema_metadata({b"traps": json.dumps(state).encode()}), path)
+        write_sealed(path, data, {b"traps": json.dumps(state).encode()})
     else:
         path.write_text(json.dumps(json.loads(content) | {"version": "0" * 16}))
     return lambda: path.write_bytes(content)
