@@ -81,6 +81,12 @@ class Step:
         _BEGUN.append(events)
         try:
             yield from events
+        except (KeyboardInterrupt, dg.DagsterExecutionInterruptedError):
+            # Else Dagster, which did not stop it itself, would call what a person has stopped a failure.
+            run = self.context.instance.get_run_by_id(self.context.run_id)
+            if run is not None and run.status == dg.DagsterRunStatus.STARTED:
+                self.context.instance.report_run_canceling(run, "Stopped by a signal.")
+            raise
         finally:
             if events in _BEGUN:
                 _BEGUN.remove(events)
@@ -290,8 +296,9 @@ class Step:
         shown: dict[str, Any] = {**made.shown, TALLY: json.dumps(vars(made.tally))}
         if self.stage.table is None:
             files = cast(Mapping[str, bytes], made.content)
-            paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in files}
-            return {path: value for path, value in paths.items() if path.count("/") < 2} | shown
+            pages = [path for path in files if "/" not in path]
+            paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in pages}
+            return {"files": len(files)} | paths | shown
         count = "dagster/row_count" if self.stage.scheme is None else "dagster/partition_row_count"
         preview = _preview(self.stage.table, made)
         return {count: len(made.content)} | ({"first rows": preview} if preview else {}) | shown
