@@ -7,7 +7,7 @@ import dagster as dg
 from traps_pipeline import defs as declared
 from traps_pipeline.base.paths import require_root
 from traps_pipeline.base.redaction import redact_tracebacks
-from traps_pipeline.orchestration.automation import JOBS, SENSORS
+from traps_pipeline.orchestration.automation import jobs, sensors
 from traps_pipeline.orchestration.graph import DECLARED
 from traps_pipeline.orchestration.lost_runs import lost_runs
 from traps_pipeline.orchestration.stage import WorkspaceResource
@@ -27,13 +27,13 @@ def _assets() -> list[dg.AssetsDefinition | dg.SourceAsset]:
 
 def _sensors() -> list[dg.SensorDefinition]:
     is_on_cluster = isinstance(Workspace.default_place(), str) and bool(os.environ.get(RAY))
-    return [*SENSORS, *([lost_runs] if is_on_cluster else [])]
+    return [*sensors(), *([lost_runs] if is_on_cluster else [])]
 
 
 # Runs are in process: a run costs 2 s instead of 5, and rendering and calls use their own processes and connections.
 defs = dg.Definitions(
     assets=_assets(),
-    jobs=JOBS,
+    jobs=jobs(),
     sensors=_sensors(),
     executor=dg.in_process_executor,
     resources={"workspace": WorkspaceResource(root=str(Workspace.default_place()))},

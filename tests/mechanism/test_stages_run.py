@@ -107,8 +107,8 @@ from traps_pipeline.definitions import defs
 from traps_pipeline.orchestration.graph import Source, name_of, the_graph
 from traps_pipeline.orchestration.lineage import Lineage, _report_state
 from traps_pipeline.orchestration.run import dagster_history
-from traps_pipeline.orchestration.runs import _execute
 from traps_pipeline.storage.parquet import write_sealed
+from traps_pipeline.orchestration.runs import RunsHere
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.orchestration.wanted import Wanted
 
@@ -146,7 +146,8 @@ def meanwhile(stage, key, parent):
     object.__setattr__(stage, "make", make and made)
     object.__setattr__(stage, "collect", collect and collected)
     try:
-        problems = _execute(history, job, [stage], key, {}).problems
+        [ran] = RunsHere(history, job).make([stage], [(key, key)], {})
+        problems = ran.problems
         status = Lineage(workspace).status(stage.name, key)
     finally:
         object.__setattr__(stage, "make", make)

@@ -10,7 +10,9 @@ import pytest
 from tests.tables import TABLES
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.definitions import defs
-from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.orchestration import stage as declaration
+from traps_pipeline.orchestration.graph import JOB_GROUPS, the_graph
+from traps_pipeline.storage.parquet import Made
 
 DAGSTER = defs.get_repository_def().asset_graph
 GRAPH = the_graph()
@@ -94,3 +96,31 @@ def test_what_can_cost_money_is_marked() -> None:
 def test_an_unknown_stage_is_answered_with_the_known_ones() -> None:
     with pytest.raises(TrapsError, match=r"no stage 'stages'; choose from scene_specs, videos"):
         _ = GRAPH["stages"]
+
+
+def test_every_stage_is_made_by_one_job_and_by_the_job_of_everything() -> None:
+    groups = [group for groups in JOB_GROUPS.values() for group in groups]
+    assert len(groups) == len(set(groups))
+    assert {stage.spec.group_name for stage in GRAPH.stages} == set(groups)
+    assert {job.name for job in defs.jobs or ()} == {*JOB_GROUPS, "everything"}
+
+
+def test_the_report_is_a_job_of_assets_and_its_selection_is_its_group() -> None:
+    job = defs.resolve_job_def("report")
+    made = {key.path[-1] for key in job.asset_layer.executable_asset_keys}
+    assert made == {stage.name for stage in GRAPH.stages if stage.spec.group_name == "report"}
+
+
+def test_each_asset_shows_the_sensors_that_make_it_again() -> None:
+    repository, free = defs.get_repository_def(), {s.spec.key for s in GRAPH.stages if not s.cost}
+    for name, expected in (
+        ("follow_corrections", free),
+        ("follow_corrections_paid", {s.spec.key for s in GRAPH.stages}),
+    ):
+        selection = repository.get_sensor_def(name).asset_selection
+        assert selection is not None and selection.resolve(repository.asset_graph) == expected
+
+
+def test_a_group_that_no_job_makes_is_refused_where_it_is_declared() -> None:
+    with pytest.raises(ValueError, match="no job makes the group extras; add it to JOB_GROUPS"):
+        declaration.stage("extra", lambda workspace, key: Made({}), group="extras", deps=[])

@@ -21,7 +21,7 @@ from traps_pipeline.cli import main
 from traps_pipeline.judging.tables import JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.orchestration.graph import the_graph
 from traps_pipeline.report import publish
-from traps_pipeline.report.catalogue import FIGURES, JUDGED_STAGES, OF_PAPER, OF_STUDY, PRINTED, TABLES, workspace_files
+from traps_pipeline.report.catalogue import FIGURES, JUDGED_STAGES, TABLES, workspace_files
 from traps_pipeline.report.figures.abstention import doubt_points
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.study_results import StudyResults
@@ -289,13 +289,13 @@ def test_the_doubt_figure_refuses_to_mix_epochs():
     assert set(flash["doubt"]) == {0.20}
 
 
-def test_a_table_or_figure_is_stale_when_what_it_reads_changed_and_only_then():
+def test_the_report_is_few_assets_that_depend_on_all_that_their_tables_and_figures_read():
     graph = the_graph()
-    assert {*PRINTED} <= {stage.name for stage in graph.stages}
-    assert graph.parents("figure_pecs_landscape", None) == {"leaderboard": [None]}
-    assert "chaotic" in graph.parents("table_chaotic_sub_scenarios", None)["metrics"]
-    assert graph.parents("published_tables", None) == {"published": [None]}
-    assert graph.parents("report_page", None).keys() >= {*OF_STUDY, *OF_PAPER, "verdicts", "leaderboard"}
+    for name, reports in (("report_tables", TABLES), ("report_figures", FIGURES)):
+        reads = {stage for report in reports for stage in report.reads}
+        assert graph.parents(name, None).keys() == reads & graph.declared.keys()
+    assert graph.parents("published_report", None) == {"published": [None]}
+    assert {"report_tables", "report_figures", "published_report", "verdicts"} <= graph.parents_of["report_page"].keys()
 
 
 def test_whatever_reads_figures_that_the_panel_decided_says_who_judged():
@@ -318,13 +318,13 @@ def test_the_page_of_the_docs_names_every_table_and_figure():
 def test_names_of_tables_and_figures_are_unique():
     names = [table.name for report in TABLES for table in report.tables(PAPER)]
     assert len(set(names)) == len(names)
-    assert len(PRINTED) == len(set(PRINTED)) == len(OF_STUDY) + len(OF_PAPER)
+    assert len({report.name for report in FIGURES}) == len(FIGURES)
 
 
 def test_a_workspace_keeps_every_table_file_and_a_figures_picture(partial):
-    files = workspace_files(OF_STUDY["table_overall"], partial)
+    files = workspace_files(next(r for r in TABLES if r.name == "overall"), partial)
     assert sorted(files) == [f"tables/overall.{kind}" for kind in ("csv", "md", "parquet", "tex")]
-    files = workspace_files(next(r for r in OF_PAPER["published_figures"] if r.name == "doubt_conversion"), PAPER)
+    files = workspace_files(next(r for r in FIGURES if r.name == "doubt_conversion"), PAPER)
     assert list(files) == ["figures/published/doubt_conversion.png"]
     assert imread(io.BytesIO(files["figures/published/doubt_conversion.png"])).shape[1] == 990  # 3.3 in, 300 dpi
 

@@ -1,4 +1,4 @@
-"""The report groups: contact sheet, gallery, the catalogue's tables and figures, the report page."""
+"""The report group: contact sheet, gallery, the catalogue's tables and figures, the report page."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,8 +11,9 @@ from traps_pipeline.benchmark.tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.defs import inside, judging, mechanism, people, scoring
 from traps_pipeline.defs.shown import thumbnail
 from traps_pipeline.orchestration.graph import Need
-from traps_pipeline.orchestration.stage import key_of, shown, source, stage
-from traps_pipeline.report.catalogue import OF_PAPER, OF_STUDY, PRINTED, Report, TableReport, workspace_files
+from traps_pipeline.orchestration.pieces import Files, Piece, make_pieces
+from traps_pipeline.orchestration.stage import code_of, key_of, shown, source, stage
+from traps_pipeline.report.catalogue import FIGURES, TABLES, Report, workspace_files
 from traps_pipeline.report.results import Results
 from traps_pipeline.scoring.published import published_digest
 from traps_pipeline.storage.parquet import Made
@@ -20,11 +21,10 @@ from traps_pipeline.storage.workspace import Workspace
 
 GROUP = "report"
 READ = (judging, people, mechanism, inside, scoring)  # declared before this group, which reads their tables
-Files = dict[str, bytes]
 published = source(
     "published",
     lambda workspace, key: published_digest(),
-    group="published",
+    group=GROUP,
     doc="assets/published: the paper's tables as printed.",
     kinds=["csv"],
 )
@@ -36,25 +36,31 @@ def _report(
     doc: str,
     *,
     deps: Sequence[str],
-    group: str = GROUP,
     kinds: Sequence[str] = ("png",),
 ) -> dg.AssetsDefinition:
     """An asset that writes files for people into the workspace's `reports` folder, from those tables that exist."""
 
     def made(workspace: Workspace, _: None) -> Made:
         files = make(workspace)
-        return Made(files, shown=_previews(files))
+        return Made(files, shown=_previews(files, [*files]))
 
+    return _stage(name, made, doc, deps, kinds)
+
+
+def _stage(
+    name: str, made: Callable[[Workspace, Any], Made], doc: str, deps: Sequence[str], kinds: Sequence[str]
+) -> dg.AssetsDefinition:
     existing = [dep for dep in deps if shown(dep)]
     needs: dict[str, Need] = dict.fromkeys(existing, "none")
-    return stage(name, made, doc=doc, group=group, deps=[key_of(dep) for dep in existing], needs=needs, kinds=kinds)
+    above = [key_of(dep) for dep in existing]
+    return stage(name, made, doc=doc, group=GROUP, deps=above, needs=needs, kinds=kinds)
 
 
-def _previews(files: Mapping[str, bytes]) -> dict[str, Any]:
-    """Previews for Dagster: small pictures, and the tables themselves."""
-    shown = {f"preview of {f}": thumbnail(content) for f, content in files.items() if f.endswith(".png")}
-    text = {f: content.decode() for f, content in files.items() if f.endswith(".md")}
-    return shown | {f"preview of {file}": dg.MetadataValue.md(content) for file, content in text.items()}
+def _previews(files: Mapping[str, bytes], names: Sequence[str]) -> dict[str, Any]:
+    """Previews for Dagster of some files: small pictures, and tables as Markdown."""
+    pictures = {f"preview of {f}": thumbnail(files[f]) for f in names if f.endswith(".png")}
+    texts = {f"preview of {f}": dg.MetadataValue.md(files[f].decode()) for f in names if f.endswith(".md")}
+    return pictures | texts
 
 
 def _sheet(workspace: Workspace) -> Files:
@@ -179,7 +185,7 @@ def _results(workspace: Workspace, *, of_paper: bool) -> Results:
 
     if of_paper:
         return _kept(("paper", published_digest()), PublishedResults)
-    reads = {"items", *(name for report in OF_STUDY.values() for name in report.reads)}
+    reads = {"items", *(name for report in (*TABLES, *FIGURES) for name in report.reads)}
     files = [f for name in sorted(reads) for f in workspace.store.below(workspace.tables.root / name)]
     slot = (workspace.root, *((file, workspace.store.changed_ns(file)) for file in files))
     return _kept(("study", slot), lambda: StudyResults(workspace))
@@ -194,29 +200,47 @@ def _kept(slot: tuple[str, Any], make: Callable[[], Results]) -> Results:
 _KEPT: dict[str, tuple[Any, Results]] = {}
 
 
-def _printed(name: str, report: Report) -> dg.AssetsDefinition:
-    table = isinstance(report, TableReport)
-    return _report(
-        name,
-        lambda workspace: workspace_files(report, _results(workspace, of_paper=False)),
-        report.doc,
-        deps=report.reads,
-        group="tables" if table else "figures",
-        kinds=["csv" if table else "png"],
-    )
+def _printed(name: str, reports: Sequence[Report], doc: str, previewed: Sequence[str]) -> dg.AssetsDefinition:
+    """An asset of many tables or figures of the study, each made again only when a table that it reads changed."""
+
+    def made(workspace: Workspace, _: None) -> Made:
+        def piece(report: Report) -> Piece:
+            make = lambda: workspace_files(report, _results(workspace, of_paper=False))  # noqa: E731 - of this report
+            return Piece(report.name, report.reads, make)
+
+        files, remade = make_pieces(workspace, name, code_of(GROUP), [piece(report) for report in reports])
+        shown = {"made again": ", ".join(remade) or "none"} | _previews(files, [f for f in previewed if f in files])
+        return Made(files, shown=shown)
+
+    reads = dict.fromkeys(dep for report in reports for dep in report.reads)
+    return _stage(name, made, doc, [*reads], ["csv" if name == "report_tables" else "png"])
 
 
-def _printed_of_paper(name: str, reports: Sequence[Report]) -> dg.AssetsDefinition:
+def _printed_of_paper(name: str, reports: Sequence[Report], doc: str) -> dg.AssetsDefinition:
     def files(workspace: Workspace) -> Files:
         results = _results(workspace, of_paper=True)
         return {path: data for report in reports for path, data in workspace_files(report, results).items()}
 
-    doc = f"From the paper's published numbers: {', '.join(report.name for report in reports)}."
-    return _report(name, files, doc, deps=["published"], group="published")
+    return _report(name, files, doc, deps=["published"])
 
 
-printed = [_printed(name, report) for name, report in OF_STUDY.items()]
-printed_of_paper = [_printed_of_paper(name, reports) for name, reports in OF_PAPER.items()]
+report_tables = _printed(
+    "report_tables",
+    TABLES,
+    "Every table of the study, as CSV, LaTeX, Markdown and Parquet.",
+    ["tables/overall.md"],
+)
+report_figures = _printed(
+    "report_figures",
+    FIGURES,
+    "Every figure of the study.",
+    ["figures/pecs_landscape.png", "figures/abs_rec.png"],
+)
+published_report = _printed_of_paper(
+    "published_report",
+    [report for report in (*TABLES, *FIGURES) if report.published],
+    "Tables and figures of the paper's published numbers.",
+)
 report_page = _report(
     "report_page",
     _page,
@@ -235,7 +259,9 @@ report_page = _report(
         "shortcuts",
         "worked_example",
         "cases",
-        *PRINTED,
+        "report_tables",
+        "report_figures",
+        "published_report",
     ],
     kinds=["html"],
 )

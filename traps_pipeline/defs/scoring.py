@@ -48,7 +48,6 @@ metrics = stage(
     group=GROUP,
     deps=[items, dg.AssetDep(verdicts, partition_mapping=by_dataset), judges],
     scheme=DATASET,
-    code="3",
     needs={"verdicts": "some"},
     columns={
         **_SHARES,
@@ -162,17 +161,14 @@ def _wrong_doses(workspace: Workspace, key: str | None, made: Made) -> str:
 _OF_SOME: dict[str, Need] = {"metrics": "some", "verdicts": "some"}
 # The panel is an input of all that is counted from its verdicts: after a change of it they are stale at once, and not
 # only when its votes are made again.
-contrasts = stage(CONTRASTS, _make_contrasts, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME, code="2")
-regime_tests = stage(
-    REGIME_TESTS, _make_regime_tests, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME, code="2"
-)
+contrasts = stage(CONTRASTS, _make_contrasts, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME)
+regime_tests = stage(REGIME_TESTS, _make_regime_tests, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME)
 leaderboard = stage(
     LEADERBOARD,
     _make_leaderboard,
     group=GROUP,
     deps=[metrics, verdicts, contrasts, judges],
     needs=_OF_SOME,
-    code="3",
     columns={name: [f"metrics.{name}"] for name in ("acc", "abs_rec", "false_abs", "j", "pecs")},
     checks=[
         Check(
@@ -188,7 +184,6 @@ robust = stage(
     group=GROUP,
     deps=[metrics, verdicts, judges],
     needs=_OF_SOME,
-    code="2",
     columns={"acc_r": ["verdicts.correct"], "abs_rec_r": ["verdicts.abstained"], "false_abs_r": ["verdicts.abstained"]},
     checks=[
         Check(

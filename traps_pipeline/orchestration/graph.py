@@ -26,18 +26,15 @@ if TYPE_CHECKING:
 Node = tuple[str, str | None]  # stage or source, and its partition key
 Need = Literal["every", "some", "none"]
 Cost = Literal["", "money", "machine"]
-GROUPS = (
-    "benchmark",
-    "evaluation",
-    "scoring",
-    "judging",
-    "people",
-    "mechanism",
-    "report",
-    "tables",
-    "figures",
-    "published",
-)
+# Each job and the groups of assets that it makes. Every group stands here once, in the order in which groups are made.
+JOB_GROUPS: Mapping[str, tuple[str, ...]] = {
+    "benchmark": ("benchmark", "arms"),
+    "evaluation": ("evaluation",),
+    "scoring": ("scoring", "judging", "people"),
+    "mechanism": ("mechanism",),
+    "report": ("report",),
+}
+GROUPS = tuple(group for groups in JOB_GROUPS.values() for group in groups)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,12 +18,12 @@ from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_text
 from traps_pipeline.models.traffic import remembering_stops
-from traps_pipeline.orchestration.graph import name_of, the_graph
+from traps_pipeline.orchestration.graph import Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
 from traps_pipeline.orchestration.runs import HOST_TAG, PID_TAG, Runs, this_host
 from traps_pipeline.orchestration.shared_history import unusable
-from traps_pipeline.orchestration.step import EXPERIMENT_TAG, MAKE_TAG, OUTDATED, STALE, to_make
+from traps_pipeline.orchestration.step import EXPERIMENT_TAG, MAKE_TAG, STALE, to_make
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.storage.workspace import Workspace
 
@@ -110,6 +110,25 @@ def _alive(pid: int) -> bool:
     return True
 
 
+def pending_in(
+    block: Sequence[Stage], lineage: Lineage, history: History, wanted: Wanted, *, existing: bool = False
+) -> tuple[list[Stage], list[str | None]]:
+    """Return the stages of a block that have something to make, or stand below one that has, and the keys of these.
+
+    existing: only what is there already and outdated, and waits for nothing above it.
+    """
+    pending: dict[str, list[str | None]] = {}
+    for stage in block:
+        recorded = history.recorded(stage.name)
+        every = stage.wanted(wanted)
+        keys = [k for k in every if to_make(lineage, recorded, stage.name, k, existing=existing)]
+        keys = [k for k in keys if not (existing and lineage.waits(stage.name, k))]
+        if keys or lineage.graph.parents_of[stage.name].keys() & pending.keys():
+            pending[stage.name] = keys
+    every = lineage.graph.keys(block[0].name)
+    return [lineage.graph[name] for name in pending], [k for k in every if any(k in keys for keys in pending.values())]
+
+
 def walk(
     instance: dg.DagsterInstance,
     runs: Runs,
@@ -117,30 +136,18 @@ def walk(
     stages: Collection[str],
     *,
     experiment: str | None = None,
-    existing: bool = False,
 ) -> WalkResult:
     """Make what is missing or stale of these stages, block by block.
 
-    experiment: only what that one of the study's wants; existing: only what is there already and outdated.
-    KeyboardInterrupt passes through.
+    experiment: only what that one of the study's wants. KeyboardInterrupt passes through.
     """
     outcome, began, graph = WalkResult(), time.monotonic(), the_graph()
     history, wanted = History(instance, graph), Wanted(workspace, experiment)
-    tags = {MAKE_TAG: OUTDATED if existing else STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})
+    tags = {MAKE_TAG: STALE} | ({EXPERIMENT_TAG: experiment} if experiment else {})
     with remembering_stops():
         for block in graph.blocks([name for name in stages if graph[name].wanted(wanted)]):
-            lineage = Lineage(workspace)
-            todo: dict[str, list[str | None]] = {}
-            for stage in block:
-                known = history.recorded(stage.name)
-                every = stage.wanted(wanted)
-                keys = [k for k in every if to_make(lineage, known, stage.name, k, existing=existing)]
-                keys = [k for k in keys if not (existing and lineage.waits(stage.name, k))]
-                if keys or graph.parents_of[stage.name].keys() & todo.keys():
-                    todo[stage.name] = keys
-            keys = [key for key in graph.keys(block[0].name) if any(key in of for of in todo.values())]
-            made = [graph[name] for name in todo]
-            for ran in runs.make(made, runs.ranges(made, keys), tags):
+            pending, keys = pending_in(block, Lineage(workspace), history, wanted)
+            for ran in runs.make(pending, runs.ranges(pending, keys), tags):
                 outcome.problems += ran.problems
                 outcome.over_budget |= ran.over_budget
     outcome.problems = [*dict.fromkeys(outcome.problems)]

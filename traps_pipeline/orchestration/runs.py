@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import re
 import socket
+import uuid
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from traps_pipeline.orchestration.ranges import Range, batches
 from traps_pipeline.orchestration.step import close_dropped
 
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
+PARENT_TAG, ROOT_TAG = "dagster/parent_run_id", "dagster/root_run_id"
 _RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"
 # Errors whose message is for people; the last one's class is imported where SQLite holds the history alone.
 _SENTENCES = (TrapsError.__name__, BudgetReached.__name__, "HistoryUnwritable")
@@ -49,10 +51,21 @@ class Runs(ABC):
 
 
 class RunsHere(Runs):
-    """Runs in this process, of the job of all assets."""
+    """Runs in this process, of the job of all assets. parent: the run that starts them, which their tags name; log: is
+    told of each. finished: what each run was, for the parent's metadata."""
 
-    def __init__(self, instance: dg.DagsterInstance, job: dg.JobDefinition) -> None:
-        self._instance, self._job = instance, job
+    def __init__(
+        self,
+        instance: dg.DagsterInstance,
+        job: dg.JobDefinition,
+        *,
+        parent: dg.DagsterRun | None = None,
+        log: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self._instance, self._job, self._log = instance, job, log
+        ids = {PARENT_TAG: parent.run_id, ROOT_TAG: parent.root_run_id or parent.run_id} if parent else {}
+        self._tags = {PID_TAG: str(os.getpid()), HOST_TAG: this_host(), **ids}
+        self.finished: list[dict[str, str]] = []
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
         """See `Runs`: as few as there can be of these keys alone."""
@@ -60,9 +73,40 @@ class RunsHere(Runs):
 
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[Ran]:
         """See `Runs`."""
-        for one in ranges:
-            key = one[0] if one[0] == one[1] else None
-            yield _execute(self._instance, self._job, stages, key, {**tags, **range_tags(one)})
+        for number, one in enumerate(ranges, start=1):
+            run_id, names = str(uuid.uuid4()), ", ".join(stage.name for stage in stages)
+            which = "" if one[0] is None else one[0] if one[0] == one[1] else f"{one[0]} to {one[1]}"
+            self._log(f"run {run_id} ({number} of {len(ranges)}): {names} {which}")
+            ran = self._execute(stages, one, tags, run_id)
+            result = "; ".join(ran.problems) or "made"
+            self._log(f"run {run_id}: {result}")
+            self.finished.append({"run": run_id, "assets": names, "partitions": which, "result": result})
+            yield ran
+
+    def _execute(self, stages: Sequence[Stage], one: Range, tags: Mapping[str, str], run_id: str) -> Ran:
+        key = one[0] if one[0] == one[1] else None
+        try:
+            result = self._job.execute_in_process(
+                instance=self._instance,
+                asset_selection=[stage.spec.key for stage in stages],
+                partition_key=key,
+                tags={**self._tags, **tags, **range_tags(one)},
+                raise_on_error=False,
+                run_config=_QUIET,
+                run_id=run_id,
+            )
+        except dg.DagsterExecutionInterruptedError:
+            raise KeyboardInterrupt from None
+        finally:
+            close_dropped()
+        failures = [event for event in result.all_events if event.is_step_failure]
+        if any(error.cls_name in _INTERRUPTS for event in failures for error in _causes(event)):
+            raise KeyboardInterrupt
+        ran = problems_of(failures)
+        if not result.success and not ran.problems:
+            names = ", ".join(stage.name for stage in stages)
+            ran.problems.append(f"{names} {key or ''}: the run failed; see its log in Dagster")
+        return ran
 
 
 def range_tags(one: Range, *, always: bool = False) -> dict[str, str]:
@@ -83,37 +127,6 @@ def this_host() -> str:
     """Where process numbers mean what they mean here: the machine and its namespace of processes."""
     namespace = Path("/proc/self/ns/pid")
     return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
-
-
-def _execute(
-    instance: dg.DagsterInstance,
-    job: dg.JobDefinition,
-    stages: Sequence[Stage],
-    key: str | None,
-    tags: Mapping[str, str],
-) -> Ran:
-    try:
-        result = job.execute_in_process(
-            instance=instance,
-            asset_selection=[stage.spec.key for stage in stages],
-            partition_key=key,
-            tags={PID_TAG: str(os.getpid()), HOST_TAG: this_host(), **tags},
-            raise_on_error=False,
-            run_config=_QUIET,
-        )
-    except dg.DagsterExecutionInterruptedError:
-        raise KeyboardInterrupt from None
-    finally:
-        close_dropped()
-    failures = [event for event in result.all_events if event.is_step_failure]
-    if any(error.cls_name in _INTERRUPTS for event in failures for error in _causes(event)):
-        raise KeyboardInterrupt
-    ran = problems_of(failures)
-    if not result.success and not ran.problems:
-        ran.problems.append(
-            f"{', '.join(stage.name for stage in stages)} {key or ''}: the run failed; see its log in Dagster"
-        )
-    return ran
 
 
 def problems_of(failures: Sequence[dg.DagsterEvent]) -> Ran:

@@ -6,12 +6,15 @@ edit. `orchestration.step` makes its partitions.
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
 import dagster as dg
 
-from traps_pipeline.orchestration.graph import DECLARED, Check, Cost, Need, Shared, Source, Stage, Takes
+from traps_pipeline.base.digests import digest, file_digest
+from traps_pipeline.base.paths import PACKAGE
+from traps_pipeline.orchestration.graph import DECLARED, GROUPS, Check, Cost, Need, Shared, Source, Stage, Takes
 from traps_pipeline.orchestration.schemes import LEFT_OUT, Scheme, study_here
 from traps_pipeline.orchestration.step import CURRENT, CURRENT_DOC, Event, Step
 from traps_pipeline.orchestration.wanted import Wanted
@@ -50,12 +53,27 @@ def _shared_history() -> list[str]:
 _PREFIX = _shared_history()
 
 
+# Stages of these groups take seconds: their code version follows every file of these rooms. Others cost money or take
+# long, and state one that is raised by hand.
+_FOLLOWED = {"report": ("report",)} | dict.fromkeys(("scoring", "judging", "people"), ("judging", "scoring"))
+
+
+@cache
+def code_of(group: str) -> str:
+    """Return the code version of a group's stages that take no money and little time."""
+    paths = [path for room in _FOLLOWED.get(group, ()) for path in sorted((PACKAGE / room).rglob("*"))]
+    files = [path for path in paths if path.is_file() and path.suffix != ".pyc"]
+    return digest({path.relative_to(PACKAGE).as_posix(): file_digest(path) for path in files})[:12] if files else "1"
+
+
 def shown(name: str) -> bool:
     """Whether a stage or source, declared before, is part of the study's graph."""
     return name in DECLARED
 
 
 def _declare(name: str, one: Stage | Source) -> None:
+    if one.spec.group_name not in GROUPS:
+        raise ValueError(f"{name}: no job makes the group {one.spec.group_name}; add it to JOB_GROUPS")
     if one.spec.group_name not in LEFT_OUT:
         DECLARED[name] = one
 
@@ -103,7 +121,7 @@ def stage(
     needs: Mapping[str, Need] | None = None,
     checks: Sequence[Check] = (),
     kinds: Collection[str] = (),
-    code: str = "1",
+    code: str = "",
     cost: Cost = "",
     wants: Callable[[Wanted, Any], bool] = lambda wanted, key: True,
     lost: Callable[[Workspace, Any], list[str]] = lambda workspace, key: [],
@@ -113,11 +131,12 @@ def stage(
 ) -> dg.AssetsDefinition:
     """The asset of a table, or of files for people where only a name is given (see `graph.Stage` for the parameters).
 
-    The description is `doc`, else the docstring of `make` or `collect`. columns: columns of parents that a column is
-    made from, as `parent.column`, where that is known.
+    The description is `doc`, else the docstring of `make` or `collect`; the code is `code_of` the group, unless stated.
+    columns: columns of parents that a column is made from, as `parent.column`, where that is known.
     """
     name = table if isinstance(table, str) else table.name
     described = doc or (make or collect).__doc__ or ""
+    code = code or ("1" if cost else code_of(group))
     spec = dg.AssetSpec(
         key_of(name),
         deps=deps,

@@ -25,8 +25,8 @@ from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
-from traps_pipeline.orchestration.metadata import visible_metadata
 from traps_pipeline.orchestration.machine import parts_of_run, require_machine, why_nothing
+from traps_pipeline.orchestration.metadata import visible_metadata
 from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.scenes.workers import kept_workers
@@ -90,6 +90,12 @@ class Step:
             if (shown := redacted(error)) is error:
                 raise
             raise shown from None
+        except (KeyboardInterrupt, dg.DagsterExecutionInterruptedError):
+            # Else Dagster, which did not stop it itself, would call what a person has stopped a failure.
+            run = self.context.instance.get_run_by_id(self.context.run_id)
+            if run is not None and run.status == dg.DagsterRunStatus.STARTED:
+                self.context.instance.report_run_canceling(run, "Stopped by a signal.")
+            raise
         finally:
             if events in _BEGUN:
                 _BEGUN.remove(events)
@@ -302,8 +308,9 @@ class Step:
         shown: dict[str, Any] = {**made.shown, TALLY: json.dumps(vars(made.tally))}
         if self.stage.table is None:
             files = cast(Mapping[str, bytes], made.content)
-            paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in files}
-            return {path: value for path, value in paths.items() if path.count("/") < 2} | shown
+            pages = [path for path in files if "/" not in path]
+            paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in pages}
+            return {"files": len(files)} | paths | shown
         count = "dagster/row_count" if self.stage.scheme is None else "dagster/partition_row_count"
         preview = _preview(self.stage.table, made)
         return {count: len(made.content)} | ({"first rows": preview} if preview else {}) | shown

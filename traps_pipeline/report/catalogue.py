@@ -6,7 +6,7 @@ follow from the entry.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -304,18 +304,6 @@ FIGURES: tuple[FigureReport, ...] = (
 )
 
 INSIDE = ("probe_baselines", "gate_arrows", "patching", "doses_among_nulls")  # figures of controls inside models
-
-# Assets by name. A study has one for each table or figure; the paper's numbers change together, so they have one asset
-# for all tables and one for all figures.
-OF_STUDY: Mapping[str, Report] = {
-    **{f"table_{report.name}": report for report in TABLES},
-    **{f"figure_{report.name}": report for report in FIGURES},
-}
-OF_PAPER: Mapping[str, Sequence[Report]] = {
-    "published_tables": [report for report in TABLES if report.published],
-    "published_figures": [report for report in FIGURES if report.published],
-}
-PRINTED: Sequence[str] = (*OF_STUDY, *OF_PAPER)
 
 
 def folder(kind: str, results: Results) -> str:

@@ -1,0 +1,61 @@
+"""Jobs from an empty study: each makes its part, shows the runs that it starts, and is stopped as a whole."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from pathlib import Path
+
+import dagster as dg
+import pytest
+
+from tests.conftest import ROOT, Checkout
+from traps_pipeline.orchestration.graph import JOB_GROUPS
+from traps_pipeline.orchestration.run import dagster_history
+from traps_pipeline.orchestration.runs import PARENT_TAG, ROOT_TAG
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.slow
+EXECUTE = ("job", "execute", "-m", "traps_pipeline.definitions", "-j")
+
+
+@pytest.fixture
+def empty(tmp_path: Path) -> Checkout:
+    """A study with an arm of which nothing is made."""
+    study = Checkout(ROOT, tmp_path / "study")
+    initialized = study.traps("init", "tests/experiments/with_arm.yaml")
+    assert initialized.code == 0, initialized.err
+    return study
+
+
+def runs_of(study: Checkout, monkeypatch: pytest.MonkeyPatch) -> list[dg.DagsterRun]:
+    monkeypatch.setenv("DAGSTER_HOME", str(study.workspace / "dagster"))
+    with dagster_history(Workspace.open(study.workspace)) as instance:
+        return [*instance.get_runs()]
+
+
+def test_every_job_succeeds_in_its_turn_from_an_empty_study(empty: Checkout, monkeypatch: pytest.MonkeyPatch) -> None:
+    for job in [*(name for name in JOB_GROUPS if name != "mechanism"), "everything"]:
+        executed = empty.dagster(*EXECUTE, job)
+        assert executed.code == 0, f"{job}: {executed.out}{executed.err}"
+    assert (empty.workspace / "reports" / "report.html").exists()
+    runs = {run.run_id: run for run in runs_of(empty, monkeypatch)}
+    assert {run.status for run in runs.values()} == {dg.DagsterRunStatus.SUCCESS}
+    started = [run for run in runs.values() if PARENT_TAG in run.tags]
+    # Specs, clips and arms are one run, items another; then answers to verdicts; metrics, and what hangs on them.
+    assert [runs[run.tags[PARENT_TAG]].job_name for run in started[::-1]] == [
+        *("benchmark", "benchmark", "evaluation", "scoring", "scoring"),
+    ]
+    assert all(run.tags[ROOT_TAG] == run.tags[PARENT_TAG] for run in started)
+
+
+def test_a_job_that_is_stopped_leaves_no_failed_run_behind(empty: Checkout, monkeypatch: pytest.MonkeyPatch) -> None:
+    process = empty.start(sys.executable, "-m", "dagster", *EXECUTE, "benchmark")
+    while not [*(empty.workspace / "clips").rglob("*.mp4")]:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    process.communicate()
+    [started] = [run for run in runs_of(empty, monkeypatch) if PARENT_TAG in run.tags]
+    assert started.status == dg.DagsterRunStatus.CANCELED
