@@ -53,6 +53,7 @@ def wait_for_rows(study: Checkout, process: subprocess.Popen[str], kind: str, co
         time.sleep(0.002 if written else 0.02)  # it takes seconds to begin, and then moments
 
 
+@pytest.mark.promise
 def test_kills_while_answering_and_voting_leave_the_same_tables_and_no_call_is_made_twice(
     unasked: Checkout, one_regime: Checkout
 ) -> None:
@@ -71,6 +72,7 @@ def test_kills_while_answering_and_voting_leave_the_same_tables_and_no_call_is_m
     assert_same_tables(unasked.workspace, one_regime.workspace)
 
 
+@pytest.mark.promise
 def test_a_history_that_cannot_be_written_in_mid_evaluation_ends_the_run_and_loses_nothing(
     unasked: Checkout, one_regime: Checkout
 ) -> None:

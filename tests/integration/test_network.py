@@ -123,6 +123,7 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_
     assert SECRET not in finished.out + finished.err
 
 
+@pytest.mark.promise
 def test_the_cap_holds_and_the_next_run_goes_on(unasked: Checkout, provider: Provider) -> None:
     provider.configure(latency_s=0.05)
     register(unasked, provider, entry("image-model", "images").replace("limits: {", "limits: {concurrency: 200, "))

@@ -74,6 +74,7 @@ def examined(small: Checkout, tmp_path_factory: pytest.TempPathFactory, tmp_path
     return Checkout(tmp_path / "checkout", tmp_path / "study"), Finished(0, made.with_suffix(".out").read_text(), "")
 
 
+@pytest.mark.promise
 def test_traps_run_looks_into_a_model_once(examined: tuple[Checkout, Finished]) -> None:
     study, finished = examined
     extracted, answers, votes = counted(finished)

@@ -165,13 +165,14 @@ except TrapsError as error:
 """
 
 
-@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed (make test installs it)")
+@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed (make campaign installs it)")
 @pytest.mark.parametrize("fault", ["fsync:error=EDQUOT", "fsync:error=EIO", "rename:error=ENFILE"])
 @carries_out(
     "free some space, or raise the quota",
     "the disk fails: look at it, or choose a folder on another one",
     "end programs that hold many files open",
 )
+@pytest.mark.slow
 def test_what_the_system_refused_is_written_once_it_no_longer_does(tmp_path: Path, fault: str) -> None:
     said = {
         "EDQUOT": "or raise the quota",
