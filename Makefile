@@ -68,7 +68,7 @@ ui: setup ## Dagster's web server and daemon on 127.0.0.1; open the address that
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
 	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/traps ui --port $(PORT)
 
-bench: setup ## ratios against what one would otherwise use
+bench: setup ## ratios against what one would otherwise use; each script has --quick
 	$(BIN)/python bench/render.py
 	$(BIN)/python bench/ledger.py
 	$(BIN)/python bench/calls.py

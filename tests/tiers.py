@@ -18,6 +18,8 @@ from typing import Any
 
 import pytest
 
+from tests.forked import FORKS
+
 DURATIONS = Path(__file__).with_name("durations.json")  # tier to file to CPU seconds, written by the full campaign
 UNKNOWN_S = 10.0  # CPU seconds that a file without a measurement is taken to need
 SERVICES = {"demo", "small", "shared_provider", "page", "stored", "whole", "postgres", "s3", "tiny_disk", "small_disk"}
@@ -110,9 +112,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def cpu_s() -> float:
-    """Return the CPU seconds of this process and of its children that have ended."""
+    """Return the CPU seconds of this process, of its children that have ended, and of forked commands."""
     times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    return times.user + times.system + times.children_user + times.children_system + FORKS.cpu_s()
 
 
 @cache
@@ -161,7 +163,7 @@ class Durations:
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Add what a test took."""
         if report.when == "teardown":
-            for tier, took in (value for name, value in report.user_properties if name == "cpu"):
+            for tier, took in (value for name, value in report.user_properties if name == "cpu"):  # pyright: ignore
                 files = self.of[tier]
                 file = report.nodeid.partition("::")[0]
                 files[file] = files.get(file, 0.0) + took

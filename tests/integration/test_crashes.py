@@ -17,7 +17,6 @@ import pandas as pd
 import pytest
 
 from tests.conftest import EXPERIMENT, Checkout
-from tests.remedies.remedied import carries_out
 from tests.tables import TABLES
 from traps_pipeline.storage.tables import VOLATILE
 from traps_pipeline.storage.workspace import Workspace
@@ -137,7 +136,6 @@ def test_a_kill_while_rendering_leaves_whole_clips_that_are_not_drawn_again(stud
     ) == sorted(clips)
 
 
-@carries_out("traps: interrupted; every finished answer and clip is kept. Run the same command to continue.")
 def test_ctrl_c_drains_and_the_same_command_goes_on(unasked: Checkout, one_regime: Checkout) -> None:
     process = start(unasked)
     wait_for_rows(unasked, process, "answers", 100)

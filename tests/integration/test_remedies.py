@@ -14,7 +14,6 @@ import pytest
 from tests.conftest import EXPERIMENT, Checkout, Finished
 from tests.integration.test_crashes import assert_same_tables
 from tests.integration.test_errors import edit_record
-from tests.remedies.remedied import carries_out
 
 pytestmark = pytest.mark.slow
 CELL = "occlusion|oracle__json__run1"
@@ -111,7 +110,6 @@ def told(finished: Finished, path: Path, remedy: str) -> str:
     return found[0]
 
 
-@carries_out("finished work is kept: run the same command to continue")
 def test_each_remedy_for_a_file_lets_the_same_command_go_on(study: Checkout, small: Checkout, tmp_path: Path) -> None:
     for folder in ("scene_specs", "assets"):
         shutil.copytree(study.root / folder, tmp_path / "kept" / folder)
