@@ -158,8 +158,8 @@ def first_calls(study: Checkout, provider: Provider, path: Path) -> None:
 
 
 def main() -> None:
+    from tests.build.network import entry, experiment, register
     from tests.conftest import KEY, SECRET, make_checkout
-    from tests.integration.test_network import entry, experiment, register
     from tests.postgres import Postgres
 
     parser = argparse.ArgumentParser(description=__doc__)

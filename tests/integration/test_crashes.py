@@ -11,31 +11,14 @@ import subprocess
 import sys
 import time
 from contextlib import closing
-from pathlib import Path
 
-import pandas as pd
 import pytest
 
+from tests.build.studies import ONE_REGIME, assert_same_tables
 from tests.conftest import EXPERIMENT, Checkout
-from tests.tables import TABLES
-from traps_pipeline.storage.tables import VOLATILE
-from traps_pipeline.storage.workspace import Workspace
 
-ONE_REGIME = "tests/experiments/one_regime.yaml"
 pytestmark = pytest.mark.slow
 ANSWERS, VOTES = 192, 864  # 4 models x 1 regime x 48 items; 4.5 votes an item
-
-
-def tables(root: Path) -> dict[str, pd.DataFrame]:
-    store = Workspace.open(root).tables
-    return {name: store.read_all(table).drop(columns=list(VOLATILE), errors="ignore") for name, table in TABLES.items()}
-
-
-def assert_same_tables(one: Path, other: Path) -> None:
-    ours, theirs = tables(one), tables(other)
-    assert ours.keys() == theirs.keys()
-    for name, frame in ours.items():
-        pd.testing.assert_frame_equal(frame, theirs[name], obj=name)
 
 
 def rows_written(study: Checkout, kind: str) -> int:

@@ -17,10 +17,10 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 from scipy.stats import binomtest
 
+from tests.build.cells import row, write_cell
 from tests.conftest import Checkout
 from tests.foreign_page import CHROMIUM, QUIET
 from tests.pages import patient, until
-from tests.report.test_items import row, write_cell
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.explorer.site import write_site
 from traps_pipeline.judging.tables import VERDICTS

@@ -22,10 +22,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.inside import with_mechanism
+from tests.build.studies import ONE_REGIME, assert_same_tables
 from tests.conftest import Checkout, Finished, copied, copy_workspace, forget_answers
-from tests.integration.test_crashes import ONE_REGIME, assert_same_tables
 from tests.lacking import lack
-from tests.mechanism.test_stages_run import with_mechanism
 
 pytestmark = pytest.mark.slow
 MANY = os.environ.get("TRAPS_FAULTS")

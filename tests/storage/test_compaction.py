@@ -13,12 +13,12 @@ from typing import Any
 import psycopg
 import pytest
 
+from tests.build.ledger import answer, paid, write
 from tests.conftest import ROOT
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
 from tests.storage.conftest import VARIABLE
-from tests.storage.test_ledger import answer, paid, write
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage import compaction
 from traps_pipeline.storage.bucket import object_name

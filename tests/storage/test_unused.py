@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
+from tests.build.ledger import answer, write
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import command, remedied
 from tests.storage.test_compaction import finish, in_database
-from tests.storage.test_ledger import answer, write
 from traps_pipeline.storage import unused as module
 from traps_pipeline.storage.bucket import Bucket, object_name
 from traps_pipeline.storage.database import Session
