@@ -1,6 +1,7 @@
 """What a test does where a program or a package that it needs is not installed.
 
-It is skipped by name; `make test` and `make campaign` fail on it (`tests/tiers.py`)."""
+It is skipped by name; `make test` and `make campaign` fail on it (`tests/tiers.py`).
+"""
 
 from __future__ import annotations
 

@@ -168,9 +168,10 @@ class Durations:
                 file = report.nodeid.partition("::")[0]
                 files[file] = files.get(file, 0.0) + took
 
-    def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Store them, if this is the full campaign."""
-        if session.config.getoption("--write-durations"):
+    def pytest_sessionfinish(self, session: pytest.Session, exitstatus: int) -> None:
+        """Store them, if this is the full campaign and it came to its end."""
+        ended = exitstatus in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED)
+        if ended and session.config.getoption("--write-durations"):
             known = json.loads(DURATIONS.read_text()) if DURATIONS.is_file() else {}
             for tier in ("test", "campaign"):
                 files = known.get(tier, {}) | self.of[tier]

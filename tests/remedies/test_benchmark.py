@@ -37,7 +37,7 @@ OTHER_LABEL = next(label for label in RECORDS[ID].labels if label != RECORDS[ID]
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence", "right"),
+    ("wrong", "by", "right"),
     [
         (correction(answer="maybe"), "benchmark.corrections.apply_words", correction(answer=OTHER_LABEL)),
         (correction("mend"), "benchmark.corrections.read_corrections", correction("keep")),
@@ -66,13 +66,13 @@ OTHER_LABEL = next(label for label in RECORDS[ID].labels if label != RECORDS[ID]
     ],
 )
 def test_a_decision_that_is_corrected_as_told_is_folded(
-    tmp_path: Path, wrong: dict[str, Any] | str, sentence: str, right: dict[str, Any]
+    tmp_path: Path, wrong: dict[str, Any] | str, by: str, right: dict[str, Any]
 ) -> None:
     path = tmp_path / "review.jsonl"
     write(path, correction("keep", OTHER), wrong)()
     scenarios = remedied(
         lambda: fold(RECORDS, read_corrections(tmp_path)),
-        sentence,
+        by,
         write(path, correction("keep", OTHER), right),
     )
     assert set(RECORDS) <= set(scenarios)
@@ -83,7 +83,7 @@ def record(number: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("lines", "sentence", "remedy"),
+    ("lines", "by", "remedy"),
     [
         ([record(0), record(1), record(0)], "benchmark.records.load_released", [record(0), record(1)]),
         ([record(0), record(1) | {"labels": 3}], "benchmark.records.parse_record", None),
@@ -92,12 +92,12 @@ def record(number: int) -> dict[str, Any]:
     ],
 )
 def test_records_are_read_once_they_are_what_they_were(
-    tmp_path: Path, lines: list[Any], sentence: str, remedy: list[Any] | None
+    tmp_path: Path, lines: list[Any], by: str, remedy: list[Any] | None
 ) -> None:
     path = tmp_path / "plinko.jsonl"
     write(path, *lines)()
     restored = write(path, *remedy) if remedy else lambda: shutil.copy(RELEASED / "plinko.jsonl", path)
-    assert "plinko-0001" in remedied(lambda: load_released(tmp_path), sentence, restored)
+    assert "plinko-0001" in remedied(lambda: load_released(tmp_path), by, restored)
 
 
 def restore(path: Path) -> Path:
@@ -105,7 +105,7 @@ def restore(path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("damage", "sentence"),
+    ("damage", "by"),
     [
         (lambda path: path.unlink(), "scenes.spec.load_trajectory"),
         (lambda path: path.write_bytes(b"PK"), "scenes.spec.load_trajectory"),
@@ -115,13 +115,11 @@ def restore(path: Path) -> Path:
         ),
     ],
 )
-def test_a_trajectory_is_read_once_it_is_restored(
-    tmp_path: Path, damage: Callable[[Path], object], sentence: str
-) -> None:
+def test_a_trajectory_is_read_once_it_is_restored(tmp_path: Path, damage: Callable[[Path], object], by: str) -> None:
     path = restore(tmp_path / "plinko-0001.npz")
     damage(path)
     digest = RECORDS["plinko-0001"].trajectory_sha256
-    qpos = remedied(lambda: load_trajectory(path, digest), sentence, lambda: restore(path), error=ValueError)
+    qpos = remedied(lambda: load_trajectory(path, digest), by, lambda: restore(path), error=ValueError)
     assert len(qpos) > 1
 
 
@@ -139,18 +137,18 @@ def decision(action: str, **changes: Any) -> Correction:
 
 
 @pytest.mark.parametrize(
-    ("content", "sentence"),
+    ("content", "by"),
     [
         (None, "benchmark.held_out.held_out_key"),
         ("no key", "benchmark.held_out.held_out_key"),
     ],
 )
-def test_the_key_that_the_release_made_is_read(tmp_path: Path, content: str | None, sentence: str) -> None:
+def test_the_key_that_the_release_made_is_read(tmp_path: Path, content: str | None, by: str) -> None:
     right, wrong = tmp_path / "key", tmp_path / "other"
     made = held_out_key(right, make=True)
     if content is not None:
         wrong.write_text(content)
-    assert remedied(lambda: held_out_key(wrong), sentence, again=lambda: held_out_key(right)) == made
+    assert remedied(lambda: held_out_key(wrong), by, again=lambda: held_out_key(right)) == made
 
 
 # --- clips and items --------------------------------------------------------------------------------------------------

@@ -111,16 +111,16 @@ def test_a_name_that_is_too_long_fits_in_a_folder_with_a_shorter_path(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("prepare", "sentence"),
+    ("prepare", "by"),
     [
         (lambda at: (at / "f").write_text("file"), "base.files.replacing"),
         (lambda at: (at / "f" / "a.txt").mkdir(parents=True), "base.files.replacing"),
     ],
 )
-def test_what_lies_in_the_way_is_moved_away(tmp_path: Path, prepare: Callable[[Path], object], sentence: str) -> None:
+def test_what_lies_in_the_way_is_moved_away(tmp_path: Path, prepare: Callable[[Path], object], by: str) -> None:
     prepare(tmp_path)
     in_the_way = tmp_path / "f" if (tmp_path / "f").is_file() else tmp_path / "f" / "a.txt"
-    remedied(written(tmp_path / "f" / "a.txt"), sentence, lambda: in_the_way.rename(tmp_path / "away"))
+    remedied(written(tmp_path / "f" / "a.txt"), by, lambda: in_the_way.rename(tmp_path / "away"))
 
 
 def test_a_file_among_the_folders_of_a_path_is_moved_away(tmp_path: Path) -> None:
@@ -213,22 +213,22 @@ def test_a_run_whose_lock_file_was_removed_is_run_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"),
+    ("wrong", "by"),
     [
         (b"name: [", "base.yamlfile.read_yaml"),
         (b"name: !!binary x", "base.yamlfile.read_yaml"),
         (b"- name", "base.yamlfile.read_mapping"),
     ],
 )
-def test_a_yaml_file_is_read_once_it_is_corrected(tmp_path: Path, wrong: bytes, sentence: str) -> None:
+def test_a_yaml_file_is_read_once_it_is_corrected(tmp_path: Path, wrong: bytes, by: str) -> None:
     path = tmp_path / "a.yaml"
     path.write_bytes(wrong)
-    assert remedied(lambda: read_mapping(path), sentence, lambda: path.write_text("name: a")) == {"name": "a"}
+    assert remedied(lambda: read_mapping(path), by, lambda: path.write_text("name: a")) == {"name": "a"}
     assert read_yaml(path) == {"name": "a"}
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"),
+    ("wrong", "by"),
     [
         (r'{"a": "\ud800"}', "base.yamlfile._check_line"),
         ('{"a": 1, "a": 2}', "base.yamlfile._check_line"),
@@ -236,11 +236,11 @@ def test_a_yaml_file_is_read_once_it_is_corrected(tmp_path: Path, wrong: bytes, 
         ('{"a": ' + "9" * 5000 + "}", "base.yamlfile._check_line"),
     ],
 )
-def test_a_line_is_read_once_it_is_corrected(tmp_path: Path, wrong: str, sentence: str) -> None:
+def test_a_line_is_read_once_it_is_corrected(tmp_path: Path, wrong: str, by: str) -> None:
     path = tmp_path / "a.jsonl"
     path.write_text(f'{{"a": 1}}\n{wrong}\n')
     right = '{"a": 1}\n{"a": 2}\n'
-    lines = remedied(lambda: list(read_lines(path)), sentence, lambda: path.write_text(right))
+    lines = remedied(lambda: list(read_lines(path)), by, lambda: path.write_text(right))
     assert lines == [(1, '{"a": 1}'), (2, '{"a": 2}')]
 
 

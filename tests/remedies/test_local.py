@@ -47,7 +47,7 @@ def saved_again(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damage", "sentence"),
+    ("damage", "by"),
     [
         (without_a_weight, "models.local.adapter._load"),
         (
@@ -57,27 +57,23 @@ def saved_again(folder: Path) -> None:
         (lambda folder: (folder / "config.json").unlink(), "models.local.checkpoint._require_whole"),
     ],
 )
-def test_a_checkpoint_that_is_saved_again_is_loaded(
-    folder: Path, damage: Callable[[Path], object], sentence: str
-) -> None:
+def test_a_checkpoint_that_is_saved_again_is_loaded(folder: Path, damage: Callable[[Path], object], by: str) -> None:
     damage(folder)
-    remedied(lambda: load_local_model(entry("qwen3-vl", folder)), sentence, lambda: saved_again(folder))
+    remedied(lambda: load_local_model(entry("qwen3-vl", folder)), by, lambda: saved_again(folder))
 
 
 @pytest.mark.parametrize(
-    ("damage", "sentence"),
+    ("damage", "by"),
     [
         (of_another_class, "models.local.adapter._load"),
         (with_code, "models.local.checkpoint.require_no_code"),
     ],
 )
-def test_another_checkpoint_that_is_named_is_loaded(
-    folder: Path, damage: Callable[[Path], object], sentence: str
-) -> None:
+def test_another_checkpoint_that_is_named_is_loaded(folder: Path, damage: Callable[[Path], object], by: str) -> None:
     damage(folder)
     remedied(
         lambda: load_local_model(entry("qwen3-vl", folder)),
-        sentence,
+        by,
         again=lambda: load_local_model(entry("qwen3-vl", checkpoint("qwen3-vl"))),
     )
 

@@ -53,7 +53,7 @@ models:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence", "right"),
+    ("wrong", "by", "right"),
     [
         (MINE.replace("    media: images\n", ""), "base.yamlfile.within", MINE),
         (
@@ -100,10 +100,10 @@ models:
         (MINE + "regimes: [polite]\n", "base.yamlfile.parse_yaml_model", MINE + "regimes: [guided]\n"),
     ],
 )
-def test_an_experiment_is_read_once_it_is_as_told(tmp_path: Path, wrong: str, sentence: str, right: str) -> None:
+def test_an_experiment_is_read_once_it_is_as_told(tmp_path: Path, wrong: str, by: str, right: str) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(wrong)
-    assert remedied(lambda: load_experiment(str(path)), sentence, lambda: path.write_text(right)).models == ["my-model"]
+    assert remedied(lambda: load_experiment(str(path)), by, lambda: path.write_text(right)).models == ["my-model"]
 
 
 def test_an_experiment_that_is_not_there_is_named_by_its_path_or_a_known_name(tmp_path: Path) -> None:

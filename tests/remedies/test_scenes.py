@@ -31,7 +31,7 @@ FOLLOWS = (
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"),
+    ("wrong", "by"),
     [
         (
             {"family": ("FAMILY = ", "MINE = ")},
@@ -55,11 +55,9 @@ FOLLOWS = (
         ),
     ],
 )
-def test_a_family_that_is_written_as_told_may_be_drawn(
-    add: Add, wrong: dict[str, tuple[str, str]], sentence: str
-) -> None:
+def test_a_family_that_is_written_as_told_may_be_drawn(add: Add, wrong: dict[str, tuple[str, str]], by: str) -> None:
     write(add, **wrong)
-    family = remedied(lambda: registry.fit_to_sample("plank_post"), sentence, lambda: write(add))
+    family = remedied(lambda: registry.fit_to_sample("plank_post"), by, lambda: write(add))
     assert family.name == "plank_post"
 
 

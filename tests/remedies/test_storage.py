@@ -127,7 +127,7 @@ def test_media_are_prepared_once_their_folder_can_be_made(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("damage", "sentence"),
+    ("damage", "by"),
     [
         (lambda path: path.unlink(), "storage.parquet.TableStore._load"),
         (
@@ -140,7 +140,7 @@ def test_media_are_prepared_once_their_folder_can_be_made(tmp_path: Path) -> Non
         ),
     ],
 )
-def test_a_table_that_is_made_again_is_read(tmp_path: Path, damage: Callable[[Path], object], sentence: str) -> None:
+def test_a_table_that_is_made_again_is_read(tmp_path: Path, damage: Callable[[Path], object], by: str) -> None:
     store = TableStore(tmp_path)
 
     def made() -> None:
@@ -149,7 +149,7 @@ def test_a_table_that_is_made_again_is_read(tmp_path: Path, damage: Callable[[Pa
 
     made()
     damage(store.path(VIDEOS, PARTITION))
-    assert list(remedied(lambda: store.read(VIDEOS, PARTITION), sentence, made)["scenario_id"]) == ["plinko-0001"]
+    assert list(remedied(lambda: store.read(VIDEOS, PARTITION), by, made)["scenario_id"]) == ["plinko-0001"]
 
 
 def test_a_study_lies_in_a_folder_or_an_object_store(tmp_path: Path) -> None:
