@@ -1,4 +1,4 @@
-"""Shared by all tests: one real demo study, and checkouts that a test may alter."""
+"""Shared by all tests: the golden study, the demo, and checkouts that a test may alter."""
 
 from __future__ import annotations
 
