@@ -85,3 +85,9 @@ def test_every_promise_of_the_page_has_its_test() -> None:
     for file, name in listed:
         source = (ROOT / "tests" / file).read_text()
         assert f"def {name}(" in source and "mark.promise" in source, (file, name)
+
+
+def test_what_all_tests_import_loads_no_library_that_takes_seconds() -> None:
+    code = "import tests.conftest, sys; print(sorted({'dagster', 'aiohttp', 'pandas', 'torch'} & set(sys.modules)))"
+    finished = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert finished.stdout.strip() == "[]"
