@@ -10,7 +10,10 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: demo demo-mechanism check fast-tests test all-tests test-cluster test-cluster-gate test-cluster-kills cluster-setup ui bench bench-cluster explorer-vendor lint setup setup-core lock wheel sbom docs render-packages test-packages clean environments
+.PHONY: help demo demo-mechanism check fast-tests test promises campaign test-cluster test-cluster-gate test-cluster-kills cluster-setup ui bench bench-cluster explorer-vendor lint setup setup-core lock wheel sbom docs render-packages browser test-packages clean environments
+
+help: ## what make can do here
+	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 22
 
 demo: setup-core ## leaderboard of nine models on 32 scenarios, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
@@ -21,24 +24,33 @@ demo-mechanism: setup ## the pocket model from hidden states to steering, on the
 
 # Threads of a worker's own would only wait for another's. Workers steal what another has yet to do.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist worksteal
+# The tiers of tests (tests/tiers.py): marks, and for the fast ones no look into a folder that has none.
+FAST := -m "not slow and not promise" --ignore=tests/integration
+PROMISES := -m "promise or not slow"
+CAMPAIGN := -m "slow and not promise"
+# Of `make test` and `make campaign` nothing may be skipped but what tests/tiers.py lists.
+COMPLETE := TRAPS_TEST_ALL=1
 
-check: setup ## lint, types and the fast tests, side by side: under three minutes
+check: setup ## lint, types and fast tests: two minutes on two cores
 	$(MAKE) --no-print-directory -j2 --output-sync=line lint fast-tests
 
 fast-tests: setup
-	$(PYTEST) -n 2 -m "not slow"
+	$(PYTEST) -n 2 $(FAST)
 
-# One more worker than the two cores that are needed: tests of servers and of Dagster's daemon wait for much of their time.
-test: test-packages cluster-setup ## lint, types and all tests, the slow ones too
-	$(MAKE) --no-print-directory -j2 lint all-tests
+test: setup browser ## check, and one real path for each promise of the documentation: eight minutes
+	$(MAKE) --no-print-directory -j2 --output-sync=line lint promises
 
-# Nothing that tests need may lack here (TRAPS_TEST_ALL); elsewhere what lacks is skipped, and named.
-# What is compiled is copied to the checkouts of the tests, whose hundreds of commands would each compile it again.
-all-tests: setup
+# What is compiled is copied to the checkouts of the tests, whose commands would each compile it again. One worker more
+# than the two cores that are needed: tests of servers and of Dagster's daemon wait for much of their time.
+promises: setup
 	$(BIN)/python -m compileall -q traps_pipeline
-	TRAPS_TEST_ALL=1 $(PYTEST) -n 3
+	$(COMPLETE) $(PYTEST) -n 3 $(PROMISES)
 
-# Of these `make test` has a small version (tests/integration/test_cluster.py).
+campaign: test-packages cluster-setup ## everything else, in full or SHARD=2/6 of it; needs root for full disks
+	$(BIN)/python -m compileall -q traps_pipeline
+	$(COMPLETE) $(PYTEST) -n 3 $(CAMPAIGN) $(if $(SHARD),--shard $(SHARD),--write-durations)
+
+# Of these the campaign has a small version (tests/integration/test_cluster.py).
 test-cluster: cluster-setup ## two studies on two nodes of Ray, one killed in mid-run, against runs of one process; tests of runs
 	$(BIN)/python bench/cluster_study.py --kill
 	$(BIN)/python bench/cluster_study.py --mechanism --kill --at hidden_states
@@ -52,11 +64,11 @@ test-cluster-gate: cluster-setup ## kill Dagster's runs on Ray in every way, in 
 
 cluster-setup: test-packages setup $(VENV)/.cluster
 
-ui: setup ## Dagster's web server and daemon on 127.0.0.1:$(PORT); open the address that it prints
+ui: setup ## Dagster's web server and daemon on 127.0.0.1; open the address that it prints
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
 	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/traps ui --port $(PORT)
 
-bench: setup ## ratios against what one would otherwise use
+bench: setup ## ratios against what one would otherwise use; each script has --quick
 	$(BIN)/python bench/render.py
 	$(BIN)/python bench/ledger.py
 	$(BIN)/python bench/calls.py
@@ -81,7 +93,7 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --warnings
 
-setup: render-packages $(VENV)/.installed ## everything, as `make test` wants it
+setup: render-packages $(VENV)/.installed ## everything that `make check` needs
 
 setup-core: render-packages $(VENV)/.core ## what the demo wants: no torch, no provider's library, no web server
 
@@ -137,6 +149,8 @@ sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
 # apt only when something is missing; without root the one line to run is printed.
 render-packages:
 	@{ ldconfig -p | grep -q libOSMesa && $(PYTHON) -c 'import ensurepip'; } 2>/dev/null || $(call install,$(RENDER_PACKAGES))
+browser:
+	@command -v chromium >/dev/null || $(call install,chromium)
 test-packages:
 	@{ ldconfig -p | grep -q libOSMesa && $(PYTHON) -c 'import ensurepip' && command -v chromium >/dev/null && command -v strace >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null; } 2>/dev/null || $(call install,$(TEST_PACKAGES))
 

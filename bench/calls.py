@@ -25,6 +25,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+from bench.quick import parse  # noqa: E402
+
 PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
 SYSTEM, QUESTION = "You watch a clip. " * 90, "Does the ball clear the barrier {number}, yes or no?"  # 2 KB in all
 CONNECTIONS = (24, 200)
@@ -153,7 +155,7 @@ def main() -> None:
     parser.add_argument("--memory", action="store_true", help="peak memory after 4,000 and after 20,000 calls")
     parser.add_argument("--database", action="store_true", help="the ledger in PostgreSQL, too")
     parser.add_argument("--inspect", metavar="PYTHON", help="a Python that has inspect_ai and openai")
-    arguments = parser.parse_args()
+    arguments = parse(parser, answers=60)
     with ExitStack() as opened:
         provider = opened.enter_context(Provider.start({"latency_s": 0.05}, keeps_records=False))
         database = opened.enter_context(Postgres.running(durable=True)) if arguments.database else None

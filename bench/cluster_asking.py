@@ -24,8 +24,8 @@ from tempfile import TemporaryDirectory
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from bench.cluster_gate import Cluster
 from bench.cluster_study import Study
+from tests.build.network import entry, register
 from tests.conftest import KEY, SECRET, Checkout, make_checkout
-from tests.integration.test_network import entry, register
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.providers.server import Provider

@@ -276,8 +276,8 @@ def kill_each(
 ) -> list[str]:
     """Make a study with each kind of kill; what did not hold. keep: a file for the daemon's log; clips: a folder of
     scenarios' clips that need not be rendered."""
+    from tests.build.network import entry, register
     from tests.conftest import KEY, SECRET, Checkout, make_checkout
-    from tests.integration.test_network import entry, register
 
     foreign = ("TRAPS_", "DAGSTER_", "RAY_", "AWS_")
     plain = {key: value for key, value in os.environ.items() if not key.startswith(foreign)} | {KEY: SECRET}

@@ -155,7 +155,7 @@ def look_inside(folder: Path, experiment: Path) -> dict[str, str]:
     """Write a tiny checkpoint, a registry with it, and an experiment that looks into it; what a shell exports."""
     import yaml
 
-    from tests.mechanism.test_stages_run import ENTRY, MECHANISM
+    from tests.build.inside import ENTRY, MECHANISM
     from traps_pipeline.models.local.tiny import build_tiny
 
     build_tiny("qwen3-vl", folder / "tiny")

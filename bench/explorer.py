@@ -24,6 +24,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from bench.quick import parse
 from traps_pipeline.base.partitions import CATEGORIES, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.specs import build_specs
@@ -316,7 +317,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--models", type=int, default=16)
     parser.add_argument("--keep", type=Path, help="folder for the study, made once and used again")
-    arguments = parser.parse_args()
+    arguments = parse(parser, models=2)
     missed: list[str] = []
 
     def say(what: str, value: float, target: float, unit: str) -> None:
@@ -347,7 +348,7 @@ def main() -> None:
         problems = measure(site, list(items.itertuples(index=False, name=None)), say)
     for problem in problems[:10]:
         print(f"console or request: {problem}")
-    sys.exit(bool(missed or problems))
+    sys.exit(bool(problems or (missed and not arguments.quick)))
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from bench.quick import parse
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.progress import Progress, reporting
 from traps_pipeline.mechanism.hidden_states import Item, extract
@@ -217,7 +218,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", help="id in assets/models.yaml")
     parser.add_argument("--runs", type=int, default=50)
-    arguments = parser.parse_args()
+    arguments = parse(parser, runs=1)
     import torch
 
     few = max(3, arguments.runs // 10)

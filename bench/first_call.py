@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from bench.quick import parse
 from tests.conftest import Checkout
 from tests.providers.server import Provider
 
@@ -157,8 +158,8 @@ def first_calls(study: Checkout, provider: Provider, path: Path) -> None:
 
 
 def main() -> None:
+    from tests.build.network import entry, experiment, register
     from tests.conftest import KEY, SECRET, make_checkout
-    from tests.integration.test_network import entry, experiment, register
     from tests.postgres import Postgres
 
     parser = argparse.ArgumentParser(description=__doc__)
@@ -166,7 +167,7 @@ def main() -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--database", action="store_true", help="move the ledger into PostgreSQL first")
     where.add_argument("--store", action="store_true", help="the study in an object store, before and after compaction")
-    arguments = parser.parse_args()
+    arguments = parse(parser, rows=2_000)
     os.environ |= {KEY: SECRET, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "osmesa")}
     with ExitStack() as opened:
         name, provider = opened.enter_context(tempfile.TemporaryDirectory()), opened.enter_context(Provider.start())

@@ -20,6 +20,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+from bench.quick import parse  # noqa: E402
+
 CELL = "chaotic|random-50__standard__run1"
 STAGES = {"responses": CELL, "votes": CELL, "verdicts": CELL, "metrics": "chaotic"}
 PAGE = """
@@ -67,7 +69,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--items", type=int, default=100_000)
-    arguments = parser.parse_args()
+    arguments = parse(parser, items=1_000)
     with tempfile.TemporaryDirectory() as name:
         study = Checkout(make_checkout(Path(name) / "checkout"), Path(name) / "study")
         path = study.root / "large.yaml"

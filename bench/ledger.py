@@ -21,6 +21,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from bench.quick import parse
 from traps_pipeline.storage.segments import SegmentLedger
 
 ROWS = [{"key": f"{number:064x}", "outcome": "answer", "text": "x" * 900} for number in range(20_000)]
@@ -111,7 +112,10 @@ def _rate(work: Callable[[Path], object], folder: Path) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--database", action="store_true")
-    if parser.parse_args().database:
+    parser.add_argument("--rows", type=int, default=len(ROWS))
+    arguments = parse(parser, rows=500)
+    del ROWS[arguments.rows :]
+    if arguments.database:
         database_rates()
         return
     with tempfile.TemporaryDirectory() as name:

@@ -16,6 +16,7 @@ from collections import defaultdict
 import numpy as np
 from scipy.stats import kendalltau
 
+from bench.quick import parse
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.partitions import DATASETS, datasets_of_category, taxonomy_of
 from traps_pipeline.base.paths import ASSETS
@@ -71,13 +72,13 @@ def separated(pecs: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.sign(difference) * beyond
 
 
-def fidelity(shares: np.ndarray, most: int, rng: np.random.Generator) -> tuple[float, float, float]:
-    """Tau, share of separations kept, mean error of PECS, means over DRAWS."""
+def fidelity(shares: np.ndarray, most: int, rng: np.random.Generator, draws: int) -> tuple[float, float, float]:
+    """Tau, share of separations kept, mean error of PECS, means over `draws`."""
     full = np.array([FULL[taxonomy_of(dataset)] * RUNS for dataset in DATASETS])
     small = np.full(len(DATASETS), most)
     truth = (shares[..., 0] * np.maximum(shares[..., 1] - shares[..., 2], 0)).mean(axis=1)
     found = []
-    for _ in range(DRAWS):
+    for _ in range(draws):
         (whole, whole_error), (part, part_error) = (simulated(shares, pairs, rng) for pairs in (full, small))
         apart, kept = separated(whole, whole_error), separated(part, part_error)
         share = (apart == kept)[apart != 0].mean()
@@ -89,7 +90,8 @@ def fidelity(shares: np.ndarray, most: int, rng: np.random.Generator) -> tuple[f
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help="write assets/lite.yaml")
-    arguments = parser.parse_args()
+    parser.add_argument("--draws", type=int, default=DRAWS, help="simulated evaluations of each kind")
+    arguments = parse(parser, draws=20)
     if arguments.write:
         head = "# 100 scenarios of each taxonomy, balanced over families and answers (bench/lite.py --write).\n"
         (ASSETS / "lite.yaml").write_text(head + "scenarios:\n" + "".join(f"  - {name}\n" for name in chosen()))
@@ -104,7 +106,7 @@ def main() -> None:
         )
         for what, half in (("all", slice(None)), ("one half", slice(0, None, 2)), ("the other", slice(1, None, 2))):
             for name, most in STUDIES.items():
-                tau, share, error = fidelity(rates[half], most, np.random.default_rng(1))
+                tau, share, error = fidelity(rates[half], most, np.random.default_rng(1), arguments.draws)
                 cost = 2 * most / (sum(FULL.values()) * RUNS)
                 print(
                     f"{regime}, {what} ({len(rates[half])} models), {name}: tau {tau:.2f}, {share:.0%} of separations, "

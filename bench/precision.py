@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from bench.quick import parse
 from traps_pipeline.base.partitions import DATASETS, REGIMES, SIDES, datasets_of_category
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.yamlfile import read_yaml
@@ -87,15 +88,16 @@ def main() -> None:
     """Print the comparison."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--study", type=Path, help="the workspace of a finished study")
-    arguments = parser.parse_args()
+    parser.add_argument("--sizes", type=int, default=3, help="so many of the sizes, the smallest first")
+    arguments = parse(parser, sizes=1)
     sizes = {
-        "all 702 scenarios": [*load_released()],
-        "lite, 200": read_yaml(LITE_FILE)["scenarios"],
         "demo, 32": load_experiment("demo").scenarios or [],
+        "lite, 200": read_yaml(LITE_FILE)["scenarios"],
+        "all 702 scenarios": [*load_released()],
     }
     rows = [
         compared(size, model, pairs_of(names), observed(model, names))
-        for size, names in sizes.items()
+        for size, names in [*sizes.items()][: arguments.sizes]
         for model in BY_CHANCE
     ]
     if arguments.study:

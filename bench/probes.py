@@ -19,6 +19,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 from threadpoolctl import threadpool_limits
 
+from bench.quick import parse
 from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.mechanism.paths import TRANSFER_PAIRS
 from traps_pipeline.mechanism.probes import Split, auroc, fit_probe, transfer_scores
@@ -68,7 +69,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--layers", type=int, default=37)
     parser.add_argument("--sample", type=int, default=4, help="layers whose four fits scikit-learn makes too")
-    arguments = parser.parse_args()
+    arguments = parse(parser, layers=1, sample=1)
     began, began_cpu = time.perf_counter(), time.process_time()
     evaluations = sum(each_layer(run_layer, arguments.layers))
     wall, cpu = time.perf_counter() - began, time.process_time() - began_cpu

@@ -6,6 +6,7 @@ python bench/render.py
 
 from __future__ import annotations
 
+import argparse
 import os
 import tempfile
 import time
@@ -19,6 +20,7 @@ os.environ.setdefault("MUJOCO_GL", "osmesa")  # MuJoCo reads it when it is first
 import mujoco
 import numpy as np
 
+from bench.quick import parse
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Camera
@@ -107,7 +109,9 @@ def stage_against_gl(specs: list[SceneSpec]) -> float:
 
 
 def main() -> None:
-    specs = [load_released()[name] for name in SCENES]
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", type=int, default=len(SCENES))
+    specs = [load_released()[name] for name in SCENES[: parse(parser, scenes=1).scenes]]
     for draw in (ours, stock):
         draw(specs[0])  # first use opens contexts and compiles shaders
     print(f"frames a second at {WIDTH} x {HEIGHT}")

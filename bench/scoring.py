@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.quick import parse
 from traps_pipeline.base.partitions import DATASETS, REGIMES, taxonomy_of
 from traps_pipeline.judging.verdicts import decide
 from traps_pipeline.scoring.bootstrap import intervals, resample
@@ -33,7 +34,7 @@ def main() -> None:
     parser.add_argument("--models", type=int, default=16)
     parser.add_argument("--resamples", type=int, default=10_000)
     parser.add_argument("--entries", type=int, default=3, help="entries timed in the straightforward implementation")
-    arguments = parser.parse_args()
+    arguments = parse(parser, models=2, resamples=2_000, entries=1)
     items, responses, votes = study(arguments.models)
     print(f"{len(responses) // 2:,} pairs, {len(votes):,} votes")
     began = time.perf_counter()
@@ -84,7 +85,9 @@ def study(models: int) -> tuple[Any, Any, Any]:
         [(f"model-{m:02d}", regime, run) for m in range(models) for regime in REGIMES for run in RUNS],
         columns=pd.Index(["model", "regime", "run"]),
     )
-    responses = items.merge(cells, how="cross").assign(outcome="answer", epoch="bench", benchmark_version="v")
+    responses = items.merge(cells, how="cross").assign(
+        outcome="answer", is_json=True, epoch="bench", benchmark_version="v"
+    )
     tasks = [responses.assign(task="abstention"), responses[responses["side"] == "control"].assign(task="correctness")]
     asked = pd.concat(tasks, ignore_index=True)
     often = ((asked["side"] == "void") | (asked["task"] == "correctness")).to_numpy(bool)
@@ -103,7 +106,7 @@ def ballot(asked: pd.DataFrame, judge: str, yes: np.ndarray, rng: np.random.Gene
     abstained[~on_abstention], correct[on_abstention] = None, None
     columns = asked.drop(columns=["pair_id", "scenario_id", "outcome"])
     valid = rng.random(len(asked)) > 0.01
-    return columns.assign(judge=judge, valid=valid, abstained=abstained, correct=correct)
+    return columns.assign(judge=judge, panel="three@1", valid=valid, abstained=abstained, correct=correct)
 
 
 def straightforward(verdicts: Any, entry: tuple[str, str, str], resamples: int, found: Any) -> float:

@@ -29,6 +29,7 @@ import mujoco
 import numpy as np
 import pandas as pd
 
+from bench.quick import parse
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.foretelling import foretold
 from traps_pipeline.benchmark.records import load_released
@@ -76,7 +77,7 @@ def main() -> None:
     parser.add_argument("--workspace", type=Path, help="a study that asked the arms; without one they are not reported")
     parser.add_argument("--observer", action="store_true", help="let the observer read each whole control, too")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    arguments = parser.parse_args()
+    arguments = parse(parser, per_family=1, workers=1)
     chosen = first_of_each(load_released(arguments.specs), arguments.per_family)
     with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
         found = list(pool.map(partial(measure, folder=arguments.specs, whole=arguments.observer), chosen, chunksize=4))

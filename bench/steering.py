@@ -27,6 +27,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from bench.quick import parse
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.models.local.adapter import Generated, LocalModel, load_local_model
@@ -56,7 +57,7 @@ def main() -> None:
     parser.add_argument("--layer", type=int, help="the steered block")
     parser.add_argument("--prompts", type=int, default=8)
     parser.add_argument("--directions", type=int, default=8)
-    chosen = parser.parse_args()
+    chosen = parse(parser, prompts=2, directions=2)
     with TemporaryDirectory() as folder:
         measure(random_entry(Path(folder)) if chosen.random else get_model(chosen.model), chosen)
 

@@ -21,6 +21,8 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+from bench.quick import parse  # noqa: E402
+
 MODELS, CONNECTIONS, LATENCY_S = 16, 24, 8.0
 CLIPS = 48
 PARAMS = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
@@ -59,7 +61,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--answers", type=int, default=404, help="of each model; the smallest cell has 404")
-    arguments = parser.parse_args()
+    arguments = parse(parser, answers=8)
     os.environ["BENCH_KEY"] = "k"
     spec = MediaSpec(profile="images", fps=5, most=25)
     with (

@@ -28,6 +28,8 @@ from playwright.sync_api import Page, sync_playwright
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+from bench.quick import parse  # noqa: E402
+
 CHROMIUM, TOKEN = "/usr/bin/chromium", "a-token-of-the-benchmark"
 DATASETS, REGIMES, RUNS = 4, 3, 3
 VIEWS = 3  # of each page; the fastest counts, so that the first one fills caches
@@ -193,7 +195,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cells", type=int, nargs="+", default=[576, 10_000])
     parser.add_argument("--database", action="store_true", help="Dagster's history in PostgreSQL")
-    arguments = parser.parse_args()
+    arguments = parse(parser, cells=[24])
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         for cells in arguments.cells:

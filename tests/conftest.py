@@ -1,4 +1,4 @@
-"""Shared by all tests: one real demo study, and checkouts that a test may alter."""
+"""Shared by all tests: the golden study, the demo, and checkouts that a test may alter."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-import traps_pipeline.definitions  # noqa: F401 - declares the graph
 from tests import objectstore
 from tests.forked import FORKS
 from tests.lacking import lack, need
 from tests.objectstore import S3
 from tests.postgres import LACKING, Postgres, programs
-from tests.providers.server import Provider
 
+if TYPE_CHECKING:  # aiohttp is imported by the tests that use the provider
+    from tests.providers.server import Provider
+
+pytest_plugins = ["tests.tiers"]
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = "tests/experiments/small.yaml"  # of the small study, relative to a checkout
 SMALL = ROOT / EXPERIMENT
@@ -129,39 +131,6 @@ def copy_workspace(source: Path, target: Path) -> None:
     shutil.copytree(source, target, symlinks=True)
 
 
-# A test with one of these fixtures needs a study, a server, a browser or scenarios drawn for it: it is slow.
-SERVICES = {"demo", "small", "shared_provider", "page", "stored", "whole"}
-LONGEST = ("test_readme", "test_paper_run", "test_stages_run", "test_faults", "test_one_command", "test_batches")
-
-
-def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """A file that is slow as a whole is not even imported where the fast tests are wanted: torch takes seconds."""
-    fast = config.option.markexpr == "not slow" and collection_path.suffix == ".py"
-    return True if fast and "\npytestmark = pytest.mark.slow\n" in collection_path.read_text() else None
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what needs a service as slow, and let the last two workers begin with it: the one with what waits for
-    Dagster's daemon, the other with what takes longest besides, the longest first. (At first each worker is dealt an
-    equal part of the items, in their order.) So the studies that all wait for are made early, and none ends alone with
-    something long."""
-    groups: tuple[list[pytest.Item], ...] = ([], [], [])
-    for item in items:
-        if SERVICES & set(getattr(item, "fixturenames", ())):
-            item.add_marker(pytest.mark.slow)
-            groups[1 if any(name in item.nodeid for name in LONGEST) else 2].append(item)
-        else:
-            groups[0].append(item)
-    rest, longest, services = groups
-    longest.sort(key=lambda item: next(k for k, name in enumerate(LONGEST) if name in item.nodeid))
-    services.sort(key=lambda item: "test_ui" not in item.nodeid)
-    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    first, second = (max(0, len(items) * k // workers) for k in (workers - 2, workers - 1))
-    between = max(0, second - first - len(longest))
-    items[:] = [*rest[:first], *longest, *rest[first : first + between], *services, *rest[first + between :]]
-
-
 def pytest_sessionstart() -> None:
     """What tests start is stopped by signals, also where this run was itself started in the background."""
     for stop in (signal.SIGINT, signal.SIGHUP):
@@ -169,15 +138,11 @@ def pytest_sessionstart() -> None:
             signal.signal(stop, signal.default_int_handler if stop is signal.SIGINT else signal.SIG_DFL)
 
 
-def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Name each skipped test and why: what did not run was not tested."""
-    for report in terminalreporter.stats.get("skipped", ()):
-        terminalreporter.write_line(f"not run: {report.nodeid}: {report.longrepr[-1]}")
-
-
 @pytest.fixture(scope="session")
 def shared_provider() -> Iterator[Provider]:
     """A server that speaks like providers do and misbehaves as it is told."""
+    from tests.providers.server import Provider
+
     with Provider.start() as provider:
         yield provider
 
@@ -240,9 +205,16 @@ def demo_output(demo: Checkout) -> str:
 
 
 @pytest.fixture(scope="session")
-def small(demo: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Checkout:
-    """Three models, two regimes, three scenarios a family: what a correction does there it does in any study."""
-    return run_once(tmp_path_factory, "small", SMALL, demo.workspace / "clips")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Checkout:
+    """The golden study, from records to report: three models, two regimes, three scenarios a family. Made once a test
+    run and copied: what a correction does there it does in any study."""
+    return run_once(tmp_path_factory, "small", SMALL)
+
+
+@pytest.fixture(scope="session")
+def small_output(small: Checkout) -> str:
+    """What making the golden study printed."""
+    return small.workspace.with_suffix(".out").read_text()
 
 
 def copied(source: Checkout, folder: Path) -> Checkout:
@@ -295,10 +267,10 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
     folder = tmp_path / "tiny-disk"
     folder.mkdir()
     if os.geteuid() != 0:
-        pytest.skip("mounting a tmpfs needs root")
+        lack("mounting a tmpfs needs root")
     mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", str(folder)]
     if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
-        pytest.skip("mounting a tmpfs is not permitted here")
+        lack("mounting a tmpfs is not permitted here")
     try:
         yield folder
     finally:

@@ -80,6 +80,14 @@ class Forks:
         self._lock = threading.Lock()
         self._control: socket.socket | None = None
         self._environment: Mapping[str, str] = {}
+        self._pid: int | None = None
+
+    def cpu_s(self) -> float:
+        """Return the CPU seconds of the process and of the commands that it forked and that have ended."""
+        if self._pid is None:
+            return 0.0
+        stat = Path(f"/proc/{self._pid}/stat").read_text().rpartition(")")[2].split()
+        return sum(map(int, stat[11:15])) / os.sysconf("SC_CLK_TCK")  # utime, stime, cutime, cstime
 
     def run(self, what: Sequence[str | Path], folder: Path, environment: Mapping[str, str]) -> tuple[int, str, str]:
         """Exit code, stdout and stderr of `python` with these arguments, which begin with `-m MODULE` or `-c CODE`, in
@@ -113,7 +121,7 @@ class Forks:
                 command = [sys.executable, __file__, str(theirs.fileno())]
                 process = subprocess.Popen(command, env=clean, pass_fds=[theirs.fileno()])
                 theirs.close()
-                self._control = ours
+                self._control, self._pid = ours, process.pid
                 atexit.register(lambda: (ours.close(), process.wait()))
             return self._control
 

@@ -25,6 +25,7 @@ def build(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.promise
 def test_the_site_is_built_twice_to_the_same_bytes_and_fetches_nothing(tmp_path: Path) -> None:
     site = build(tmp_path / "a")
     assert build(tmp_path / "b") == site

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import ROOT, Checkout, Finished
+from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished
 from tests.providers.server import Provider
 
 pytestmark = pytest.mark.slow
@@ -39,6 +39,22 @@ def run(study: Checkout, command: str) -> Finished:
     if name in ("traps", "dagster") and not re.search(r"[$`<>&;*?~#]| \| ", arguments):
         return {"traps": study.traps, "dagster": study.dagster}[name](*shlex.split(arguments))
     return study.run("bash", "-c", re.sub(r"\btraps ", f"{sys.executable} -m traps_pipeline.cli ", command, count=1))
+
+
+# Left to the campaign: these draw, certify, render or train, or repeat what another test of `make test` holds.
+DEAR = re.compile(r"make |sed |traps (sample|certify|run|harness|models check --live)|TRAPS_SCENE_SPECS|export ")
+
+
+@pytest.mark.promise
+def test_the_commands_of_the_readme_that_render_nothing_run_on_the_golden_study(study: Checkout) -> None:
+    (experiment,) = blocks("yaml")
+    (study.root / "mine.yaml").write_text(experiment)
+    commands = [line for line in "".join(blocks("sh")).splitlines() if not DEAR.match(line)]
+    assert len(commands) == 15
+    for command in commands:
+        ours = re.sub(r"\b(status|plan) demo$", rf"\1 {EXPERIMENT}", command)
+        finished = run(study, in_this_study(study, ours))
+        assert finished.code == 0, (command, finished.out[-2000:], finished.err[-2000:])
 
 
 def test_every_command_of_the_readme_runs(demo_study: Checkout, provider: Provider) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT, Finished
-from tests.remedies.remedied import carries_out
 
 pytestmark = pytest.mark.slow
 SHIPPED = "traps_pipeline/shipped"
@@ -150,7 +149,6 @@ def test_a_command_that_wants_more_is_one_sentence(installed: Installed, command
     assert finished.err.endswith(f"not installed: `python -m pip install 'traps-pipeline[{extra}]'`\n")
 
 
-@carries_out("copy {} to a folder of your own, set {} to it, and decide there")
 def test_the_shipped_benchmark_is_not_changed_and_a_copy_of_it_is(installed: Installed) -> None:
     code = (
         "from datetime import date; from traps_pipeline.base.errors import TrapsError\n"

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tests.report.test_items import CELL, HOSTILE, row, write_cell
+from tests.build.cells import CELL, HOSTILE, row, write_cell
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS

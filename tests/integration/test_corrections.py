@@ -94,6 +94,7 @@ def test_a_corrected_question_asks_its_three_items_again(study: Checkout) -> Non
     assert why.count("still stands") == EVALUATIONS
 
 
+@pytest.mark.promise
 def test_a_corrected_ill_posed_question_asks_one_item_again(study: Checkout) -> None:
     study.correct("plinko-0002", ill_posed_question="What does the triangle at the bottom weigh?")
     why = study.traps("why", "chaotic_ill_posed:plinko-0002:void").out
@@ -141,6 +142,7 @@ def test_a_rematerialization_that_changes_nothing_makes_nothing_stale(study: Che
     assert len(rows) > 20 and set(rows) == {("0", "0")}  # stale and missing
 
 
+@pytest.mark.promise
 def test_a_corrected_parameter_renders_that_scenario_alone(study: Checkout) -> None:
     clips = study.workspace / "clips"
     before = {path: path.stat().st_mtime_ns for path in clips.rglob("*.mp4")}

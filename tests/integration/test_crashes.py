@@ -11,32 +11,14 @@ import subprocess
 import sys
 import time
 from contextlib import closing
-from pathlib import Path
 
-import pandas as pd
 import pytest
 
+from tests.build.studies import ONE_REGIME, assert_same_tables
 from tests.conftest import EXPERIMENT, Checkout
-from tests.remedies.remedied import carries_out
-from tests.tables import TABLES
-from traps_pipeline.storage.tables import VOLATILE
-from traps_pipeline.storage.workspace import Workspace
 
-ONE_REGIME = "tests/experiments/one_regime.yaml"
 pytestmark = pytest.mark.slow
 ANSWERS, VOTES = 192, 864  # 4 models x 1 regime x 48 items; 4.5 votes an item
-
-
-def tables(root: Path) -> dict[str, pd.DataFrame]:
-    store = Workspace.open(root).tables
-    return {name: store.read_all(table).drop(columns=list(VOLATILE), errors="ignore") for name, table in TABLES.items()}
-
-
-def assert_same_tables(one: Path, other: Path) -> None:
-    ours, theirs = tables(one), tables(other)
-    assert ours.keys() == theirs.keys()
-    for name, frame in ours.items():
-        pd.testing.assert_frame_equal(frame, theirs[name], obj=name)
 
 
 def rows_written(study: Checkout, kind: str) -> int:
@@ -53,6 +35,7 @@ def wait_for_rows(study: Checkout, process: subprocess.Popen[str], kind: str, co
         time.sleep(0.002 if written else 0.02)  # it takes seconds to begin, and then moments
 
 
+@pytest.mark.promise
 def test_kills_while_answering_and_voting_leave_the_same_tables_and_no_call_is_made_twice(
     unasked: Checkout, one_regime: Checkout
 ) -> None:
@@ -71,6 +54,7 @@ def test_kills_while_answering_and_voting_leave_the_same_tables_and_no_call_is_m
     assert_same_tables(unasked.workspace, one_regime.workspace)
 
 
+@pytest.mark.promise
 def test_a_history_that_cannot_be_written_in_mid_evaluation_ends_the_run_and_loses_nothing(
     unasked: Checkout, one_regime: Checkout
 ) -> None:
@@ -136,7 +120,6 @@ def test_a_kill_while_rendering_leaves_whole_clips_that_are_not_drawn_again(stud
     ) == sorted(clips)
 
 
-@carries_out("traps: interrupted; every finished answer and clip is kept. Run the same command to continue.")
 def test_ctrl_c_drains_and_the_same_command_goes_on(unasked: Checkout, one_regime: Checkout) -> None:
     process = start(unasked)
     wait_for_rows(unasked, process, "answers", 100)

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, ROOT, Checkout, Finished, forget_answers, make_checkout
+from tests.lacking import lack
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.scoring.tables import METRICS
 from traps_pipeline.storage.workspace import Workspace
@@ -144,7 +145,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         and subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", folder], check=False).returncode == 0
     )
     if not mounted:
-        pytest.skip("mounting a tmpfs needs root; tests/storage covers a full disk with a writer that raises ENOSPC")
+        lack("mounting a tmpfs needs root")
     yield folder
     subprocess.run(["umount", "-l", folder], check=True)
 

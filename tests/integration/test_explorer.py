@@ -17,10 +17,10 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 from scipy.stats import binomtest
 
+from tests.build.cells import row, write_cell
 from tests.conftest import Checkout
 from tests.foreign_page import CHROMIUM, QUIET
 from tests.pages import patient, until
-from tests.report.test_items import row, write_cell
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.explorer.site import write_site
 from traps_pipeline.judging.tables import VERDICTS
@@ -132,6 +132,7 @@ def cells(page: Page, name: str) -> list[list[str]]:
     return page.locator(f"table[data-name={name}] tbody tr").evaluate_all(script)
 
 
+@pytest.mark.promise
 def test_every_leaderboard_figure_is_that_of_the_table(site: Site, browser: Browser) -> None:
     board = site.workspace.tables.read(LEADERBOARD, {})
     compared = 0
@@ -231,7 +232,7 @@ def test_a_comparison_counts_what_differs_and_tests_it_as_the_tables_do(site: Si
         assert sorted(listed) == sorted(item.split(":")[1] for item in by.index[left & ~right])
 
 
-@pytest.mark.parametrize("over", ["file", "http"])
+@pytest.mark.parametrize("over", [pytest.param("file", marks=pytest.mark.promise), "http"])
 def test_a_confabulation_is_found_in_three_clicks_and_its_clips_play_in_step(
     site: Site, browser: Browser, over: str
 ) -> None:

@@ -22,14 +22,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.inside import with_mechanism
+from tests.build.studies import ONE_REGIME, assert_same_tables
 from tests.conftest import Checkout, Finished, copied, copy_workspace, forget_answers
-from tests.integration.test_crashes import ONE_REGIME, assert_same_tables
 from tests.lacking import lack
-from tests.mechanism.test_stages_run import with_mechanism
 
 pytestmark = pytest.mark.slow
 MANY = os.environ.get("TRAPS_FAULTS")
-FAULTS = int(MANY or 10)
+FAULTS = int(MANY or 5)
 HELD_US = 10**9  # longer than any test
 # How a file gets its content, its name and its place on the disk; SQLite writes by pwrite64 and fdatasync.
 CALLS = "fsync,fdatasync,rename,ftruncate,pwrite64"
@@ -124,7 +124,7 @@ def begun(
 ) -> Campaign:
     """A campaign against a study, which is run once for the number of its calls."""
     if shutil.which("strace") is None:
-        lack("strace is not installed (make test installs it)")
+        lack("strace is not installed (make campaign installs it)")
     start(study)
     log = study.root / "calls"
     finished = traced(study, command, log)

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from bench.equality import main as compare
+from tests.build.network import ITEMS, ask, entry, experiment, register, responses, settled
 from tests.conftest import Checkout, copy_workspace
-from tests.integration.test_network import ITEMS, ask, entry, experiment, register, responses, settled
 from tests.postgres import Postgres
 from tests.providers.server import Provider
 from tests.storage.conftest import VARIABLE

@@ -10,19 +10,16 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
-import pyarrow.parquet as pq
 import pytest
 
-from tests.conftest import KEY, ROOT, SECRET, SMALL, Checkout, Finished
+from tests.build.network import ITEMS, ask, entry, experiment, register, responses, settled
+from tests.conftest import SECRET, Checkout
 from tests.providers.server import Provider
 from traps_pipeline.models.budget import Journal
 
 pytestmark = pytest.mark.slow
-ITEMS = 48  # of the small study: 12 scenarios in two datasets, two sides
 MANY = "TRAPS_MANY_CALLS" in os.environ  # 864 calls in the place of 288 and of 192, and five kills: for a release
-SAMPLING = "temperature: 0.8, top_p: 0.95, max_tokens: 8000"
 TRANSIENT = {
     "rate_limited": 0.03,
     "rate_limited_bare": 0.03,
@@ -36,51 +33,6 @@ TRANSIENT = {
 }
 OUTCOMES = {"empty": "empty", "length": "truncated", "thinking_exhausted": "empty", "content_filter": "refused"}
 ENDINGS = dict.fromkeys(("empty", "length", "content_filter", "thinking_exhausted", "invalid_json"), 0.01)
-
-
-def entry(name: str, profile: str, more: str = "prices: {input: 1.0, output: 10.0, as_of: 2026-11-01}") -> str:
-    return f"""
-  - id: {name}
-    backend: api
-    account: here
-    provider_id: openai/{name}
-    media: {{profile: {profile}, fps: 5, most: 25}}
-    params: {{{SAMPLING}}}
-    limits: {{timeout_s: 36, backoff_s: 0.05}}
-    {more}
-"""
-
-
-def register(study: Checkout, provider: Provider, *entries: str) -> None:
-    """Put these models at the provider into the registry, in the place of what a test has put there before."""
-    registry = study.root / "assets" / "models.yaml"
-    shipped = (ROOT / "assets" / "models.yaml").read_text()
-    account = f"accounts:\n  here: {{key: {KEY}, base_url: {provider.url}/v1}}\n"
-    registry.write_text(shipped.replace("accounts:\n", account, 1) + "".join(entries))
-
-
-def experiment(study: Checkout, models: list[str], **more: Any) -> Path:
-    """An experiment on the small study's scenarios."""
-    scenarios = SMALL.read_text()[SMALL.read_text().index("scenarios:") :]
-    settings = {"models": models, "regimes": ["standard", "json"], "runs": [1], **more}
-    head = "".join(f"{name}: {value!r}\n".replace("'", '"') for name, value in settings.items())
-    path = study.root / "network.yaml"
-    path.write_text(f"name: network\npanel: rules\njudged_by_rules: true\n{head}{scenarios}")
-    return path
-
-
-def responses(study: Checkout) -> list[dict[str, Any]]:
-    files = sorted((study.workspace / "tables" / "responses").rglob("*.parquet"))
-    return [row for file in files for row in pq.read_table(file, partitioning=None).to_pylist()]
-
-
-def ask(study: Checkout, path: Path, *more: str) -> Finished:
-    """Run an experiment as far as these tests look."""
-    return study.traps("run", path, "--no-preflight", "--until", "responses", *more)
-
-
-def settled(study: Checkout) -> list[dict[str, Any]]:
-    return [row for row in study.ledger_rows("answers") if row["outcome"] != "error"]
 
 
 def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_of_the_key(
@@ -123,6 +75,7 @@ def test_a_fifth_of_all_calls_fails_and_every_item_ends_rightly_without_a_trace_
     assert SECRET not in finished.out + finished.err
 
 
+@pytest.mark.promise
 def test_the_cap_holds_and_the_next_run_goes_on(unasked: Checkout, provider: Provider) -> None:
     provider.configure(latency_s=0.05)
     register(unasked, provider, entry("image-model", "images").replace("limits: {", "limits: {concurrency: 200, "))

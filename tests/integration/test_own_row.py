@@ -37,6 +37,7 @@ def board(study: Checkout) -> dict[str, dict[str, object]]:
     return {row["model"]: row for row in own.to_dict("records")}
 
 
+@pytest.mark.promise
 def test_a_model_that_says_dots_is_broken_and_not_modest_and_a_changed_panel_makes_exactly_its_own_stale(
     unasked: Checkout, provider: Provider
 ) -> None:
@@ -63,6 +64,7 @@ def test_a_model_that_says_dots_is_broken_and_not_modest_and_a_changed_panel_mak
     assert all(str(row["panel"]).startswith("one@") for row in board(unasked).values())
 
 
+@pytest.mark.promise
 def test_whatever_is_wrong_with_a_model_is_named_before_anything_is_rendered_or_judged(
     provider: Provider, tmp_path: Path
 ) -> None:

@@ -11,10 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.studies import assert_same_tables
 from tests.conftest import EXPERIMENT, Checkout, Finished
-from tests.integration.test_crashes import assert_same_tables
 from tests.integration.test_errors import edit_record
-from tests.remedies.remedied import carries_out
 
 pytestmark = pytest.mark.slow
 CELL = "occlusion|oracle__json__run1"
@@ -76,56 +75,40 @@ def wrong_correction(study: Checkout) -> Path:
     return study.root / "scene_specs" / "corrections" / "review.jsonl"
 
 
-# What is done to a study, and what the error then says to do, in its words.
-RESTORE = r"restore (it|the file|the line) from git"
-FAULTS: dict[str, tuple[Callable[[Checkout], Path], str]] = {
-    "a record cut short": (cut_record, RESTORE),
-    "a record that occurs twice": (doubled_record, "remove one of the lines"),
-    "another scene's trajectory": (swapped_trajectory, RESTORE),
-    "an empty prompt": (empty_prompt, RESTORE),
-    "an altered note of a clip": (altered_note, "delete it and run again"),
-    "half of a clip": (halved_clip, "delete it and run again"),
-    "a correction of no scene": (wrong_correction, "name a scenario of the benchmark"),
+def restored(study: Checkout, path: Path, kept: Path) -> None:
+    for folder in ("scene_specs", "assets"):
+        shutil.copytree(kept / folder, study.root / folder, dirs_exist_ok=True)
+
+
+def renamed(study: Checkout, path: Path, kept: Path) -> None:
+    path.write_text(path.read_text().replace("domino_chain-0777", "domino_chain-0001"))
+
+
+# What is done to a study, and what the error then says to do with the file that it names.
+FAULTS: dict[str, tuple[Callable[[Checkout], Path], Callable[[Checkout, Path, Path], object]]] = {
+    "a record cut short": (cut_record, restored),
+    "a record that occurs twice": (doubled_record, lambda study, path, kept: without_last_line(path)),
+    "another scene's trajectory": (swapped_trajectory, restored),
+    "an empty prompt": (empty_prompt, restored),
+    "an altered note of a clip": (altered_note, lambda study, path, kept: path.unlink()),
+    "half of a clip": (halved_clip, lambda study, path, kept: path.unlink()),
+    "a correction of no scene": (wrong_correction, renamed),
 }
 
 
-def carried_out(words: str, study: Checkout, path: Path, kept: Path) -> None:
-    if re.fullmatch(RESTORE, words):
-        for folder in ("scene_specs", "assets"):
-            shutil.copytree(kept / folder, study.root / folder, dirs_exist_ok=True)
-    elif words.startswith("remove"):
-        without_last_line(path)
-    elif words.startswith("name"):
-        path.write_text(path.read_text().replace("domino_chain-0777", "domino_chain-0001"))
-    else:
-        path.unlink()
-
-
-def told(finished: Finished, path: Path, remedy: str) -> str:
-    """The remedy in the words of the error, which names the file."""
-    assert finished.code == 1, finished.out
-    assert "Traceback" not in finished.err, finished.err
-    assert str(path) in finished.err, finished.err
-    found = re.search(remedy, finished.err)
-    assert found, finished.err
-    return found[0]
-
-
-@carries_out("finished work is kept: run the same command to continue")
 def test_each_remedy_for_a_file_lets_the_same_command_go_on(study: Checkout, small: Checkout, tmp_path: Path) -> None:
     for folder in ("scene_specs", "assets"):
         shutil.copytree(study.root / folder, tmp_path / "kept" / folder)
-    said = ""
     for name, (damaged, remedy) in FAULTS.items():
         path = damaged(study)
         finished = study.score(EXPERIMENT)
-        words, said = told(finished, path, remedy), said + finished.err
-        carried_out(words, study, path, tmp_path / "kept")
+        assert finished.code == 1, finished.out
+        assert str(path) in finished.err and "Traceback" not in finished.err, finished.err
+        remedy(study, path, tmp_path / "kept")
         again = study.score(EXPERIMENT)
         assert again.code == 0, f"{name}: {again.err}"
         counts = again.counts()
         assert (counts["answers"], counts["votes"]) == (0, 0), f"{name}: {json.dumps(counts)}"
-    assert "problem(s); finished work is kept: run the same command to continue" in said
     assert_same_tables(study.workspace, small.workspace)
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, sync_playwright
 
+from tests.build.cells import CELL, HOSTILE, write_cell
 from tests.conftest import Checkout
 from tests.pages import patient
-from tests.report.test_items import CELL, HOSTILE, write_cell
 from traps_pipeline.report.items import item_pages
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace

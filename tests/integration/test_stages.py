@@ -86,6 +86,7 @@ def test_votes_of_a_large_cell_are_collected_in_parts_and_are_the_same_table(
         pd.testing.assert_frame_equal(again.drop(columns="created_at"), rows.drop(columns="created_at"))
 
 
+@pytest.mark.promise
 def test_a_range_of_cells_is_one_run_through_three_stages_and_makes_exactly_its_cells(study: Checkout) -> None:
     forget_answers(study)
     finished = materialize(study, "responses,votes,verdicts", "--partition-range", RANGE)
@@ -237,6 +238,7 @@ def test_a_missing_upstream_exits_with_one_and_names_it(study: Checkout) -> None
     assert "is not made; materialize responses for this partition first" in finished.out + finished.err
 
 
+@pytest.mark.promise
 def test_a_failing_step_exits_with_one_and_names_the_file(study: Checkout) -> None:
     path = study.root / "scene_specs" / "released" / "domino_chain.jsonl"
     lines = path.read_text().splitlines()
@@ -256,6 +258,7 @@ def test_a_table_that_was_deleted_is_made_again_from_the_ledger(study: Checkout)
     assert run.counts() == {"answers": 0, "votes": 0, "frames": 0}
 
 
+@pytest.mark.promise
 def test_the_code_location_validates_and_imports_nothing_heavy(study: Checkout) -> None:
     heavy = ("torch", "transformers", "litellm", "mujoco", "matplotlib", "cv2", "sklearn", "av", "pandas")
     code = f"import traps_pipeline.definitions, sys; print([m for m in {heavy} if m in sys.modules])"
@@ -266,6 +269,7 @@ def test_the_code_location_validates_and_imports_nothing_heavy(study: Checkout) 
     assert "BetaWarning" not in valid.err
 
 
+@pytest.mark.promise
 def test_help_loads_neither_dagster_nor_pandas(study: Checkout) -> None:
     code = (
         "import sys; from traps_pipeline.cli import build_parser; build_parser().format_help();"

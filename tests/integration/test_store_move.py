@@ -56,6 +56,6 @@ def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_agai
     other = copied(one_regime, tmp_path / "other")
     remedied(
         lambda: move_to_store(Workspace.open(other.workspace), ADDRESS),
-        "{}: a study lies there already; name another address. If it is this one, and a move was stopped at its very",
+        "study.store_move.move_to_store",
         again=lambda: move_to_store(Workspace.open(other.workspace), "s3://lab/moved-too"),
     )

@@ -13,7 +13,6 @@ import pytest
 
 from tests.local_models import FAMILIES, Family, model
 from tests.models.local import check_table
-from tests.remedies.remedied import carries_out
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import patching
 from traps_pipeline.mechanism.adapter_checks import CHECKS, Subject, brightening
@@ -71,7 +70,6 @@ def prefixes_of_other_states(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(prefixes, "_record", other)
 
 
-@carries_out("{}; install the pinned versions, or do not look into this model")  # what is broken stands for another
 @pytest.mark.parametrize(
     ("family", "check", "broken", "said"),
     [

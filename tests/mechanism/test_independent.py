@@ -39,7 +39,11 @@ from traps_pipeline.storage.store import FolderStore
 pytestmark = pytest.mark.slow
 POCKET = "pocket"
 NEW_TOKENS = 8
-each = pytest.mark.parametrize("name", [*FAMILIES, POCKET])
+PROMISED = ("qwen3-vl", POCKET)  # the models of `make test`
+each = pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.promise] * (name in PROMISED)) for name in (*FAMILIES, POCKET)],
+)
 
 
 @dataclass(frozen=True, eq=False)

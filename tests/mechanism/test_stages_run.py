@@ -8,51 +8,14 @@ import shutil
 from pathlib import Path
 
 import pytest
-import yaml
 
-from tests.conftest import EXPERIMENT, Checkout, Finished, copied, once
-from tests.mechanism.paper_run import words
+from tests.build.inside import with_mechanism
+from tests.conftest import Checkout, Finished, copied, once
 from traps_pipeline.mechanism.control_tables import PATCHING, PROBE_BASELINES, STEERING_NULLS
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_VOTES
-from traps_pipeline.models.local.tiny import build_tiny
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-ENTRY = """
-  - id: tiny
-    backend: local
-    device: cpu
-    media: {profile: frames, uniform: 2, size: [32, 32]}
-    params: {checkpoint: tiny, dtype: float32, quantisation: none, do_sample: false, max_new_tokens: 4}
-    runs: 1
-"""
-MECHANISM = {
-    "models": {"tiny": {"steering": 3, "centroid": 4}},
-    "prompts": ["standard"],
-    "probes": {"folds": 2, "resamples": 100},
-    "patching": {"pairs": 2},
-    "steering": {
-        **{"alphas": [5], "pairs": 2, "well_posed_pairs": 4, "ill_posed_pairs": 4, "max_new_tokens": 4},
-        **{"direction_regimes": ["standard"], "inference_regimes": ["guided"], "gaps": [1], "signs": ["minus"]},
-        "nulls": {"kinds": ["covariance"], "draws": 2},
-    },
-}
-
-
-def with_mechanism(study: Checkout) -> str:
-    """The small study's experiment on two of its datasets, asking for a look into a tiny model besides."""
-    with (study.root / "assets" / "models.yaml").open("a") as stream:
-        stream.write(ENTRY)
-    records = sorted((study.root / "scene_specs" / "released").glob("*.jsonl"))
-    lines = [json.loads(line) for path in records for line in path.read_text(encoding="utf-8").splitlines()]
-    questions = " ".join(str(value) for line in lines for name, value in line.items() if "question" in name)
-    build_tiny("qwen3-vl", study.root / "tiny", tokenizer=words(questions))
-    experiment = yaml.safe_load((study.root / EXPERIMENT).read_text()) | {
-        "datasets": ["chaotic", "chaotic_ill_posed"],
-        "mechanism": MECHANISM,
-    }
-    (study.root / "inside.yaml").write_text(yaml.safe_dump(experiment))
-    return "inside.yaml"
 
 
 def counted(finished: Finished) -> tuple[int, ...]:
@@ -78,6 +41,7 @@ def examined(small: Checkout, tmp_path_factory: pytest.TempPathFactory, tmp_path
     return Checkout(tmp_path / "checkout", tmp_path / "study"), Finished(0, made.with_suffix(".out").read_text(), "")
 
 
+@pytest.mark.promise
 def test_traps_run_looks_into_a_model_once(examined: tuple[Checkout, Finished]) -> None:
     study, finished = examined
     extracted, answers, votes = counted(finished)

@@ -20,6 +20,7 @@ from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 
+pytestmark = pytest.mark.promise  # every provider's answers and errors
 ROUTES = {"openai/m": "/v1", "gemini/gemini-2.5-pro": "/v1beta", "openai/responses/m": "/v1"}
 QUESTION = "Does the ball clear the barrier?"
 

@@ -177,6 +177,7 @@ def test_a_host_with_other_code_refuses_a_run_and_names_both(workspace: Workspac
         require_same_code({CODE_TAG: "0.1.9, files x"}, "lab")  # of a version that said it in other words
 
 
+@pytest.mark.slow
 def test_a_study_in_a_folder_and_a_missing_head_are_refused_with_the_remedy(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -208,6 +209,7 @@ def test_what_dagster_is_told_holds_no_address_of_the_database(monkeypatch: pyte
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_command_line_of_a_run_survives_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
     launcher = pytest.importorskip(
         "traps_pipeline.orchestration.ray_launcher", reason="the extra `cluster` is not installed"
@@ -221,6 +223,7 @@ def test_the_command_line_of_a_run_survives_a_shell(monkeypatch: pytest.MonkeyPa
     assert shlex.split(sent[0]) == ["dagster", "api", "execute_run", told]
 
 
+@pytest.mark.slow
 def test_a_run_that_dagsters_pages_launch_takes_and_says_what_one_of_the_command_line_does(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -250,6 +253,7 @@ def test_a_run_that_dagsters_pages_launch_takes_and_says_what_one_of_the_command
     assert (asking["num_cpus"], asking["num_gpus"]) == (1, 1.0)
 
 
+@pytest.mark.slow
 def test_a_worker_with_a_wrong_password_names_itself_the_study_and_the_variable(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -265,6 +269,7 @@ def test_a_worker_with_a_wrong_password_names_itself_the_study_and_the_variable(
         assert "a-wrong-word" not in str(raised.value) and raised.value.__cause__ is None
 
 
+@pytest.mark.slow
 def test_a_command_that_watches_runs_outlives_a_database_that_is_stopped_and_started(
     workspace: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -347,6 +352,7 @@ def test_a_process_whose_run_was_resumed_elsewhere_ends_without_a_word(tmp_path:
         assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == RESUMED_ELSEWHERE
 
 
+@pytest.mark.slow
 def test_a_shared_history_keeps_its_connection_and_survives_a_restart_of_the_server(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -94,8 +94,7 @@ def test_a_run_that_waits_for_a_host_goes_on_waiting_and_one_that_waits_for_noth
 
         remedied(
             launch,
-            "{}: Ray's head does not answer the host {}, which starts the runs of the study {} ({}). See that the head "
-            "runs (`ray status`) and that {} is its address; then run the same command again",
+            "orchestration",
             cluster.start_head,
         )
         client = launcher.client

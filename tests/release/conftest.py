@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import traps_pipeline.definitions  # noqa: F401 - declares the graph
 from tests.conftest import Checkout, once
 
 

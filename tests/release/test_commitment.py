@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from tests.conftest import Checkout, make_checkout, once
-from tests.remedies.remedied import carries_out
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
@@ -126,7 +125,6 @@ def test_a_commitment_is_made_once_and_of_one_draw(copy: Path, tmp_path: Path) -
         read_commitment(copy / "reveal.json")
 
 
-@carries_out("composition.yaml has no number of scenarios for {}; say --count N")
 def test_a_family_without_a_number_is_sampled_with_one(copy: Path, tmp_path: Path) -> None:
     checkout = Checkout(make_checkout(tmp_path / "checkout"), tmp_path / "study")
     composition = checkout.root / "scene_specs" / "composition.yaml"

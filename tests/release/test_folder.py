@@ -13,7 +13,6 @@ import yaml
 
 from tests.conftest import Checkout
 from tests.release.environments import run_in
-from tests.remedies.remedied import carries_out
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.held_out import held_out_key
@@ -249,11 +248,6 @@ print(check_signature(folder, public).partition(" (")[0])
 """
 
 
-@carries_out(
-    "{}: cannot sign ({}); give a private elliptic key in PEM, e.g. of `openssl ecparam -name prime256v1 -genkey "
-    "-noout -out KEY.pem`",
-    "{}: is missing, so that there is nothing to verify; leave --key out",
-)
 def test_a_signature_is_of_its_key_over_these_files_alone(copy: Path, tmp_path: Path, demo: Checkout) -> None:
     keys = []
     for name in ("one", "two"):

@@ -76,6 +76,7 @@ def problems(path: Path, release: Path | None = None) -> list[str]:
     return verify(read_submission(path), release).problems
 
 
+@pytest.mark.promise
 def test_a_study_packed_twice_is_the_same_file_and_holds_against_its_release(
     packed: Path, release: Path, small: Checkout, tmp_path: Path
 ) -> None:
@@ -99,6 +100,7 @@ def test_a_table_that_is_not_the_packed_one_is_named(packed: Path, tmp_path: Pat
     assert problems(tmp_path / "f.zip") == ["votes.parquet: is not the table that was packed"]
 
 
+@pytest.mark.promise
 def test_an_edited_answer_is_named(packed: Path, tmp_path: Path) -> None:
     def edit(frames: Frames) -> None:
         put(frames, "responses", "text", "The answer is: left.", item_id=ITEM, model="prior", regime="standard")

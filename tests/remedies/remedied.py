@@ -1,81 +1,78 @@
-"""How a test carries a remedy out: the real thing is refused with the sentence, what the sentence says is done, and the
-same call succeeds. `test_every_remedy.py` reads the sentences of these calls, so that each remedy of the package has a
-test that carries it out."""
+"""How a test carries a remedy out: a call is refused, what the error says is done, and the same call succeeds.
+
+The error is known by the function that raises it, not by its words: they may be improved without breaking a test."""
 
 from __future__ import annotations
 
-import contextlib
-import io
 import os
-import re
 from collections.abc import Callable
+from types import TracebackType
 from typing import TypeVar
 
 import pytest
+from pydantic import ValidationError
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.cli import main
+from traps_pipeline.cli import build_parser
 from traps_pipeline.storage.workspace import VARIABLE
 
+PACKAGE = "traps_pipeline."
 T = TypeVar("T")
 
 
-def says(sentence: str, told: str) -> bool:
-    """Whether an error has a part of a sentence of the package; `{}` stands for what is only known then."""
-    sentence = sentence.rpartition(" | ")[2]
-    return re.search(re.escape(sentence).replace(r"\{\}", ".*?"), told, re.DOTALL) is not None
+def raised_in(error: BaseException) -> str:
+    """Return the innermost function of the package in a traceback, as `base.files.replacing`.
+
+    Otherwise the model of pydantic that refused, or nothing.
+    """
+    function, frames = "", error.__traceback__
+    while isinstance(frames, TracebackType):
+        module = frames.tb_frame.f_globals.get("__name__", "")
+        if module.startswith(PACKAGE):
+            function = f"{module.removeprefix(PACKAGE)}.{frames.tb_frame.f_code.co_qualname}"
+        frames = frames.tb_next
+    return error.title if not function and isinstance(error, ValidationError) else function
 
 
-def refused(call: Callable[[], T], sentence: str, *, error: type[BaseException] = TrapsError) -> Callable[[], T]:
-    """`call`, after it ended in `error` with `sentence`: to be made again when the remedy of several is carried out."""
+def refused(call: Callable[[], T], by: str, *, error: type[BaseException] = TrapsError) -> Callable[[], T]:
+    """Return `call` after it ended in `error`, raised in the function or module `by`; any of the package if empty."""
     with pytest.raises(error) as caught:
         call()
-    assert says(sentence, str(caught.value)), f"{sentence}\nis not what was said: {caught.value}"
+    function = raised_in(caught.value)
+    assert not by or f"{function}.".startswith(f"{by}."), f"raised in {function}, not {by}: {caught.value}"
     return call
 
 
 def remedied(
     call: Callable[[], T],
-    sentence: str,
+    by: str,
     remedy: Callable[[], object] | None = None,
     *,
     again: Callable[[], T] | None = None,
     error: type[BaseException] = TrapsError,
 ) -> T:
-    """What `call` returns once `remedy` is carried out; before, it ends in `error` with `sentence`.
+    """Return what `call` gives once `remedy` is carried out; before, `by` refuses it with `error`.
 
-    again: the call with what the sentence says to give instead, where the remedy is another argument.
+    again: the call with what the error says to give instead, where the remedy is another argument.
     """
     assert (remedy is None) != (again is None), (
         "a remedy is either done before the same call, or another argument of it"
     )
-    refused(call, sentence, error=error)
+    refused(call, by, error=error)
     if remedy is not None:
         remedy()
     return (again or call)()
 
 
-def carries_out(*sentences: str) -> Callable[[T], T]:
-    """Marks a test that provokes errors with these sentences, carries out what they say and sees the command succeed,
-    where `remedied` does not fit: a command in a process of its own, or several errors at once."""
-    assert sentences
-
-    def marked(test: T) -> T:
-        return test
-
-    return marked
-
-
 def command(*arguments: object) -> None:
-    """Run a `traps` command in this process. Raises TrapsError with what it says on stderr unless it ends in 0."""
-    said, before = io.StringIO(), os.environ.get(VARIABLE)
+    """Run a `traps` command in this process. Raises its error, or TrapsError where it ends in another code than 0."""
+    before, parsed = os.environ.get(VARIABLE), build_parser().parse_args([str(argument) for argument in arguments])
     try:
-        with contextlib.redirect_stderr(said):
-            code = main([str(argument) for argument in arguments])
+        code = parsed.command(parsed)
     finally:  # a command tells the processes that it starts where its workspace is
         if before is None:
             os.environ.pop(VARIABLE, None)
         else:
             os.environ[VARIABLE] = before
     if code:
-        raise TrapsError(said.getvalue())
+        raise TrapsError(f"the command ended with {code}")

@@ -13,25 +13,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import dagster as dg
 import pytest
 
 from tests.conftest import ROOT, Checkout, make_checkout
 from tests.objectstore import S3
 from tests.postgres import Postgres
-from tests.remedies.remedied import carries_out, remedied
+from tests.remedies.remedied import remedied
 from tests.remedies.test_money import paid
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.defs import benchmark
-from traps_pipeline.orchestration.cluster import RayRuns, require_cluster
-from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.orchestration.cluster import require_cluster
 from traps_pipeline.orchestration.run import dagster_history
-from traps_pipeline.orchestration.runs import Ran, RunsHere
 from traps_pipeline.orchestration.same_code import CODE_TAG, code_here, require_same_code
 from traps_pipeline.orchestration.shared_history import SharedHistory
-from traps_pipeline.orchestration.stage import WorkspaceResource
-from traps_pipeline.storage.bucket import Bucket, object_name
-from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.storage.bucket import Bucket
 from traps_pipeline.storage.place import place_of
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import DATABASE, RAY, Workspace
@@ -56,12 +50,12 @@ def test_a_bucket_that_is_made_and_a_key_that_is_exported_are_used(
 ) -> None:
     s3.empty()
     content = b"frames"
-    remedied(lambda: Bucket(address).put("a", content), "See that the bucket exists, that its keys", s3.make_bucket)
+    remedied(lambda: Bucket(address).put("a", content), "storage.bucket.Bucket.put", s3.make_bucket)
     assert Bucket(address).get("a") == content
     monkeypatch.setenv("AWS_ENDPOINT", "http://127.0.0.1:1")
     found = remedied(
         lambda: Bucket(address).get("a"),
-        "exists, that its keys and its address are in the environment",
+        "storage.bucket.Bucket.get",
         lambda: monkeypatch.setenv("AWS_ENDPOINT", s3.environment["AWS_ENDPOINT"]),
     )
     assert found == content
@@ -103,25 +97,8 @@ def test_a_store_of_azure_is_opened_once_its_account_and_key_are_exported(monkey
         monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "lab")
         monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_KEY", "a2V5")
 
-    opened = remedied(lambda: Bucket("az://lab/study"), "and that this machine's clock is right; then run", export)
+    opened = remedied(lambda: Bucket("az://lab/study"), "storage.bucket.Bucket.__init__", export)
     assert opened.address == "az://lab/study"
-
-
-def test_what_is_gone_from_the_store_is_there_once_it_is_made_anew(address: str) -> None:
-    workspace = Workspace.create(address, Study())
-    store, path = workspace.store, workspace.root / "tables" / "a.parquet"
-    assert isinstance(store, ObjectStore)
-    store.write({path: b"rows"})
-    row = store._current(path)
-    assert row is not None
-    store.bucket.delete(row.digest)
-    (store.root / ".objects" / object_name(row.digest)).unlink()
-    here = remedied(
-        lambda: store.here(path) if store.has(path) else pytest.fail("it is not current"),
-        "storage/objects.py | {}/{}: {}; run again, and it is made anew",
-        lambda: store.write({path: b"rows"}),
-    )
-    assert here.read_bytes() == b"rows"
 
 
 def test_a_budget_of_an_account_in_a_folder_that_all_hosts_see_is_spent_from(address: str, tmp_path: Path) -> None:
@@ -131,7 +108,7 @@ def test_a_budget_of_an_account_in_a_folder_that_all_hosts_see_is_spent_from(add
     workspace = Workspace.create(address, Study(budget_usd=50, account_budgets={"openai": "openai"}))
     remedied(
         paid(address),
-        "account_budgets names the folder {}, which other hosts do not see; give the path of a folder that all hosts",
+        "models.spending._shared_budgets",
         lambda: workspace.allow(account_budgets={"openai": str(shared)}),
     )
 
@@ -160,11 +137,6 @@ def head(workspace: Workspace) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @pytest.mark.slow
-@carries_out(
-    "runs on other hosts need {} here and there: install the extra `cluster`",
-    "{} is not set: export {}=http://HEAD:8265, the address of Ray's head for the study",
-    "nobody takes runs from its queue; run `traps ui` on the head, with the same variables, and then",
-)
 def test_runs_are_submitted_once_the_extra_the_address_and_the_head_are_there(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -200,62 +172,6 @@ def test_runs_are_submitted_once_the_extra_the_address_and_the_head_are_there(
                 time.sleep(1)
 
 
-@carries_out("{} ended as {} ({}); see its log in `traps ui`")
-def test_the_log_of_a_run_that_ended_says_why_and_the_next_run_tells_nothing(tmp_path: Path) -> None:
-    @dg.op
-    def one() -> None: ...
-
-    @dg.job
-    def study() -> None:
-        one()
-
-    with dg.DagsterInstance.ephemeral() as instance:
-        runs = RayRuns(instance, Workspace(tmp_path, Study(name="lab")), 1, 0.0, "leave")
-        run = instance.create_run_for_job(study)
-        instance.report_run_failed(run, "its host died and was resumed three times")
-        ((problem,),) = (ran.problems for ran in runs._watch([run.run_id]))
-        assert "ended as failure (its host died" in problem and "see its log in `traps ui`" in problem
-        assert [entry.message for entry in instance.all_logs(run.run_id)] == [
-            "its host died and was resumed three times"
-        ]
-        again = study.execute_in_process(instance=instance)
-        assert runs._watch([again.run_id]) == [Ran([], over_budget=False)]
-
-
-class Mounted(WorkspaceResource):
-    """A study whose disk must be there before a run can begin."""
-
-    def setup_for_execution(self, context: dg.InitResourceContext) -> None:
-        """Raises FileNotFoundError."""
-        (Path(self.root) / "study.yaml").read_text()
-
-
-def test_a_run_that_could_not_begin_begins_once_what_its_log_names_is_mended(tmp_path: Path) -> None:
-    place = tmp_path / "study"
-    stage = the_graph()["scene_specs"]
-    key = str(the_graph().keys(stage.name)[0])
-    definitions = dg.Definitions(
-        assets=[benchmark.scene_specs],
-        resources={"workspace": Mounted(root=str(place))},
-        executor=dg.in_process_executor,
-    )
-    with dg.DagsterInstance.ephemeral() as instance:
-        runs = RunsHere(instance, definitions.resolve_implicit_global_asset_job_def())
-
-        def made() -> None:
-            (ran,) = runs.make([stage], [(key, key)], {})
-            if ran.problems:
-                raise TrapsError("\n".join(ran.problems))
-
-        remedied(
-            made,
-            "{} {}: the run failed; see its log in Dagster",
-            lambda: Workspace.create(place, Study()),
-        )
-        logged = [str(entry) for run in instance.get_runs() for entry in instance.all_logs(run.run_id)]
-        assert any("study/study.yaml" in entry for entry in logged)
-
-
 def of_another_host(checkout: Checkout) -> Callable[[], Mapping[str, str]]:
     """The tags of a run that a host with the code of a checkout submits."""
 
@@ -275,7 +191,7 @@ def test_a_run_of_a_host_is_taken_once_it_has_the_same_version(tmp_path: Path) -
     file.write_text(ours + "# altered on that host\n")
     remedied(
         lambda: require_same_code(tags(), "lab"),
-        "Install the same version of the package from the same lock on both, and run the same command again",
+        "orchestration.same_code.require_same_code",
         lambda: file.write_text(ours),
     )
     assert tags() == {CODE_TAG: code_here()}
@@ -288,7 +204,7 @@ def test_a_worker_whose_password_is_wrong_opens_the_history_once_it_is_right(
     monkeypatch.setenv(DATABASE, postgres.address(password="wrong"))
     history: Any = remedied(
         lambda: SharedHistory.from_config_value(None, {"variable": DATABASE}),
-        "with {} ({}); see that the address, its user and its password are right on this host, and run the same",
+        "orchestration",
         lambda: monkeypatch.setenv(DATABASE, postgres.address()),
     )
     assert history.run_storage.get_runs() == []
@@ -301,7 +217,7 @@ def test_a_host_that_exports_the_database_opens_the_history(
     monkeypatch.delenv(DATABASE, raising=False)
     history: Any = remedied(
         lambda: SharedHistory.from_config_value(None, {"variable": DATABASE}),
-        "{} is not set on the host {}; export the address of the database of the study {}",
+        "orchestration",
         lambda: monkeypatch.setenv(DATABASE, postgres.address()),
     )
     assert history.run_storage.get_runs_count() >= 0

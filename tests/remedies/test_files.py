@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from tests.remedies.remedied import carries_out, remedied
+from tests.remedies.remedied import remedied
 from traps_pipeline.base.files import require_in_place, try_lock, write_text
 from traps_pipeline.base.yamlfile import read_lines, read_mapping, read_yaml
 
@@ -55,25 +55,24 @@ def another_user(*folders: Path) -> Iterator[None]:
         os.seteuid(0)
 
 
-@carries_out("base/files.py | {}: cannot be written ({}); {} and run the same command again")
 def test_a_full_disk_is_written_to_once_some_space_is_freed(tiny_disk: Path) -> None:
     filler = tiny_disk / "filler"
     filler.write_bytes(b"0" * 60_000)
     text = "x" * 30_000
     call = written(tiny_disk / "a.txt", text)
-    assert remedied(call, "base/files.py | free some space", filler.unlink) == text
+    assert remedied(call, "base.files.replacing", filler.unlink) == text
 
 
 def test_a_file_beyond_the_limit_is_written_once_that_is_raised(tmp_path: Path) -> None:
     with limited(resource.RLIMIT_FSIZE, 1000) as raise_it:
         call = written(tmp_path / "a.txt", "x" * 2000)
-        assert len(remedied(call, "raise the limit of a file's size (`ulimit -f`)", raise_it)) == 2000
+        assert len(remedied(call, "base.files.replacing", raise_it)) == 2000
 
 
 def test_a_file_is_written_once_this_shell_may_open_more(tmp_path: Path) -> None:
     held = os.open("/", os.O_RDONLY)
     with limited(resource.RLIMIT_NOFILE, held) as raise_it:  # descriptors below `held` are taken
-        remedied(written(tmp_path / "a.txt"), "let this shell open more files (`ulimit -n 4096`)", raise_it)
+        remedied(written(tmp_path / "a.txt"), "base.files.replacing", raise_it)
     os.close(held)
 
 
@@ -82,7 +81,7 @@ def test_a_disk_that_is_mounted_for_writing_is_written_to(tiny_disk: Path) -> No
         subprocess.run(["mount", "-o", f"remount,{how}", str(tiny_disk)], check=True)
 
     mount("ro")
-    remedied(written(tiny_disk / "a.txt"), "choose another folder, or mount it for writing", lambda: mount("rw"))
+    remedied(written(tiny_disk / "a.txt"), "base.files.replacing", lambda: mount("rw"))
 
 
 @pytest.mark.parametrize("chosen", ["writable", "another"])
@@ -103,25 +102,25 @@ def test_a_folder_of_somebody_else_is_written_to_once_this_user_may(tmp_path: Pa
 
         another = written(tmp_path / "open" / "a.txt")
         done = {"remedy": allow} if chosen == "writable" else {"again": another}
-        remedied(written(folder / "a.txt"), "make its folder writable for this user, or choose another folder", **done)
+        remedied(written(folder / "a.txt"), "base.files.replacing", **done)
 
 
 def test_a_name_that_is_too_long_fits_in_a_folder_with_a_shorter_path(tmp_path: Path) -> None:
     deep = Path(str(tmp_path) + "/" + "/".join(["d" * 200] * 25))
-    remedied(written(deep / "a.txt"), "choose a folder with a shorter path", again=written(tmp_path / "a.txt"))
+    remedied(written(deep / "a.txt"), "base.files.replacing", again=written(tmp_path / "a.txt"))
 
 
 @pytest.mark.parametrize(
-    ("prepare", "sentence"),
+    ("prepare", "by"),
     [
-        (lambda at: (at / "f").write_text("file"), "a file lies where its folder must be: move that away"),
-        (lambda at: (at / "f" / "a.txt").mkdir(parents=True), "a folder lies in its place: move that away"),
+        (lambda at: (at / "f").write_text("file"), "base.files.replacing"),
+        (lambda at: (at / "f" / "a.txt").mkdir(parents=True), "base.files.replacing"),
     ],
 )
-def test_what_lies_in_the_way_is_moved_away(tmp_path: Path, prepare: Callable[[Path], object], sentence: str) -> None:
+def test_what_lies_in_the_way_is_moved_away(tmp_path: Path, prepare: Callable[[Path], object], by: str) -> None:
     prepare(tmp_path)
     in_the_way = tmp_path / "f" if (tmp_path / "f").is_file() else tmp_path / "f" / "a.txt"
-    remedied(written(tmp_path / "f" / "a.txt"), sentence, lambda: in_the_way.rename(tmp_path / "away"))
+    remedied(written(tmp_path / "f" / "a.txt"), by, lambda: in_the_way.rename(tmp_path / "away"))
 
 
 def test_a_file_among_the_folders_of_a_path_is_moved_away(tmp_path: Path) -> None:
@@ -129,7 +128,7 @@ def test_a_file_among_the_folders_of_a_path_is_moved_away(tmp_path: Path) -> Non
     call = written(tmp_path / "f" / "g" / "a.txt")
     remedied(
         call,
-        "one of the folders of its path is a file: move that file away, or choose another folder",
+        "base.files.replacing",
         lambda: (tmp_path / "f").rename(tmp_path / "away"),
     )
 
@@ -141,7 +140,7 @@ def test_where_the_folder_is_gone_the_right_one_is_named(tmp_path: Path, monkeyp
     gone.rmdir()
     remedied(
         written(Path("a.txt")),
-        "its folder is gone: make it again, or name the right one",
+        "base.files.replacing",
         again=written(tmp_path / "a.txt"),
     )
     monkeypatch.chdir(tmp_path)
@@ -150,7 +149,7 @@ def test_where_the_folder_is_gone_the_right_one_is_named(tmp_path: Path, monkeyp
 def test_whatever_else_is_wrong_with_a_file_is_seen_to(tmp_path: Path) -> None:
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
-    remedied(written(loop / "deeper" / "a.txt"), "see to the file or its disk", loop.unlink)
+    remedied(written(loop / "deeper" / "a.txt"), "base.files.replacing", loop.unlink)
 
 
 WRITE = """
@@ -165,13 +164,9 @@ except TrapsError as error:
 """
 
 
-@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed (make test installs it)")
+@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed (make campaign installs it)")
 @pytest.mark.parametrize("fault", ["fsync:error=EDQUOT", "fsync:error=EIO", "rename:error=ENFILE"])
-@carries_out(
-    "free some space, or raise the quota",
-    "the disk fails: look at it, or choose a folder on another one",
-    "end programs that hold many files open",
-)
+@pytest.mark.slow
 def test_what_the_system_refused_is_written_once_it_no_longer_does(tmp_path: Path, fault: str) -> None:
     said = {
         "EDQUOT": "or raise the quota",
@@ -211,42 +206,41 @@ def test_a_run_whose_lock_file_was_removed_is_run_again(tmp_path: Path) -> None:
 
     remedied(
         lambda: require_in_place(held, path),
-        "nothing more is sent. Leave lock files alone (they hold nothing when no run goes on), and run the same",
+        "base.files.require_in_place",
         again=again,
     )
     os.close(held)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"),
+    ("wrong", "by"),
     [
-        (b"name: [", "not valid YAML ({}); correct the file"),
-        (b"name: !!binary x", "not valid YAML ({}); correct the file"),
-        (b"name: !!bool a", "remove the tag {}: no value has one"),
-        (b"- name", "must be a mapping of names, not {}; correct the file"),
+        (b"name: [", "base.yamlfile.read_yaml"),
+        (b"name: !!bool a", "base.yamlfile.read_yaml"),
+        (b"- name", "base.yamlfile.read_mapping"),
     ],
 )
-def test_a_yaml_file_is_read_once_it_is_corrected(tmp_path: Path, wrong: bytes, sentence: str) -> None:
+def test_a_yaml_file_is_read_once_it_is_corrected(tmp_path: Path, wrong: bytes, by: str) -> None:
     path = tmp_path / "a.yaml"
     path.write_bytes(wrong)
-    assert remedied(lambda: read_mapping(path), sentence, lambda: path.write_text("name: a")) == {"name": "a"}
+    assert remedied(lambda: read_mapping(path), by, lambda: path.write_text("name: a")) == {"name": "a"}
     assert read_yaml(path) == {"name": "a"}
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"),
+    ("wrong", "by"),
     [
-        (r'{"a": "\ud800"}', "half of a surrogate pair stands in it; correct that line"),
-        ('{"a": 1, "a": 2}', "base/yamlfile.py | {}: {}; correct that line"),
-        ('{"a": NaN}', "base/yamlfile.py | {}: {}; correct that line"),
-        ('{"a": ' + "9" * 5000 + "}", "a number of thousands of digits; correct that line"),
+        (r'{"a": "\ud800"}', "base.yamlfile._check_line"),
+        ('{"a": 1, "a": 2}', "base.yamlfile._check_line"),
+        ('{"a": NaN}', "base.yamlfile._check_line"),
+        ('{"a": ' + "9" * 5000 + "}", "base.yamlfile._check_line"),
     ],
 )
-def test_a_line_is_read_once_it_is_corrected(tmp_path: Path, wrong: str, sentence: str) -> None:
+def test_a_line_is_read_once_it_is_corrected(tmp_path: Path, wrong: str, by: str) -> None:
     path = tmp_path / "a.jsonl"
     path.write_text(f'{{"a": 1}}\n{wrong}\n')
     right = '{"a": 1}\n{"a": 2}\n'
-    lines = remedied(lambda: list(read_lines(path)), sentence, lambda: path.write_text(right))
+    lines = remedied(lambda: list(read_lines(path)), by, lambda: path.write_text(right))
     assert lines == [(1, '{"a": 1}'), (2, '{"a": 2}')]
 
 
@@ -256,7 +250,7 @@ def test_lines_are_read_once_the_file_is_restored(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe")
     lines = remedied(
         lambda: list(read_lines(path)),
-        "base/yamlfile.py | {}: cannot be read ({}); restore it from git",
+        "base.yamlfile.read_lines",
         lambda: shutil.copy(kept, path),
     )
     assert lines == [(1, "{}")]

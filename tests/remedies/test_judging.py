@@ -19,7 +19,6 @@ from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.explorer.labelstore import DATABASE, LabelStore
 from traps_pipeline.judging.labels import LABELS_FILE, label_lines
 from traps_pipeline.judging.panel import collect_votes, judged_answers, wanted_ballots
-from traps_pipeline.judging.people import TASKS, require_task
 from traps_pipeline.judging.robustness import check_panel, load_attacks
 from traps_pipeline.judging.tables import CONFABULATION, VOTES
 from traps_pipeline.judging.validation import annotation_sheet, read_labels, write_sheet
@@ -48,14 +47,14 @@ def test_answers_are_judged_once_they_are_of_the_items_that_are_there(tmp_path: 
     write(responses.assign(request_key="of an earlier question"))()
     remedied(
         lambda: wanted_ballots(workspace, panel, CELL),
-        "is of an earlier question, clip or setting; materialize responses for this cell first",
+        "judging.panel.wanted_ballots",
         lambda: answered_study(tmp_path, ANSWERS),
     )
     whole = workspace.tables.read(RESPONSES, CELL.partition)
     workspace.tables.write(ITEMS, {"dataset": "chaotic"}, items.iloc[1:], {})
     remedied(
         lambda: list(judged_answers(workspace, RESPONSES, CELL)),
-        "item {} is no longer in items {}; materialize {} for {}",
+        "judging.panel.judged_answers",
         write(whole[whole["item_id"] != items["item_id"][0]]),
     )
 
@@ -79,7 +78,7 @@ def test_verdicts_are_made_once_all_votes_are_there(tmp_path: Path) -> None:
         ]
         return decide(items, answers, workspace.tables.read(VOTES, CELL.partition))
 
-    assert len(remedied(verdicts, "judging/verdicts.py | {} {}: {}; materialize {} for {}", voted)) == 4
+    assert len(remedied(verdicts, "judging.verdicts._refuse", voted)) == 4
 
 
 @pytest.mark.slow  # asks a server
@@ -97,7 +96,7 @@ def test_the_judges_that_failed_alone_are_asked_again(
 
     remedied(
         call,
-        "calls to the judges failed; run the same command again: only they are asked",
+        "judging.robustness.check_panel.<locals>.finish",
         lambda: provider.configure(fault_by_model={}),
     )
 
@@ -114,17 +113,17 @@ def test_a_sheet_is_written_once_there_are_labels_of_these_answers(tmp_path: Pat
     (tmp_path / "labels.csv").write_text(f"{HEAD}\n")
     remedied(
         lambda: command("confabulation", "sheet", sheet, *at),
-        "no labelled failure of {}; run the study first",
+        "judging.validation.sheet_rows",
         lambda: workspace.tables.write(CONFABULATION, {}, labels, {}),
     )
     remedied(
         lambda: command("confabulation", "sheet", sheet, *at),
-        "exists already and may hold labels; give another name, or delete it",
+        "judging.validation.write_sheet",
         again=lambda: command("confabulation", "sheet", tmp_path / "other.csv", *at),
     )
     remedied(
         lambda: write_sheet(annotation_sheet(workspace), sheet),
-        "exists already and may hold labels; give another name, or delete it",
+        "judging.validation.write_sheet",
         sheet.unlink,
     )
     cell = Cell("chaotic", Evaluation(MODEL, "standard", 1))
@@ -132,7 +131,7 @@ def test_a_sheet_is_written_once_there_are_labels_of_these_answers(tmp_path: Pat
     workspace.tables.write(RESPONSES, cell.partition, answers.assign(text="Right."), {})
     remedied(
         lambda: annotation_sheet(workspace),
-        "are of earlier answers (of {}, for one); materialize confabulation, then write the sheet again",
+        "judging.validation._sheet_row",
         lambda: labelled_study(root, ["Right."]),
     )
 
@@ -143,7 +142,7 @@ def test_labels_of_people_are_read_and_compared_once_they_are_as_told(tmp_path: 
         written(tmp_path, HEAD, *GOOD[:3], "bob,s2,1,0,2,1")
         remedied(
             lambda: read_labels(path, ["s1", "s2"]),
-            "{} is {}; write 1 or 0, true or false, yes or no",
+            "judging.validation._refuse",
             lambda right=right: written(tmp_path, HEAD, *GOOD[:3], f"bob,s2,1,0,{right},1"),
         )
     workspace = labelled_study(tmp_path / "study", ["It goes left."])
@@ -153,7 +152,7 @@ def test_labels_of_people_are_read_and_compared_once_they_are_as_told(tmp_path: 
     workspace.tables.write(CONFABULATION, {}, [], {})
     remedied(
         lambda: command("confabulation", "validate", path, "--workspace", workspace.root),
-        "the study has no labelled failure to compare with; run it first",
+        "judging.validation.validate",
         lambda: workspace.tables.write(CONFABULATION, {}, labels, {}),
     )
 
@@ -171,14 +170,14 @@ def test_labels_are_read_once_their_file_is_restored_and_the_database_is_made_fr
     path.write_bytes(path.read_bytes().replace(b'"u1"', b'"u9"', 1))
     lines = remedied(
         lambda: label_lines(tmp_path),
-        "judging/labels.py | {}:{}: is {}; restore the file from a copy",
+        "judging.labels.label_lines",
         lambda: shutil.copy(kept, path),
     )
     assert [line.unit for line in lines] == ["u1", "u2"]
     path.write_bytes(path.read_bytes() + b"nonsense\n")
     remedied(
         lambda: LabelStore(tmp_path),
-        "its last line is no label ({}); restore the file from a copy",
+        "explorer.labelstore._last_seq",
         lambda: shutil.copy(kept, path),
     )
     for name in (f"{DATABASE}-wal", f"{DATABASE}-shm"):
@@ -186,14 +185,7 @@ def test_labels_are_read_once_their_file_is_restored_and_the_database_is_made_fr
     (tmp_path / DATABASE).write_bytes(b"nonsense" * 1000)
     again = remedied(
         lambda: LabelStore(tmp_path),
-        "every confirmed label is in {}: move the database away, and it is made again from there",
+        "explorer.labelstore.LabelStore._database",
         lambda: (tmp_path / DATABASE).rename(tmp_path / "away"),
     )
     assert again.labelled("jd", "abstention") == ["u1", "u2"]
-
-
-def test_a_task_that_is_chosen_from_those_that_are_named_is_known() -> None:
-    for task in TASKS:
-        remedied(
-            lambda: require_task("none"), "no task of this name; choose from {}", again=lambda t=task: require_task(t)
-        )

@@ -9,7 +9,7 @@ import pytest
 from tests.base.test_webguard import PEOPLE, ask
 from tests.conftest import KEY
 from tests.providers.server import Provider
-from tests.remedies.remedied import carries_out, remedied
+from tests.remedies.remedied import remedied
 from tests.study.test_live_check import NAME, Check, check
 from traps_pipeline.base.webguard import public_name, token_for
 
@@ -17,7 +17,6 @@ __all__ = ["check"]  # the fixture
 
 
 @pytest.mark.slow
-@carries_out("nothing answers at {} ({}): start the server there, or mend its `base_url`")
 def test_an_address_that_is_mended_is_answered(check: Check) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -28,7 +27,6 @@ def test_an_address_that_is_mended_is_answered(check: Check) -> None:
 
 
 @pytest.mark.slow
-@carries_out("{}, and answers to that name: make sure that it is the model that you mean")
 def test_a_name_that_is_listed_is_the_model_that_is_meant(check: Check, provider: Provider) -> None:
     provider.configure(served=["an-example"])
     assert "make sure that it is the model that you mean" in check().notes[0]
@@ -37,7 +35,6 @@ def test_a_name_that_is_listed_is_the_model_that_is_meant(check: Check, provider
 
 
 @pytest.mark.slow
-@carries_out("the key in {} is not accepted{}: export the right one", "a key is wanted{}: name its variable as `key`")
 def test_a_right_key_is_accepted(check: Check, provider: Provider, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRAPS_TEST_WRONG_KEY", "sk-wrong")
     provider.configure(fault_by_model={NAME: "unauthorized"})
@@ -50,9 +47,6 @@ def test_a_right_key_is_accepted(check: Check, provider: Provider, monkeypatch: 
 
 
 @pytest.mark.slow
-@carries_out(
-    "it ignores the schema (its answer in the JSON regime is no such object): say `json_schema: false` and why"
-)
 def test_a_model_without_a_schema_says_so_in_its_entry(check: Check, provider: Provider) -> None:
     provider.configure(scripts={NAME: {"": "red and then blue"}})
     (problem,) = check().problems
@@ -62,7 +56,6 @@ def test_a_model_without_a_schema_says_so_in_its_entry(check: Check, provider: P
 
 
 @pytest.mark.slow
-@carries_out("it refuses structured output ({}): say `json_schema: false` and why under waivers")
 def test_a_model_that_refuses_a_schema_is_asked_without_one(check: Check, provider: Provider) -> None:
     provider.configure(unstructured=[NAME])
     (problem,) = check().problems
@@ -72,7 +65,6 @@ def test_a_model_that_refuses_a_schema_is_asked_without_one(check: Check, provid
 
 
 @pytest.mark.slow
-@carries_out("it thinks between <think> tags in its answer: say `inline_thinking: true` in its entry")
 def test_a_model_that_thinks_in_its_answer_says_so_in_its_entry(check: Check, provider: Provider) -> None:
     said = '<think>red, then blue</think>{"reason": "seen", "final_answer": "red and blue"}'
     provider.configure(scripts={NAME: {"": said}})
@@ -84,10 +76,6 @@ def test_a_model_that_thinks_in_its_answer_says_so_in_its_entry(check: Check, pr
 # --- servers of pages -------------------------------------------------------------------------------------------------
 
 
-@carries_out(
-    "open the address that `{}` printed: the token in it lets this browser in",
-    "this is not the name of this server: open the address that `{}` printed",
-)
 def test_the_address_that_was_printed_lets_a_browser_in() -> None:
     status, text, _ = ask()
     assert status == 403 and "open the address that `make ui` printed" in text
@@ -106,7 +94,7 @@ def test_a_server_listens_beyond_this_machine_with_a_token_of_ones_own() -> None
     for host, token in (("0.0.0.0", mine), ("127.0.0.1", None)):
         found = remedied(
             lambda: listen("0.0.0.0"),
-            "give a token of your own (--token, or {}), and put a server that speaks HTTPS before it",
+            "base.webguard.token_for",
             again=lambda host=host, token=token: listen(host, token),
         )
         assert found == mine if token else len(found) > 20
@@ -115,7 +103,7 @@ def test_a_server_listens_beyond_this_machine_with_a_token_of_ones_own() -> None
 def test_a_server_behind_another_one_is_given_its_address() -> None:
     name = remedied(
         lambda: public_name("labels.example.org"),
-        "--behind {}: give the address of the server with HTTPS, as https://labels.example.org",
+        "base.webguard.public_name",
         again=lambda: public_name("https://labels.example.org"),
     )
     assert name == "labels.example.org"

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from tests.remedies.remedied import carries_out, command, remedied
+from tests.remedies.remedied import command, remedied
 from traps_pipeline.models import own, prompts
 from traps_pipeline.models.local.settings import LocalParams
 from traps_pipeline.models.reading import read_answer
@@ -53,57 +53,57 @@ models:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence", "right"),
+    ("wrong", "by", "right"),
     [
-        (MINE.replace("    media: images\n", ""), "media: say what your server takes of a clip: `images`", MINE),
+        (MINE.replace("    media: images\n", ""), "base.yamlfile.within", MINE),
         (
             MINE.replace("    media: images\n", ""),
-            "or `video` (the clip as one mp4 in video_url",
+            "base.yamlfile.within",
             MINE.replace("images", "video"),
         ),
         (
             PUBLIC.replace("media: images", "media: images\n    params: {temperature: 0}"),
-            "params.{} {}, the protocol has {}: send that, or say why under waivers",
+            "base.yamlfile.within",
             PUBLIC.replace("media: images", "media: images\n    params: {temperature: 0.8}"),
         ),
         (
             PUBLIC.replace("media: images", "media: images\n    params: {temperature: 0}"),
-            "params.{} {}, the protocol has {}: send that, or say why under waivers",
+            "base.yamlfile.within",
             PUBLIC.replace("media: images", "media: images\n    params: {temperature: 0}")
             + "    waivers: {temperature: the server has no other}\n",
         ),
         (
             PUBLIC + "    waivers: {temperature: none}\n",
-            "waivers.{}: is sent as the protocol has it; remove the waiver",
+            "base.yamlfile.within",
             PUBLIC,
         ),
         (
             PUBLIC.replace("media: images", "media: {profile: images, fps: 2, most: 10}"),
-            "media: the protocol has fps 5, most 25: send that, or say why under waivers",
+            "base.yamlfile.within",
             PUBLIC.replace("media: images", "media: {profile: images, fps: 5, most: 25}"),
         ),
         (
             WHOLE,
-            "; add one under `accounts:` of {} or of the experiment",
+            "base.yamlfile.within",
             WHOLE + "accounts: {mine: {base_url: 'https://example.org/v1'}}\n",
         ),
         (
             MINE + "scenarios: [plinko-0001]\nper_family: 2\n",
-            "give scenarios or per_family, not both",
+            "base.yamlfile.parse_yaml_model",
             MINE + "per_family: 2\n",
         ),
         (
             MINE + "datasets: [schema_answer]\nregimes: [json]\n",
-            "datasets {} ask for an object of their own, and so does the regime json: leave one of them out",
+            "base.yamlfile.parse_yaml_model",
             MINE + "datasets: [schema_answer]\nregimes: [standard]\n",
         ),
-        (MINE + "regimes: [polite]\n", "study/experiment.py | {} given; choose from {}", MINE + "regimes: [guided]\n"),
+        (MINE + "regimes: [polite]\n", "base.yamlfile.parse_yaml_model", MINE + "regimes: [guided]\n"),
     ],
 )
-def test_an_experiment_is_read_once_it_is_as_told(tmp_path: Path, wrong: str, sentence: str, right: str) -> None:
+def test_an_experiment_is_read_once_it_is_as_told(tmp_path: Path, wrong: str, by: str, right: str) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(wrong)
-    assert remedied(lambda: load_experiment(str(path)), sentence, lambda: path.write_text(right)).models == ["my-model"]
+    assert remedied(lambda: load_experiment(str(path)), by, lambda: path.write_text(right)).models == ["my-model"]
 
 
 def test_an_experiment_that_is_not_there_is_named_by_its_path_or_a_known_name(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_an_experiment_that_is_not_there_is_named_by_its_path_or_a_known_name(tm
     for known in ("demo", str(path)):
         remedied(
             lambda: load_experiment("mine"),
-            "is not there; known: {}, or give the path of a YAML file",
+            "study.experiment.load_experiment",
             again=lambda known=known: load_experiment(known),
         )
 
@@ -125,23 +125,23 @@ def test_a_panel_is_named_in_one_place(tmp_path: Path) -> None:
     one = experiment(tmp_path, panel="paper")
     remedied(
         lambda: one.judged(None, "rules"),
-        "--panel {}: experiment {} names the panel {}; edit one of them",
+        "study.experiment.Experiment.judged",
         again=lambda: experiment(tmp_path, panel="rules").judged(None, "rules"),
     )
     judged = Study(panel="rules")
     remedied(
         lambda: one.judged(judged, None),
-        "study.yaml: panel is {}, experiment {} has {}; edit one of them",
+        "study.experiment.Experiment.judged",
         again=lambda: one.judged(Study(panel="paper"), None),
     )
     remedied(
         lambda: one.check_study(judged, tmp_path),
-        "study/experiment.py | {}: {} is {}, experiment {} has {}; edit one of them",
+        "study.experiment.Experiment.check_study",
         again=lambda: one.check_study(Study(panel="paper"), tmp_path),
     )
     remedied(
         lambda: experiment(tmp_path).judged(None, None),
-        "write `panel: NAME` into the experiment, or say --panel NAME",
+        "models.judges.load_panel",
         again=lambda: experiment(tmp_path).judged(None, "rules"),
     )
 
@@ -150,7 +150,7 @@ def test_rules_judge_other_models_where_somebody_says_so() -> None:
     asks = Experiment.model_validate({"name": "one", "models": ["gpt-5-mini"], "panel": "rules"})
     remedied(
         lambda: asks.judged(None, None),
-        "name a panel of language models, or say --judged-by-rules (`judged_by_rules: true` in the experiment)",
+        "models.judges.require_panel",
         again=lambda: asks.judged(None, None, judged_by_rules=True),
     )
     other = asks.model_copy(update={"panel": "paper"})
@@ -164,7 +164,7 @@ def test_two_mechanism_sections_are_made_one(tmp_path: Path) -> None:
     for right in (paper.mechanism, None):
         remedied(
             lambda: paper.check_study(paper.study.model_copy(update={"mechanism": other}), tmp_path),
-            "edit one of them, or remove it from study.yaml to use the experiment's",
+            "study.experiment.Experiment.check_study",
             again=lambda right=right: paper.check_study(paper.study.model_copy(update={"mechanism": right}), tmp_path),
         )
 
@@ -172,7 +172,7 @@ def test_two_mechanism_sections_are_made_one(tmp_path: Path) -> None:
 def test_a_greedy_model_has_no_temperature() -> None:
     remedied(
         lambda: LocalParams.model_validate(LOCAL | {"temperature": 0.8}),
-        "do_sample: false is greedy, and {} has no effect; leave it out",
+        "LocalParams",
         again=lambda: LocalParams.model_validate(LOCAL),
         error=ValidationError,
     )
@@ -183,7 +183,7 @@ def test_a_key_that_is_exported_is_found(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.delenv("TRAPS_TEST_SOME_KEY", raising=False)
     found = remedied(
         account.secret,
-        "{} is not set; export the key, or leave the models that need it out",
+        "models.registry.Account.secret",
         lambda: monkeypatch.setenv("TRAPS_TEST_SOME_KEY", "sk"),
     )
     assert found == "sk"
@@ -202,14 +202,11 @@ def test_a_prompt_is_read_once_it_is_restored(
         shutil.copy(prompts.ASSETS / "prompts" / "json_suffix.txt", copy)
 
     if (copy / "json_suffix.txt").exists():
-        assert remedied(lambda: read("json_suffix"), "is empty; restore it from git", restored)
+        assert remedied(lambda: read("json_suffix"), "models.prompts.prompt", restored)
     else:
-        assert remedied(
-            lambda: read("json_suffix"), "models/prompts.py | {}: cannot be read ({}); restore it from git", restored
-        )
+        assert remedied(lambda: read("json_suffix"), "models.prompts.prompt", restored)
 
 
-@carries_out("thinks between tags in its text; say `inline_thinking: true` in its entry")
 def test_a_model_that_thinks_in_its_answer_is_read_once_its_entry_says_so() -> None:
     row = {"outcome": "answer", "text": "<think>red, then blue</think>The blue one."}
     told = read_answer(row, None, "standard", inline_thinking=False).why
@@ -224,14 +221,14 @@ def test_a_workspace_is_there_once_it_is_made_or_named(tmp_path: Path, monkeypat
     root = tmp_path / "study"
     made = remedied(
         lambda: Workspace.open(root),
-        "no such workspace; make one with `traps init` or `traps run demo`, or set {}",
+        "storage.workspace.Workspace.open",
         lambda: command("init", "demo", "--workspace", root),
     )
     assert made.study.panel == "rules"
     monkeypatch.setenv(VARIABLE, str(tmp_path / "other"))
     remedied(
         Workspace.open,
-        "make one with `traps init` or `traps run demo`, or set {}",
+        "storage.workspace.Workspace.open",
         lambda: monkeypatch.setenv(VARIABLE, str(root)),
     )
 
@@ -240,7 +237,7 @@ def test_another_benchmark_gets_another_folder(tmp_path: Path) -> None:
     Workspace.create(tmp_path / "one", Study())
     remedied(
         lambda: Workspace.create(tmp_path / "one", Study(per_family=2)),
-        "a workspace keeps its benchmark: choose another folder with {} or --workspace",
+        "storage.workspace.Workspace.create",
         again=lambda: Workspace.create(tmp_path / "two", Study(per_family=2)),
     )
 
@@ -259,7 +256,7 @@ def test_a_study_of_another_format_goes_on_in_a_new_workspace_with_its_ledger(tm
 
     new = remedied(
         lambda: Workspace.open(old.root),
-        "or start a new workspace (its ledger folder can be copied over: answers keep their keys)",
+        "storage.workspace.Workspace.open",
         again=anew,
     )
     assert list(new.answers.read("m__standard__run1").rows) == ["k"]
@@ -270,6 +267,6 @@ def test_a_study_asks_inside_models_once_an_experiment_does(tmp_path: Path) -> N
     paper = load_experiment("mechanism")
     remedied(
         lambda: Workspace.open(root).mechanism,
-        "asks nothing inside models; run an experiment with a `mechanism:` section",
+        "storage.workspace.Workspace.mechanism",
         lambda: Workspace.open(root).allow(mechanism=paper.mechanism),
     )

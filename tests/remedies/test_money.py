@@ -32,13 +32,13 @@ PRICES = Prices(input=2, output=10, as_of=datetime.date(2026, 11, 1))
 def test_a_paid_model_is_asked_once_there_is_a_budget_or_a_price() -> None:
     remedied(
         lambda: check_money(Study(), priced(PRICES)),
-        "costs money and the study has no budget: set one (--budget-usd, or budget_usd in study.yaml)",
+        "models.budget.check_money",
         again=lambda: check_money(Study(budget_usd=1), priced(PRICES)),
     )
     for study, entry in ((Study(budget_usd=1), priced(PRICES)), (Study(allow_unknown_prices=True), priced(None))):
         remedied(
             lambda: check_money(Study(budget_usd=1), priced(None)),
-            "the price of {} is unknown: give it prices in the registry, or accept that nothing bounds it",
+            "models.budget.check_money",
             again=lambda study=study, entry=entry: check_money(study, entry),
         )
 
@@ -50,7 +50,7 @@ def spend(budget: Budget, dollars: float) -> None:
 def test_a_budget_that_is_raised_leaves_room_for_the_call() -> None:
     remedied(
         lambda: spend(Budget(1.0, {}, {}, None), 2.0),
-        "the next call may cost ${}. Raise it (--budget-usd, or study.yaml) and run the same command to go on",
+        "models.budget.Budget._fits",
         again=lambda: spend(Budget(3.0, {}, {}, None), 2.0),
         error=BudgetReached,
     )
@@ -76,16 +76,16 @@ def test_an_account_has_room_once_its_budget_is_raised_its_file_written_or_its_n
     def corrected(old: str, new: str) -> Callable[[], int]:
         return lambda: file.write_text(file.read_text().replace(old, new))
 
-    refused(call, "no account of assets/models.yaml; correct the name, or remove its line")
+    refused(call, "models.spending._check_names")
     corrected("opnai", "openai")()
-    refused(call, "nor a judge of assets/judges.yaml; correct the name, or remove its line")
+    refused(call, "models.spending._check_names")
     corrected("gpt-5-mni", "gpt-5-mini")()
-    refused(call, "no such file; write `usd: 100` (dollars that all studies together may spend")
+    refused(call, "models.account_budget.AccountBudget.__init__")
     folder.mkdir()
     (folder / "budget.yaml").write_text("usd: 1")
     remedied(
         call,
-        "the next call may cost ${}. Raise `usd` in {} and run the same command to go on",
+        "models.budget.Budget._fits_account",
         lambda: (folder / "budget.yaml").write_text("usd: 100"),
         error=BudgetReached,
     )
@@ -96,7 +96,7 @@ def test_an_account_without_its_file_is_left_out_as_told(tmp_path: Path) -> None
     workspace = Workspace.create(tmp_path / "study", Study(budget_usd=50, account_budgets={"openai": str(folder)}))
     remedied(
         paid(workspace.root),
-        "into it, or remove {} from account_budgets in study.yaml",
+        "models.account_budget.AccountBudget.__init__",
         lambda: workspace.allow(account_budgets={}),
     )
 
@@ -109,7 +109,7 @@ def test_a_file_of_spending_that_is_removed_is_filled_again(tmp_path: Path) -> N
     path.write_bytes(path.read_bytes().replace(b"1.0", b"0.1"))
     remedied(
         lambda: AccountBudget("openai", tmp_path, "b"),
-        "compare the provider's bill, then remove the file: every study that names it adds its own spending again",
+        "models.account_budget.AccountBudget._catch_up",
         path.unlink,
     )
     running.begin(known_usd=1.0)
@@ -122,7 +122,7 @@ def test_an_account_whose_file_cannot_be_read_is_read_once_that_is_mended(tmp_pa
     path.mkdir()
     remedied(
         lambda: AccountBudget("openai", tmp_path, "b"),
-        "cannot be read or written ({}); {} and run the same command again: nothing is sent through an account",
+        "models.account_budget.AccountBudget._held",
         path.rmdir,
     )
 
@@ -136,9 +136,7 @@ def test_a_journal_on_a_full_disk_is_written_once_there_is_space(tiny_disk: Path
         for _ in range(100):
             journal.add("m", 0.5)
 
-    remedied(
-        add_many, "models/budget.py | {}: cannot be written ({}); {} and run the same command again", filler.unlink
-    )
+    remedied(add_many, "models.budget.Journal.add", filler.unlink)
     journal.close()
 
 
@@ -147,7 +145,7 @@ def test_connections_that_a_shell_does_not_allow_are_lowered() -> None:
     try:
         remedied(
             lambda: allow_connections(hard),
-            "raise that (`ulimit -n {}`), or lower limits.concurrency of the models that are asked; nothing was sent",
+            "models.participants.allow_connections",
             again=lambda: allow_connections(24),
         )
     finally:
@@ -164,7 +162,7 @@ def test_a_stopped_model_is_asked_by_the_same_command_once_the_cause_is_mended()
 
     remedied(
         lambda: run("error"),
-        "its answers so far are kept. Mend the cause and run the same command again: only what is missing is asked",
+        "models.traffic.Breaker._stop",
         again=lambda: run("answer"),
         error=Stopped,
     )

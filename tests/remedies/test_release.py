@@ -9,7 +9,7 @@ import pytest
 
 from tests.conftest import Checkout
 from tests.release.test_commitment import committed
-from tests.remedies.remedied import carries_out, command, remedied
+from tests.remedies.remedied import command, remedied
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.release.checksums import CHECKSUMS, read_checksums
 from traps_pipeline.release.commitment import commit, read_commitment
@@ -51,24 +51,24 @@ def test_a_release_is_written_to_an_empty_a_new_or_a_deleted_folder(workspace: W
     for other in (tmp_path / "empty", tmp_path / "new"):
         remedied(
             lambda: write_release(content, folder, Options()),
-            "holds other files, or what a stopped release left; give an empty or a new folder, or delete it",
+            "release.folder.write_release",
             again=lambda other=other: write_release(content, other, Options()),
         )
     remedied(
         lambda: write_release(content, folder, Options()),
-        "give an empty or a new folder, or delete it",
+        "release.folder.write_release",
         lambda: shutil.rmtree(folder),
     )
     assert (folder / CHECKSUMS).is_file()
     (folder / "letter.txt").write_text("mine")
     remedied(
         lambda: write_release(content, folder, Options()),
-        "is no file of the release there; move it away",
+        "release.folder._clear",
         lambda: (folder / "letter.txt").rename(tmp_path / "letter.txt"),
     )
     remedied(
         lambda: write_release(content, folder, Options(held_out=folder / "key")),
-        "lies in the folder that is published; keep the key elsewhere",  # and the former release is still there
+        "release.folder.write_release",  # and the former release is still there
         again=lambda: write_release(content, folder, Options(held_out=tmp_path / "key")),
     )
 
@@ -78,7 +78,7 @@ def test_a_pair_is_released_once_both_sides_are_there_and_an_arm_that_is_left_ou
 ) -> None:
     remedied(
         lambda: content_of(workspace, ["decoy"]),
-        "Name it among the datasets of an experiment and run that, or leave it out",
+        "release.content.content_of",
         again=lambda: content_of(workspace),
     )
     root = tmp_path / "study"
@@ -88,7 +88,7 @@ def test_a_pair_is_released_once_both_sides_are_there_and_an_arm_that_is_left_ou
     own.tables.write(ITEMS, partition, whole.iloc[1:], {})
     remedied(
         lambda: pair_rows(content_of(own)),
-        "{}: only its {} is there; make items again",
+        "release.content.pair_rows",
         lambda: own.tables.write(ITEMS, partition, whole, {}),
     )
 
@@ -97,7 +97,7 @@ def test_a_harness_is_written_to_an_empty_folder(release: Path, tmp_path: Path) 
     (tmp_path / "letter.txt").write_text("mine")
     count = remedied(
         lambda: write_harness(release, tmp_path),
-        "release/harness/write.py | {}: holds other files; give an empty or a new folder",
+        "release.harness.write.write_harness",
         again=lambda: write_harness(release, tmp_path / "new"),
     )
     assert count > 0
@@ -106,12 +106,12 @@ def test_a_harness_is_written_to_an_empty_folder(release: Path, tmp_path: Path) 
 def test_what_traps_release_wrote_is_verified(release: Path, tmp_path: Path) -> None:
     remedied(
         lambda: read_checksums(tmp_path),
-        "cannot be read ({}); give the folder that `traps release` wrote",
+        "release.checksums.read_checksums",
         again=lambda: read_checksums(release),
     )
     remedied(
         lambda: command("verify", tmp_path),
-        "give the folder that `traps release` wrote",
+        "release.checksums.read_checksums",
         again=lambda: command("verify", release),
     )
 
@@ -120,7 +120,7 @@ def test_a_release_has_a_date_that_is_one(small: Checkout, tmp_path: Path) -> No
     said = ["release", tmp_path / "out", "--workspace", small.workspace, "--date"]
     remedied(
         lambda: command(*said, "22.11.2026"),
-        "--date {}: is no date; write it as YYYY-MM-DD",
+        "cli.release._date",
         again=lambda: command(*said, "2026-11-22"),
     )
 
@@ -130,7 +130,7 @@ def test_results_are_of_a_repository_and_of_models_that_were_run(
 ) -> None:
     remedied(
         lambda: write_results(workspace, tmp_path / "out", "traps", Who()),
-        "--dataset {}: is no repository of the hub; write it as OWNER/NAME",
+        "release.results.write_results",
         again=lambda: write_results(workspace, tmp_path / "out", "me/traps", Who()),
     )
     root = tmp_path / "study"
@@ -139,25 +139,24 @@ def test_results_are_of_a_repository_and_of_models_that_were_run(
     aside = board.rename(tmp_path / "aside")
     remedied(
         lambda: write_results(Workspace.open(root), tmp_path / "out", "me/traps", Who()),
-        "no model has all four datasets yet; run the experiment first",
+        "release.results.write_results",
         lambda: aside.rename(board),
     )
     assert len(workspace.tables.read_all(LEADERBOARD))
 
 
-@carries_out("items and clips against a release: name its folder with --release")
 def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     workspace: Workspace, small: Checkout, release: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "small.zip"
     remedied(
         lambda: pack(workspace, path, "Small Study"),
-        "--name {}: {}; use lower-case letters, digits, - and .",
+        "release.submission.pack",
         again=lambda: pack(workspace, path, "small-study-1.0"),
     )
     submission = remedied(
         lambda: read_submission(tmp_path / "none.zip"),
-        "release/submission.py | {}: cannot be read ({}); name a file that `traps submit` wrote",
+        "release.submission.read_submission",
         again=lambda: read_submission(path),
     )
     told = "items and clips against a release: name its folder with --release"
@@ -165,7 +164,7 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     assert told not in verify(submission, release).unchecked
     remedied(
         lambda: command("verify", path, "--key", tmp_path / "key.pub"),
-        "--key: only folders are signed, and {} is none; leave it out",
+        "cli.release.verify",
         again=lambda: command("verify", path),
     )
     root = tmp_path / "study"
@@ -174,7 +173,7 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     aside = votes.rename(tmp_path / "aside")
     remedied(
         lambda: pack(Workspace.open(root), path, "small"),
-        "{}: has no {}; run it first: traps run EXPERIMENT",
+        "release.submission.pack",
         lambda: aside.rename(votes),
     )
 
@@ -183,23 +182,23 @@ def test_a_commitment_is_made_of_one_draw_into_files_that_are_not_there(committe
     copy = Path(shutil.copytree(committed, tmp_path / "copy"))
     remedied(
         lambda: commit(copy / "private", copy / "commitment.json", tmp_path / "reveal.json"),
-        "is there already, and a commitment is made once; name another file",
+        "release.commitment.commit",
         again=lambda: commit(copy / "private", tmp_path / "commitment.json", tmp_path / "reveal.json"),
     )
     remedied(
         lambda: read_commitment(tmp_path / "none.json"),
-        "release/commitment.py | cannot be read ({}); name a file of `traps commit`",
+        "release.commitment._read",
         again=lambda: read_commitment(tmp_path / "commitment.json"),
     )
     (copy / "private" / "released" / "draws.json").unlink()
     remedied(
         lambda: commit(copy / "private", tmp_path / "c.json", tmp_path / "r.json"),
-        "is not one draw of one seed; draw one with `traps sample` into a new folder",
+        "release.commitment.commit",
         again=lambda: commit(committed / "private", tmp_path / "c.json", tmp_path / "r.json"),
     )
     files = [copy / "commitment.json", copy / "reveal.json"]
     remedied(
         lambda: command("verify-commitment", *files, "--without-drawing"),
-        "--without-drawing: leaves nothing to look at; name the revealed benchmark with --specs",
+        "cli.release.verify_commitment",
         again=lambda: command("verify-commitment", *files, "--without-drawing", "--specs", committed / "private"),
     )

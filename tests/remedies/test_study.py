@@ -43,39 +43,33 @@ def test_once_a_study_was_run_all_that_wanted_its_tables_has_them(small: Checkou
     experiment = load_experiment(str(study.root / EXPERIMENT))
     cards = {**{name: partial(make, workspace) for name, make in FILES.items()}}
     again: list[Callable[[], Any]] = [
-        refused(
-            lambda: build_items(workspace, "occlusion"), "no scene_specs yet; materialize scene_specs and videos first"
-        ),
-        refused(
-            lambda: wanted_questions(workspace, CELL), "not made yet; materialize scene_specs, videos and items first"
-        ),
-        refused(cards["sheet"], "contact_sheet: no items yet; materialize items first"),
-        refused(cards["gallery"], "gallery: no clips yet; materialize videos first"),
-        refused(cards["shortcuts"], "shortcuts: no items yet; materialize items first"),
+        refused(lambda: build_items(workspace, "occlusion"), "benchmark.items.build_items"),
+        refused(lambda: wanted_questions(workspace, CELL), "models.answers.wanted_questions"),
+        refused(cards["sheet"], "defs.report._sheet"),
+        refused(cards["gallery"], "defs.report._gallery"),
+        refused(cards["shortcuts"], "defs.report._shortcuts"),
         refused(
             lambda: scoring._make_metrics(workspace, "occlusion"),
-            "no verdicts yet; materialize verdicts for a cell of this dataset first",
+            "defs.scoring._make_metrics",
         ),
-        refused(
-            lambda: scoring._scored(workspace, "contrasts"), "no metrics yet; materialize metrics for a dataset first"
-        ),
+        refused(lambda: scoring._scored(workspace, "contrasts"), "defs.scoring._scored"),
         refused(
             lambda: scoring._make_robust(workspace, None),
-            "robust: no verdicts yet; materialize verdicts for a cell first",
+            "defs.scoring._make_robust",
         ),
-        refused(lambda: judging._votes(workspace, "agreement"), "no votes yet; materialize votes for a cell first"),
-        refused(lambda: Annotation(workspace), "has no clips yet; run `traps run EXPERIMENT` in it first"),
-        refused(lambda: study_items(workspace), "has no items yet; run `traps run EXPERIMENT` in it first"),
-        refused(lambda: Review(workspace, "jd").specs, "has no scenes yet; run `traps run EXPERIMENT` in it first"),
-        refused(lambda: canary_items(workspace), "canary: no items yet; materialize items first"),
+        refused(lambda: judging._votes(workspace, "agreement"), "defs.judging._votes"),
+        refused(lambda: Annotation(workspace), "explorer.annotate.Annotation.__init__"),
+        refused(lambda: study_items(workspace), "explorer.answers.study_items"),
+        refused(lambda: Review(workspace, "jd").specs, "explorer.review.Review.specs"),
+        refused(lambda: canary_items(workspace), "study.canary.canary_items"),
         refused(
             lambda: export_requests(workspace, experiment, tmp_path / "out"),
-            "no items yet; materialize scene_specs, videos and items first",
+            "study.exchange._cells",
         ),
-        refused(lambda: content_of(workspace), "no pairs to release; make items first (traps run ... --until items)"),
+        refused(lambda: content_of(workspace), "release.content.content_of"),
         refused(
             may_be_made(workspace, "verdicts"),
-            "is not made; materialize {} for this partition first",
+            "",
             error=AssertionError,
         ),
     ]
@@ -99,16 +93,16 @@ def damaged(workspace: Workspace, experiment: Experiment) -> list[Callable[[], A
     calls = [
         refused(
             lambda: list(exchange._wanted_votes(workspace, experiment)),
-            "no answers yet; make responses first (traps run ... --until responses)",
+            "study.exchange._wanted_votes",
         ),
         refused(
             lambda: build_items(workspace, "occlusion"),
-            "is not the clip that was rendered ({} of {} bytes; truncated or altered); delete it and run again: it is",
+            "benchmark.items._check_clips",
         ),
-        refused(lambda: content_of(workspace), "is missing or not the clip of its item; materialize videos again"),
+        refused(lambda: content_of(workspace), "release.content.content_of"),
         refused(
             lambda: read_clip(note.with_suffix(".mp4")),
-            "scenes/clips.py | is not what was written ({}); delete it and run again",
+            "scenes.clips.read_note",
             error=DamagedClip,
         ),
     ]
@@ -117,7 +111,7 @@ def damaged(workspace: Workspace, experiment: Experiment) -> list[Callable[[], A
     items = workspace.tables.path(ITEMS, {"dataset": "occlusion"})
     items.write_bytes(items.read_bytes()[:-200])
     made = may_be_made(workspace, "responses")
-    return [*calls, refused(made, "is damaged: {}; materialize {} for it again", error=AssertionError)]
+    return [*calls, refused(made, "", error=AssertionError)]
 
 
 FILES = {"sheet": report._sheet, "gallery": report._gallery, "shortcuts": report._shortcuts}

@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 from matplotlib.image import imread
 
+from tests.build.cells import row
 from tests.conftest import ROOT
-from tests.report.test_items import row
 from tests.report.test_report import board_of, board_row
 from tests.report.test_writing import latex_cells
 from traps_pipeline.base.partitions import DATASETS

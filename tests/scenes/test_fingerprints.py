@@ -1,6 +1,6 @@
 """Every family still gives, bit for bit, the worlds, draws, words and answers that were frozen for it.
 
-The observers, which need rendered clips, are slow tests. One family alone:
+One family alone:
 `pytest tests/scenes/test_fingerprints.py -k "bounce-"`.
 """
 
@@ -11,12 +11,16 @@ import pytest
 from tests.scenes import fingerprints
 from traps_pipeline.scenes.registry import family_names
 
+pytestmark = pytest.mark.slow
 FROZEN = fingerprints.frozen()
 HERE = fingerprints.versions()
+LIBRARIES = ("mujoco", "numpy", "machine")
+# On a machine whose elementary functions differ in the last bit, one family's compiled model does too.
+ROUNDED = {"launch": {"model"}} if FROZEN["versions"]["arithmetic"] != HERE["arithmetic"] else {}
 
-same_arithmetic = pytest.mark.skipif(
-    FROZEN["versions"] != HERE,
-    reason=f"digests were frozen with {FROZEN['versions']}, here it is {HERE}: their last bits differ",
+same_libraries = pytest.mark.skipif(
+    any(FROZEN["versions"][name] != HERE[name] for name in LIBRARIES),
+    reason=f"digests were frozen with {FROZEN['versions']}, here it is {HERE}",
 )
 families = pytest.mark.parametrize("name", sorted(FROZEN["families"]), ids=lambda name: f"{name}-")
 
@@ -29,9 +33,10 @@ def differing(name: str, records: list[str]) -> list[str]:
             FROZEN["families"][name]["records"][scenario_id].split(),
             fingerprints.of_record(scenario_id).split(),
         )
-        parts = [part for part, a, b in zip(("model", "scene", "outcome", "twins"), then, now, strict=True) if a != b]
+        parts = {part for part, a, b in zip(("model", "scene", "outcome", "twins"), then, now, strict=True) if a != b}
+        parts -= ROUNDED.get(name, set())
         if parts:
-            found.append(f"{scenario_id}: {', '.join(parts)}")
+            found.append(f"{scenario_id}: {', '.join(sorted(parts))}")
     return found
 
 
@@ -42,14 +47,14 @@ def test_every_released_record_has_a_frozen_digest() -> None:
     assert sum(map(len, frozen.values())) == 702
 
 
-@same_arithmetic
+@same_libraries
 @families
 def test_draws_and_words_of_300_seeds_are_as_frozen(name: str) -> None:
     frozen = FROZEN["families"][name]
     assert fingerprints.of_family(name) == {part: frozen[part] for part in ("constants", "draws")}
 
 
-@same_arithmetic
+@same_libraries
 @families
 def test_all_released_worlds_are_built_as_frozen(name: str) -> None:
     assert differing(name, fingerprints.records_of(name)) == []

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.report.test_items import row
+from tests.build.cells import row
 from traps_pipeline.base.partitions import ANSWERABLE_ARMS, ARMS, DATASETS, VOID_ARMS
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.defs import judging, scoring

@@ -62,7 +62,7 @@ def in_database(server: Postgres, idle_s: float = 30.0) -> Place:
     return Place(("postgres", server.address(), f"study-{secrets.token_hex(4)}", str(idle_s)))
 
 
-@pytest.fixture(params=["segments", "postgres"])
+@pytest.fixture(params=["segments", pytest.param("postgres", marks=pytest.mark.slow)])
 def place(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
     """An empty ledger of each kind."""
     if request.param == "segments":

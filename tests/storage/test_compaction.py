@@ -13,12 +13,12 @@ from typing import Any
 import psycopg
 import pytest
 
+from tests.build.ledger import answer, paid, write
 from tests.conftest import ROOT
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
 from tests.storage.conftest import VARIABLE
-from tests.storage.test_ledger import answer, paid, write
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage import compaction
 from traps_pipeline.storage.bucket import object_name
@@ -198,7 +198,7 @@ def test_a_segment_that_is_gone_or_altered_is_named_and_not_believed_until_it_is
         other.read("m", ["a"])
     rows = remedied(
         lambda: seen(other) if not list(other.damage()) else other.read("m"),
-        "put it back from a copy (a host that has read it has one below .objects in its scratch folder) and run the",
+        "storage.compaction.Segments.rows",
         lambda: bucket.put(name, whole),
     )
     assert rows == before
@@ -211,7 +211,7 @@ def test_segments_are_read_at_the_address_of_the_study(host: Open) -> None:
     finish(one)
     rows = remedied(
         lambda: SharedLedger(one.session, "answers").read("m").rows,
-        "lie in the object store of the study {}; open the study at its address (TRAPS_WORKSPACE=s3://BUCKET/STUDY)",
+        "storage.compaction.Segments.rows",
         again=lambda: host("other").read("m").rows,
     )
     assert rows == before

@@ -7,11 +7,10 @@ import json
 import os
 import signal
 import time
-from collections.abc import Mapping
-from typing import Any
 
 import pytest
 
+from tests.build.ledger import answer, paid, write
 from tests.storage.conftest import Place
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.ledger import Ledger, LockGivenUp, Totals
@@ -37,26 +36,6 @@ async def write():
             print(f"k{n}", flush=True)
 asyncio.run(write())
 """
-
-
-def write(ledger: Ledger, *rows: Mapping[str, object], evaluation: str = "m") -> None:
-    async def all_of_them() -> None:
-        async with ledger.writing(evaluation, print) as writer:
-            await writer.require()
-            writer.open()
-            for row in rows:
-                writer.append(row)
-            await writer.kept()
-
-    asyncio.run(all_of_them())
-
-
-def answer(key: str, text: str) -> dict[str, Any]:
-    return {"key": key, "outcome": "answer", "text": text}
-
-
-def paid(key: str, cost: float | None, participant: str = "m") -> dict[str, Any]:
-    return answer(key, "left") | {"cost_usd": cost, "components": {"participant": participant}}
 
 
 def damage(ledger: Ledger, key: str, change: bytes) -> None:

@@ -18,10 +18,10 @@ from typing import Any
 
 import pytest
 
+from tests.build.ledger import answer, write
 from tests.conftest import ROOT
 from tests.postgres import Postgres
 from tests.storage.conftest import VARIABLE, Place, in_database, opened
-from tests.storage.test_ledger import answer, write
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.storage.database import Claim, Session, session_of
 from traps_pipeline.storage.shared_ledger import SharedLedger

@@ -34,7 +34,7 @@ class Hosts:
     open: Callable[[str], Store]
 
 
-@pytest.fixture(params=["folder", "objects"])
+@pytest.fixture(params=["folder", pytest.param("objects", marks=pytest.mark.slow)])
 def hosts(request: pytest.FixtureRequest, tmp_path: Path) -> Hosts:
     """Hosts that share a folder, or a bucket."""
     if request.param == "folder":
@@ -54,7 +54,7 @@ def _hosts_of_bucket(request: pytest.FixtureRequest, tmp_path: Path) -> Callable
     return lambda name: opened(str(tmp_path), postgres.address(), study, name)
 
 
-@pytest.fixture(params=["folder", "objects"])
+@pytest.fixture(params=["folder", pytest.param("objects", marks=pytest.mark.slow)])
 def where(request: pytest.FixtureRequest, tmp_path: Path) -> Sequence[str]:
     """What `opened` is told of a study."""
     if request.param == "folder":

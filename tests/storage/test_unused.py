@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
+from tests.build.ledger import answer, write
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import command, remedied
 from tests.storage.test_compaction import finish, in_database
-from tests.storage.test_ledger import answer, write
 from traps_pipeline.storage import unused as module
 from traps_pipeline.storage.bucket import Bucket, object_name
 from traps_pipeline.storage.database import Session
@@ -153,7 +153,7 @@ def test_an_object_whose_removal_broke_off_may_be_written_once_it_surely_ended(h
 
     remedied(
         lambda: store.write({table(store): OLD}),
-        "is being removed at this moment by `traps doctor --unused remove` of the study {}; run the same command again",
+        "storage.removal.forget",
         later,
     )
     assert store.bucket.get(object_name(digest(OLD))) == OLD
@@ -168,7 +168,7 @@ def test_a_database_that_names_nothing_of_the_store_is_refused(
     other = ObjectStore(tmp_path / "other", address, Session(postgres.address(), "DB", f"{study}-other"))
     found = remedied(
         lambda: unused(other, grace_days=0),
-        "of them for the study {}; see that its variable has the address of the study's own database",
+        "storage.unused.unused",
         again=lambda: unused(host("one"), grace_days=0),
     )
     assert found == [] and names(store) == {object_name(digest(NEW))}
@@ -187,7 +187,7 @@ def test_the_command_shows_and_removes_what_is_old_enough(
     store.bucket.put(object_name(digest(LOST)), LOST)
     remedied(
         lambda: command("doctor", "--unused", "--workspace", folder),
-        "a study in a folder has no objects that nobody names; give the address of one in an object store with",
+        "study.doctor.examine_unused",
         again=lambda: command("doctor", "--unused", "--workspace", address),
     )
     assert "would be removed by `traps doctor --unused remove`" in capsys.readouterr().out

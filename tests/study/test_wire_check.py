@@ -70,6 +70,7 @@ def test_the_sixteen_configurations_are_there_in_the_papers_order() -> None:
 
 
 @pytest.mark.parametrize("name", CHECKED)
+@pytest.mark.promise
 def test_an_entry_sends_what_it_declares(name: str) -> None:
     (checked,) = check_named([name])
     assert checked.problems == []

@@ -1,0 +1,57 @@
+"""The golden study as a user sees it: from records to the report, and what a second command then finds to do."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from tests.conftest import EXPERIMENT, Checkout
+from tests.tables import TABLES
+from traps_pipeline.benchmark.records import load_release
+from traps_pipeline.scoring.tables import LEADERBOARD, METRICS
+from traps_pipeline.storage.workspace import Workspace
+
+pytestmark = pytest.mark.promise
+ANSWERS = 3 * 2 * 48  # models x regimes x items of 12 scenarios in two datasets, two sides
+VOTES = ANSWERS // 2 * 9  # three judges on a control's two tasks and on a void's one
+FRAMES = 6 * 150 + 6 * 100  # control, void and twin; the void of a chaotic scenario is the beginning of its control
+
+
+def test_one_command_goes_from_records_to_the_leaderboard_and_the_report(small: Checkout, small_output: str) -> None:
+    told = f"{ANSWERS} answers asked (0 from the ledger), {VOTES} votes asked (0 from the ledger), {FRAMES} frames"
+    assert told in small_output
+    for name in ("report.html", "gallery.html", "figures/pecs_landscape.png", "contact_sheet.png", "shortcuts.png"):
+        path = small.workspace / "reports" / name
+        assert str(path) in small_output.splitlines()
+        assert path.stat().st_size > 1000
+
+
+def test_the_oracle_scores_one_and_nothing_is_missing(small: Checkout) -> None:
+    tables = Workspace.open(small.workspace).tables
+    board = tables.read(LEADERBOARD, {}).query("model == 'oracle'")
+    assert len(board) == 2 * 5  # regimes x (four datasets and overall)
+    assert (board[["acc", "abs_rec", "pecs", "pecs_ci_low", "pecs_ci_high"]] == 1.0).all().all()
+    assert (tables.read_all(METRICS)["n_missing"] == 0).all()
+
+
+def test_every_table_that_was_made_knows_its_benchmark_version(small: Checkout) -> None:
+    workspace, made = Workspace.open(small.workspace), 0
+    for table in TABLES.values():
+        rows = workspace.tables.read_all(table)
+        made += not rows.empty
+        assert set(rows.get("benchmark_version", ())) <= {load_release().version}, table.name
+    assert made > 10
+
+
+def test_a_second_run_does_nothing_and_status_and_plan_agree(study: Checkout) -> None:
+    again = study.traps("run", EXPERIMENT)
+    assert again.code == 0, again.err
+    assert again.counts() == {"answers": 0, "votes": 0, "frames": 0}
+    assert "to do" not in again.out  # no partition was materialized
+    status = study.traps("status", EXPERIMENT).out
+    expected = {"scene_specs": 4, "items": 4, "responses": 24, "verdicts": 24, "leaderboard": 1}
+    for stage, partitions in expected.items():
+        assert re.search(rf"^{stage} +{partitions} +0 +0$", status, re.MULTILINE), status
+    plan = study.traps("plan", EXPERIMENT).out
+    assert re.search(rf"^all +{ANSWERS} +{ANSWERS} +0 +{VOTES:,} +{VOTES:,} +0$", plan, re.MULTILINE), plan

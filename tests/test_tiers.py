@@ -1,0 +1,93 @@
+"""Tiers, shards, the guard over fast tests, and the skips that a complete run accepts."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests import tiers
+from tests.conftest import ROOT
+
+COSTS = {"a": 50.0, "b": 30.0, "c": 30.0, "d": 20.0, "e": 10.0}
+TESTS = """
+import time
+import pytest
+
+def burn():
+    end = time.process_time() + 0.2
+    while time.process_time() < end:
+        pass
+
+def test_quick(): pass
+def test_dear(): burn()
+@pytest.mark.slow
+def test_slow(): burn()
+@pytest.mark.slow
+@pytest.mark.promise
+def test_promise(): burn()
+def test_lacking(): pytest.skip("strace is not installed")
+def test_accepted(): pytest.skip("there is a GPU")
+"""
+RUN = """
+import sys, pytest
+from tests import tiers
+tiers.FAST_S = 0.01
+sys.exit(pytest.main([*sys.argv[1:], "-p", "no:cacheprovider", "--strict-markers", "-rA"], plugins=[tiers]))
+"""
+
+
+def test_shards_hold_each_file_once_and_cost_the_same() -> None:
+    parts = tiers.shards(COSTS, 3)
+    assert parts == [["a"], ["b", "d"], ["c", "e"]]  # 50, 50, 40
+    assert sorted(name for part in parts for name in part) == sorted(COSTS)
+    assert tiers.shards(COSTS, 1) == [["a", "b", "c", "d", "e"]]
+    assert tiers.shards({"a": 1.0}, 2) == [["a"], []]
+
+
+@pytest.mark.parametrize("shard", ["0/3", "4/3", "2", "2/0", "a/b"])
+def test_a_shard_that_there_is_not_is_refused(shard: str) -> None:
+    with pytest.raises(pytest.UsageError, match="give K/N"):
+        tiers.of_shard([], shard)
+
+
+@pytest.mark.parametrize(
+    ("selection", "complete", "passed", "failed"),
+    [
+        ("not slow and not promise", False, {"test_quick"}, {"test_dear"}),
+        ("promise or not slow", False, {"test_quick", "test_promise"}, {"test_dear"}),
+        ("slow and not promise", False, {"test_slow"}, set()),
+        ("not slow and not promise", True, {"test_quick"}, {"test_dear", "test_lacking"}),
+    ],
+)
+def test_a_tier_has_its_tests_and_fails_those_that_are_too_dear_or_lack_something(
+    selection: str, complete: bool, passed: set[str], failed: set[str], tmp_path: Path
+) -> None:
+    (tmp_path / "test_tier.py").write_text(TESTS)
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n  slow: x\n  promise: x\n")
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "TRAPS"))}
+    environment |= {"PYTHONPATH": str(ROOT)} | ({tiers.COMPLETE: "1"} if complete else {})
+    command = [sys.executable, "-c", RUN, tmp_path, "-m", selection]
+    finished = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    lines = [line.split() for line in finished.stdout.splitlines() if line.startswith(("PASSED ", "FAILED "))]
+    assert {words[1].partition("::")[2] for words in lines if words[0] == "PASSED"} == passed, finished.stdout
+    assert {words[1].partition("::")[2] for words in lines if words[0] == "FAILED"} == failed, finished.stdout
+    assert "not run: test_tier.py::test_accepted: Skipped: there is a GPU" in finished.stdout or "slow and" in selection
+
+
+def test_every_promise_of_the_page_has_its_test() -> None:
+    listed = re.findall(r"`([\w/]+\.py)::(\w+)` \|$", (ROOT / "docs" / "testing.md").read_text(), re.MULTILINE)
+    assert len(listed) > 15
+    for file, name in listed:
+        source = (ROOT / "tests" / file).read_text()
+        assert f"def {name}(" in source and "mark.promise" in source, (file, name)
+
+
+def test_what_all_tests_import_loads_no_library_that_takes_seconds() -> None:
+    code = "import tests.conftest, sys; print(sorted({'dagster', 'aiohttp', 'pandas', 'torch'} & set(sys.modules)))"
+    finished = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert finished.stdout.strip() == "[]"

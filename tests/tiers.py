@@ -1,0 +1,233 @@
+"""The three tiers of tests, the shards of the last one, and what a test of the first may cost (docs/testing.md).
+
+`make check` runs tests without a mark, `make test` also those marked `promise`, and `make campaign` those that are only
+marked `slow`. A test that uses one of the `SERVICES` is slow by itself.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import time
+from collections import defaultdict
+from collections.abc import Generator, Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.forked import FORKS
+
+DURATIONS = Path(__file__).with_name("durations.json")  # tier to file to CPU seconds, written by the full campaign
+UNKNOWN_S = 5.0  # CPU seconds that a file without a measurement is taken to need
+SERVICES = {"demo", "small", "shared_provider", "page", "stored", "whole", "postgres", "s3", "tiny_disk", "small_disk"}
+FAST_S = 5.0  # CPU seconds of a test of `make check`, on the machine on which `LOOP_S` was measured
+LOOP_S = 0.011  # CPU seconds of `_loop` there
+COMPLETE = "TRAPS_TEST_ALL"  # set by `make test` and `make campaign`: only skips that are listed here are accepted
+ACCEPTED_SKIPS = {
+    r"there is a GPU": "the test shows the error on a machine without one",
+    r"no environment \w+: make environments": "other harnesses are installed by `make environments` before a release",
+    r"faults through every stage take an hour": "TRAPS_FAULTS=100 asks for them before a release",
+}
+CPU = pytest.StashKey[float]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options of the campaign."""
+    group = parser.getgroup("tiers")
+    group.addoption("--shard", metavar="K/N", help="run the K-th of N parts of the selected tests, of equal CPU time")
+    group.addoption("--write-durations", action="store_true", help=f"store CPU seconds by file in {DURATIONS.name}")
+
+
+def tier_of(item: pytest.Item) -> str:
+    """Return `check`, `test` or `campaign`."""
+    if item.get_closest_marker("promise"):
+        return "test"
+    return "campaign" if item.get_closest_marker("slow") else "check"
+
+
+@cache
+def durations(tier: str) -> dict[str, float]:
+    """Return CPU seconds by test file of a tier, as the last full campaign measured them."""
+    return json.loads(DURATIONS.read_text()).get(tier, {}) if DURATIONS.is_file() else {}
+
+
+def shards(costs: Mapping[str, float], count: int) -> list[list[str]]:
+    """Deal names to `count` shards so that their costs are about equal; the same for the same costs."""
+    parts, loads = [list[str]() for _ in range(count)], [0.0] * count
+    for name in sorted(costs, key=lambda name: (-costs[name], name)):
+        least = loads.index(min(loads))
+        parts[least].append(name)
+        loads[least] += costs[name]
+    return parts
+
+
+def file_of(item: pytest.Item) -> str:
+    """Return the file of a test as its id has it."""
+    return item.nodeid.partition("::")[0]
+
+
+def _units(items: Iterable[pytest.Item]) -> dict[str, str]:
+    """Return what is dealt as one by file: files that need the demo stay together, since it takes minutes to make."""
+    units: dict[str, str] = {}
+    for item in items:
+        if "demo" in getattr(item, "fixturenames", ()):
+            units[file_of(item)] = "demo"
+        units.setdefault(file_of(item), file_of(item))
+    return units
+
+
+def of_shard(items: list[pytest.Item], shard: str) -> list[pytest.Item]:
+    """Return the tests of shard `K/N`. Raises UsageError for another form."""
+    match = re.fullmatch(r"(\d+)/(\d+)", shard)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise pytest.UsageError(f"--shard {shard}: give K/N with K from 1 to N, such as 2/6")
+    units, known = _units(items), durations("campaign")
+    costs: dict[str, float] = defaultdict(float)
+    for file, unit in units.items():
+        costs[unit] += known.get(file, UNKNOWN_S)
+    chosen = {*shards(costs, int(match[2]))[int(match[1]) - 1]}
+    return [item for item in items if units[file_of(item)] in chosen]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> Generator[None, None, None]:
+    """Mark what needs a service as slow; after `-m` chose, take the shard, and put files that take long first."""
+    for item in items:
+        if SERVICES & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
+    yield
+    if shard := config.getoption("--shard"):
+        chosen = of_shard(items, shard)
+        taken = {id(item) for item in chosen}
+        config.hook.pytest_deselected(items=[item for item in items if id(item) not in taken])
+        items[:] = chosen
+    known = durations("test") | durations("campaign")
+    items.sort(key=lambda item: -known.get(file_of(item), 0.0) if tier_of(item) != "check" else 0.0)
+
+
+# --- what a test costs ------------------------------------------------------------------------------------------------
+
+
+def cpu_s() -> float:
+    """Return the CPU seconds of this process, of its children that have ended, and of forked commands."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system + FORKS.cpu_s()
+
+
+@cache
+def slowness() -> float:
+    """Return how many times slower this machine is than the one of `LOOP_S`; at least 1."""
+
+    def _loop() -> float:
+        began = time.process_time()
+        sum(i * i for i in range(300_000))
+        return time.process_time() - began
+
+    return max(1.0, min(_loop() for _ in range(3)) / LOOP_S)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item: pytest.Item) -> Generator[None, object, object]:
+    """Note the CPU seconds before the test."""
+    item.stash[CPU] = cpu_s()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Fail a test of `make check` that takes too much CPU time, its fixtures included."""
+    result = yield
+    took = cpu_s() - item.stash[CPU]
+    if tier_of(item) == "check" and took > FAST_S and took > FAST_S * slowness():
+        pytest.fail(f"took {took:.1f} s of CPU, of {FAST_S:.0f} s: mark it slow, or promise", pytrace=False)
+    return result
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, object, object]:
+    """Attach tier and CPU seconds to the report, which xdist brings to the process that writes them."""
+    result = yield
+    item.user_properties.append(("cpu", [tier_of(item), cpu_s() - item.stash[CPU]]))
+    return result
+
+
+class Durations:
+    """CPU seconds by tier and file, collected from the reports of all workers."""
+
+    def __init__(self) -> None:
+        self.of: dict[str, dict[str, float]] = {"check": {}, "test": {}, "campaign": {}}
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Add what a test took."""
+        if report.when == "teardown":
+            for tier, took in (value for name, value in report.user_properties if name == "cpu"):  # pyright: ignore
+                files = self.of[tier]
+                file = report.nodeid.partition("::")[0]
+                files[file] = files.get(file, 0.0) + took
+
+    def pytest_sessionfinish(self, session: pytest.Session, exitstatus: int) -> None:
+        """Store them, if this is the full campaign and it came to its end."""
+        ended = exitstatus in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED)
+        if ended and session.config.getoption("--write-durations"):
+            known = json.loads(DURATIONS.read_text()) if DURATIONS.is_file() else {}
+            for tier in ("test", "campaign"):
+                files = known.get(tier, {}) | self.of[tier]
+                kept = {file: round(took, 1) for file, took in sorted(files.items()) if Path(file).is_file()}
+                known[tier] = kept
+            DURATIONS.write_text(json.dumps(known, indent=1) + "\n")
+
+    def pytest_terminal_summary(self, terminalreporter: Any) -> None:
+        """Say what each tier took, and the dearest files."""
+        for tier, files in self.of.items():
+            if files:
+                dearest = sorted(files, key=lambda file: -files[file])[:5]
+                told = ", ".join(f"{file.removeprefix('tests/')} {files[file]:.0f}" for file in dearest)
+                terminalreporter.write_line(f"{tier}: {sum(files.values()):.0f} s of CPU in tests; most in {told}")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Collect what tests take where reports arrive: not in a worker of xdist."""
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Durations(), "durations-of-tiers")
+
+
+# --- what is skipped --------------------------------------------------------------------------------------------------
+
+
+def is_accepted(reason: str) -> bool:
+    """Return whether a complete run accepts that a test is skipped for this reason."""
+    return any(re.search(pattern, reason) for pattern in ACCEPTED_SKIPS)
+
+
+def _refuse(report: pytest.TestReport | pytest.CollectReport) -> None:
+    """Make a failure of a skip that a complete run does not accept."""
+    if report.skipped and os.environ.get(COMPLETE) and not hasattr(report, "wasxfail"):
+        reason = str(report.longrepr[-1]) if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        if not is_accepted(reason):
+            report.outcome = "failed"
+            report.longrepr = f"{reason} ({COMPLETE} is set: only skips of tests/tiers.py are accepted)"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Refuse skips of tests in a complete run."""
+    report = yield
+    _refuse(report)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Refuse skips of whole files in a complete run."""
+    report = yield
+    _refuse(report)
+    return report
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Name each skipped test and why: what did not run was not tested."""
+    for report in terminalreporter.stats.get("skipped", ()):
+        terminalreporter.write_line(f"not run: {report.nodeid}: {report.longrepr[-1]}")
