@@ -1,0 +1,29 @@
+"""Printed numbers as numbers, for files that other programs read."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+NONE = "–"  # a cell without a number
+_PRINTED_NUMBER = re.compile(r"([+−-]?(?:\d+(?:\.\d*)?|\.\d+))(%?)")
+
+
+def as_numbers(values: pd.Series) -> pd.Series:
+    """Return a column of printed numbers (the paper's) as numbers, a dash as missing; any other column as it is.
+
+    A number in percent stays as it is printed in a field whose name ends in `_pct`, and is a fraction in any other.
+    """
+    import pandas as pd
+
+    texts = [None if value is None or value != value or value in ("", NONE) else str(value) for value in values]
+    matches = [_PRINTED_NUMBER.fullmatch(text) for text in texts if text is not None]
+    if not matches or not all(matches) or len({match[2] for match in matches if match}) > 1:
+        return values
+    scale = 100.0 if matches[0] and matches[0][2] and not str(values.name).endswith("_pct") else 1.0
+    figures = [None if t is None else float(t.removesuffix("%").replace("−", "-")) / scale for t in texts]
+    whole = scale == 1.0 and all(figure is None or figure.is_integer() for figure in figures)
+    return pd.Series(figures, values.index, "Int64" if whole and None not in figures else "Float64", values.name)
