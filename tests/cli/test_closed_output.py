@@ -16,9 +16,9 @@ def ended(*arguments: str, closed: tuple[str, ...]) -> tuple[int, str, str]:
     """Exit code, stdout and stderr of a `traps` command; `closed` names the streams that nobody reads."""
     reading, writing = os.pipe()
     os.close(reading)
-    streams = {name: writing if name in closed else subprocess.PIPE for name in ("stdout", "stderr")}
+    out, err = (writing if name in closed else subprocess.PIPE for name in ("stdout", "stderr"))
     command = [sys.executable, "-m", "traps_pipeline.cli", *arguments]
-    done = subprocess.run(command, cwd=ROOT, text=True, check=False, **streams)
+    done = subprocess.run(command, cwd=ROOT, text=True, check=False, stdout=out, stderr=err)
     os.close(writing)
     return done.returncode, done.stdout or "", done.stderr or ""
 

@@ -157,7 +157,7 @@ class Step:
             recorded = self.history.recorded(stage.name)
             existing = tags[MAKE_TAG] == OUTDATED
             return [k for k in keys if k in wanted and to_make(lineage, recorded, stage.name, k, existing=existing)]
-        if not wanted & {*keys} and BACKFILL_TAG not in tags:
+        if stage.scheme and not wanted & {*keys} and BACKFILL_TAG not in tags:
             raise TrapsError(f"{stage.name}: nothing is made: {why_nothing(keys, tags, self.workspace)}")
         for key in keys:
             if key not in wanted:
