@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import asdict
+from typing import Any, cast
 
 import dagster as dg
 
 from traps_pipeline.base.terminal import visible
+from traps_pipeline.storage.parquet import Made
+from traps_pipeline.storage.tables import Table
+
+PREVIEWED = 5  # rows
 
 
 def visible_metadata(value: Any) -> Any:
@@ -24,3 +29,13 @@ def visible_metadata(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {visible_metadata(key): visible_metadata(each) for key, each in value.items()}
     return [visible_metadata(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def preview(table: Table, made: Made) -> dg.TableMetadataValue | None:
+    """The first rows without long texts: what a model wrote is shown on the report's pages, where it is escaped."""
+    content = cast(Any, made.content)
+    first = content[:PREVIEWED]
+    rows = first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
+    names = [c.name for c in table.columns if c.name in table.key or c.type in (int, float, bool)]
+    records = [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows]
+    return dg.MetadataValue.table(records) if records else None

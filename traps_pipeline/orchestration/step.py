@@ -12,7 +12,6 @@ import json
 import os
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict
 from typing import Any, cast
 
 import dagster as dg
@@ -26,13 +25,12 @@ from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
 from traps_pipeline.orchestration.machine import parts_of_run, require_machine, why_nothing
-from traps_pipeline.orchestration.metadata import visible_metadata
+from traps_pipeline.orchestration.metadata import preview, visible_metadata
 from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.scenes.workers import kept_workers
 from traps_pipeline.storage.leases import alone
 from traps_pipeline.storage.parquet import Made, State
-from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 CURRENT = "current"  # the check that every stage has
@@ -42,7 +40,6 @@ BACKFILL_TAG = "dagster/backfill"  # of a run of many: one that has nothing to m
 STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
 REACHED = "a budget is reached"  # in a check's metadata
 STILL = "still failing"  # in a check's metadata: of a partition that the run did not touch
-PREVIEWED = 5  # rows
 TALLY, TAKEN = "tally", "taken over"  # in an event's metadata: what this run did for it; that another run has made it
 _ATTEMPTS: dict[str, int] = {}  # by run: how often it had been resumed when this process began with it
 RESUMED_ELSEWHERE = 5  # the exit code of a process whose run another one goes on with
@@ -312,8 +309,8 @@ class Step:
             paths = {path: dg.MetadataValue.path(str(self.workspace.reports / path)) for path in pages}
             return {"files": len(files)} | paths | shown
         count = "dagster/row_count" if self.stage.scheme is None else "dagster/partition_row_count"
-        preview = _preview(self.stage.table, made)
-        return {count: len(made.content)} | ({"first rows": preview} if preview else {}) | shown
+        rows = preview(self.stage.table, made)
+        return {count: len(made.content)} | ({"first rows": rows} if rows else {}) | shown
 
     # --- the end ------------------------------------------------------------------------------------------------------
 
@@ -371,16 +368,6 @@ def _evaluation(stage: Stage, check: str, key: str | None, wrong: Mapping[str, A
 
 def _failed_calls(count: int) -> str:
     return f"{count} calls failed and can be asked again"
-
-
-def _preview(table: Table, made: Made) -> dg.TableMetadataValue | None:
-    """The first rows without long texts: what a model wrote is shown on the report's pages, where it is escaped."""
-    content = cast(Any, made.content)
-    first = content[:PREVIEWED]
-    rows = first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
-    names = [c.name for c in table.columns if c.name in table.key or c.type in (int, float, bool)]
-    records = [dg.TableRecord({n: str(row.get(n)) for n in names}) for row in rows]
-    return dg.MetadataValue.table(records) if records else None
 
 
 def _plain(problems: Any) -> Any:
