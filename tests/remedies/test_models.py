@@ -183,7 +183,7 @@ def test_a_key_that_is_exported_is_found(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.delenv("TRAPS_TEST_SOME_KEY", raising=False)
     found = remedied(
         account.secret,
-        "models.registry.Account.secret",
+        "base.keys.read_key",
         lambda: monkeypatch.setenv("TRAPS_TEST_SOME_KEY", "sk"),
     )
     assert found == "sk"

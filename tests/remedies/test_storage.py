@@ -132,7 +132,7 @@ def test_media_are_prepared_once_their_folder_can_be_made(tmp_path: Path) -> Non
         (lambda path: path.unlink(), "storage.parquet.TableStore._load"),
         (
             lambda path: path.write_bytes(b"PAR1 no table"),
-            "storage.parquet.TableStore._load",
+            "storage.parquet._sound_bytes",
         ),
         (
             lambda path: path.write_bytes(path.read_bytes().replace(b"plinko-0001", b"plinko-0002")),
