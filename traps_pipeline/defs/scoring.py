@@ -83,7 +83,7 @@ def _make_contrasts(workspace: Workspace, _: None) -> Made:
 
     cells, judged = _scored(workspace, "contrasts")
     table = paired(resample(judged), cells, judged)
-    separable, refused = table["separable"].to_numpy(bool), len(table.loc[table["refused"].notna()])
+    separable, refused = table["separable"].eq(True).to_numpy(bool), len(table.loc[table["refused"].notna()])
     separable_overall = table.loc[separable & (table["dataset"] == "overall")]
     shown = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": refused}
     return Made(table, shown=shown)
@@ -162,7 +162,7 @@ def _wrong_doses(workspace: Workspace, key: str | None, made: Made) -> str:
 _OF_SOME: dict[str, Need] = {"metrics": "some", "verdicts": "some"}
 # The panel is an input of all that is counted from its verdicts: after a change of it they are stale at once, and not
 # only when its votes are made again.
-contrasts = stage(CONTRASTS, _make_contrasts, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME, code="2")
+contrasts = stage(CONTRASTS, _make_contrasts, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME, code="3")
 regime_tests = stage(
     REGIME_TESTS, _make_regime_tests, group=GROUP, deps=[metrics, verdicts, judges], needs=_OF_SOME, code="2"
 )
@@ -172,7 +172,7 @@ leaderboard = stage(
     group=GROUP,
     deps=[metrics, verdicts, contrasts, judges],
     needs=_OF_SOME,
-    code="2",
+    code="3",
     columns={name: [f"metrics.{name}"] for name in ("acc", "abs_rec", "false_abs", "j", "pecs")},
     checks=[
         Check(
@@ -188,7 +188,7 @@ robust = stage(
     group=GROUP,
     deps=[metrics, verdicts, judges],
     needs=_OF_SOME,
-    code="2",
+    code="3",
     columns={"acc_r": ["verdicts.correct"], "abs_rec_r": ["verdicts.abstained"], "false_abs_r": ["verdicts.abstained"]},
     checks=[
         Check(
@@ -204,11 +204,12 @@ hypotheses = stage(
     group=GROUP,
     deps=[items, metrics, verdicts, judges],
     needs={**_OF_SOME, "items": "some"},
+    code="2",
     columns={"acc": ["verdicts.correct"], "abs_rec": ["verdicts.abstained"], "false_abs": ["verdicts.abstained"]},
     checks=[
         Check(
             "doses_hold",
-            "Shares lie in [0, 1], differences in [-1, 1], and intervals are ordered.",
+            "Shares lie in [0, 1], J in [-1, 1], changes in [-2, 2], and intervals are ordered.",
             _wrong_doses,
         )
     ],

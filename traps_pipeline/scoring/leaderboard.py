@@ -104,7 +104,7 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
     """rank, rank_low and rank_high of every row among those of its panel, on `board`'s index; null where there is no
     PECS, and where the row is of several panels."""
     separable = contrasts.loc[
-        (contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & contrasts["separable"]
+        (contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & contrasts["separable"].eq(True)
     ]
     wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
     for row in separable.to_dict("records"):
