@@ -64,7 +64,7 @@ DEPENDENCE = {  # shares of the variance that a scenario's items and an item's r
     "clustered, 3 runs": (0.5, 0.3, 0.6, 3),
 }
 ARMS = ("decoy", "frame_out", "held_void", "twin_control")
-N_FAMILIES, ARM_SHARE = 8, 4  # an arm has an item of every fourth scenario
+N_FAMILIES, ARM_SHARE = 8, 4  # an arm has an item of a quarter of the scenarios, of all families
 FIGURES = (
     *(f"{name}, one dataset" for name in RESAMPLED),
     *RESAMPLED,
@@ -184,7 +184,7 @@ def drawn_counts(setting: Setting, rng: np.random.Generator, studies: int) -> di
             counts |= {name: drawn[:, :, k] for k, name in enumerate(names)}
     for arm in ARMS:
         if arm in counts:
-            counts[arm][np.arange(len(counts[arm])) % ARM_SHARE != 0] = 0
+            counts[arm][np.arange(len(counts[arm])) // N_FAMILIES % ARM_SHARE != 0] = 0
             counts[arm][..., 4:] *= arm in WITH_VOIDS
             counts[arm][..., :4] *= arm in WITH_CONTROLS
     return counts
@@ -253,8 +253,7 @@ def main() -> None:
     sizes = [*SIZES][:4] if arguments.quick else [*SIZES]
     rows = []
     for size in sizes:
-        # Studies of one call share their weights, and large ones need memory: many small draws.
-        studies = 50 if arguments.quick else 100 if sum(SIZES[size]) > 300 else 200
+        studies = 50 if arguments.quick else 200
         for strength in STRENGTHS:
             for dependence in DEPENDENCE:
                 setting = Setting(size, strength, dependence)

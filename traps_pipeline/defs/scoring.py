@@ -83,7 +83,7 @@ def _make_contrasts(workspace: Workspace, _: None) -> Made:
 
     cells, judged = _scored(workspace, "contrasts")
     table = paired(resample(judged), cells, judged)
-    separable, refused = table["separable"].eq(True).to_numpy(bool), len(table.loc[table["refused"].notna()])
+    separable, refused = table["separable"].to_numpy(bool, na_value=False), len(table.loc[table["refused"].notna()])
     separable_overall = table.loc[separable & (table["dataset"] == "overall")]
     shown = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": refused}
     return Made(table, shown=shown)

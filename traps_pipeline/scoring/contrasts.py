@@ -65,7 +65,7 @@ def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFram
             rows.append(row)
     table = pd.DataFrame(rows, columns=pd.Index([*CONTRASTS.names, "_regime"]))
     table["p_holm"] = _holm_by(table, _FAMILY)
-    table["separable"] = _separable(table)
+    table["separable"] = _separable(table, _FAMILY)
     return table.loc[:, CONTRASTS.names]
 
 
@@ -74,8 +74,9 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
 
     then and now are VERDICTS rows; a pair that is not whole in both, in the same run and cell, is left out. Columns:
     model, regime, dataset (and `overall`), figure, n_pairs per run, n_scenarios, then, now, difference, ci_low,
-    ci_high, p, p_holm, VERSION_SIDES with the suffixes _then and _now, and refused: why there is no difference, where
-    an item was answered in different epochs. Raises TrapsError where the two studies share no whole pair.
+    ci_high, p, p_holm, separable, VERSION_SIDES with the suffixes _then and _now, and refused: why there is no
+    difference, where an item was answered in different epochs. Raises TrapsError where the two studies share no whole
+    pair.
     """
     sides = _whole_pairs_of_both(then, now)
     if sides[0].empty:
@@ -92,6 +93,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
             values = {f"{name}_{side}": about[f"{name}_{side}"] for name in VERSION_SIDES for side in ("then", "now")}
             values |= {side: about[f"{figure}_{side}"] for side in ("then", "now")}
             row = dict(zip(ENTRY, entry, strict=True)) | {"figure": figure, "n_pairs": about["n_pairs"], **values}
+            row["n_scenarios"] = sizes[entry]
             if refused is None:
                 ends = [found[entry][:, RESAMPLED.index(figure)] for found in draws[::-1]]
                 row |= _difference(figure, ends, [row["now"], row["then"]], sizes[entry])
@@ -109,9 +111,11 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
         "p",
         "p_holm",
     ]
-    columns += [f"{name}_{side}" for name in VERSION_SIDES for side in ("then", "now")] + ["refused"]
+    columns += ["separable"] + [f"{name}_{side}" for name in VERSION_SIDES for side in ("then", "now")] + ["refused"]
     table = pd.DataFrame(rows, columns=pd.Index(columns))
-    table["p_holm"] = _holm_by(table, ["dataset", "figure"])
+    family = ["dataset", "figure"]
+    table["p_holm"] = _holm_by(table, family)
+    table["separable"] = _separable(table, family)
     return table
 
 
@@ -234,10 +238,10 @@ def _beyond(ends: np.ndarray) -> float:
     return min(share, erfc(float(ends.mean()) / error / sqrt(2) if error else inf) / 2)
 
 
-def _separable(table: pd.DataFrame) -> pd.Series:
+def _separable(table: pd.DataFrame, family: Sequence[str]) -> pd.Series:
     """Whether p_holm is below SEPARABLE_BELOW; null where no answers of so few scenarios could make the smallest p of
     the family that small, and False where there is no p."""
-    compared = table.groupby(_FAMILY)["p"].transform("count").to_numpy(float)
+    compared = table.groupby(list(family))["p"].transform("count").to_numpy(float)
     least = np.array([least_p(int(n)) if n == n else 0.0 for n in table["n_scenarios"].astype(float)])
     separable = pd.Series(table["p_holm"].astype(float) < SEPARABLE_BELOW, dtype="boolean")
     return separable.mask(table["p"].notna() & (least * compared >= SEPARABLE_BELOW))

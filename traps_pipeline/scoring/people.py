@@ -35,8 +35,7 @@ def stratum_weights(labels: pd.DataFrame) -> np.ndarray:
 
 
 def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
-    """HUMAN_ROW rows from HUMAN_LABELS rows: figures of all labels of clips, with intervals by the cluster bootstrap
-    over scenarios. Without a label of a clip there is no row; overall is null until all four datasets have figures."""
+    """HUMAN_ROW rows from HUMAN_LABELS rows: figures of all labels of clips, with intervals over scenarios. Without a label of a clip there is no row; overall is null until all four datasets have figures."""
     clips = labels.loc[labels["task"] == "answerability"].reset_index(drop=True)
     if clips.empty:
         return pd.DataFrame(columns=pd.Index(HUMAN_ROW.names))
