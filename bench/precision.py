@@ -9,7 +9,7 @@ model has one study a regime, and those that leave nothing to chance have a widt
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -72,13 +72,13 @@ def observed(model: str, scenarios: Sequence[str]) -> float:
     return float((found["pecs_ci_high"] - found["pecs_ci_low"]).mean())
 
 
-def pairs_of(scenarios: Sequence[str]) -> list[int]:
+def pairs_of(scenarios: Sequence[str]) -> dict[str, int]:
     """The number of pairs of each dataset."""
     categories = [load_released()[name].category for name in scenarios]
-    return [sum(dataset in datasets_of_category(category) for category in categories) for dataset in DATASETS]
+    return {d: sum(d in datasets_of_category(category) for category in categories) for d in DATASETS}
 
 
-def compared(size: str, model: str, pairs: Sequence[int], seen: float) -> tuple[str, ...]:
+def compared(size: str, model: str, pairs: Mapping[str, int], seen: float) -> tuple[str, ...]:
     """A row of the table."""
     promised = precision(pairs, SHARES[model]).width
     return size, model, f"{promised:.4f}", f"{seen:.4f}", f"{promised / seen - 1:+.1%}" if seen else "-"
@@ -112,7 +112,7 @@ def of_study(workspace: Workspace) -> list[tuple[str, ...]]:
     overall = board.loc[board["dataset"] == "overall"].set_index("model")
     widths = (overall["pecs_ci_high"] - overall["pecs_ci_low"]).groupby("model").mean()
     return [
-        compared(workspace.study.name, model, [int(n) for n in counts], float(widths[model]))
+        compared(workspace.study.name, model, {str(d): int(n) for d, n in counts.items()}, float(widths[model]))
         for model in SHARES
         if model in widths.index
     ]

@@ -1,13 +1,15 @@
-"""The cluster bootstrap compared with a slow loop that computes the same."""
+"""The bootstrap with its unseen scenario: against exact binomial intervals, and a slow loop that computes the same."""
 
 from __future__ import annotations
 
 import numpy as np
 import pandas as pd
 import pytest
+from statsmodels.stats.proportion import proportion_confint
 
 from traps_pipeline.base.partitions import DATASETS
-from traps_pipeline.scoring.bootstrap import ENTRY, INTERVAL_COLUMNS, intervals, resample, scenario_weights
+from traps_pipeline.scoring import bootstrap
+from traps_pipeline.scoring.bootstrap import ENTRY, INTERVAL_COLUMNS, draw_scenarios, intervals, resample
 
 
 def random_pairs(n, seed, acc=0.7, false_abs=0.1, abs_rec=0.6):
@@ -28,57 +30,84 @@ def interval(table, dataset="occlusion", model="m", regime="standard"):
     return row["pecs_ci_low"], row["pecs_ci_high"]
 
 
-def test_the_oracles_interval_is_exactly_one_to_one(rows, strategy):
-    found = pecs_intervals(everywhere(rows, strategy("oracle", 30)), resamples=500)
-    assert list(found.columns) == [*ENTRY, *INTERVAL_COLUMNS]
-    assert list(found["dataset"]) == [*DATASETS, "overall"]
-    assert (found[["pecs_ci_low", "pecs_ci_high"]] == 1.0).all(axis=None)
+def share_interval(rows, yes, n, resamples=4000):
+    """The interval of AbsRec where n voids are decided and yes of them abstained on."""
+    table = intervals(resample(rows([(True, False, k < yes) for k in range(n)]), resamples))
+    row = table.set_index("dataset").loc["occlusion"]
+    return row["abs_rec_ci_low"], row["abs_rec_ci_high"]
+
+
+@pytest.mark.parametrize(("yes", "n"), [(0, 1), (1, 1), (1, 2), (0, 64), (64, 64), (3, 16), (60, 100)])
+def test_a_shares_interval_is_that_of_clopper_and_pearson(yes, n, rows):
+    # 1 of 1: the lower end is 0.025. 0 of 64: the upper end is 1 - 0.025^(1/64) = 0.056.
+    assert share_interval(rows, yes, n) == pytest.approx(proportion_confint(yes, n, method="beta"), abs=0.012)
+
+
+def test_intervals_narrow_with_more_scenarios_and_are_never_of_no_width(rows):
+    widths = [high - low for low, high in (share_interval(rows, n, n, 1000) for n in (1, 2, 4, 8, 32, 128))]
+    assert widths == sorted(widths, reverse=True)
+    assert 0 < widths[-1] < 0.04 < 0.9 < widths[0]
+
+
+def test_right_and_wrong_exchanged_reflect_the_interval(rows):
+    (low, high), (other_low, other_high) = share_interval(rows, 5, 20), share_interval(rows, 15, 20)
+    assert (low, high) == pytest.approx((1 - other_high, 1 - other_low), abs=0.01)
+
+
+def test_the_oracles_interval_ends_at_one_and_has_a_width(rows, strategy):
+    table = pecs_intervals(everywhere(rows, strategy("oracle", 30)), resamples=500)
+    assert list(table.columns) == [*ENTRY, *INTERVAL_COLUMNS]
+    assert list(table["dataset"]) == [*DATASETS, "overall"]
+    assert (table["pecs_ci_high"] == 1.0).all()
+    assert table["pecs_ci_low"].between(0.7, 0.95).all()
 
 
 @pytest.mark.parametrize("name", ["always-abstain", "never-abstain", "perfect-answerer", "inverse-oracle"])
-def test_degenerate_strategies_have_the_interval_zero_to_zero(name, rows, strategy):
-    found = pecs_intervals(everywhere(rows, strategy(name, 30)), resamples=200)
-    assert (found[["pecs_ci_low", "pecs_ci_high"]] == 0.0).all(axis=None)
+def test_the_interval_of_a_degenerate_strategy_begins_at_zero_and_has_a_width(name, rows, strategy):
+    table = pecs_intervals(everywhere(rows, strategy(name, 30)), resamples=200)
+    assert (table["pecs_ci_low"] == 0.0).all()
+    if name != "inverse-oracle":  # J is -1, far from any PECS above 0
+        assert table["pecs_ci_high"].between(0.001, 0.15).all()
 
 
 def test_the_matrix_product_agrees_with_a_loop_over_resamples(rows):
     n, resamples, seed = 40, 300, 5
     pairs = {run: random_pairs(n, run) for run in (1, 2, 3)}
     verdicts = pd.concat([rows(p, run=run) for run, p in pairs.items()], ignore_index=True)
-    weights = scenario_weights(n, resamples, [seed, 0])  # the weights of the occlusion taxonomy
-    means = []
-    for weight in weights:
-        drawn = np.repeat(np.arange(n), weight.astype(int))
-        per_run = []
+    drawn = draw_scenarios(verdicts.assign(taxonomy="occlusion"), resamples, seed)
+    weights, unseen = drawn.scenarios["occlusion"][1], drawn.unseen("m|standard|occlusion", 3)
+    lower, upper = [], []
+    for k in range(1, resamples + 1):
+        low, high = [], []
         for cell in pairs.values():
-            acc, false_abs, abs_rec = np.array(cell, float)[drawn].mean(axis=0)
-            per_run.append(acc * max(0.0, abs_rec - false_abs))
-        means.append(np.mean(per_run))
-    expected = np.quantile(means, [0.025, 0.975])
+            yes, made = weights[k].astype(float) @ np.array(cell, float), weights[k].astype(float).sum()
+            least = yes / (made + unseen[:3, k])
+            most = (yes + unseen[:3, k]) / (made + unseen[:3, k])
+            low.append(least[0] * (least[2] - most[1]))
+            high.append(most[0] * max(0.0, most[2] - least[1]))
+        lower.append(np.mean(low))
+        upper.append(np.mean(high))
+    expected = max(0.0, np.quantile(lower, 0.025)), np.quantile(upper, 0.975)
     assert interval(pecs_intervals(verdicts, resamples, seed)) == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_single_proportions_interval_is_the_binomials(rows):
-    # Acc 1, FalseAbs 0: PECS is AbsRec = 60/100; the binomial's central 95 % is 0.50 to 0.69 (sd 0.049).
-    pairs = [(True, False, k < 60) for k in range(100)]
-    low, high = interval(pecs_intervals(rows(pairs), resamples=4000))
-    assert (low, high) == pytest.approx((0.50, 0.695), abs=0.015)
+def test_scenarios_of_a_taxonomy_stay_together_in_both_of_its_datasets(rows):
+    # Where one dataset's void is abstained on, the other's is not: their mean AbsRec is the same in every resample.
+    a, b = ([(True, False, k % 2 == rest) for k in range(100)] for rest in (0, 1))
+    widths = []
+    for other in (a, b):
+        placed = {"occlusion": a, "occlusion_ill_posed": other, "chaotic": a, "chaotic_ill_posed": other}
+        verdicts = pd.concat([rows(pairs, dataset=d) for d, pairs in placed.items()], ignore_index=True)
+        low, high = interval(pecs_intervals(verdicts, resamples=300), "overall")
+        widths.append(high - low)
+    assert widths[1] < 0.5 * widths[0]
 
 
-def test_the_two_datasets_of_a_taxonomy_share_their_resamples(rows):
-    pairs = random_pairs(50, 3)
-    found = pecs_intervals(everywhere(rows, pairs), resamples=500)
-    assert interval(found, "occlusion") == interval(found, "occlusion_ill_posed")
-    assert interval(found, "occlusion") != interval(found, "chaotic")
-
-
-def test_opposite_cells_of_one_taxonomy_cancel_because_clusters_stay_together(rows):
-    # Where one dataset's void is abstained on, the other's is not: their mean AbsRec is 1/2 in every resample.
-    a = [(True, False, k % 2 == 0) for k in range(20)]
-    b = [(True, False, k % 2 == 1) for k in range(20)]
-    placed = {"occlusion": a, "occlusion_ill_posed": b, "chaotic": a, "chaotic_ill_posed": b}
-    verdicts = pd.concat([rows(pairs, dataset=d) for d, pairs in placed.items()], ignore_index=True)
-    assert interval(pecs_intervals(verdicts, resamples=300), "overall") == pytest.approx((0.5, 0.5))
+def test_an_interval_contains_the_figure_that_it_is_of():
+    ends = np.array([[0.4, 0.5, 0.6], [0.5, 0.6, 0.7]])
+    assert bootstrap.interval(ends, 0.95, (0.0, 1.0)).tolist() == pytest.approx([0.405, 0.95])
+    assert bootstrap.interval(ends - 0.5, 0.0, (0.0, 1.0)).tolist() == pytest.approx([0.0, 0.195])
+    assert np.isnan(bootstrap.interval(ends * np.nan, np.nan, (0.0, 1.0))).all()
 
 
 def test_a_models_interval_does_not_depend_on_who_else_is_scored(rows):
@@ -96,10 +125,10 @@ def test_runs_of_one_scenario_stay_together(rows):
     assert interval(thrice) == pytest.approx(interval(once), abs=1e-12)
 
 
-def test_resamples_with_an_empty_denominator_are_dropped(rows):
-    # Of four voids one is decided: (3/4)^4 = 32 % of the resamples miss it, the others give PECS 1.
-    pairs = [(True, False, True), *[(True, False, None)] * 3]
-    assert interval(pecs_intervals(rows(pairs), 300)) == (1.0, 1.0)
+def test_items_that_are_not_decided_are_no_evidence(rows):
+    # Of four voids one is decided: what is known is 1 of 1.
+    table = intervals(resample(rows([(True, False, True), *[(True, False, None)] * 3]), 2000)).iloc[0]
+    assert (table["abs_rec_ci_low"], table["abs_rec_ci_high"]) == (pytest.approx(0.025, abs=0.01), 1.0)
 
 
 def test_a_cell_without_any_decision_has_no_interval(rows):

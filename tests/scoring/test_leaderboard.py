@@ -74,7 +74,8 @@ def test_a_run_that_lacks_a_dataset_stays_out_of_overall(rows):
     parts = [rows([(True, False, True)], dataset=d) for d in DATASETS]
     parts.append(rows([(False, False, True)], dataset="chaotic", run=2))
     row = entry(board_of(pd.concat(parts, ignore_index=True)), "overall")
-    assert (row.n_runs, row.acc, row.pecs_ci_low, row.pecs_ci_high) == (1, 1.0, 1.0, 1.0)
+    assert (row.n_runs, row.acc, row.pecs_ci_high) == (1, 1.0, 1.0)
+    assert row.pecs_ci_low < 0.1  # one scenario of each taxonomy says next to nothing
 
 
 def test_a_null_run_makes_the_mean_null_instead_of_resting_on_fewer_runs(rows):
@@ -175,7 +176,8 @@ def test_degenerate_strategies_score_zero_overall_and_the_oracle_one(rows, strat
     board = board_of(pd.concat(parts, ignore_index=True))
     overall = board[board["dataset"] == "overall"].set_index("model")
     assert overall["pecs"].to_dict() == {s: float(s == "oracle") for s in STRATEGIES}
-    assert entry(board, "overall", "oracle")[["pecs_ci_low", "pecs_ci_high"]].to_list() == [1.0, 1.0]
+    oracle = entry(board, "overall", "oracle")
+    assert 0.4 < oracle.pecs_ci_low < 0.8 and oracle.pecs_ci_high == 1.0
     assert entry(board, "overall", "inverse-oracle").j == -1.0
     store = TableStore(tmp_path)
     store.write(LEADERBOARD, {}, board, {})

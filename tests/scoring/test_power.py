@@ -8,27 +8,39 @@ import pytest
 
 from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.scoring.bootstrap import intervals, resample
-from traps_pipeline.scoring.power import Precision, Shares, precision
+from traps_pipeline.scoring.power import Shares, precision
+
+
+def everywhere(n: int) -> dict[str, int]:
+    return dict.fromkeys(DATASETS, n)
 
 
 def test_the_width_of_one_dataset_follows_by_hand() -> None:
-    # Acc 0.5, AbsRec 0.5, FalseAbs 0: J 0.5; 0.25 x 0.25 + 0.25 x 0.25 = 0.125 of a pair, so sqrt(0.125 / 200) = 0.025.
-    found = precision([200], Shares(0.5, 0.5, 0.0))
-    assert found.width == pytest.approx(2 * 1.96 * 0.025, rel=0.05)
-    assert found.difference == pytest.approx(2.8016 * 0.035355, rel=0.1)
-    assert precision([200, 200, 200, 200], Shares(0.5, 0.5, 0.0)).width == pytest.approx(found.width / 2, rel=0.05)
-    assert precision([200, 0]).width == precision([200]).width
+    # Acc 0.5, AbsRec 0.5, FalseAbs 0: J 0.5; 0.25 x 0.25 + 0.25 x 0.25 = 0.125 of a pair: sqrt(0.125 / 800) = 0.0125.
+    # The unseen scenario takes 1/801 of Acc, of J twice that, and gives as much: 2 x (0.5 + 1) x 0.5 / 801 at most.
+    found = precision({"occlusion": 800}, Shares(0.5, 0.5, 0.0))
+    assert 2 * 1.96 * 0.0125 < found.width < 2 * 1.96 * 0.0125 + 2 * 1.5 * 0.5 / 801 + 0.002
+    assert found.difference is not None and found.difference > 2.8016 * 0.017678
+    assert precision({"occlusion": 800, "chaotic": 0}).width == precision({"occlusion": 800}).width
     with pytest.raises(ValueError, match="no dataset"):
-        precision([0])
+        precision({"occlusion": 0})
 
 
-def test_with_two_pairs_nothing_is_promised() -> None:
-    found = precision([2])
-    assert found.width <= 1 and found.difference is None
+def test_with_few_pairs_little_is_promised() -> None:
+    widths = [precision(everywhere(n)).width for n in (1, 2, 4, 16, 64)]
+    assert widths == sorted(widths, reverse=True) and widths[0] > 0.5
+    assert precision({"occlusion": 2}).difference is None and precision(everywhere(2)).difference is None
 
 
-def test_a_model_that_never_varies_has_no_width() -> None:
-    assert precision([16] * 4, Shares(1.0, 1.0, 0.0)) == Precision(0.0, 0.0)
+def test_a_model_that_never_varies_has_a_width_all_the_same() -> None:
+    assert 0.1 < precision(everywhere(16), Shares(1.0, 1.0, 0.0)).width < 0.5
+
+
+def test_more_models_need_a_larger_difference_and_too_few_scenarios_find_none() -> None:
+    two, many = precision(everywhere(100)), precision(everywhere(100), models=16)
+    assert two.difference == two.among_all == many.difference
+    assert many.among_all is not None and two.difference is not None and many.among_all > 1.3 * two.difference
+    assert precision({"occlusion": 12}, models=16).among_all is None  # 120 x 2^-11 > 0.05
 
 
 @pytest.mark.parametrize(
@@ -46,4 +58,4 @@ def test_the_promised_width_is_within_15_percent_of_the_bootstraps(shares: Share
             parts.append(rows(pairs, dataset=dataset))
         found = intervals(resample(pd.concat(parts, ignore_index=True), 400)).set_index("dataset").loc["overall"]
         widths.append(found["pecs_ci_high"] - found["pecs_ci_low"])
-    assert np.mean(widths) == pytest.approx(precision([n] * 4, shares).width, rel=0.15)
+    assert np.mean(widths) == pytest.approx(precision(everywhere(n), shares).width, rel=0.15)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from math import comb
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.terminal import text_table
@@ -53,7 +54,7 @@ def plan(arguments: argparse.Namespace) -> int:
     print(text_table(headings, [_plan_row(name, counts) for name, counts in [*rows.items(), ("all", total)]]))
     if planned.forecasts:
         _print_forecasts(planned.forecasts, planned.minutes)
-    _print_precision(planned.pairs)
+    _print_precision(planned.pairs, len(planned.calls))
     if planned.uncertain:
         print(
             f"This is an upper bound: items of {', '.join(planned.uncertain)} are still to be made, so all of their "
@@ -66,18 +67,26 @@ def _plan_row(name: str, counts: tuple[Count, Count]) -> list[str]:
     return [name, *(f"{number:,}" for count in counts for number in (count.wanted, count.known, count.new))]
 
 
-def _print_precision(pairs: Mapping[str, int]) -> None:
+def _print_precision(pairs: Mapping[str, int], models: int) -> None:
     from traps_pipeline.scoring.power import Shares, precision
 
     if any(pairs.values()):
-        found, middling = precision([*pairs.values()]), Shares()
-        least = "no difference" if found.difference is None else f"a difference of {found.difference:.3f}"
+        expected, middling = precision(pairs, models=models), Shares()
         print(
             f"\nprecision with {sum(pairs.values()):,} pairs: a model with Acc {middling.acc:.0%}, AbsRec "
             f"{middling.abs_rec:.0%}, FalseAbs {middling.false_abs:.0%} (PECS {middling.pecs:.2f}) gets a 95 % "
-            f"interval of PECS about {found.width:.3f} wide; of two models with unrelated answers {least} is found in "
-            "80 % of studies"
+            f"interval of PECS about {expected.width:.3f} wide; of two models with unrelated answers "
+            f"{_difference(expected.difference)} is found in 80 % of studies"
         )
+        if models > 2:
+            print(
+                f"of {models} models, after Holm's correction over their {comb(models, 2)} pairs: "
+                f"{_difference(expected.among_all)}"
+            )
+
+
+def _difference(least: float | None) -> str:
+    return "no difference (too few pairs)" if least is None else f"a difference of {least:.3f}"
 
 
 def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:

@@ -61,7 +61,8 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     table = version_contrasts(then, now)
     if arguments.csv:
         table.to_csv(arguments.csv, index=False)
-    shown = table.assign(refused=table["refused"].fillna(""))
+    separable = table["separable"].map({True: "yes", False: "no"}).astype(object).fillna("too few")
+    shown = table.assign(separable=separable.where(table["p"].notna(), "-"), refused=table["refused"].fillna(""))
     print(text_table(list(shown), [[_cell(value) for value in row] for row in shown.itertuples(index=False)]))
     return OK
 

@@ -106,6 +106,8 @@ human_labels = stage(
     needs=_NONE,
 )
 human_agreement = stage(HUMAN_AGREEMENT, _make_agreement, group=GROUP, deps=[human_labels])
-human_row = stage(HUMAN_ROW, _make_row, group=GROUP, deps=[human_labels])
-panel_errors = stage(PANEL_ERRORS, _make_errors, group=GROUP, deps=[human_labels, verdicts, judges], needs=_SOME)
-corrected = stage(CORRECTED, _make_corrected, group=GROUP, deps=[human_labels, verdicts, judges], needs=_SOME)
+human_row = stage(HUMAN_ROW, _make_row, group=GROUP, code="2", deps=[human_labels])
+panel_errors = stage(
+    PANEL_ERRORS, _make_errors, group=GROUP, code="2", deps=[human_labels, verdicts, judges], needs=_SOME
+)
+corrected = stage(CORRECTED, _make_corrected, group=GROUP, code="2", deps=[human_labels, verdicts, judges], needs=_SOME)

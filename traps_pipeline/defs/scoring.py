@@ -82,7 +82,7 @@ def _make_contrasts(workspace: Workspace, _: None) -> Made:
 
     cells, judged = _scored(workspace, "contrasts")
     table = paired(resample(judged), cells, judged)
-    separable, refused = table["separable"].to_numpy(bool), len(table.loc[table["refused"].notna()])
+    separable, refused = table["separable"].to_numpy(bool, na_value=False), len(table.loc[table["refused"].notna()])
     separable_overall = table.loc[separable & (table["dataset"] == "overall")]
     shown = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": refused}
     return Made(table, shown=shown)
@@ -203,7 +203,7 @@ hypotheses = stage(
     checks=[
         Check(
             "doses_hold",
-            "Shares lie in [0, 1], differences in [-1, 1], and intervals are ordered.",
+            "Shares lie in [0, 1], J in [-1, 1], changes in [-2, 2], and intervals are ordered.",
             _wrong_doses,
         )
     ],

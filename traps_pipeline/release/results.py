@@ -129,7 +129,7 @@ def _ever_results(row: Row, dataset: str, release: Release) -> Iterator[dict[str
         low, high = row[f"{name}_ci_low"], row[f"{name}_ci_high"]
         if pd.notna(low) and pd.notna(high):
             interval: dict[str, Any] = {"lower": float(low), "upper": float(high), "confidence_level": 0.95}
-            interval["method"] = "cluster bootstrap over scenarios"
+            interval["method"] = "Bayesian bootstrap over scenarios with one unseen"
             score["uncertainty"] = {"confidence_interval": interval, "num_bootstrap_samples": RESAMPLES}
         yield {
             "evaluation_result_id": f"{release.name}/{row['regime']}/{name}",

@@ -71,7 +71,7 @@ LEGEND = {
     "J": "AbsRec − FalseAbs, from −1 to 1; 0 for every strategy that does not distinguish void from control",
     "PECS": "Acc × max(0, J), from 0 to 1; computed per run, then averaged. J is clipped at 0 here, so chance alone "
     "lifts a random strategy slightly above 0; look at the column J, which is not clipped",
-    "95 % CI": "percentile interval of PECS, cluster bootstrap over scenarios",
+    "95 % CI": "interval of PECS, Bayesian bootstrap over scenarios with one unseen",
     "±": "population standard deviation over runs",
     "n": "pairs (one control, one void) per run",
     "Missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares are over the other items",

@@ -1,18 +1,22 @@
-"""Resampled figures and their percentile intervals: a cluster bootstrap over scenarios (docs/scoring.md, "Intervals").
+"""Resampled figures and their intervals: a Bayesian bootstrap over scenarios, one of them unseen (docs/scoring.md,
+"Intervals").
 
 A scenario is one draw of the world: its pairs in both datasets of its taxonomy, in every run, model and regime, stay
 together. All cells of a taxonomy share one weight matrix, so two entries' resamples are paired, and their difference is
 a paired difference (`contrasts`).
 
-Because PECS clips J at 0, the interval of PECS for a strategy without discrimination (J = 0 up to chance) lies slightly
-above 0 and need not contain 0; to test whether J differs from 0, use J (`leaderboard.pooled_j`).
+Every resample is computed twice, since scenarios that were not drawn may be unlike all those that were: once with one
+unseen scenario in each share that is the worst for the figure (its lower end), once with one that is the best (its
+upper end). For a share of n answers this is the interval of Clopper and Pearson; for a mean over scenarios it is the
+bound of Gaffke (2005). So an interval keeps a width where all answers agree, and with one scenario.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import cast
+from zlib import crc32
 
 import numpy as np
 import pandas as pd
@@ -25,30 +29,34 @@ ENTRY = ["model", "regime", "dataset"]
 RESAMPLED = ("acc", "abs_rec", "false_abs", "j", "pecs")
 INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED for end in ("low", "high")]
 RESAMPLES, SEED = 10_000, 20260101
+_GRAIN = 256  # weights are multiples of 1/256, so that float32 sums of them are exact on every machine
+_LEVEL = 0.95
 
 
 @dataclass(frozen=True)
 class Resampled:
-    """The mean over runs of every figure in every resample.
+    """The mean over runs of every figure, and of its ends in every resample.
 
-    entries: (model, regime, dataset or `overall`) of each row; values: (entries, RESAMPLED, resamples) float64, NaN
-    where a denominator is 0, and for an `overall` entry without a run that has all four datasets.
+    entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED) float64;
+    values: (entries, 2, RESAMPLED, resamples) float64, lower ends before upper ends. NaN where nothing is decided, and
+    for an `overall` entry without a run that has all four datasets.
     """
 
     entries: list[tuple[str, str, str]]
+    observed: np.ndarray
     values: np.ndarray
 
     def figure(self, name: str) -> np.ndarray:
-        """The resamples of one figure: (entries, resamples)."""
-        return self.values[:, RESAMPLED.index(name)]
+        """Return the ends of one figure: (entries, 2, resamples)."""
+        return self.values[:, :, RESAMPLED.index(name)]
 
 
 def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> Resampled:
-    """Resamples of every (model, regime) on each of its datasets, and overall: the equal-weight mean over the four
+    """Resample every (model, regime) on each of its datasets, and overall: the equal-weight mean over the four
     datasets, over the runs that have all four. Figures are computed per run, then averaged.
 
     Memory: one float32 weight matrix (resamples, scenarios) per taxonomy, one (resamples, 6 x cells) product of a
-    single model and regime, and the result: 200 kB per entry and figure at 10,000 resamples over four datasets.
+    single model and regime, and the result: 400 kB per entry and figure at 10,000 resamples over four datasets.
     """
     items = pd.concat(
         [verdicts[["model", "regime", "dataset", "run", "scenario_id"]], decision_counts(verdicts)], axis=1
@@ -58,36 +66,66 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
     entries, values = [], []
     for key, group in items.groupby(["model", "regime"], sort=True):
         model, regime = cast(tuple[str, str], key)
-        draws = {cell: figures_of(sums) for cell, sums in run_sums(group, drawn).items()}
-        for dataset, mean in means_over_runs(draws, resamples).items():
+        sums = run_sums(group, drawn, f"{model}|{regime}")
+        for dataset, mean in means_over_runs(sums, figures_of, resamples + 1).items():
             entries.append((model, regime, dataset))
             values.append(mean)
-    shape = (len(entries), len(RESAMPLED), resamples)
-    return Resampled(entries, np.stack(values) if values else np.zeros(shape))
+    stacked = np.stack(values) if values else np.zeros((0, 2, len(RESAMPLED), resamples + 1))
+    return Resampled(entries, stacked[:, 1, :, 0], stacked[..., 1:])
 
 
-def intervals(resampled: Resampled, level: float = 0.95) -> pd.DataFrame:
-    """Percentile intervals: columns ENTRY and INTERVAL_COLUMNS, one row per entry.
-
-    A resample in which some denominator is 0 is dropped from that interval's percentiles; null where none is left.
-    """
-    bounds = percentiles(resampled.values, level).reshape(len(resampled.entries), len(INTERVAL_COLUMNS))
+def intervals(resampled: Resampled, level: float = _LEVEL) -> pd.DataFrame:
+    """Return 95 % intervals: columns ENTRY and INTERVAL_COLUMNS, one row per entry; null where nothing is decided."""
+    ends = [
+        interval(resampled.figure(name), resampled.observed[:, k], limits_of(name), level)
+        for k, name in enumerate(RESAMPLED)
+    ]
     table = pd.DataFrame(resampled.entries, columns=pd.Index(ENTRY))
+    bounds = np.concatenate(ends, axis=-1) if resampled.entries else np.zeros((0, len(INTERVAL_COLUMNS)))
     return pd.concat([table, pd.DataFrame(bounds, columns=pd.Index(INTERVAL_COLUMNS))], axis=1)
 
 
-def percentiles(draws: np.ndarray, level: float = 0.95) -> np.ndarray:
+def limits_of(figure: str) -> tuple[float, float]:
+    """Return the least and the greatest value of a figure: [-1, 1] for J, [0, 1] for all others."""
+    return (-1.0, 1.0) if figure == "j" else (0.0, 1.0)
+
+
+def interval(
+    ends: np.ndarray, observed: np.ndarray | float, limits: tuple[float, float], level: float = _LEVEL
+) -> np.ndarray:
+    """Return the interval of figures from their resampled ends: (.., 2, resamples) -> (.., 2).
+
+    Every interval that is printed comes from here. It contains `observed` (..) and lies within the limits; a NaN among
+    the resamples is left out, and the interval is NaN where all are.
+    """
+    low = np.fmin(quantile(ends[..., 0, :], (1 - level) / 2), observed)
+    high = np.fmax(quantile(ends[..., 1, :], (1 + level) / 2), observed)
+    nothing = np.isnan(ends).all(axis=(-2, -1))[..., None]
+    return np.where(nothing, np.nan, np.clip(np.stack([low, high], axis=-1), *limits))
+
+
+def difference(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the ends of left - right from theirs, (.., 2, resamples) each: an unseen scenario may be the worst for one
+    and the best for the other."""
+    return left - right[..., ::-1, :]
+
+
+def percentiles(draws: np.ndarray, level: float = _LEVEL) -> np.ndarray:
     """The central interval over the last axis without NaN: (.., resamples) -> (.., 2); NaN where all values are NaN."""
-    tails = [(1 - level) / 2, (1 + level) / 2]
+    return np.stack([quantile(draws, q) for q in ((1 - level) / 2, (1 + level) / 2)], axis=-1)
+
+
+def quantile(draws: np.ndarray, q: float) -> np.ndarray:
+    """A quantile over the last axis without NaN: (.., resamples) -> (..); NaN where all values are NaN."""
     flat = draws.reshape(-1, draws.shape[-1])
     whole = ~np.isnan(flat).any(axis=1)
-    bounds = np.full((len(flat), 2), np.nan)
-    bounds[whole] = np.quantile(flat[whole], tails, axis=1).T
+    values = np.full(len(flat), np.nan)
+    values[whole] = np.quantile(flat[whole], q, axis=1)
     for row in np.flatnonzero(~whole):
         valid = flat[row][~np.isnan(flat[row])]
         if len(valid):
-            bounds[row] = np.quantile(valid, tails)
-    return bounds.reshape(*draws.shape[:-1], 2)
+            values[row] = np.quantile(valid, q)
+    return values.reshape(draws.shape[:-1])
 
 
 def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> np.ndarray:
@@ -98,31 +136,47 @@ def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> n
     return rng.multinomial(scenarios, np.full(scenarios, 1 / scenarios), size=resamples).astype(np.float32)
 
 
-Drawn = Mapping[str, tuple[pd.Index, np.ndarray]]  # by taxonomy: its scenarios, and how often each is drawn
+@dataclass(frozen=True)
+class Drawn:
+    """Weights of scenarios in every resample, after a first draw that takes each scenario once and no unseen one, and
+    so gives the figures themselves.
+
+    scenarios: by taxonomy its scenarios (n,) and their weights (1 + resamples, n) float32: exponential with mean 1,
+    positive.
+    """
+
+    scenarios: Mapping[str, tuple[pd.Index, np.ndarray]]
+    resamples: int
+    seed: int
+
+    def unseen(self, figures_of: str, decisions: int) -> np.ndarray:
+        """Return the weights of an unseen scenario for each decision of what is named, (2 x decisions, 1 + resamples)
+        float64: the same for one name, unrelated for two. Those of figures come before those of means over datasets,
+        which weigh half as much: four datasets are not all unlucky at once, and their distances add up in squares."""
+        rng = np.random.default_rng([self.seed, len(TAXONOMIES), crc32(figures_of.encode())])
+        whole, normal = (
+            rng.standard_exponential((decisions, self.resamples)),
+            rng.standard_normal((decisions, self.resamples)),
+        )
+        return np.concatenate([np.zeros((2 * decisions, 1)), np.concatenate([whole, normal**2 / 2])], axis=1)
 
 
 def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Drawn:
-    """Scenarios of items (columns scenario_id, taxonomy) with their weights (`scenario_weights`)."""
+    """Draw the weights of the scenarios of items (columns scenario_id, taxonomy)."""
     drawn = {}
     for k, taxonomy in enumerate(TAXONOMIES):
         ids = pd.Index(sorted(items.loc[items["taxonomy"] == taxonomy, "scenario_id"].unique()))
-        drawn[taxonomy] = ids, scenario_weights(len(ids), resamples, [seed, k])
-    return drawn
-
-
-def with_observed(drawn: Drawn) -> Drawn:
-    """The same draws after one that takes each scenario once, and so gives the figures themselves."""
-    return {
-        taxonomy: (ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights]))
-        for taxonomy, (ids, weights) in drawn.items()
-    }
+        weights = np.random.default_rng([seed, k]).standard_exponential((resamples, len(ids)), np.float32)
+        weights = np.ceil(weights * _GRAIN) / _GRAIN
+        drawn[taxonomy] = ids, np.concatenate([np.ones((1, len(ids)), np.float32), weights])
+    return Drawn(drawn, resamples, seed)
 
 
 def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Sums of counts of every cell and resample: (cells, kinds, resamples).
+    """Weighted sums of counts of every cell and resample: (cells, kinds, resamples).
 
     weights is (resamples, scenarios), counts is (scenarios, cells, kinds), such as the six of COUNTS. Sums of whole
-    counts stay far below 2^24, so float32 products are exact; weighted counts are summed in float64.
+    counts stay below 2^16, so float32 products are exact; weighted counts are summed in float64.
     """
     scenarios, cells, kinds = counts.shape
     whole = np.array_equal(counts, np.rint(counts))
@@ -130,49 +184,85 @@ def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return products.reshape(cells, kinds, -1).astype(np.float64)
 
 
-def shares_of(sums: np.ndarray) -> np.ndarray:
-    """Acc, FalseAbs and AbsRec of sums of COUNTS: (.., 6, resamples) -> (.., 3, resamples); NaN where a denominator is
-    0."""
+def with_unseen(sums: np.ndarray, scenarios: np.ndarray, unseen: np.ndarray) -> np.ndarray:
+    """Return sums (.., 2 x decisions, draws) of how often each decision was yes and was made, followed by how often the
+    unseen scenario makes it: (.., 4 x decisions, draws).
+
+    That is as often as a scenario that has it does on average. scenarios: how many have it, (.., decisions); unseen:
+    weights of `Drawn.unseen`.
+    """
+    size = sums[..., 1::2, 0] / np.maximum(scenarios, 1)
+    return np.concatenate([sums, np.concatenate([size, size], axis=-1)[..., None] * unseen], axis=-2)
+
+
+def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
+    """Return the lower and upper ends of shares from sums of `with_unseen`, of COUNTS those of Acc, FalseAbs and
+    AbsRec: (.., 4 x decisions, resamples) -> (2, .., decisions, resamples); NaN where a denominator is 0.
+
+    in_mean: whether the shares enter a mean over datasets or arms (`Drawn.unseen`).
+    """
+    decisions = sums.shape[-2] // 4
+    yes, made = sums[..., 0 : 2 * decisions : 2, :], sums[..., 1 : 2 * decisions : 2, :]
+    first = (3 if in_mean else 2) * decisions
+    unseen = sums[..., first : first + decisions, :]
     with np.errstate(invalid="ignore"):
-        return sums[..., 0::2, :] / sums[..., 1::2, :]
+        return np.stack([yes, yes + unseen]) / (made + unseen)
 
 
-def figures_of(sums: np.ndarray) -> np.ndarray:
-    """RESAMPLED figures of sums of COUNTS: (.., 6, resamples) -> (.., RESAMPLED, resamples); NaN where a denominator
-    is 0."""
-    return figures_of_shares(shares_of(sums))
+def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
+    """RESAMPLED figures of sums of COUNTS: (.., 12, resamples) -> (2, .., RESAMPLED, resamples), as `shares_of`."""
+    return figures_of_shares(shares_of(sums, in_mean))
 
 
 def figures_of_shares(shares: np.ndarray) -> np.ndarray:
-    """RESAMPLED figures of Acc, FalseAbs and AbsRec: (.., 3, resamples) -> (.., RESAMPLED, resamples)."""
+    """RESAMPLED figures of the ends of Acc, FalseAbs and AbsRec: (2, .., 3, resamples) -> (2, .., RESAMPLED,
+    resamples)."""
     acc, false_abs, abs_rec = np.moveaxis(shares, -2, 0)
-    j = abs_rec - false_abs
-    return np.stack([acc, abs_rec, false_abs, j, pecs_of(acc, j)], axis=-2)
+    j = abs_rec - false_abs[::-1]
+    return np.stack([acc, abs_rec, false_abs, j, ends_of_pecs(acc, j)], axis=-2)
 
 
-def run_sums(group: pd.DataFrame, drawn: Drawn) -> dict[tuple[str, int], np.ndarray]:
-    """(dataset, run) -> sums of COUNTS (6, resamples), for the items of one model and regime. A dataset (an arm) may
-    have items of both taxonomies."""
-    found: dict[tuple[str, int], np.ndarray] = {}
+def ends_of_pecs(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Return the ends of PECS from those of Acc and of J, (2, ..) each.
+
+    J is not clipped at the lower end: at J = 0 the clipped J of every cell and run is above 0 by chance, and so would
+    be the lower end of their mean. `interval` clips the mean.
+    """
+    return np.stack([acc[0] * j[0], pecs_of(acc[1], j[1])])
+
+
+def run_sums(group: pd.DataFrame, drawn: Drawn, named: str) -> dict[tuple[str, int], np.ndarray]:
+    """(dataset, run) -> sums of COUNTS with an unseen scenario (12, 1 + resamples), for the items of one model and
+    regime. A dataset (an arm) may have items of both taxonomies. named: what tells the items' unseen scenarios from
+    others'."""
+    totals: dict[tuple[str, int], np.ndarray] = {}
+    having: dict[tuple[str, int], np.ndarray] = {}
     for taxonomy, items in group.groupby("taxonomy", sort=True):
-        scenarios, weights = drawn[str(taxonomy)]
+        scenarios, weights = drawn.scenarios[str(taxonomy)]
         cells = items.groupby(["dataset", "run"], sort=True)
         counts = np.zeros((len(scenarios), cells.ngroups, len(COUNTS)))
         places = scenarios.get_indexer(pd.Index(items["scenario_id"])), cells.ngroup().to_numpy()
         np.add.at(counts, places, items[COUNTS].to_numpy())
-        for cell, sums in zip(cells.size().index, resampled_sums(weights, counts), strict=True):
+        having_any = (counts[..., 1::2] > 0).sum(axis=0)
+        for cell, sums, n in zip(cells.size().index, resampled_sums(weights, counts), having_any, strict=True):
             key = cast(tuple[str, int], cell)
-            found[key] = found[key] + sums if key in found else sums
-    return found
+            totals[key] = totals.get(key, 0) + sums
+            having[key] = having.get(key, 0) + n
+    unseen = {dataset: drawn.unseen(f"{named}|{dataset}", len(COUNTS) // 2) for dataset in {of for of, _ in totals}}
+    return {key: with_unseen(sums, having[key], unseen[key[0]]) for key, sums in totals.items()}
 
 
-def means_over_runs(draws: Mapping[tuple[str, int], np.ndarray], resamples: int) -> dict[str, np.ndarray]:
-    """Dataset or `overall` -> mean over runs (RESAMPLED, resamples), from those of (dataset, run)."""
-    runs = sorted({run for _, run in draws})
+def means_over_runs(
+    sums: Mapping[tuple[str, int], np.ndarray], figures: Callable[[np.ndarray, bool], np.ndarray], draws: int
+) -> dict[str, np.ndarray]:
+    """Dataset or `overall` -> mean over runs (2, RESAMPLED, draws), from the `run_sums` of (dataset, run) and the
+    function (`figures_of`) that makes figures of them."""
+    runs = sorted({run for _, run in sums})
     means = {
-        dataset: np.mean([draws[dataset, run] for run in runs if (dataset, run) in draws], axis=0)
+        dataset: np.mean([figures(sums[dataset, run], False) for run in runs if (dataset, run) in sums], axis=0)
         for dataset in DATASETS
-        if any((dataset, run) in draws for run in runs)
+        if any((dataset, run) in sums for run in runs)
     }
-    whole = [draws[d, run] for run in runs if all((d, run) in draws for d in DATASETS) for d in DATASETS]
-    return {**means, "overall": np.mean(whole, axis=0) if whole else np.full((len(RESAMPLED), resamples), np.nan)}
+    whole = [sums[d, run] for run in runs if all((d, run) in sums for d in DATASETS) for d in DATASETS]
+    nothing = np.full((2, len(RESAMPLED), draws), np.nan)
+    return {**means, "overall": np.mean([figures(own, True) for own in whole], axis=0) if whole else nothing}

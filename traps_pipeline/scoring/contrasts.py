@@ -18,7 +18,16 @@ import pandas as pd
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import DATASETS, REGIMES
-from traps_pipeline.scoring.bootstrap import ENTRY, RESAMPLED, RESAMPLES, Resampled, percentiles, resample
+from traps_pipeline.scoring.bootstrap import (
+    ENTRY,
+    RESAMPLED,
+    RESAMPLES,
+    Resampled,
+    difference,
+    interval,
+    limits_of,
+    resample,
+)
 from traps_pipeline.scoring.epochs import answered, origins_of, refusal
 from traps_pipeline.scoring.leaderboard import means_over_runs, standings
 from traps_pipeline.scoring.metrics import CELL, cell_metrics
@@ -40,7 +49,7 @@ def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFram
     on each dataset, and overall where both sides have a run of all four.
     """
     places = {entry: row for row, entry in enumerate(resampled.entries)}
-    items_of = answered(verdicts)
+    items_of, sizes = answered(verdicts), _scenarios(verdicts)
     means = means_over_runs(metrics).loc[:, [*FIGURES]].to_dict("index")
     rows = []
     for kind, dataset, left, right in _pairs([entry for entry in resampled.entries if entry in items_of]):
@@ -52,11 +61,11 @@ def contrasts(resampled: Resampled, metrics: pd.DataFrame, verdicts: pd.DataFram
             if refused is None:
                 draws = [resampled.figure(figure)[places[(*side, dataset)]] for side in (left, right)]
                 observed = [means.get((*side, dataset), {}).get(figure, np.nan) for side in (left, right)]
-                row |= _difference(draws[0] - draws[1], observed[0] - observed[1], len(items) // 2)
+                row |= _difference(figure, draws, observed, sizes[(*left, dataset)])
             rows.append(row)
     table = pd.DataFrame(rows, columns=pd.Index([*CONTRASTS.names, "_regime"]))
     table["p_holm"] = _holm_by(table, _FAMILY)
-    table["separable"] = table["p_holm"].astype(float) < SEPARABLE_BELOW
+    table["separable"] = _separable(table, _FAMILY)
     return table.loc[:, CONTRASTS.names]
 
 
@@ -64,9 +73,10 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     """The change between two studies, such as two versions of the benchmark: now minus then, on their common pairs.
 
     then and now are VERDICTS rows; a pair that is not whole in both, in the same run and cell, is left out. Columns:
-    model, regime, dataset (and `overall`), figure, n_pairs per run, then, now, difference, ci_low, ci_high, p, p_holm,
-    VERSION_SIDES with the suffixes _then and _now, and refused: why there is no difference, where an item was answered
-    in different epochs. Raises TrapsError where the two studies share no whole pair.
+    model, regime, dataset (and `overall`), figure, n_pairs per run, n_scenarios, then, now, difference, ci_low,
+    ci_high, p, p_holm, separable, VERSION_SIDES with the suffixes _then and _now, and refused: why there is no
+    difference, where an item was answered in different epochs. Raises TrapsError where the two studies share no whole
+    pair.
     """
     sides = _whole_pairs_of_both(then, now)
     if sides[0].empty:
@@ -75,6 +85,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     board = boards[0].join(boards[1], how="inner").rename(columns={"n_pairs_now": "n_pairs"})
     asked, drawn = [answered(rows) for rows in sides], [resample(rows, resamples) for rows in sides]
     draws = [dict(zip(found.entries, found.values, strict=True)) for found in drawn]
+    sizes = _scenarios(sides[1])
     rows = []
     for entry, about in board.to_dict("index").items():
         refused = refusal(asked[0][entry], asked[1][entry])
@@ -82,14 +93,29 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
             values = {f"{name}_{side}": about[f"{name}_{side}"] for name in VERSION_SIDES for side in ("then", "now")}
             values |= {side: about[f"{figure}_{side}"] for side in ("then", "now")}
             row = dict(zip(ENTRY, entry, strict=True)) | {"figure": figure, "n_pairs": about["n_pairs"], **values}
+            row["n_scenarios"] = sizes[entry]
             if refused is None:
-                before, after = (found[entry][RESAMPLED.index(figure)] for found in draws)
-                row |= _difference(after - before, row["now"] - row["then"], row["n_pairs"])
+                ends = [found[entry][:, RESAMPLED.index(figure)] for found in draws[::-1]]
+                row |= _difference(figure, ends, [row["now"], row["then"]], sizes[entry])
             rows.append(row | {"refused": refused})
-    columns = [*ENTRY, "figure", "n_pairs", "then", "now", "difference", "ci_low", "ci_high", "p", "p_holm"]
-    columns += [f"{name}_{side}" for name in VERSION_SIDES for side in ("then", "now")] + ["refused"]
+    columns = [
+        *ENTRY,
+        "figure",
+        "n_pairs",
+        "n_scenarios",
+        "then",
+        "now",
+        "difference",
+        "ci_low",
+        "ci_high",
+        "p",
+        "p_holm",
+    ]
+    columns += ["separable"] + [f"{name}_{side}" for name in VERSION_SIDES for side in ("then", "now")] + ["refused"]
     table = pd.DataFrame(rows, columns=pd.Index(columns))
-    table["p_holm"] = _holm_by(table, ["dataset", "figure"])
+    family = ["dataset", "figure"]
+    table["p_holm"] = _holm_by(table, family)
+    table["separable"] = _separable(table, family)
     return table
 
 
@@ -165,26 +191,60 @@ def _pairs(entries: Sequence[tuple[str, str, str]]) -> Iterator[tuple[str, str, 
                 yield "regimes", dataset, left, right
 
 
-def _difference(draws: np.ndarray, observed: float, pairs: int) -> dict[str, float]:
-    """The columns of a paired difference over a number of pairs: its interval and two-sided p from its resamples.
+def least_p(scenarios: int) -> float:
+    """Return the smallest two-sided p that paired differences of n scenarios can give, 2^(1 - n): that of a sign-flip
+    test whose differences all have one sign. Pairs of one scenario go together, so they count once."""
+    return min(1.0, 2.0 ** (1 - scenarios))
 
-    If every resample is NaN there are no columns. p is twice the smaller share of resamples on one side of 0; a
-    resample at 0 counts for both sides, and one is added to each count. This is never below 2 / (resamples + 1), so
-    no contrast of many models could be significant after Holm's correction. Therefore, where no resample lies beyond 0,
-    p is the tail beyond 0 of a normal distribution with the resamples' mean and standard error, if that is smaller, but
-    not below 2^(1 - pairs), the smallest p that a sign-flip test over all pairs could give.
+
+def _scenarios(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], int]:
+    """The number of scenarios of every (model, regime, dataset), and of `overall`: those of all its datasets."""
+    rows = verdicts[[*ENTRY, "scenario_id"]]
+    counts = pd.concat([rows, rows.assign(dataset="overall")]).groupby(ENTRY)["scenario_id"].nunique()
+    return cast(dict[tuple[str, str, str], int], counts.to_dict())
+
+
+def _difference(
+    figure: str, sides: Sequence[np.ndarray], observed: Sequence[float], scenarios: int
+) -> dict[str, float]:
+    """The columns of a paired difference of two sides over a number of scenarios: its interval and two-sided p.
+
+    sides: the resampled ends of the left and the right, (2, resamples) each. If every resample is NaN, there is no p.
     """
-    valid = draws[~np.isnan(draws)]
-    if not len(valid):
-        return {}
-    low, high = percentiles(valid)
-    beyond = min(int((valid <= 0).sum()), int((valid >= 0).sum()))
-    p = 2 * (beyond + 1) / (len(valid) + 1)
-    if not beyond:
-        error = float(valid.std())
-        tail = erfc(abs(float(valid.mean())) / error / sqrt(2) if error else inf)
-        p = min(p, max(tail, 2.0 ** (1 - pairs)))
-    return {"difference": observed, "ci_low": low, "ci_high": high, "p": min(1.0, p)}
+    low, high = difference(*sides)
+    apart = observed[0] - observed[1]
+    least, most = limits_of(figure)
+    ends = interval(np.stack([low, high]), apart, (least - most, most - least))
+    columns = {"n_scenarios": scenarios, "difference": apart, "ci_low": ends[0], "ci_high": ends[1]}
+    low, high = low[~np.isnan(low)], high[~np.isnan(high)]
+    if not len(low) or not len(high):
+        return columns
+    p = 2 * min(_beyond(low), _beyond(-high))
+    return columns | {"p": min(1.0, max(p, least_p(scenarios)))}
+
+
+def _beyond(ends: np.ndarray) -> float:
+    """The share of ends at 0 or below, one added to their count.
+
+    This is never below 1 / (resamples + 1), so no contrast of many models could be significant after Holm's correction.
+    Therefore, where no end lies there, it is the tail of a normal distribution with the mean and standard error of the
+    ends, if that is smaller.
+    """
+    beyond = int((ends <= 0).sum())
+    share = (beyond + 1) / (len(ends) + 1)
+    if beyond:
+        return share
+    error = float(ends.std())
+    return min(share, erfc(float(ends.mean()) / error / sqrt(2) if error else inf) / 2)
+
+
+def _separable(table: pd.DataFrame, family: Sequence[str]) -> pd.Series:
+    """Whether p_holm is below SEPARABLE_BELOW; null where no answers of so few scenarios could make the smallest p of
+    the family that small, and False where there is no p."""
+    compared = table.groupby(list(family))["p"].transform("count").to_numpy(float)
+    least = np.array([least_p(int(n)) if n == n else 0.0 for n in table["n_scenarios"].astype(float)])
+    separable = pd.Series(table["p_holm"].astype(float) < SEPARABLE_BELOW, dtype="boolean")
+    return separable.mask(table["p"].notna() & (least * compared >= SEPARABLE_BELOW))
 
 
 def _holm_by(table: pd.DataFrame, family: Sequence[str]) -> np.ndarray:

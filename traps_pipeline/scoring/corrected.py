@@ -23,12 +23,13 @@ from traps_pipeline.scoring.bootstrap import (
     SEED,
     Drawn,
     draw_scenarios,
+    figures_of,
     figures_of_shares,
     means_over_runs,
     resampled_sums,
     run_sums,
     shares_of,
-    with_observed,
+    with_unseen,
 )
 from traps_pipeline.scoring.metrics import decision_counts, joined_epochs
 from traps_pipeline.scoring.people import stratum_weights, with_intervals
@@ -36,7 +37,7 @@ from traps_pipeline.scoring.people_tables import CORRECTED, PANEL_ERRORS
 
 SHARES: tuple[TaskName, ...] = ("correctness", "abstention", "abstention")  # behind Acc, FalseAbs and AbsRec
 NO_BETTER = "the panel agrees with people no better than chance"
-Errors = Mapping[TaskName, np.ndarray]  # by task: sensitivity and specificity, (2, draws)
+Errors = Mapping[TaskName, np.ndarray]  # by task: the ends of sensitivity and specificity, (2, 2, draws)
 
 
 def panel_errors(
@@ -71,7 +72,7 @@ def corrected(
     panel, rows = joined_epochs(verdicts["panel"]), list[dict[str, Any]]()
     for key, group in items.groupby(["model", "regime"], sort=True):
         model, regime = cast(tuple[str, str], key)
-        for dataset, figures in _entry(group, drawn, errors).items():
+        for dataset, figures in _entry(group, f"{model}|{regime}", drawn, errors).items():
             entry = {"model": model, "regime": regime, "dataset": dataset, "panel": panel}
             rows.append(entry | {"n_runs": _runs(group, dataset)} | figures)
     return pd.DataFrame(rows, columns=pd.Index(CORRECTED.names))
@@ -85,13 +86,20 @@ def rogan_gladen(share: np.ndarray, sensitivity: np.ndarray, specificity: np.nda
         return np.clip(np.where(gain > 1e-12, (share + specificity - 1) / gain, np.nan), 0.0, 1.0)
 
 
+def _corrected_ends(share: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """The ends of a corrected share, (2, draws), from those of the judged one, (2, draws), and of sensitivity and
+    specificity, (2, 2, draws): it rises with the share and with specificity, and falls with sensitivity."""
+    sensitivity, specificity = errors[:, 0], errors[:, 1]
+    return rogan_gladen(share, sensitivity[::-1], specificity)
+
+
 def _is_labelled(labels: pd.DataFrame) -> bool:
     return bool(labels["task"].isin(list(ABOUT_ANSWERS)).any())
 
 
 def _drawn(verdicts: pd.DataFrame, resamples: int, seed: int) -> Drawn:
     items = verdicts[["scenario_id"]].assign(taxonomy=[taxonomy_of(dataset) for dataset in verdicts["dataset"]])
-    return with_observed(draw_scenarios(items, resamples, seed))
+    return draw_scenarios(items, resamples, seed)
 
 
 def _errors(labels: pd.DataFrame, drawn: Drawn) -> Errors:
@@ -105,15 +113,14 @@ def _errors(labels: pd.DataFrame, drawn: Drawn) -> Errors:
         truth, panel = answers["truth"].to_numpy(bool), answers["panel"].to_numpy(bool)
         counts = np.stack([truth & panel, truth, ~truth & ~panel, ~truth], axis=1) * stratum_weights(answers)[:, None]
         taxonomies = np.array([taxonomy_of(dataset) for dataset in answers["dataset"]])
-        total: np.ndarray | float = 0.0
-        for taxonomy, (ids, weights) in drawn.items():
+        total, having = np.zeros(()), np.zeros(counts.shape[1] // 2)
+        for taxonomy, (ids, weights) in drawn.scenarios.items():
             here = taxonomies == taxonomy
             by_scenario = np.zeros((len(ids), 1, counts.shape[1]))
             np.add.at(by_scenario[:, 0], ids.get_indexer(pd.Index(answers["scenario_id"][here])), counts[here])
             total = total + resampled_sums(weights, by_scenario)[0]
-        sums = np.asarray(total)
-        with np.errstate(invalid="ignore"):
-            found[task] = sums[0::2] / sums[1::2]
+            having = having + (by_scenario[:, 0, 1::2] > 0).sum(axis=0)
+        found[task] = shares_of(with_unseen(total, having, drawn.unseen(task, len(having))))
     return found
 
 
@@ -124,7 +131,7 @@ def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: 
     if n_yes in (0, len(decided)):
         why = f"people say {'yes' if n_yes else 'no'} of every answer"
     else:
-        why = None if draws[:, 0].sum() > 1 else NO_BETTER
+        why = None if draws[0, :, 0].sum() > 1 else NO_BETTER
     return {
         "task": task,
         "n_answers": len(decided),
@@ -137,20 +144,20 @@ def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: 
     }
 
 
-def _entry(group: pd.DataFrame, drawn: Drawn, errors: Errors) -> dict[str, dict[str, float]]:
+def _entry(group: pd.DataFrame, named: str, drawn: Drawn, errors: Errors) -> dict[str, dict[str, float]]:
     """The figures of one model and regime, judged and corrected, by dataset."""
-    judged, right = {}, {}
-    draws = next(iter(drawn.values()))[1].shape[0]
-    for cell, sums in run_sums(group, drawn).items():
-        shares = shares_of(sums)
-        judged[cell] = figures_of_shares(shares)
-        fixed = [rogan_gladen(share, *errors[task]) for share, task in zip(shares, SHARES, strict=True)]
-        right[cell] = figures_of_shares(np.stack(fixed))
-    both = means_over_runs(judged, draws), means_over_runs(right, draws)
+
+    def right(sums: np.ndarray, in_mean: bool) -> np.ndarray:
+        shares = shares_of(sums, in_mean)
+        fixed = [_corrected_ends(shares[:, k], errors[task]) for k, task in enumerate(SHARES)]
+        return figures_of_shares(np.stack(fixed, axis=1))
+
+    sums = run_sums(group, drawn, named)
+    both = [means_over_runs(sums, figures, drawn.resamples + 1) for figures in (figures_of, right)]
     return {
         dataset: {**with_intervals(RESAMPLED, figures), **with_intervals(RESAMPLED, both[1][dataset], "_corrected")}
         for dataset, figures in both[0].items()
-        if not np.isnan(figures[:, 0]).all()
+        if not np.isnan(figures[:, :, 0]).all()
     }
 
 

@@ -20,11 +20,13 @@ from traps_pipeline.scoring.bootstrap import (
     RESAMPLES,
     SEED,
     Drawn,
+    difference,
     draw_scenarios,
     figures_of,
-    percentiles,
+    interval,
+    limits_of,
     run_sums,
-    with_observed,
+    shares_of,
 )
 from traps_pipeline.scoring.metrics import COUNTS, decision_counts, joined_epochs
 from traps_pipeline.scoring.tables import HYPOTHESES as TABLE
@@ -32,6 +34,9 @@ from traps_pipeline.scoring.tables import HYPOTHESES as TABLE
 VISUAL = ("occlusion", "chaotic")
 RULES = ("panel-rule", "length-rule", "wording-rule")  # each abstains by one cue alone
 SHOWN = ("acc", "false_abs", "abs_rec", "j")
+_UNSEEN = ("_unseen", "_unseen_in_mean")  # the sums of `with_unseen` after those of COUNTS
+_SUMS = (*COUNTS, *(f"{name}{kind}" for kind in _UNSEEN for name in COUNTS[::2]))
+_CHANGE = (-2.0, 2.0)  # the limits of a change of J
 _KEPT = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]
 
 
@@ -127,7 +132,7 @@ def hypotheses(
     items = pd.concat([verdicts[_KEPT], decision_counts(verdicts)], axis=1)
     items["taxonomy"] = [datasets_of_category(category)[0] for category in verdicts["category"]]
     items["offered"] = [offered[id_] for id_ in items["item_id"]]
-    drawn = with_observed(draw_scenarios(items, resamples, seed))
+    drawn = draw_scenarios(items, resamples, seed)
     rows: list[dict[str, Any]] = []
     for (model, regime), group in cast(Any, items.groupby(["model", "regime"], sort=True)):
         for hypothesis in HYPOTHESES:
@@ -154,7 +159,9 @@ def _row(
     hypothesis: Hypothesis, dose: Dose, items: pd.DataFrame, reference: pd.DataFrame, drawn: Drawn
 ) -> dict[str, Any]:
     """The columns of a dose's row, those of rules aside."""
-    figures = _figures(items, drawn)
+    model, regime = (items[name].iloc[0] for name in ("model", "regime"))
+    named = f"{model}|{regime}|{hypothesis.name}"
+    figures = _figures(items, drawn, f"{named}|{dose.name}")
     control = items["side"].eq("control").to_numpy()
     decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
     row: dict[str, Any] = {
@@ -175,8 +182,8 @@ def _row(
         **dict.fromkeys(_ends("change")),
     }
     for name in SHOWN:
-        row |= _told(name, figures[RESAMPLED.index(name)])
-    row["value"] = _compared(hypothesis, figures)[0]
+        row |= _told(name, figures[:, RESAMPLED.index(name)], limits_of(name))
+    row["value"] = _compared(hypothesis, figures)[1, 0]
     if dose is hypothesis.doses[0] or reference.empty:
         return row
     shared = reference.loc[reference["scenario_id"].isin(items["scenario_id"])]
@@ -185,36 +192,39 @@ def _row(
         return row
     row["refused"] = _refusal(mine, shared)
     if row["refused"] is None:
-        before, after = (_compared(hypothesis, _figures(some, drawn)) for some in (shared, mine))
-        row |= {"n_compared": mine["scenario_id"].nunique(), "at_reference": before[0]}
-        row |= _told("change", after - before)
+        names = (hypothesis.doses[0].name, dose.name)
+        before, after = (
+            _compared(hypothesis, _figures(some, drawn, f"{named}|{name}"))
+            for some, name in zip((shared, mine), names, strict=True)
+        )
+        row |= {"n_compared": mine["scenario_id"].nunique(), "at_reference": before[1, 0]}
+        row |= _told("change", difference(after, before), _CHANGE)
     return row
 
 
-def _figures(items: pd.DataFrame, drawn: Drawn) -> np.ndarray:
-    """RESAMPLED figures and the share of abstentions, (RESAMPLED + 1, draws): of all items per run, then the mean over
-    runs."""
-    sums = run_sums(items.assign(dataset="all"), drawn)
+def _figures(items: pd.DataFrame, drawn: Drawn, named: str) -> np.ndarray:
+    """The ends of RESAMPLED figures and of the share of abstentions, (2, RESAMPLED + 1, draws): of all items per run,
+    then the mean over runs."""
+    sums = run_sums(items.assign(dataset="all"), drawn, named)
     by_run = []
     for of_run in sums.values():
-        at = {name: of_run[COUNTS.index(name)] for name in COUNTS}
-        with np.errstate(invalid="ignore"):
-            abstains = (at["false_abs"] + at["abs_rec"]) / (at["false_abs_of"] + at["abs_rec_of"])
-        by_run.append(np.concatenate([figures_of(of_run), abstains[None]]))
+        rows = dict(zip(_SUMS, of_run, strict=True))
+        both = [rows[f"false_abs{kind}"] + rows[f"abs_rec{kind}"] for kind in ("", "_of", *_UNSEEN)]
+        by_run.append(np.concatenate([figures_of(of_run), shares_of(np.stack(both))], axis=1))
     return np.mean(by_run, axis=0)
 
 
 def _compared(hypothesis: Hypothesis, figures: np.ndarray) -> np.ndarray:
-    return figures[-1] if hypothesis.figure == "abstains" else figures[RESAMPLED.index("j")]
+    return figures[:, -1] if hypothesis.figure == "abstains" else figures[:, RESAMPLED.index("j")]
 
 
 def _ends(name: str) -> list[str]:
     return [name, f"{name}_ci_low", f"{name}_ci_high"]
 
 
-def _told(name: str, draws: np.ndarray) -> dict[str, Any]:
-    """A figure, the first of its draws, and its interval; null where it has no denominator."""
-    values = [draws[0], *percentiles(draws[None, 1:])[0]]
+def _told(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, Any]:
+    """A figure, the first of its ends, and its interval; null where it has no denominator."""
+    values = [ends[1, 0], *interval(ends[:, 1:], ends[1, 0], limits)]
     return dict(zip(_ends(name), [None if value != value else float(value) for value in values], strict=True))
 
 
@@ -254,8 +264,8 @@ def wrong_rows(table: pd.DataFrame) -> int:
     wrong = np.zeros(len(table), bool)
     for name in (*SHOWN, "change"):
         figure, low, high = (table[column].to_numpy(float) for column in _ends(name))
-        least = -1 if name in ("j", "change") else 0
-        wrong |= (figure < least) | (figure > 1) | (low > high) | (low < least) | (high > 1)
+        least, most = _CHANGE if name == "change" else limits_of(name)
+        wrong |= (figure < least) | (figure > most) | (low > high) | (low < least) | (high > most)
     columns = ("j", "abs_rec", "false_abs", "change", "value", "at_reference")
     j, abs_rec, false_abs, change, value, before = (table[name].to_numpy(float) for name in columns)
     whole = (table["n_compared"] == table["n_scenarios"]).fillna(False).to_numpy(bool)

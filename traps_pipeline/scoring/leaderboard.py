@@ -103,9 +103,8 @@ def _deviation(values: pd.Series) -> float:
 def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
     """rank, rank_low and rank_high of every row among those of its panel, on `board`'s index; null where there is no
     PECS, and where the row is of several panels."""
-    separable = contrasts.loc[
-        (contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & contrasts["separable"]
-    ]
+    known = contrasts["separable"].astype("boolean").fillna(False)
+    separable = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & known]
     wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
     for row in separable.to_dict("records"):
         winner, loser = (row["left_model"], row["right_model"])[:: 1 if row["difference"] > 0 else -1]

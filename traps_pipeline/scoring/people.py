@@ -20,10 +20,10 @@ from traps_pipeline.scoring.bootstrap import (
     SEED,
     draw_scenarios,
     figures_of,
+    interval,
+    limits_of,
     means_over_runs,
-    percentiles,
     run_sums,
-    with_observed,
 )
 from traps_pipeline.scoring.metrics import COUNTS, decision_counts
 from traps_pipeline.scoring.people_tables import HUMAN_ROW
@@ -35,17 +35,18 @@ def stratum_weights(labels: pd.DataFrame) -> np.ndarray:
 
 
 def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
-    """HUMAN_ROW rows from HUMAN_LABELS rows: figures of all labels of clips, with intervals by the cluster bootstrap
-    over scenarios. Without a label of a clip there is no row; overall is null until all four datasets have figures."""
+    """Return HUMAN_ROW rows from HUMAN_LABELS rows: figures of all labels of clips, with intervals over scenarios.
+
+    Without a label of a clip there is no row; overall is null until all four datasets have figures.
+    """
     clips = labels.loc[labels["task"] == "answerability"].reset_index(drop=True)
     if clips.empty:
         return pd.DataFrame(columns=pd.Index(HUMAN_ROW.names))
     counts = decision_counts(clips).mul(stratum_weights(clips), axis=0)
     items = pd.concat([clips[["dataset", "scenario_id"]].assign(run=1), counts[COUNTS]], axis=1)
     items["taxonomy"] = items["dataset"].map(taxonomy_of)
-    drawn = with_observed(draw_scenarios(items, resamples, seed))
-    draws = {cell: figures_of(sums) for cell, sums in run_sums(items, drawn).items()}
-    means = means_over_runs(draws, resamples + 1)
+    drawn = draw_scenarios(items, resamples, seed)
+    means = means_over_runs(run_sums(items, drawn, "people"), figures_of, resamples + 1)
     rows = [_row(dataset, figures, _of(clips, dataset)) for dataset, figures in means.items()]
     return pd.DataFrame(rows, columns=pd.Index(HUMAN_ROW.names))
 
@@ -70,9 +71,11 @@ def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, An
 
 
 def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") -> Mapping[str, float]:
-    """Each figure with its interval, as columns, from draws of which the first is what was observed: (names, 1 +
+    """Each figure with its interval, as columns, from ends of which the first is what was observed: (2, names, 1 +
     resamples)."""
-    found: dict[str, float] = {}
-    for name, own, (low, high) in zip(names, draws, percentiles(draws[:, 1:]), strict=True):
-        found |= {f"{name}{suffix}": own[0], f"{name}{suffix}_ci_low": low, f"{name}{suffix}_ci_high": high}
-    return found
+    columns: dict[str, float] = {}
+    for k, name in enumerate(names):
+        own = float(draws[1, k, 0])
+        low, high = interval(draws[:, k, 1:], own, limits_of(name))
+        columns |= {f"{name}{suffix}": own, f"{name}{suffix}_ci_low": low, f"{name}{suffix}_ci_high": high}
+    return columns

@@ -1,23 +1,26 @@
 """How precise a study will be before it is run: the width of PECS's interval, and the difference that can be found.
 
 Studies of a model are drawn, with answers that are independent of each other, and each is resampled as `bootstrap`
-does it. That holds at J = 0 as well, where PECS is clipped, and with few pairs. The overall figure is the mean over
-datasets. Runs ask the same scenarios again and are not counted. Two datasets of one taxonomy share their clips: where
-answers to them go together, intervals are wider than this.
+does it, with its unseen scenarios. That holds at J = 0 as well, where PECS is clipped, and with few pairs. The overall
+figure is the mean over datasets. Runs ask the same scenarios again and are not counted. Two datasets of one taxonomy
+share their clips: where answers to them go together, intervals are wider than this.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from math import sqrt
+from math import comb, sqrt
+from statistics import NormalDist
 
 import numpy as np
 
-from traps_pipeline.scoring.bootstrap import percentiles
+from traps_pipeline.base.partitions import DATASETS, taxonomy_of
+from traps_pipeline.scoring.bootstrap import RESAMPLED, TAXONOMIES, figures_of, interval, limits_of
+from traps_pipeline.scoring.contrasts import SEPARABLE_BELOW, least_p
 from traps_pipeline.scoring.metrics import pecs_of
 
-Z_95, Z_80 = 1.959963984540054, 0.8416212335729143  # of a two-sided 5 % test, and of 80 % power
+POWER = 0.8
 STUDIES, RESAMPLES, SEED = 400, 400, 7  # 0.3 s; the width is off by less than 2 %
 
 
@@ -39,33 +42,57 @@ class Shares:
 @dataclass(frozen=True)
 class Precision:
     """width: of the 95 % interval of PECS. difference: the smallest one between two models of unrelated answers that a
-    test at 5 % finds in 80 % of studies; answers of the same items go together, which makes it smaller, and the
-    correction for many comparisons makes it larger. None where not even a difference of 1 is found so often."""
+    test at 5 % finds in 80 % of studies; among_all: the same after Holm's correction over the pairs of all models, if
+    it is the first to be tested. Answers of the same items go together, which makes both smaller. None where not even
+    a difference of 1 is found so often."""
 
     width: float
     difference: float | None
+    among_all: float | None
 
 
-def precision(pairs: Sequence[int], shares: Shares | None = None) -> Precision:
-    """The precision of the mean over datasets with these numbers of pairs (those without a pair left out). Raises
-    ValueError where none has a pair."""
-    counts = [n for n in pairs if n]
+def precision(pairs: Mapping[str, int], shares: Shares | None = None, models: int = 2) -> Precision:
+    """Return the precision of the mean over datasets with these numbers of pairs (those without a pair left out), in a
+    study of so many models. Raises ValueError where no dataset has a pair."""
+    counts = [pairs.get(name, 0) for name in DATASETS if pairs.get(name, 0)]
     if not counts:
         raise ValueError("no dataset has a pair")
     s, rng = shares or Shares(), np.random.default_rng(SEED)
-    controls = np.array([s.acc, s.false_abs, max(0.0, 1 - s.acc - s.false_abs)])
-    found, drawn = np.zeros(STUDIES), np.zeros((STUDIES, RESAMPLES))
+    control, void = [s.acc, s.false_abs, max(0.0, 1 - s.acc - s.false_abs)], [s.abs_rec, 1 - s.abs_rec]
+    observed, ends = np.zeros(STUDIES), np.zeros((STUDIES, 2, RESAMPLES))
     for n in counts:
-        control = rng.multinomial(n, controls, size=STUDIES) / n
-        void = rng.binomial(n, s.abs_rec, size=STUDIES) / n
-        found += _pecs(control, void) / len(counts)
-        again = rng.multinomial(n, control[:, None], size=(STUDIES, RESAMPLES)) / n
-        drawn += _pecs(again, rng.binomial(n, void[:, None], size=(STUDIES, RESAMPLES)) / n) / len(counts)
-    low, high = percentiles(drawn).T
-    difference = (Z_95 + Z_80) * sqrt(2) * float(found.std())
-    return Precision(float(np.mean(high - low)), difference if difference <= 1 else None)
+        answers = rng.multinomial(n, np.outer(control, void).ravel(), size=STUDIES)
+        drawn = rng.standard_gamma(answers[:, :, None], size=(STUDIES, 6, RESAMPLES))
+        unseen = np.concatenate([rng.standard_exponential((3, RESAMPLES)), rng.standard_gamma(0.5, (3, RESAMPLES))])
+        observed += _pecs(answers[..., None], np.zeros((6, 1)), False)[:, 1, 0] / len(counts)
+        ends += _pecs(drawn, unseen, len(counts) > 1) / len(counts)
+    low, high = interval(ends, observed, limits_of("pecs")).T
+    scenarios = sum(max(pairs.get(name, 0) for name in DATASETS if taxonomy_of(name) == t) for t in TAXONOMIES)
+    return Precision(
+        float(np.mean(high - low)),
+        _detectable(observed, ends, scenarios, 1),
+        _detectable(observed, ends, scenarios, max(1, comb(models, 2))),
+    )
 
 
-def _pecs(control: np.ndarray, void: np.ndarray) -> np.ndarray:
-    """PECS of shares of controls (.., right, abstained, rest) and of voids abstained on (..)."""
-    return pecs_of(control[..., 0], void - control[..., 1])
+def _pecs(answers: np.ndarray, unseen: np.ndarray, in_mean: bool) -> np.ndarray:
+    """The ends of PECS, (studies, 2, draws), of weighted numbers of pairs (studies, 6, draws): right, abstained, wrong
+    on the control, each with a void that was abstained on and with one that was not."""
+    all_pairs = answers.sum(axis=1)
+    yes = answers[:, :2].sum(axis=1), answers[:, 2:4].sum(axis=1), answers[:, ::2].sum(axis=1)
+    sums = np.stack([part for own in yes for part in (own, all_pairs)], axis=1)
+    added = np.broadcast_to(unseen, (len(answers), *unseen.shape))
+    return np.moveaxis(figures_of(np.concatenate([sums, added], axis=1), in_mean)[:, :, RESAMPLED.index("pecs")], 0, 1)
+
+
+def _detectable(observed: np.ndarray, ends: np.ndarray, scenarios: int, comparisons: int) -> float | None:
+    """The difference of two models that is found in 80 % of studies at 5 % by the number of comparisons: the lower end
+    of the one less the upper end of the other is then above 0."""
+    if least_p(scenarios) * comparisons >= SEPARABLE_BELOW:
+        return None
+    normal, (low, high) = NormalDist(), np.moveaxis(ends, 1, 0)
+    apart = float((observed - low.mean(axis=1)).mean() + (high.mean(axis=1) - observed).mean())
+    error = sqrt(float(low.var(axis=1).mean() + high.var(axis=1).mean()))
+    found = apart + normal.inv_cdf(1 - SEPARABLE_BELOW / 2 / comparisons) * error
+    found += normal.inv_cdf(POWER) * sqrt(2) * float(observed.std())
+    return found if found <= 1 else None

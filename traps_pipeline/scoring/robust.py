@@ -27,20 +27,21 @@ from traps_pipeline.scoring.bootstrap import (
     RESAMPLES,
     SEED,
     Drawn,
+    difference,
     draw_scenarios,
+    ends_of_pecs,
     figures_of,
-    percentiles,
+    interval,
     run_sums,
-    with_observed,
 )
-from traps_pipeline.scoring.metrics import decision_counts, joined_epochs, pecs_of
+from traps_pipeline.scoring.metrics import decision_counts, joined_epochs
 from traps_pipeline.scoring.tables import ROBUST
 
 TWIN = "twin_control"
 VISUAL = tuple(dataset for dataset in DATASETS if not is_ill_posed(dataset))
 WITH_CONTROLS, WITH_VOIDS = (*ANSWERABLE_ARMS, *PAIRED_ARMS), (*VOID_ARMS, *PAIRED_ARMS)
 FIGURES = ("acc_r", "abs_rec_r", "false_abs_r", "pecs", "pecs_r", "gap")
-INTERVALS = ("pecs_r", "gap")
+INTERVALS = {"pecs_r": (0.0, 1.0), "gap": (-1.0, 1.0)}  # with the limits of each figure
 _ITEM = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]
 
 
@@ -62,9 +63,9 @@ def robust(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED)
     if not entries:
         return pd.DataFrame(columns=pd.Index(ROBUST.names))
     # A scenario is drawn with its items in all datasets and arms.
-    drawn = with_observed(draw_scenarios(items, resamples, seed))
+    drawn = draw_scenarios(items, resamples, seed)
     rows = [
-        {"model": model, "regime": regime, "arms": list(arms), **_row(group, arms, drawn)}
+        {"model": model, "regime": regime, "arms": list(arms), **_row(group, f"{model}|{regime}", arms, drawn)}
         for (model, regime), (arms, group) in cast(Mapping[tuple[str, str], Any], entries).items()
     ]
     return pd.DataFrame(rows, columns=pd.Index(ROBUST.names))
@@ -85,13 +86,15 @@ def _runs_and_arms(group: pd.DataFrame) -> tuple[list[int], tuple[str, ...]]:
     return sets[best], best
 
 
-def _row(items: pd.DataFrame, arms: Sequence[str], drawn: Drawn) -> dict[str, Any]:
+def _row(items: pd.DataFrame, named: str, arms: Sequence[str], drawn: Drawn) -> dict[str, Any]:
     """The columns of an entry's ROBUST row except model, regime and arms."""
-    figures = {cell: figures_of(sums) for cell, sums in run_sums(items, drawn).items()}
+    figures = {cell: figures_of(sums, in_mean=True) for cell, sums in run_sums(items, drawn, named).items()}
     runs = sorted({run for _, run in figures})
     by_run = np.stack([run_figures({d: figures[d, run] for d in (*DATASETS, *arms)}, arms) for run in runs])
     twins = [_twins(items.loc[items["run"] == run]) for run in runs] if TWIN in arms else []
-    observed = by_run[..., 0]  # (runs, FIGURES)
+    observed = by_run[:, 1, :, 0]  # (runs, FIGURES)
+    gap, pecs, pecs_r = (FIGURES.index(name) for name in ("gap", "pecs", "pecs_r"))
+    observed[:, gap] = observed[:, pecs] - observed[:, pecs_r]
     row: dict[str, Any] = {
         "n_runs": len(runs),
         "n_items": max(rows["item_id"].nunique() for _, rows in items.groupby("run")),
@@ -108,26 +111,28 @@ def _row(items: pd.DataFrame, arms: Sequence[str], drawn: Drawn) -> dict[str, An
     row |= {"twin_accuracy": None, "twin_accuracy_std": None}
     if shares:
         row |= {"twin_accuracy": np.mean(shares), "twin_accuracy_std": np.std(shares)}
-    bounds = percentiles(by_run.mean(axis=0)[:, 1:])
-    for name in INTERVALS:
-        row |= dict(zip((f"{name}_ci_low", f"{name}_ci_high"), bounds[FIGURES.index(name)], strict=True))
+    ends = by_run.mean(axis=0)[..., 1:]
+    for name, limits in INTERVALS.items():
+        bounds = interval(ends[:, FIGURES.index(name)], row[name], limits)
+        row |= dict(zip((f"{name}_ci_low", f"{name}_ci_high"), bounds, strict=True))
     if row["refused"]:
         row |= {name: None for name in row if name.startswith("gap")}
     return row
 
 
 def run_figures(cells: Mapping[str, np.ndarray], arms: Sequence[str]) -> np.ndarray:
-    """FIGURES of one run, (FIGURES, draws), from the RESAMPLED figures (RESAMPLED, draws) of its datasets and arms."""
+    """The ends of FIGURES of one run, (2, FIGURES, draws), from those of RESAMPLED, (2, RESAMPLED, draws), of its
+    datasets and arms."""
 
     def mean_over_kinds(figure: str, of: Sequence[str]) -> np.ndarray:
         at = RESAMPLED.index(figure)
-        return np.mean([pairs[at], *(cells[arm][at] for arm in arms if arm in of)], axis=0)
+        return np.mean([pairs[:, at], *(cells[arm][:, at] for arm in arms if arm in of)], axis=0)
 
     pairs = np.mean([cells[dataset] for dataset in DATASETS], axis=0)
     acc, false_abs = (mean_over_kinds(figure, WITH_CONTROLS) for figure in ("acc", "false_abs"))
-    abs_rec, pecs = mean_over_kinds("abs_rec", WITH_VOIDS), pairs[RESAMPLED.index("pecs")]
-    pecs_r = pecs_of(acc, abs_rec - false_abs)
-    return np.stack([acc, abs_rec, false_abs, pecs, pecs_r, pecs - pecs_r])
+    abs_rec, pecs = mean_over_kinds("abs_rec", WITH_VOIDS), pairs[:, RESAMPLED.index("pecs")]
+    pecs_r = ends_of_pecs(acc, difference(abs_rec, false_abs))
+    return np.stack([acc, abs_rec, false_abs, pecs, pecs_r, difference(pecs, pecs_r)], axis=1)
 
 
 def _twins(items: pd.DataFrame) -> tuple[float, int]:

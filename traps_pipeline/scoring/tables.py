@@ -14,7 +14,9 @@ BROKEN_ABOVE = 0.01  # a model that says nothing in more of its answers than thi
 
 Mean = Annotated[float | None, "mean over runs"]
 Deviation = Annotated[float | None, "population standard deviation over runs"]
-Bootstrap = Annotated[float | None, "95 % percentile interval, cluster bootstrap over scenarios"]
+Bootstrap = Annotated[
+    float | None, "95 % interval, Bayesian bootstrap over scenarios with one unseen; null without a figure"
+]
 Refused = Annotated[str | None, "why the two may not be compared"]
 DatasetOrOverall = Annotated[str, "one of four, or overall"]
 
@@ -74,21 +76,20 @@ class ContrastRow:
     left_regime: shared.Regime
     right_model: shared.Model
     right_regime: shared.Regime
+    n_scenarios: Annotated[int | None, "scenarios that both sides answered; null where refused"]
     difference: Annotated[float | None, "left minus right, means over runs; null where refused"]
-    ci_low: Annotated[
-        float | None,
-        "95 % percentile interval of the paired difference, cluster bootstrap over scenarios",
-    ]
-    ci_high: Annotated[float | None, "95 % percentile interval of the paired difference"]
+    ci_low: Bootstrap
+    ci_high: Bootstrap
     p: Annotated[
         float | None,
-        "two-sided, from the share of resamples on either side of 0; where none lies beyond it, from a normal tail",
+        "two-sided, from the share of resamples on either side of 0 (where none lies beyond it, from a normal tail); "
+        "never below 2^(1 - n_scenarios)",
     ]
     p_holm: Annotated[
         float | None,
         "corrected by Holm over the rows of the same kind, dataset and figure (for models, also the same regime)",
     ]
-    separable: Annotated[bool, "whether p_holm is below 0.05"]
+    separable: Annotated[bool | None, "whether p_holm is below 0.05; null: too few scenarios for any answers to be"]
     refused: Refused
 
 

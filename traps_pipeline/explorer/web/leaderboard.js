@@ -202,7 +202,7 @@ function notes(info, shown, dataset) {
   if (shown.some((row) => row.own?.incomplete)) used.push(`${incompleteMark} ${info.marks[incompleteMark]}`);
   if (dataset === "overall" && shown.some((row) => !row.own))
     used.push(`${NOT_RUN}: this study did not ask the model, or not on all four datasets`);
-  used.push("Brackets: 95 % interval, cluster bootstrap over scenarios. ±: population standard deviation over runs.");
+  used.push("Brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen. ±: population standard deviation over runs.");
   return used.map((text) => h("p", { class: "note" }, text));
 }
 

@@ -203,11 +203,15 @@ def reasoning(results: Results) -> list[PrintedTable]:
     return [PrintedTable("reasoning_pairs", "Reasoning pairs", table, columns, notes, why, trace)]
 
 
+TOO_FEW = "too few"
+
+
 def contrasts(results: Results) -> list[PrintedTable]:
     """Paired contrasts of overall PECS between models of one regime, or regimes of one model; Holm's correction."""
     rows = results.contrasts
     rows = rows.loc[(rows["dataset"] == "overall") & (rows["figure"] == "pecs")]
-    rows = rows.assign(separable=rows["separable"].map({True: "yes", False: "no"}))
+    known = rows["separable"].map({True: "yes", False: "no"}).astype(object)
+    rows = rows.assign(separable=known.where(rows["separable"].notna(), TOO_FEW))
     rows = rows.sort_values(["kind", "p_holm", "left_model"], ignore_index=True, kind="stable")
     rows = counted(rows, entries(results), [(f"{s}_model", f"{s}_regime", "dataset") for s in ("left", "right")])
     columns = [
@@ -218,6 +222,9 @@ def contrasts(results: Results) -> list[PrintedTable]:
         *COUNTS, Column("refused", "Refused"),
     ]  # fmt: skip
     notes = ["left minus right; the other figures and datasets are in the workspace's table `contrasts`"]
+    notes += [f"{TOO_FEW}: no answers to so few scenarios could differ significantly"] * rows["separable"].eq(
+        TOO_FEW
+    ).any()
     notes += ["missing: items of both sides", *marks(rows)] if len(rows) else []
     trace: Trace = lambda row, field: Behind("", row["left_model"], row["left_regime"])  # noqa: E731
     why = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")

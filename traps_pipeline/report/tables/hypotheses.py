@@ -50,7 +50,7 @@ def _of(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTable:
     ]  # fmt: skip
     notes = [
         f"change: in points, from “{hypothesis.doses[0].name}”, on the scenarios that both have; brackets: 95 % "
-        "interval, cluster bootstrap over scenarios, without width where all scenarios agree, however few they are",
+        "interval, Bayesian bootstrap over scenarios with one unseen",
         "rules: panel-rule, length-rule and wording-rule, each of which reads one cue and understands nothing; what a "
         "rule gets too, a model need not understand anything for; guess: Acc of a guess among the answers offered",
         "no part of PECS or PECS-R",

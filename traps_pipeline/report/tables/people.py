@@ -29,7 +29,7 @@ def people(results: Results) -> list[PrintedTable]:
         Column("n_clips", "Clips", "count"), Column("n_labels", "Labels", "count"),
     ]  # fmt: skip
     notes = [
-        "labels of all people pooled; brackets: 95 % interval, cluster bootstrap over scenarios",
+        "labels of all people pooled; brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen",
         "agree, α: on whether the clip lets the question be answered",
     ]
     agreement = ordered(results.human_agreement, ["task", "decision"])

@@ -1,0 +1,279 @@
+"""How often the intervals of docs/scoring.md hold the truth, by size, strength and dependence, and how wide they are.
+
+Studies are drawn with known shares: every scenario has a family (a shift of its difficulty), an effect that all its
+items share, an effect of each item that its runs share, and noise. Each study is resampled by the code that the
+leaderboard uses (`scoring.bootstrap`, `scoring.robust`), and by the percentile bootstrap that it replaced ("before").
+`--quick` takes seconds; the full run some minutes of CPU. `--csv FILE` keeps every setting; the printed tables have
+the lowest coverage and the mean width over the strengths and kinds of dependence of a size.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.stats import norm
+
+from traps_pipeline.base.partitions import DATASETS, taxonomy_of
+from traps_pipeline.scoring.bootstrap import (
+    RESAMPLED,
+    TAXONOMIES,
+    Drawn,
+    difference,
+    draw_scenarios,
+    figures_of,
+    interval,
+    limits_of,
+    percentiles,
+    resampled_sums,
+    scenario_weights,
+    with_unseen,
+)
+from traps_pipeline.scoring.metrics import pecs_of
+from traps_pipeline.scoring.robust import FIGURES as OF_ROBUST
+from traps_pipeline.scoring.robust import WITH_CONTROLS, WITH_VOIDS, run_figures
+
+SIZES = {
+    "1": (1, 0),
+    "2": (1, 1),
+    "4": (2, 2),
+    "8": (4, 4),
+    "16": (8, 8),
+    "36 (32 + 4, arms.yaml)": (32, 4),
+    "100": (50, 50),
+    "200 (lite)": (100, 100),
+    "702 (all)": (351, 351),
+}
+STRENGTHS = {  # Acc, AbsRec, FalseAbs
+    "weak": (0.35, 0.3, 0.2),
+    "middle": (0.6, 0.5, 0.1),
+    "strong": (0.95, 0.97, 0.02),
+    "nearly perfect": (0.995, 0.995, 0.005),
+    "perfect": (1.0, 1.0, 0.0),
+    "J = 0": (0.5, 0.4, 0.4),
+    "always abstains": (0.0, 1.0, 1.0),
+    "never abstains": (0.6, 0.0, 0.0),
+}
+DEPENDENCE = {  # shares of the variance that a scenario's items and an item's runs have in common; spread of families
+    "independent, 1 run": (0.0, 0.0, 0.0, 1),
+    "clustered, 1 run": (0.5, 0.3, 0.6, 1),
+    "clustered, 3 runs": (0.5, 0.3, 0.6, 3),
+}
+ARMS = ("decoy", "frame_out", "held_void", "twin_control")
+N_FAMILIES, ARM_SHARE = 8, 4  # an arm has an item of a quarter of the scenarios, of all families
+FIGURES = (
+    *(f"{name}, one dataset" for name in RESAMPLED),
+    *RESAMPLED,
+    "pecs_r",
+    "difference of j",
+    "difference of pecs",
+)
+LIMITS = {"difference of j": (-2.0, 2.0), "difference of pecs": (-1.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A size, a strength and a kind of dependence."""
+
+    size: str
+    strength: str
+    dependence: str
+
+    @property
+    def families(self) -> np.ndarray:
+        """The shift of each family: (N_FAMILIES,)."""
+        return np.linspace(-1, 1, N_FAMILIES) * DEPENDENCE[self.dependence][2]
+
+    def truth(self) -> dict[str, float]:
+        """Return the figures that these studies estimate."""
+        acc, abs_rec, false_abs = (
+            self._share(share, way) for share, way in zip(STRENGTHS[self.strength], (1, 1, -1), strict=True)
+        )
+        pecs = float(pecs_of(np.asarray(acc), np.asarray(abs_rec - false_abs)))
+        known = {"acc": acc, "abs_rec": abs_rec, "false_abs": false_abs, "j": abs_rec - false_abs, "pecs": pecs}
+        of_one = {f"{name}, one dataset": value for name, value in known.items()}
+        return {**of_one, **known, "pecs_r": pecs, "difference of j": 0.0, "difference of pecs": 0.0}
+
+    def _share(self, share: float, way: int) -> float:
+        return float(norm.cdf(norm.ppf(share) + way * self.families).mean())
+
+    def counts(self, rng: np.random.Generator, studies: int, scenarios: int, cells: int) -> np.ndarray:
+        """Draw COUNTS of one taxonomy: (scenarios, studies, cells, runs, 6). A scenario that is easy is answered
+        rightly, and its void is abstained on."""
+        common, of_item, spread, runs = DEPENDENCE[self.dependence]
+        families = rng.permuted(np.tile(np.arange(N_FAMILIES), (studies, 1)), axis=1)
+        shift = self.families[families[:, np.arange(scenarios) % N_FAMILIES].T] if spread else np.zeros((1, 1))
+        parts = [
+            np.sqrt(share) * rng.standard_normal((scenarios, studies, *shape))
+            for share, shape in (
+                (common, (1, 1, 1)),
+                (of_item, (cells, 1, 2)),
+                (1 - common - of_item, (cells, runs, 2)),
+            )
+        ]
+        control, void = np.moveaxis(sum(parts) + shift[..., None, None, None], -1, 0)
+        acc, abs_rec, false_abs = (norm.ppf(share) for share in STRENGTHS[self.strength])
+        one = np.ones(control.shape)
+        return np.stack([control > -acc, one, control < false_abs, one, void > -abs_rec, one], axis=-1).astype(float)
+
+
+def cells_of(counts: np.ndarray, drawn: Drawn, taxonomy: str, named: str) -> np.ndarray:
+    """Return the sums of one dataset or arm with its unseen scenario: (studies, runs, 12, draws)."""
+    scenarios, studies, runs, kinds = counts.shape
+    sums = resampled_sums(drawn.scenarios[taxonomy][1], counts.reshape(scenarios, studies * runs, kinds))
+    having = (counts[..., 1::2] > 0).sum(axis=0)
+    return with_unseen(sums.reshape(studies, runs, kinds, -1), having, drawn.unseen(named, kinds // 2))
+
+
+def ends_now(counts: Mapping[str, np.ndarray], drawn: Drawn, model: str) -> dict[str, np.ndarray]:
+    """Return the ends of every figure, (studies, 2, 1 + resamples), from counts by dataset and arm."""
+    sums = {name: cells_of(own, drawn, _taxonomy(name), f"{model}|{name}") for name, own in counts.items()}
+    first = next(iter(sums.values()))
+    of_one = np.moveaxis(figures_of(first).mean(axis=2), 0, 1)  # (studies, 2, RESAMPLED, draws)
+    ends = {f"{name}, one dataset": of_one[:, :, k] for k, name in enumerate(RESAMPLED)}
+    if not all(name in sums for name in DATASETS):
+        return ends
+    inside = {name: np.moveaxis(figures_of(own, in_mean=True).mean(axis=2), 0, 1) for name, own in sums.items()}
+    overall = np.mean([inside[name] for name in DATASETS], axis=0)
+    ends |= {name: overall[:, :, k] for k, name in enumerate(RESAMPLED)}
+    robust = [run_figures({name: own[study] for name, own in inside.items()}, ARMS) for study in range(len(overall))]
+    return ends | {"pecs_r": np.stack(robust)[:, :, OF_ROBUST.index("pecs_r")]}
+
+
+def draws_before(counts: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the resamples of every figure by the percentile bootstrap, (studies, resamples)."""
+    figures = {}
+    for name, own in counts.items():
+        scenarios, studies, runs, kinds = own.shape
+        sums = resampled_sums(weights[_taxonomy(name)], own.reshape(scenarios, studies * runs, kinds))
+        with np.errstate(invalid="ignore"):
+            acc, false_abs, abs_rec = np.moveaxis(sums[:, 0::2] / sums[:, 1::2], 1, 0)
+        j = abs_rec - false_abs
+        stacked = np.stack([acc, abs_rec, false_abs, j, pecs_of(acc, j)])
+        figures[name] = stacked.reshape(len(RESAMPLED), studies, runs, -1).mean(axis=2)
+    first = next(iter(figures.values()))
+    draws = {f"{name}, one dataset": first[k] for k, name in enumerate(RESAMPLED)}
+    if not all(name in figures for name in DATASETS):
+        return draws
+    overall = np.mean([figures[name] for name in DATASETS], axis=0)
+    draws |= {name: overall[k] for k, name in enumerate(RESAMPLED)}
+
+    def mean_over_kinds(figure: str, of: Sequence[str]) -> np.ndarray:
+        k = RESAMPLED.index(figure)
+        return np.nanmean([overall[k], *(figures[arm][k] for arm in ARMS if arm in of)], axis=0)
+
+    acc, false_abs = (mean_over_kinds(figure, WITH_CONTROLS) for figure in ("acc", "false_abs"))
+    return draws | {"pecs_r": pecs_of(acc, mean_over_kinds("abs_rec", WITH_VOIDS) - false_abs)}
+
+
+def _taxonomy(name: str) -> str:
+    return taxonomy_of(name) if name in DATASETS else TAXONOMIES[ARMS.index(name) % 2]
+
+
+def drawn_counts(setting: Setting, rng: np.random.Generator, studies: int) -> dict[str, np.ndarray]:
+    """Draw COUNTS of every dataset and arm, (scenarios, studies, runs, 6) each."""
+    counts = {}
+    for taxonomy, scenarios in zip(TAXONOMIES, SIZES[setting.size], strict=True):
+        if scenarios:
+            names = [name for name in (*DATASETS, *ARMS) if _taxonomy(name) == taxonomy]
+            drawn = setting.counts(rng, studies, scenarios, len(names))
+            counts |= {name: drawn[:, :, k] for k, name in enumerate(names)}
+    for arm in ARMS:
+        if arm in counts:
+            counts[arm][np.arange(len(counts[arm])) // N_FAMILIES % ARM_SHARE != 0] = 0
+            counts[arm][..., 4:] *= arm in WITH_VOIDS
+            counts[arm][..., :4] *= arm in WITH_CONTROLS
+    return counts
+
+
+def measure(setting: Setting, studies: int, resamples: int, seed: int) -> Iterator[dict[str, object]]:
+    """Measure coverage and mean width of every figure of one setting, before and now."""
+    rng = np.random.default_rng([seed, *setting.size.encode(), *setting.strength.encode()])
+    names = [
+        (f"{taxonomy}-{k}", taxonomy)
+        for taxonomy, n in zip(TAXONOMIES, SIZES[setting.size], strict=True)
+        for k in range(n)
+    ]
+    drawn = draw_scenarios(pd.DataFrame(names, columns=["scenario_id", "taxonomy"]), resamples, seed)
+    weights = {
+        t: scenario_weights(n, resamples, [seed, n]) for t, n in zip(TAXONOMIES, SIZES[setting.size], strict=True)
+    }
+    weights = {t: np.concatenate([np.ones((1, own.shape[1]), np.float32), own]) for t, own in weights.items()}
+    both = [drawn_counts(setting, rng, studies) for _ in range(2)]
+    ends = [ends_now(counts, drawn, model) for counts, model in zip(both, "ab", strict=True)]
+    draws = [draws_before(counts, weights) for counts in both]
+    truth = setting.truth()
+    for figure in FIGURES:
+        name = figure.removeprefix("difference of ")
+        if name not in ends[0]:
+            continue
+        if figure in LIMITS:
+            now, before = difference(ends[0][name], ends[1][name]), draws[0][name] - draws[1][name]
+            observed = ends[0][name][:, 1, 0] - ends[1][name][:, 1, 0]
+        else:
+            now, before, observed = ends[0][name], draws[0][name], ends[0][name][:, 1, 0]
+        limits = LIMITS.get(figure, limits_of(figure.partition(",")[0]))
+        intervals = {"before": percentiles(before[:, 1:]), "now": interval(now[..., 1:], observed, limits)}
+        row = {**vars(setting), "figure": figure, "truth": truth[figure], "studies": studies}
+        for which, own in intervals.items():
+            holds = (own[:, 0] <= truth[figure] + 1e-9) & (truth[figure] - 1e-9 <= own[:, 1])
+            row |= {f"coverage_{which}": holds.mean(), f"width_{which}": (own[:, 1] - own[:, 0]).mean()}
+        yield row
+
+
+def summary(rows: pd.DataFrame) -> str:
+    """Return the Markdown table of lowest coverage and mean width by size and figure, before and now."""
+    shown = ("j, one dataset", "acc", "j", "pecs", "pecs_r", "difference of pecs")
+    lines = ["| scenarios | " + " | ".join(shown) + " |", "| --- " * (len(shown) + 1) + "|"]
+    for size in SIZES:
+        cells = []
+        for figure in shown:
+            own = rows.loc[(rows["size"] == size) & (rows["figure"] == figure)]
+            if own.empty:
+                cells.append("")
+                continue
+            ends = [(own[f"coverage_{which}"].min(), own[f"width_{which}"].mean()) for which in ("before", "now")]
+            cells.append(", ".join(f"{coverage:.0%} ({width:.2f})" for coverage, width in ends))
+        if any(cells):
+            lines.append(f"| {size} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="fewer studies, four sizes")
+    parser.add_argument("--csv", type=Path, help="write every setting to this file")
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    sizes = [*SIZES][:4] if arguments.quick else [*SIZES]
+    rows = []
+    for size in sizes:
+        studies = 50 if arguments.quick else 200
+        for strength in STRENGTHS:
+            for dependence in DEPENDENCE:
+                setting = Setting(size, strength, dependence)
+                parts = [
+                    row
+                    for part in range(max(1, studies // 50))
+                    for row in measure(setting, min(studies, 50), 1000, arguments.seed + part)
+                ]
+                frame = pd.DataFrame(parts)
+                keys = ["size", "strength", "dependence", "figure"]
+                rows.append(frame.groupby(keys, sort=False).mean(numeric_only=True).reset_index())
+    table = pd.concat(rows, ignore_index=True)
+    if arguments.csv:
+        table.to_csv(arguments.csv, index=False)
+    print(summary(table))
+    worst = table.sort_values("coverage_now").head(8)
+    print(
+        worst[["size", "strength", "dependence", "figure", "coverage_before", "coverage_now", "width_now"]].to_string()
+    )
+
+
+if __name__ == "__main__":
+    main()
