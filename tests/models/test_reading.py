@@ -6,9 +6,11 @@ import pytest
 
 from traps_pipeline.models.reading import Reading, degenerate, read_answer
 
+THINK = ("<think>", "</think>")
+
 
 def read(text: str | None, outcome: str = "answer", regime: str = "standard", *, thinks: bool = False) -> Reading:
-    return read_answer({"outcome": outcome, "text": text}, None, regime, inline_thinking=thinks)
+    return read_answer({"outcome": outcome, "text": text}, None, regime, thinking=THINK if thinks else None)
 
 
 @pytest.mark.parametrize("text", [".....", "...", "!!!", "\n\n. . .", "–", "🤖🤖"])
@@ -50,8 +52,9 @@ def test_a_text_cut_off_before_a_final_answer_is_truncated_and_one_cut_off_after
     assert read("The ball rolls down and I look at", "truncated").outcome == "truncated"
     assert read("The ball rolls down and I look at", "truncated").text is None
     assert read("The answer is: left. Moreover, the", "truncated").outcome == "answer"
-    assert read("**Answer:** left", "truncated").outcome == "answer"
-    for announced in ("The answer is:", "The answer is", "**Answer:**", "Final answer = "):
+    assert read("**Answer:** left\nI saw that the", "truncated").outcome == "answer"
+    assert read("It is a ramp. My final answer is **left**. The", "truncated").outcome == "answer"
+    for announced in ("The answer is:", "The answer is", "**Answer:**", "Final answer = ", "The answer is le"):
         assert read(announced, "truncated").outcome == "truncated"
 
 
@@ -68,7 +71,7 @@ def test_thoughts_between_tags_are_split_off_where_the_entry_declares_them() -> 
 def test_undeclared_thoughts_are_never_judged_as_the_answer() -> None:
     found = read("<think>I cannot tell, so perhaps left.</think> left")
     assert (found.outcome, found.text) == ("degenerate", None)
-    assert found.why is not None and "inline_thinking: true" in found.why
+    assert found.why is not None and 'say `thinking: "<think>"`' in found.why
 
 
 @pytest.mark.parametrize(
@@ -107,5 +110,5 @@ def test_a_text_is_the_object_that_its_dataset_asks_for_or_it_is_not(
     dataset: str, text: str, is_json: bool | None
 ) -> None:
     row = {"outcome": "answer", "text": text}
-    found = read_answer(row, None, "standard", inline_thinking=False, dataset=dataset)
+    found = read_answer(row, None, "standard", dataset=dataset)
     assert (found.outcome, found.text, found.is_json) == ("answer", text, is_json)

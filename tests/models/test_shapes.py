@@ -93,7 +93,7 @@ ODD = {
     "message-null": body(choices=[CHOICE | {"message": None}]),
     "message-text": body(choices=[CHOICE | {"message": "left"}]),
     "content-number": message(content=5),
-    "content-list": message(content=[{"type": "text", "text": "left"}]),
+    "content-list": message(content=["left"]),
     "content-object": message(content={"text": "left"}),
     "content-true": message(content=True),
     "body-null": "null",

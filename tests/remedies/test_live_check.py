@@ -72,13 +72,13 @@ def test_a_model_that_refuses_a_schema_is_asked_without_one(check: Check, provid
 
 
 @pytest.mark.slow
-@carries_out("it thinks between <think> tags in its answer: say `inline_thinking: true` in its entry")
+@carries_out("it thinks between marks in its answer: say `{}` in its entry")
 def test_a_model_that_thinks_in_its_answer_says_so_in_its_entry(check: Check, provider: Provider) -> None:
     said = '<think>red, then blue</think>{"reason": "seen", "final_answer": "red and blue"}'
     provider.configure(scripts={NAME: {"": said}})
     (problem,) = check().problems
-    assert "say `inline_thinking: true` in its entry" in problem
-    assert check(inline_thinking=True).problems == []
+    assert 'say `thinking: "<think>"` in its entry' in problem
+    assert check(thinking="<think>").problems == []
 
 
 # --- servers of pages -------------------------------------------------------------------------------------------------

@@ -116,8 +116,8 @@ def test_a_model_that_thinks_inline_is_named_and_sound_once_that_is_declared(che
     said = '<think>red, then blue</think>{"reason": "seen", "final_answer": "red and blue"}'
     provider.configure(scripts={NAME: {"": said}})
     (problem,) = check().problems
-    assert "inline_thinking: true" in problem
-    assert check(inline_thinking=True).problems == []
+    assert 'say `thinking: "<think>"` in its entry' in problem
+    assert check(thinking="<think>").problems == []
 
 
 def test_a_model_that_says_dots_is_named(check: Check, provider: Provider) -> None:

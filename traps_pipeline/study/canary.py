@@ -102,7 +102,7 @@ def _request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], e
 
 
 def _row(call: _Asked, row: Row, epoch: str) -> CanaryRow:
-    read = read_answer(row, None, REGIME, inline_thinking=call.entry.inline_thinking)
+    read = read_answer(row, None, REGIME, thinking=call.entry.thinking)
     question, labels = call.item["question"], list(call.item["labels"])
     abstained, value = None, None
     if read.text is not None:
