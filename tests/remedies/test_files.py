@@ -255,7 +255,7 @@ def test_lines_are_read_once_the_file_is_restored(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe")
     lines = remedied(
         lambda: list(read_lines(path)),
-        "base/yamlfile.py | {}: cannot be read ({}); restore it from git",
+        "base/yamlfile.py | {}: cannot be read as lines of text ({}); restore it",
         lambda: shutil.copy(kept, path),
     )
     assert lines == [(1, "{}")]
