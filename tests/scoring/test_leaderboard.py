@@ -110,6 +110,9 @@ def test_an_entry_is_broken_where_more_than_1_percent_of_its_texts_say_nothing(d
     verdicts = rows([(True, False, True)] * 50, outcomes=["degenerate"] * dots + ["answer"] * (100 - dots))
     row = entry(board_of(verdicts))
     assert (row.n_degenerate, row.broken, row.is_broken) == (dots, dots / 100, is_broken)
+    verdicts = rows([(True, False, True)] * 50, outcomes=["unfinished"] * dots + ["answer"] * (100 - dots))
+    row = entry(board_of(verdicts))
+    assert (row.n_unfinished, row.broken, row.is_broken) == (dots, dots / 100, is_broken)
 
 
 def test_models_of_two_panels_are_neither_ranked_nor_contrasted_together_and_a_mixed_one_has_no_rank(rows):

@@ -26,6 +26,7 @@ from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.models.answers import prepare_media, wanted_questions
+from traps_pipeline.models.endings import ending_of
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import Entry, ModelEntry, account_of, get_model, load_models
@@ -36,12 +37,13 @@ from traps_pipeline.storage.rows import MOST_TOKENS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.study.experiment import Experiment
-from traps_pipeline.study.harness_logs import LOG, Given, reader_of
+from traps_pipeline.study.harness_logs import LOG, OUTCOMES, Given, reader_of
 
 REQUESTS, MEDIA = "requests.jsonl", "media"
 # How a text begins that a harness put in the place of an answer when its call failed.
 _ERROR_TEXT = re.compile(
     r"\W*(?:(?:\w+\.)*(?:\w*error|\w*exception)\b\s*(?:code)?\s*[:(\[\d-]|traceback \(most recent|an error occurred"
+    r"|(?:\w+\.)+exceptions?\.\w+\b"
     r"|(?:http|status|code)\W*[45]\d\d\b|[45]\d\d (?:client|server) error|too many requests|rate limit"
     r"|internal server error|service unavailable"
     r"|bad gateway|gateway time-?out|(?:request|connection|read) (?:failed|error|refused|reset|timed out))",
@@ -65,6 +67,14 @@ class Answer(BaseModel):
     completion_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
     reasoning_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
     latency_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _outcome_follows_the_reason(cls, data: Any) -> Any:
+        """Take the outcome of a line that gives none from its finish reason: half a sentence is no answer."""
+        if isinstance(data, dict) and "outcome" not in data and isinstance(data.get("finish_reason"), str):
+            return data | {"outcome": OUTCOMES.get(ending_of(data["finish_reason"]), UNFINISHED)}
+        return data
 
     @model_validator(mode="after")
     def _text_goes_with_outcome(self) -> Answer:

@@ -23,7 +23,7 @@ from traps_pipeline.models.request import UNFINISHED, WITH_TEXT
 
 MOST_SAMPLE_BYTES, MOST_LOG_BYTES, MOST_SAMPLES = 2**28, 2 * 2**30, 1_000_000
 # What an ending means of an answer in a log; one that is asked again is an error.
-_OUTCOMES = {"complete": "answer", "truncated": "truncated", "refused": "refused", "transient": "error"}
+OUTCOMES = {"complete": "answer", "truncated": "truncated", "refused": "refused", "transient": "error"}
 _ZSTD, _LOCAL_HEADER = 93, struct.Struct("<4s5H3I2H")
 _NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, NotImplementedError, struct.error)
 LOG = ".eval"  # ends the name of a log of inspect_ai in its own format
@@ -117,7 +117,7 @@ def _sample(where: str, sample: Any) -> Given:
         about, output = sample["metadata"], sample["output"]
         stop = (output.get("choices") or [{}])[0].get("stop_reason")
         usage = output.get("usage") or {}
-        outcome = "error" if sample.get("error") else _OUTCOMES.get(ending_of(str(stop)), UNFINISHED)
+        outcome = "error" if sample.get("error") else OUTCOMES.get(ending_of(str(stop)), UNFINISHED)
         answer = _answer(outcome, output.get("completion"))
         answer |= {"finish_reason": stop, "served_model": output.get("model") or None}
         counts = {"prompt_tokens": "input_tokens", "completion_tokens": "output_tokens"}
