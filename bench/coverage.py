@@ -264,7 +264,7 @@ def main() -> None:
                 ]
                 frame = pd.DataFrame(parts)
                 keys = ["size", "strength", "dependence", "figure"]
-                rows.append(frame.groupby(keys, sort=False).mean(numeric_only=True).reset_index())
+                rows.append(frame.groupby(keys, sort=False, as_index=False).mean(numeric_only=True))
     table = pd.concat(rows, ignore_index=True)
     if arguments.csv:
         table.to_csv(arguments.csv, index=False)

@@ -51,7 +51,10 @@ def ledger_rows(rows: int) -> Iterator[tuple[str, list[Any]]]:
     from traps_pipeline.orchestration.wanted import Wanted
 
     params, text = {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}, "The ball comes to rest on the left. " * 15
-    outcome = Outcome("answer", text, None, "stop", None, "m-2026", 6500, 150, 20, 0.0002)
+    outcome = Outcome(
+        "answer", text, finish_reason="stop", served_model="m-2026", prompt_tokens=6500, completion_tokens=150,
+        reasoning_tokens=20, cost_usd=0.0002,
+    )  # fmt: skip
     asked = Evaluation("image-model", "standard", 1)
     evaluations = [asked, *(e for e in Wanted(None).evaluations if e.model != asked.model)]
     for start in range(0, rows, EVALUATION_ROWS):

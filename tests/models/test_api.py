@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from ast import literal_eval
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
 
 pytestmark = pytest.mark.promise  # every provider's answers and errors
+FINISHES = {"openai/m": "stop", "gemini/gemini-2.5-pro": "STOP", "openai/responses/m": "completed"}
 ROUTES = {"openai/m": "/v1", "gemini/gemini-2.5-pro": "/v1beta", "openai/responses/m": "/v1"}
 QUESTION = "Does the ball clear the barrier?"
 
@@ -56,7 +58,8 @@ def test_an_answer_is_read_with_what_it_took(provider: Provider, route: str) -> 
     outcome = ask(provider, route, **thinking[route])
     assert (outcome.kind, outcome.text) == ("answer", f"The answer is: {answer_to(QUESTION)}.")
     assert outcome.reasoning == f"Looking at the clip for {answer_to(QUESTION)}."
-    assert outcome.finish_reason == "stop"
+    assert outcome.finish_reason == FINISHES[route]
+    assert outcome.client == f"litellm {version('litellm')}"
     assert outcome.served_model == route.split("/")[-1] + "-2026-11"
     assert outcome.prompt_tokens and outcome.completion_tokens and outcome.reasoning_tokens
     assert outcome.cost_usd == pytest.approx((outcome.prompt_tokens + 10 * outcome.completion_tokens) / 1e6)

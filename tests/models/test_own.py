@@ -9,7 +9,7 @@ import pytest
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models import own
-from traps_pipeline.models.judges import load_panel, panel_id
+from traps_pipeline.models.judges import load_panel, panel_id, thinking_of
 from traps_pipeline.models.registry import account_of, get_model, load_models
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
@@ -65,6 +65,24 @@ def test_elsewhere_the_price_is_unknown_until_it_is_given_and_a_departure_from_t
     assert get_model("my-model").prices is None
     with pytest.raises(TrapsError, match=r"own model \(my-model\): .*temperature is 0, the protocol has 0.8"):
         load_experiment(written(tmp_path, text.replace("media: images", "media: images\n    params: {temperature: 0}")))
+
+
+def test_a_parameter_that_a_server_refuses_is_left_out_by_null(tmp_path: Path) -> None:
+    lines = "media: images\n    params: {temperature: null, top_p: null, max_completion_tokens: 8000}\n"
+    load = MINE.replace("media: images\n", lines)
+    with pytest.raises(TrapsError, match=r"temperature is not sent, the protocol has 0\.8"):
+        load_experiment(written(tmp_path, load))
+    waived = lines + "    waivers: {temperature: refused, top_p: refused}\n"
+    load_experiment(written(tmp_path, MINE.replace("media: images\n", waived)))
+    assert get_model("my-model").params == {"max_completion_tokens": 8000}
+
+
+def test_a_judge_declares_its_thinking_and_the_panel_is_another(tmp_path: Path) -> None:
+    load_experiment(written(tmp_path, MINE + JUDGES))
+    plain = panel_id("one")
+    load_experiment(written(tmp_path, MINE + JUDGES.replace("served_name: a}", 'served_name: a, thinking: "[THINK]"}')))
+    (judge,) = load_panel("one")
+    assert judge.thinking == thinking_of("judge-a") == ("[THINK]", "[/THINK]") and panel_id("one") != plain
 
 
 def test_a_panel_of_one_judge_of_ones_own_has_a_version(tmp_path: Path) -> None:

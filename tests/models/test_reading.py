@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from traps_pipeline.models.reading import Reading, degenerate, read_answer
+from traps_pipeline.models.thinking import USUAL, how_to_declare, marks_of
+
+THINK = ("<think>", "</think>")
 
 
 def read(text: str | None, outcome: str = "answer", regime: str = "standard", *, thinks: bool = False) -> Reading:
-    return read_answer({"outcome": outcome, "text": text}, None, regime, inline_thinking=thinks)
+    return read_answer({"outcome": outcome, "text": text}, None, regime, thinking=THINK if thinks else None)
 
 
 @pytest.mark.parametrize("text", [".....", "...", "!!!", "\n\n. . .", "–", "🤖🤖"])
@@ -50,8 +55,9 @@ def test_a_text_cut_off_before_a_final_answer_is_truncated_and_one_cut_off_after
     assert read("The ball rolls down and I look at", "truncated").outcome == "truncated"
     assert read("The ball rolls down and I look at", "truncated").text is None
     assert read("The answer is: left. Moreover, the", "truncated").outcome == "answer"
-    assert read("**Answer:** left", "truncated").outcome == "answer"
-    for announced in ("The answer is:", "The answer is", "**Answer:**", "Final answer = "):
+    assert read("**Answer:** left\nI saw that the", "truncated").outcome == "answer"
+    assert read("It is a ramp. My final answer is **left**. The", "truncated").outcome == "answer"
+    for announced in ("The answer is:", "The answer is", "**Answer:**", "Final answer = ", "The answer is le"):
         assert read(announced, "truncated").outcome == "truncated"
 
 
@@ -68,7 +74,7 @@ def test_thoughts_between_tags_are_split_off_where_the_entry_declares_them() -> 
 def test_undeclared_thoughts_are_never_judged_as_the_answer() -> None:
     found = read("<think>I cannot tell, so perhaps left.</think> left")
     assert (found.outcome, found.text) == ("degenerate", None)
-    assert found.why is not None and "inline_thinking: true" in found.why
+    assert found.why is not None and 'say `thinking: "<think>"`' in found.why
 
 
 @pytest.mark.parametrize(
@@ -89,6 +95,70 @@ def test_in_the_json_regime_alone_it_is_noted_whether_an_answer_is_the_object_as
     assert read(text, regime="json").outcome == "answer"
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"reason": "The answer: we need to see',
+        '{"reason": "The answer is: left. Then", "final_ans',
+        '{"reason": "r", "final_answer": "le',
+        '{"final_answer": 1',  # perhaps of 12
+        "We need to answer: does the ball go left or right? In frame 3 the",
+    ],
+)
+def test_a_text_cut_off_inside_its_reasoning_is_truncated_whatever_it_contains(text: str) -> None:
+    assert (read(text, "truncated", "json").outcome, read(text, "truncated").outcome) == ("truncated", "truncated")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"reason": "r", "final_answer": "left"',
+        '{"final_answer": 12, "reason": "I s',
+        '```json\n{"final_answer": "left"}',
+    ],
+)
+def test_a_whole_final_answer_stands_although_its_object_breaks_off(text: str) -> None:
+    assert (read(text, "truncated", "json").outcome, read(text, "truncated", "json").text) == ("answer", text)
+
+
+@pytest.mark.parametrize(("opens", "closes"), USUAL)
+def test_every_usual_mark_is_split_off_once_declared_and_named_before(opens: str, closes: str) -> None:
+    marks = marks_of(opens)
+    row = {"outcome": "answer", "text": f"{opens}It may be left.{closes} right"}
+    undeclared = read_answer(row, None, "standard")
+    assert undeclared.outcome == "degenerate" and how_to_declare(opens) in str(undeclared.why)
+    found = read_answer(row, None, "standard", thinking=marks)
+    assert (found.outcome, found.text, found.reasoning) == ("answer", "right", "It may be left.")
+    endless = {"outcome": "answer", "text": f"The answer is: left. {opens}I guess"}
+    assert read_answer(endless, None, "standard", thinking=marks).outcome == "truncated"
+
+
+def test_what_gpt_oss_writes_around_its_messages_is_no_answer() -> None:
+    thought = "<|start|>assistant<|channel|>analysis<|message|>Left?<|end|>"
+    text = f"{thought}<|start|>assistant<|channel|>final<|message|>right<|return|>"
+    found = read_answer({"outcome": "answer", "text": text}, None, "standard", thinking=marks_of(USUAL[-1][0]))
+    assert (found.text, found.reasoning) == ("right", "Left?")
+
+
+def test_thoughts_between_visible_texts_are_taken_out_and_the_texts_stay() -> None:
+    found = read("I see a ramp.<think>Or not?</think> left", thinks=True)
+    assert (found.text, found.reasoning) == ("I see a ramp. left", "Or not?")
+
+
+@pytest.mark.parametrize("declared", ["<ponder>", ["<a>"], ["<a>", "<a>"], ["<a>", ""], "", []])
+def test_marks_are_both_declared_or_the_usual_ones(declared: Any) -> None:
+    with pytest.raises(ValueError, match="<think>"):
+        marks_of(declared)
+    assert marks_of(["<ponder>", "</ponder>"]) == ("<ponder>", "</ponder>")
+
+
+def test_an_answer_that_ended_for_an_unknown_reason_is_read_again_once_the_reason_is_known() -> None:
+    row = {"outcome": "unfinished", "text": "The answer is: left.", "finish_reason": "of_the_weather"}
+    found = read_answer(row, None, "standard")
+    assert (found.outcome, found.text) == ("unfinished", None) and "'of_the_weather'" in str(found.why)
+    assert read_answer(row | {"finish_reason": "stop"}, None, "standard").text == "The answer is: left."
+
+
 def test_an_answer_that_never_came_stays_what_it_was() -> None:
     assert read(None, "refused") == Reading("refused", None, None)
 
@@ -107,5 +177,5 @@ def test_a_text_is_the_object_that_its_dataset_asks_for_or_it_is_not(
     dataset: str, text: str, is_json: bool | None
 ) -> None:
     row = {"outcome": "answer", "text": text}
-    found = read_answer(row, None, "standard", inline_thinking=False, dataset=dataset)
+    found = read_answer(row, None, "standard", dataset=dataset)
     assert (found.outcome, found.text, found.is_json) == ("answer", text, is_json)

@@ -93,7 +93,7 @@ ODD = {
     "message-null": body(choices=[CHOICE | {"message": None}]),
     "message-text": body(choices=[CHOICE | {"message": "left"}]),
     "content-number": message(content=5),
-    "content-list": message(content=[{"type": "text", "text": "left"}]),
+    "content-list": message(content=["left"]),
     "content-object": message(content={"text": "left"}),
     "content-true": message(content=True),
     "body-null": "null",
@@ -195,6 +195,46 @@ def test_a_limit_that_a_provider_ignores_is_believed_up_to_a_bound(odd: Provider
     odd.configure(raw_by_model={"over": over, "absurd": absurd})
     assert booked_for(odd, "over")[1] == pytest.approx(20e-6 + 0.2)
     assert booked_for(odd, "absurd")[1] < OVERRUN * 0.081
+
+
+@pytest.mark.parametrize(
+    ("said", "completion"),
+    [
+        (usage(completion_tokens=80_000, total_tokens=0), 80_000),
+        (usage(prompt_tokens=None, completion_tokens=80_000), 80_000),
+        (body(usage={"total_tokens": 80_020, "prompt_tokens": 20}), 80_000),
+    ],
+)
+def test_a_usage_that_contradicts_itself_is_booked_at_its_largest_and_said(
+    odd: Provider, said: str, completion: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odd.configure(raw_by_model={"m": {"content": said}})
+    with progress.reporting(progress.Progress()):
+        outcome, booked_usd = booked_for(odd, "m")
+    assert booked_usd >= completion * 1e-5 and outcome and outcome.text == ANSWER
+    assert "its usage contradicts itself" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("finish", ["error", "abort", "insufficient_system_resource"])
+def test_half_an_answer_is_asked_again_and_never_one(odd: Provider, finish: str) -> None:
+    odd.configure(raw_by_model={"m": {"content": body(choices=[CHOICE | {"finish_reason": finish}])}})
+    outcome, booked_usd = booked_for(odd, "m")
+    assert outcome and (outcome.kind, outcome.error, outcome.text) == ("error", f"ended_{finish}", None)
+    assert odd.stats()["requests"] == 2 and booked_usd >= odd.stats()["billed_usd"]
+
+
+def test_an_unknown_finish_reason_is_kept_with_its_text_and_is_no_answer(odd: Provider) -> None:
+    odd.configure(raw_by_model={"m": {"content": body(choices=[CHOICE | {"finish_reason": "of_the_weather"}])}})
+    outcome, _ = booked_for(odd, "m")
+    assert outcome and (outcome.kind, outcome.finish_reason) == ("unfinished", "of_the_weather")
+    assert (outcome.text, outcome.cost_usd) == (ANSWER, pytest.approx(20e-6 + 21e-5))
+
+
+def test_content_in_parts_is_an_answer_and_its_trace(odd: Provider) -> None:
+    thought = {"type": "thinking", "thinking": [{"type": "text", "text": "maybe right"}]}
+    odd.configure(raw_by_model={"m": {"content": message(content=[thought, {"type": "text", "text": ANSWER}])}})
+    outcome, _ = booked_for(odd, "m")
+    assert outcome and (outcome.kind, outcome.text, outcome.reasoning) == ("answer", ANSWER, "maybe right")
 
 
 def test_what_is_odd_beside_the_usage_is_typed_and_stored(odd: Provider, tmp_path: Path) -> None:

@@ -69,8 +69,8 @@ def test_a_model_that_thinks_in_its_answer_says_so_in_its_entry(check: Check, pr
     said = '<think>red, then blue</think>{"reason": "seen", "final_answer": "red and blue"}'
     provider.configure(scripts={NAME: {"": said}})
     (problem,) = check().problems
-    assert "say `inline_thinking: true` in its entry" in problem
-    assert check(inline_thinking=True).problems == []
+    assert 'say `thinking: "<think>"` in its entry' in problem
+    assert check(thinking="<think>").problems == []
 
 
 # --- servers of pages -------------------------------------------------------------------------------------------------

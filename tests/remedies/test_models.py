@@ -209,9 +209,9 @@ def test_a_prompt_is_read_once_it_is_restored(
 
 def test_a_model_that_thinks_in_its_answer_is_read_once_its_entry_says_so() -> None:
     row = {"outcome": "answer", "text": "<think>red, then blue</think>The blue one."}
-    told = read_answer(row, None, "standard", inline_thinking=False).why
-    assert told == "thinks between tags in its text; say `inline_thinking: true` in its entry"
-    assert read_answer(row, None, "standard", inline_thinking=True).text == "The blue one."
+    told = read_answer(row, None, "standard").why
+    assert told == 'thinks between marks in its text; say `thinking: "<think>"` in its entry'
+    assert read_answer(row, None, "standard", thinking=("<think>", "</think>")).text == "The blue one."
 
 
 # --- a study's file ---------------------------------------------------------------------------------------------------

@@ -116,8 +116,31 @@ def test_a_model_that_thinks_inline_is_named_and_sound_once_that_is_declared(che
     said = '<think>red, then blue</think>{"reason": "seen", "final_answer": "red and blue"}'
     provider.configure(scripts={NAME: {"": said}})
     (problem,) = check().problems
-    assert "inline_thinking: true" in problem
-    assert check(inline_thinking=True).problems == []
+    assert 'say `thinking: "<think>"` in its entry' in problem
+    assert check(thinking="<think>").problems == []
+
+
+@pytest.mark.parametrize(
+    ("content", "kind", "shape"),
+    [
+        ("<html><body>Sign in</body></html>", "text/html", "a page of HTML"),
+        ('data: {"choices": []}\n\n', "text/event-stream", "a stream of events"),
+        ('{"message": {"content": "red and blue"}}', "application/json", "no list `choices`"),
+    ],
+)
+def test_an_odd_shape_is_named(check: Check, provider: Provider, content: str, kind: str, shape: str) -> None:
+    provider.configure(raw_by_model={NAME: {"content": content, "type": kind}})
+    assert all(shape in problem for problem in check().problems)
+
+
+def test_a_judge_that_thinks_inline_is_named_and_sound_once_that_is_declared(check: Check, provider: Provider) -> None:
+    vote = '[THINK]{"abstained": false}[/THINK]{"abstained": %s, "confidence": "high", "reasoning": "r"}'
+    right = '[THINK]hm[/THINK]{"correct": true, "extracted_value": "left", "reasoning": "r"}'
+    script = {"Ground truth": right, "answer is: left": vote % "false", "": vote % "true"}
+    provider.configure(scripts={NAME: script})
+    (problem,) = check(JudgeEntry).problems
+    assert 'say `thinking: "[THINK]"` in its entry' in problem
+    assert check(JudgeEntry, thinking="[THINK]").problems == []
 
 
 def test_a_model_that_says_dots_is_named(check: Check, provider: Provider) -> None:

@@ -162,7 +162,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise TrapsError(f"{path}: cannot be read ({plain(error)[:MOST_SAID]}); restore it from git") from error
+        raise TrapsError(f"{path}: cannot be read as lines of text ({plain(error)[:MOST_SAID]}); restore it") from error
     for number, line in enumerate(text.split("\n"), start=1):  # not splitlines: JSON may hold U+2028 as it is
         if line.strip():
             _check_line(line, f"{path}:{number}")

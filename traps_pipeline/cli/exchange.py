@@ -41,6 +41,9 @@ def add(commands: Commands) -> None:
     parser.add_argument("--model", help="who answered, in a file by item (default: the experiment's only model)")
     parser.add_argument("--run", type=whole(1, 1_000), default=1, help="of a file by item (default: 1)")
     parser.add_argument("--key", type=Path, help="of the held-out set whose items a file names")
+    parser.add_argument(
+        "--errors", choices=("drop", "keep"), help="texts that look like error messages: leave them out, or import them"
+    )
 
 
 def export_calls(arguments: argparse.Namespace) -> int:
@@ -67,7 +70,7 @@ def import_given(arguments: argparse.Namespace) -> int:
 
     experiment = experiment_of(arguments)
     whose = Whose(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
-    found = import_answers(open_workspace(arguments), experiment, arguments.file, whose)
+    found = import_answers(open_workspace(arguments), experiment, arguments.file, whose, arguments.errors)
     return _imported(found, arguments, "answers")
 
 
@@ -97,6 +100,8 @@ def _exported(files: Sequence[Path], count: int, command: str) -> int:
 
 def _imported(imported: Imported, arguments: argparse.Namespace, what: str) -> int:
     print(f"{imported.new} {what} imported, {imported.known} were there already")
+    if imported.dropped:
+        print(f"{imported.dropped} error messages were left out; what they stand for is still missing")
     if imported.failed:
         print(f"failed and still missing: {imported.failed}")
     print(f"next: traps run {arguments.experiment}")

@@ -61,8 +61,10 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     table = version_contrasts(then, now)
     if arguments.csv:
         table.to_csv(arguments.csv, index=False)
-    separable = table["separable"].map({True: "yes", False: "no"}).astype(object).fillna("too few")
-    shown = table.assign(separable=separable.where(table["p"].notna(), "-"), refused=table["refused"].fillna(""))
+    words = {True: "yes", False: "no"}
+    separable = [words.get(value, "too few") for value in table["separable"]]
+    separable = ["-" if p != p else word for word, p in zip(separable, table["p"], strict=True)]
+    shown = table.assign(separable=separable, refused=table["refused"].fillna(""))
     print(text_table(list(shown), [[_cell(value) for value in row] for row in shown.itertuples(index=False)]))
     return OK
 

@@ -100,7 +100,7 @@ responses = stage(
         dg.AssetDep(prompts, partition_mapping=by_evaluation),
     ],
     scheme=CELL,
-    code=f"2.{READING}",
+    code=f"3.{READING}",
     cost="money",
     columns=_ITEM_COLUMNS,
     checks=[Check("one_answer_an_item", "Every item of the cell has exactly one row.", _answers_missing)],

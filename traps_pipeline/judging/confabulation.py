@@ -27,7 +27,7 @@ from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quoted
 from traps_pipeline.judging.tables import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.models.ask import Call, Settled
-from traps_pipeline.models.judges import JudgeEntry, load_judges
+from traps_pipeline.models.judges import JudgeEntry, load_judges, thinking_of
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, get_model, structured
@@ -108,6 +108,7 @@ def protocol_digest(panel: str) -> str:
     protocol = load_protocol()
     judge = protocol.judge(panel)
     call = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None
+    call = [*call, *judge.thinking] if call and judge and judge.thinking else call
     return digest([protocol.model_dump(exclude={"judges"}), call, SAMPLED])[:16]
 
 
@@ -226,7 +227,7 @@ def collect_labels(workspace: Workspace) -> Made:
 
 
 def _label_row(cell: Cell, failure: Failure, row: Row) -> ConfabulationRow:
-    labels = parse_judgement(Labels, row)
+    labels = parse_judgement(Labels, row, thinking_of(failure.request.participant))
     valid = isinstance(labels, Labels)
     item_id = failure.item["item_id"]
     return ConfabulationRow(

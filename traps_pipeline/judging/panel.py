@@ -33,12 +33,22 @@ from traps_pipeline.judging.tables import VoteRow
 from traps_pipeline.models.answers import answer_request, asked_items
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
 from traps_pipeline.models.backends import make_backend
-from traps_pipeline.models.judges import SCHEMAS, JudgeEntry, Seat, Task, load_panel, panel_id, require_panel
+from traps_pipeline.models.judges import (
+    SCHEMAS,
+    JudgeEntry,
+    Seat,
+    Task,
+    load_panel,
+    panel_id,
+    require_panel,
+    thinking_of,
+)
 from traps_pipeline.models.participants import Row, when_asked
 from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.models.thinking import Marks, split_thinking
 from traps_pipeline.storage.parquet import Made, joined
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
@@ -148,23 +158,27 @@ class Vote:
 Schema = TypeVar("Schema", bound=BaseModel)
 
 
-def parse_judgement(schema: type[Schema], row: Row) -> Schema | str:
-    """The parsed judgement; or the reason why it is invalid, if the judge returned anything but the schema's JSON."""
+def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = None) -> Schema | str:
+    """Return the judgement; or why it is invalid, if the judge returned anything but the schema's JSON.
+
+    thinking: the marks of the judge's thinking, which is split off first.
+    """
     if row["outcome"] not in WITH_TEXT:
         return f"judge returned {row['outcome']}"
     text = row["text"] or ""
     try:
-        parsed = schema.model_validate_json(strip_fence(text))
+        answer = strip_fence(split_thinking(text, thinking).answer if thinking else text)
+        parsed = schema.model_validate_json(answer)
     except ValidationError as error:
         return explain(error)[:200]
-    return parsed if read_object(text) is not None else "a key stands twice"
+    return parsed if read_object(answer) is not None else "a key stands twice"
 
 
-def parse_vote(task: Task, row: Row, item: Mapping[str, Any]) -> Vote:
-    """The vote in a row of the ledger."""
+def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | None = None) -> Vote:
+    """Return the vote in a row of the ledger. thinking: see `parse_judgement`."""
     if row["outcome"] in WITH_TEXT and row["text"] == UNREAD:
         return Vote(False, invalid_reason=UNREAD)
-    vote = parse_judgement(AbstentionVote if task == "abstention" else CorrectnessVote, row)
+    vote = parse_judgement(AbstentionVote if task == "abstention" else CorrectnessVote, row, thinking)
     if isinstance(vote, str):
         return Vote(False, invalid_reason=vote)
     if isinstance(vote, AbstentionVote):
@@ -192,7 +206,7 @@ class Ballot(Call):
 
     def vote(self, row: Row) -> Vote:
         """The vote that the judge returned."""
-        return parse_vote(self.task, row, self.item)
+        return parse_vote(self.task, row, self.item, thinking_of(self.judge))
 
 
 @dataclass(frozen=True)

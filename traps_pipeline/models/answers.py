@@ -120,9 +120,9 @@ def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
 
 def response_row(cell: Cell, item: Mapping[str, Any], row: Row, reasoning: str | None) -> ResponseRow:
     """One row of the responses table."""
-    thinks = get_model(cell.evaluation.model).inline_thinking
-    read = read_answer(row, reasoning, cell.evaluation.regime, inline_thinking=thinks, dataset=cell.dataset)
-    copied = ("finish_reason", "served_model", "prompt_tokens", "completion_tokens")
+    thinking = get_model(cell.evaluation.model).thinking
+    read = read_answer(row, reasoning, cell.evaluation.regime, thinking=thinking, dataset=cell.dataset)
+    copied = ("finish_reason", "served_model", "client", "prompt_tokens", "completion_tokens")
     copied += ("reasoning_tokens", "cost_usd", "latency_s", "attempts")
     return ResponseRow(
         **{name: item[name] for name in ("item_id", "pair_id", "side", "benchmark_version")},

@@ -6,14 +6,13 @@ price list from the network.
 
 from __future__ import annotations
 
-import json
 import logging
-import math
 import os
 import warnings
 from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
+from importlib.metadata import version
 from typing import Any
 
 from traps_pipeline.base import progress
@@ -21,10 +20,14 @@ from traps_pipeline.base.extras import require
 from traps_pipeline.base.network import check_network
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
+from traps_pipeline.models.budget import worst_case_usd
+from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply
+from traps_pipeline.models.endings import Ending
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import (
     MALFORMED,
     RATE_LIMITED,
+    UNFINISHED,
     UNREACHABLE,
     WITH_TEXT,
     Outcome,
@@ -38,8 +41,6 @@ from traps_pipeline.storage.media import Media, data_uris
 
 UNREADABLE = 422  # what litellm makes of a page that is no JSON; no provider here sends it
 MOST_KEPT = 4000  # characters of an answer that is out of order
-MOST_NAME = 200  # characters of what a provider says in a word: who answered, why it ended
-SERVED, REFUSAL = "traps_served_model", "traps_refusal"  # what the hook adds to a response's hidden parameters
 TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 
 
@@ -64,25 +65,23 @@ def load_litellm() -> Any:
 
 
 def _hook() -> Any:
-    """What is done to a response before litellm goes on with it. Its bridge to OpenAI's Responses API loses a refusal
-    in words, and which model answered, but hands hidden parameters on. A response that has a cost is not priced by its
-    tables, which takes a tenth of a call's CPU time: prices are the registry's, this number is never read."""
+    """Return the hook that keeps litellm from pricing a response by its tables.
+
+    That takes a tenth of a call's CPU time, and prices are the registry's: this number is never read.
+    """
     logger: Any = import_module("litellm.integrations.custom_logger").CustomLogger
 
     class Hook(logger):
         async def async_post_call_success_deployment_hook(self, _: Any, response: Any, call_type: Any) -> None:
-            hidden: dict[str, Any] = response._hidden_params
-            hidden["response_cost"] = -1.0
-            if call_type == "aresponses":
-                hidden |= {SERVED: response.model, REFUSAL: _refusal_of(response)}
+            response._hidden_params["response_cost"] = -1.0
 
     return Hook()
 
 
-def _refusal_of(response: Any) -> str | None:
-    """The words of a refusal in a response of the Responses API."""
-    parts = [part for item in response.output for part in getattr(item, "content", None) or ()]
-    return next((part.refusal for part in parts if getattr(part, "type", None) == "refusal"), None)
+@cache
+def client_version() -> str:
+    """Return the library that builds and sends calls, with its version."""
+    return f"litellm {version('litellm')}"
 
 
 @cache
@@ -137,14 +136,66 @@ class ApiBackend:
         _internal_call().set(True)
         watched = WATCHED.set(exchange)
         try:
-            response = await self._litellm.acompletion(messages=asked, **request.params, **self._fixed)
-            if exchange.status is None:  # a defect of ours, or of a new version of the client library
-                self._tell("unseen", "the answer came over a connection that is not watched; its worst case is booked")
-            return read_response(response, self._entry, request, exchange)
-        except Exception as error:  # noqa: BLE001 - litellm's, the SDKs' and httpx's errors; and of shapes none expected
-            return self._failure(error, exchange)
+            await self._litellm.acompletion(messages=asked, **request.params, **self._fixed)
+        except Exception as error:  # noqa: BLE001 - litellm's, the SDKs' and httpx's errors
+            if not exchange.answered or exchange.content is None:
+                return self._failure(error, exchange)
         finally:
             WATCHED.reset(watched)
+        return self._read(request, exchange)  # whatever the library makes of it
+
+    def _read(self, request: Request, exchange: Exchange) -> Outcome:
+        """Return what the provider's own bytes say."""
+        if exchange.content is None:  # a defect of ours, or a route of litellm's with connections of its own
+            raise self._malformed("the answer came over a connection that is not watched, so its bytes cannot be read")
+        try:
+            body = parse_body(exchange.content)
+            reply = read_reply(body, str(self._entry.provider_id))
+        except OddShapeError as error:
+            raise self._malformed(str(error), exchange.content) from None
+        if reply.ending == "transient":
+            self._tell("ended", f"its answer ended with {reply.finish!r} and is asked again")
+            raise TransientError(f"ended_{reply.finish.strip().lower()}")
+        return self._outcome(reply, request)
+
+    def _malformed(self, why: str, content: bytes = b"") -> TransientError:
+        self._tell(MALFORMED, why)
+        raw = redact(content.decode("utf-8", "replace"))[:MOST_KEPT]
+        return TransientError(MALFORMED, raw=raw, why=redact(why))
+
+    def _outcome(self, reply: Reply, request: Request) -> Outcome:
+        """Return the outcome of an answer: what is seen, what was thought, what it took."""
+        prompt_bytes = len((request.system + request.user).encode("utf-8", "replace"))
+        frames = request.sent.n_frames if request.sent else 0
+        usage = read_usage(reply.usage, Sizes(prompt_bytes, frames, len((reply.text or reply.refusal).encode())))
+        believed = usage if usage and usage.believed else None
+        kind = _kind(reply)
+        return Outcome(
+            kind,
+            text=reply.text if kind in (*WITH_TEXT, UNFINISHED) else None,
+            reasoning=reply.reasoning or None,
+            finish_reason=reply.finish,
+            served_model=reply.served_model,
+            client=client_version(),
+            prompt_tokens=believed and believed.prompt,
+            completion_tokens=believed and believed.completion,
+            reasoning_tokens=believed and believed.reasoning,
+            cost_usd=self._cost(usage, request),
+        )
+
+    def _cost(self, usage: Usage | None, request: Request) -> float | None:
+        """Return dollars; None where the price or what was used is unknown.
+
+        A usage that cannot be believed costs the call's worst case, and no less than the most that any of its counts
+        says.
+        """
+        if self._entry.prices is None or usage is None:
+            return None
+        cost, worst = self._entry.prices.cost(usage.prompt, usage.completion), worst_case_usd(self._entry, request)
+        if not usage.believed and cost > worst:
+            said = f"{usage.prompt} tokens of prompt and {usage.completion} of the answer"
+            self._tell("usage", f"its usage contradicts itself; the most that it says is booked ({said})")
+        return cost if usage.believed else max(cost, worst)
 
     def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
         """A failure as TransientError or as an outcome. Its text goes to a person, never into the ledger."""
@@ -156,10 +207,6 @@ class ApiBackend:
         kind = failure_kind(error, self._litellm, exchange)
         if kind == "connection" and exchange.unsent:
             kind = UNREACHABLE
-        if kind == MALFORMED:
-            kept = redact((exchange.content or b"").decode("utf-8", "replace"))
-            self._tell(kind, str(error) or type(error).__name__)
-            raise TransientError(kind, raw=kept[:MOST_KEPT]) from None
         self._tell(kind, str(error))
         if kind.startswith("http_"):
             return Outcome("error", error=kind, cost_usd=free)
@@ -177,7 +224,7 @@ def failure_kind(error: Exception, litellm: Any, exchange: Exchange) -> str:
     """What went wrong in a word: http_<status> is final, anything else is worth another try. A status that was seen
     counts more than what litellm makes of it."""
     if exchange.answered:
-        return MALFORMED if exchange.content is not None else "connection"
+        return "connection"  # the answer was not read to its end
     status = exchange.status
     if status is None:
         if isinstance(error, litellm.Timeout):
@@ -213,61 +260,10 @@ def retry_after_s(error: Exception) -> float | None:
         return None
 
 
-def read_response(response: Any, entry: Entry, request: Request, exchange: Exchange) -> Outcome:
-    """The outcome in a response: what is seen, what was thought, what it took. Raises what it does not understand,
-    which is malformed: ValueError where something is of a type that it cannot have."""
-    body = json.loads(exchange.content or b"null")
-    choice = response.choices[0]
-    message, finish = choice.message, _word(choice.finish_reason)
-    text = _storable(_text(message.content)).strip()
-    fields: Mapping[str, Any] = getattr(message, "provider_specific_fields", None) or {}
-    hidden: Mapping[str, Any] = getattr(response, "_hidden_params", None) or {}
-    refusal = _text(fields.get("refusal") or getattr(message, "refusal", None) or hidden.get(REFUSAL))
-    kind = _kind(text, finish, refusal)
-    prompt_bytes = len((request.system + request.user).encode("utf-8", "replace"))
-    frames = request.sent.n_frames if request.sent else 0
-    usage = read_usage(body, Sizes(prompt_bytes, frames, len((text or refusal).encode())))
-    return Outcome(
-        kind,
-        text=text if kind in WITH_TEXT else None,
-        reasoning=_storable(_text(getattr(message, "reasoning_content", None))) or None,
-        finish_reason=finish,
-        served_model=_word(hidden.get(SERVED) or getattr(response, "model", None)),
-        prompt_tokens=usage and usage.prompt,
-        completion_tokens=usage and usage.completion,
-        reasoning_tokens=usage and usage.reasoning,
-        cost_usd=_cost(entry, usage),
-    )
-
-
-def _text(value: Any) -> str:
-    """A text that may be missing. Raises ValueError for anything else."""
-    if value is None or isinstance(value, str):
-        return value or ""
-    raise ValueError(f"a text was expected, and not {type(value).__name__}")
-
-
-def _word(value: Any) -> str | None:
-    """What a provider says in a word, for a column of a table; None where it is none."""
-    return _storable(value)[:MOST_NAME] if isinstance(value, str) else None
-
-
-def _storable(text: str) -> str:
-    """Text without halves of surrogate pairs, which a cut in the middle of an emoji leaves and no file takes."""
-    return text.encode("utf-8", "replace").decode("utf-8")
-
-
-def _cost(entry: Entry, usage: Usage | None) -> float | None:
-    """Dollars; None where the price or what was used is unknown."""
-    if entry.prices is None or usage is None:
-        return None
-    cost = entry.prices.cost(usage.prompt, usage.completion)
-    return cost if math.isfinite(cost) else None
-
-
-def _kind(text: str, finish: str | None, refusal: str) -> OutcomeKind:
-    if refusal or finish in ("content_filter", "refusal"):
+def _kind(reply: Reply) -> OutcomeKind:
+    if reply.refusal or reply.ending == "refused":
         return "refused"
-    if not text:
+    if not reply.text:
         return "empty"
-    return "truncated" if finish == "length" else "answer"
+    kinds: Mapping[Ending, OutcomeKind] = {"complete": "answer", "truncated": "truncated"}
+    return kinds.get(reply.ending, UNFINISHED)

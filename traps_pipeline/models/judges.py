@@ -27,6 +27,7 @@ from traps_pipeline.models.registry import (
     structured,
     with_own,
 )
+from traps_pipeline.models.thinking import Marks
 
 JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZES = (1, 3)
@@ -78,6 +79,11 @@ class Seat(typing.Protocol):
         """What is sent besides the prompts."""
         ...
 
+    @property
+    def thinking(self) -> Marks | None:
+        """The marks of its thinking, which is split off a vote."""
+        ...
+
 
 class JudgeEntry(Entry):
     """One judge of `assets/judges.yaml`."""
@@ -102,6 +108,12 @@ def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
     """Judges by id. Raises TrapsError naming judge and field."""
     found = read_entries(path, "judges", JudgeEntry)
     return with_own(found, "judges", JudgeEntry) if path == JUDGES_FILE else found
+
+
+def thinking_of(judge: str) -> Marks | None:
+    """Return the marks of a judge's thinking; None if it shows none."""
+    entry = load_judges().get(judge)
+    return entry.thinking if entry else None
 
 
 @own.keeps
@@ -160,7 +172,7 @@ def panel_version(panel: str) -> str:
 
 def version_of_seats(seats: Iterable[Seat]) -> str:
     """Version of what these judges decide."""
-    judges = [[seat.id, seat.endpoint, dict(seat.params), SCHEMAS] for seat in seats]
+    judges = [[seat.id, seat.endpoint, dict(seat.params), SCHEMAS, *(seat.thinking or ())] for seat in seats]
     return digest([judges, prompt("judge_abstention"), prompt("judge_correctness")])[:16]
 
 

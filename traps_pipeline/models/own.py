@@ -156,13 +156,20 @@ def _whole(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
         "account": _account(raw),
         "provider_id": f"openai/{raw.get('served_name', raw['id'])}",
         **entry,
-        "params": sampling | entry.get("params", {}),
+        "params": _params(sampling, entry.get("params") or {}),
     }
     if kind == "models":
         filled |= {"media": _media(entry.get("media"))}
     if "prices" not in filled and _is_here(str(raw["base_url"])):
         filled["prices"] = {"input": 0, "output": 0, "as_of": datetime.date.today().isoformat()}
     return filled
+
+
+def _params(protocol: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is sent: the protocol's parameters and the entry's own; one that is null is left out."""
+    replaced = {"max_tokens"} if "max_completion_tokens" in own else set[str]()  # another name of the same limit
+    kept = {name: value for name, value in protocol.items() if name not in replaced}
+    return {name: value for name, value in (kept | {**own}).items() if value is not None}
 
 
 def _media(media: Any) -> Any:

@@ -12,15 +12,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from traps_pipeline.models.endings import ending_of
 from traps_pipeline.models.prompts import fields_of
-from traps_pipeline.models.request import JUDGED, WITH_TEXT
+from traps_pipeline.models.request import JUDGED, UNFINISHED, WITH_TEXT
+from traps_pipeline.models.thinking import Marks, how_to_declare, split_thinking, undeclared_mark
 
-THINKS = re.compile(r"<(/?)think(?:ing)?>", re.IGNORECASE)
-READING = "2"  # version of this module's rules; the answers' tables are stale when it is raised
+READING = "3"  # version of this module's rules; the answers' tables are stale when it is raised
 FINAL = re.compile(r"\banswer\W*?(?:\bis\b\s*:?|[:=])\s*", re.IGNORECASE)  # what announces the final answer
+# A final answer that is announced as such and ends before the text does: one that is cut off may be another.
+_STATED = re.compile(
+    r"(?:^|[.!?:\n]|\b(?:the|my|final|correct|best)\s)[\W_]*answer[\W_]*?(?:\bis\b\s*:?|[:=])[\s*_\"'`]*"
+    r"\w[^\n]*?(?:\n|[.!?][\"'`)*_\]]*(?:\s|(?<!\d.)$))",
+    re.IGNORECASE,
+)
+_OBJECT = re.compile(r'\{\s*"')
+_DECODER = json.JSONDecoder(strict=False)
 _WORD = re.compile(r"\w+")
 _LONGEST_UNIT, _LEAST_REPEATS, _LEAST_SHARE = 40, 6, 0.5  # words, times, of the text's words
 _LEAST_WORDS, _FEW_CHARACTERS = 12, 30
+_SHOWN = 60  # characters of a finish reason in a sentence
 
 
 @dataclass(frozen=True)
@@ -37,46 +47,73 @@ class Reading:
 
 
 def read_answer(
-    row: Mapping[str, Any], reasoning: str | None, regime: str, *, inline_thinking: bool, dataset: str = ""
+    row: Mapping[str, Any], reasoning: str | None, regime: str, *, thinking: Marks | None = None, dataset: str = ""
 ) -> Reading:
-    """The reading of an answer's row in the ledger. inline_thinking: whether the model's entry says that it thinks
-    between `<think>` tags in its visible text, which are then split off. dataset: of the item; it may ask for another
-    object than the regime."""
+    """Return the reading of an answer's row in the ledger.
+
+    thinking: the marks that the model's entry declares, between which thinking stands in the visible text and is split
+    off. dataset: of the item; it may ask for another object than the regime.
+    """
     fields = fields_of(regime, dataset)
     outcome, text = str(row["outcome"]), row["text"]
+    if outcome == UNFINISHED:  # the reason may be one that this version knows
+        finish = row.get("finish_reason")
+        outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish), UNFINISHED)
+        if outcome == UNFINISHED:
+            return Reading(outcome, None, reasoning, why=f"ended for the unknown reason {str(finish)[:_SHOWN]!r}")
     if outcome not in WITH_TEXT or not isinstance(text, str):
         return Reading(outcome, text, reasoning)
-    is_json = _is_json(text, fields) if fields else None
-    if THINKS.search(text):
-        if not inline_thinking:
-            why = "thinks between tags in its text; say `inline_thinking: true` in its entry"
-            return Reading("degenerate", None, reasoning, is_json, why)
-        thought, text = split_thinking(text)
-        reasoning = "\n\n".join(part for part in (reasoning, thought) if part) or None
-        is_json = _is_json(text, fields) if fields else None
+    is_cut_off = outcome == "truncated"
+    if thinking:
+        split = split_thinking(text, thinking)
+        text, is_cut_off = split.answer, is_cut_off or split.is_open
+        reasoning = "\n\n".join(part for part in (reasoning, split.thinking) if part) or None
+        if is_cut_off and (split.is_open or not text):
+            return Reading("truncated", None, reasoning, False if fields else None, "cut off inside its thinking")
         if not text:
-            return Reading("truncated" if outcome == "truncated" else "empty", None, reasoning, is_json, "only thinks")
+            return Reading("empty", None, reasoning, False if fields else None, "only thinks")
+    is_json = _is_json(text, fields) if fields else None
+    if mark := undeclared_mark(text):
+        why = f"thinks between marks in its text; say `{how_to_declare(mark)}` in its entry"
+        return Reading("degenerate", None, reasoning, is_json, why)
     if why := degenerate(text):
         return Reading("degenerate", None, reasoning, is_json, why)
-    if outcome == "truncated" and not (_says_its_answer(text) or _is_json(text, fields or ())):
+    if is_cut_off and not _states_its_answer(text):
         return Reading("truncated", None, reasoning, is_json, "cut off at the limit of tokens before a final answer")
     return Reading(JUDGED[0], text, reasoning, is_json)
 
 
-def _says_its_answer(text: str) -> bool:
-    """Whether a word follows what announces the final answer."""
-    return any(_WORD.search(piece) for piece in FINAL.split(text)[1:])
+def _states_its_answer(text: str) -> bool:
+    """Return whether a text that is cut off holds a final answer: the whole field of its object, or one announced
+    before the object. What an object gives as its reason announces nothing."""
+    brace = _OBJECT.search(text)
+    start = brace.start() if brace else len(text)
+    return bool(_STATED.search(text[:start])) or "final_answer" in _whole_fields(text[start:])
 
 
-def split_thinking(text: str) -> tuple[str, str]:
-    """The thoughts in a text and its answer. A closing tag without an opening one ends thoughts that began with the
-    text, as chat templates have it that open the tag themselves; an opening one that is never closed leaves no
-    answer."""
-    tags = list(THINKS.finditer(text))
-    last = tags[-1]
-    answer = text[last.end() :] if last.group(1) else text[: tags[0].start()]
-    thoughts = text[: last.start()] if last.group(1) else text[tags[0].end() :]
-    return THINKS.sub(" ", thoughts).strip(), answer.strip()
+def _whole_fields(text: str) -> dict[str, Any]:
+    """Return the fields of an object that may break off, up to the first that is not whole."""
+    fields, place = dict[str, Any](), 1
+    try:
+        while True:
+            place = _skip(text, place)
+            name, place = _DECODER.raw_decode(text, place)
+            place = _skip(text, place, ":")
+            value, place = _DECODER.raw_decode(text, place)
+            if not isinstance(value, str) and text[_skip(text, place)] not in ",}":  # a number may go on
+                return fields
+            fields[str(name)] = value
+            place = _skip(text, place, ",")
+    except (ValueError, IndexError, RecursionError):
+        return fields
+
+
+def _skip(text: str, place: int, sign: str = "") -> int:
+    """Return the place after white space, and after a sign and the white space behind it. Raises ValueError."""
+    place = len(text) - len(text[place:].lstrip())
+    if not text.startswith(sign, place):
+        raise ValueError(f"{sign!r} is not there")
+    return place if not sign else _skip(text, place + len(sign))
 
 
 def degenerate(text: str) -> str | None:

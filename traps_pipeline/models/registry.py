@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
@@ -24,6 +24,7 @@ from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
 from traps_pipeline.models import own
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
 from traps_pipeline.models.prompts import FIELDS, fields_of
+from traps_pipeline.models.thinking import Marks, marks_of
 from traps_pipeline.storage.media import MediaSpec, profile_digest
 
 MODELS_VARIABLE = "TRAPS_MODELS"  # names another registry
@@ -134,6 +135,9 @@ class Entry(BaseModel):
     limits: Limits = Limits()
     account: str | None = Field(default=None, description="one of `accounts`; of backend api")
     provider_id: str | None = Field(default=None, description="litellm's name: route/model, e.g. gemini/gemini-2.5-pro")
+    thinking: Marks | None = Field(
+        default=None, description="what opens and what closes the thinking in its visible text, which is split off"
+    )
     waivers: dict[str, str] = {}
     prices: Prices | None = Field(default=None, description="None: unknown, and a study must allow that")
     expected_completion_tokens: int = Field(default=500, ge=0, description="estimate for `traps plan`")
@@ -142,6 +146,11 @@ class Entry(BaseModel):
         gt=0,
         description="of a call, for `traps plan`; by default 4 s, and 60 tokens/s",
     )
+
+    @field_validator("thinking", mode="before")
+    @classmethod
+    def _marks(cls, value: Any) -> Any:
+        return marks_of(value) if isinstance(value, str | list) else value
 
     @model_validator(mode="after")
     def _network_entry_is_whole(self, info: ValidationInfo) -> Entry:
@@ -182,6 +191,8 @@ class Entry(BaseModel):
             if sent == [value]:
                 if parameter in self.waivers:
                     raise ValueError(f"waivers.{parameter}: is sent as the protocol has it; remove the waiver")
+            elif len(sent) > 1:
+                raise ValueError(f"params: {' and '.join(names)} are two names of one parameter: send one of them")
             elif parameter not in self.waivers:
                 found = f"is {sent[0]!r}" if sent else "is not sent"
                 raise ValueError(
@@ -199,9 +210,6 @@ class ModelEntry(Entry):
     media: MediaSpec | None = None
     runs: int = Field(default=3, ge=1, le=9)
     json_schema: bool = Field(default=True, description="structured output in the JSON regime; of backend api")
-    inline_thinking: bool = Field(
-        default=False, description="it thinks between <think> tags in its visible text, which are split off"
-    )
     tokens_per_frame: int = Field(default=300, ge=0, description="estimate for `traps plan`, upper bound for a budget")
     groups: Groups = Groups(family="own", access="own", input="own", group="own")
     device: str | None = Field(default=None, pattern=DEVICE, description="of backend local: cpu, cuda, cuda:1 or mps")
@@ -347,7 +355,7 @@ def answering_version(evaluation: Evaluation) -> str:
     entry = get_model(evaluation.model)
     sent: list[Any] = [effective_params(entry, evaluation.regime)]
     sent += [profile_digest(entry.media)] if entry.media else []
-    sent += [["inline_thinking"]] if entry.inline_thinking else []  # decides what is read of an answer
+    sent += [["thinking", *entry.thinking]] if entry.thinking else []  # decides what is read of an answer
     return digest([entry.id, entry.endpoint, *sent])[:16]
 
 

@@ -14,9 +14,10 @@ from traps_pipeline.base.redaction import redact
 if TYPE_CHECKING:
     from traps_pipeline.storage.media import Media
 
-OutcomeKind = Literal["answer", "truncated", "empty", "refused", "error", "malformed"]
+OutcomeKind = Literal["answer", "truncated", "unfinished", "empty", "refused", "error", "malformed"]
 WITH_TEXT: tuple[OutcomeKind, ...] = ("answer", "truncated")  # docs/models.md, "Request -> Outcome"
 JUDGED: tuple[str, ...] = ("answer",)  # of the responses table, whose outcomes are those of `models.reading`
+UNFINISHED = "unfinished"  # ended for a reason that no reader knows: no answer, whatever its text says
 RATE_LIMITED = "rate_limited"  # the kind of a 429
 UNREACHABLE = "unreachable"  # the kind of a connection that was never made
 MALFORMED = "malformed"  # the kind of an answer whose shape is out of order
@@ -68,7 +69,8 @@ class Request:
 class Outcome:
     """What came of a request. A failure is a kind, never a text: no error string ever reaches a judge.
 
-    raw: the beginning of an answer that is out of order, for a person. cost_usd: None if it is unknown.
+    finish_reason: as the provider sent it. client: library and version that built the call and sent it. raw: the
+    beginning of an answer that is out of order, for a person. cost_usd: None if it is unknown.
     """
 
     kind: OutcomeKind
@@ -77,6 +79,7 @@ class Outcome:
     finish_reason: str | None = None
     error: str | None = None
     served_model: str | None = None
+    client: str | None = None
     prompt_tokens: int | None = None
     completion_tokens: int | None = None
     reasoning_tokens: int | None = None
@@ -94,14 +97,25 @@ class Outcome:
 class TransientError(Exception):
     """A failure worth another try: time-out, 408, 409, 429, 5xx, a cut connection, an answer out of order.
 
-    billed: whether the provider may charge for it; raw: see `Outcome`.
+    billed: whether the provider may charge for it; raw: see `Outcome`; why: what is wrong, for a person.
     """
 
     def __init__(
-        self, kind: str, retry_after_s: float | None = None, *, billed: bool = True, raw: str | None = None
+        self,
+        kind: str,
+        retry_after_s: float | None = None,
+        *,
+        billed: bool = True,
+        raw: str | None = None,
+        why: str | None = None,
     ) -> None:
         super().__init__(kind)
-        self.kind, self.retry_after_s, self.billed, self.raw = kind, retry_after_s, billed, raw
+        self.kind, self.retry_after_s, self.billed, self.raw, self.why = kind, retry_after_s, billed, raw, why
+
+    @property
+    def outcome(self) -> Outcome:
+        """What it is where there is no other try."""
+        return Outcome("malformed" if self.kind == MALFORMED else "error", error=self.kind, raw=self.raw)
 
 
 class Backend(Protocol):

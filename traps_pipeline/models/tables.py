@@ -22,9 +22,10 @@ class ResponseRow:
     text: Annotated[str | None, "the visible answer; null unless outcome is answer"]
     reasoning: Annotated[str | None, "the trace, where the provider returns it"]
     is_json: Annotated[bool | None, "JSON regime: whether the text is the object that the prompt asks for"]
-    finish_reason: Annotated[str | None, "as the provider said it"]
+    finish_reason: Annotated[str | None, "as the provider sent it"]
     error: Annotated[str | None, "kind of a failure, or why a text is no answer; never shown to a judge"]
     served_model: Annotated[str | None, "what the provider says answered"]
+    client: Annotated[str | None, "library and version that built and sent the call; null where none did"]
     prompt_tokens: shared.Tokens
     completion_tokens: shared.Tokens
     reasoning_tokens: shared.Tokens

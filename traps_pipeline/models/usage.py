@@ -14,21 +14,21 @@ BYTES_A_TOKEN = 8  # of text: no provider's tokenizer puts more into a token, on
 TOKENS_A_FRAME = 8  # at least
 MOST_TOKENS = 10**9  # what is above is no count
 
-# By API: prompt tokens, those of the answer, all of them, and what of the answer (True) or of the prompt (False) is
-# told apart from these. Anthropic tells no sum.
-_FORMS: tuple[tuple[str, tuple[str, str, str | None], Mapping[str, bool]], ...] = (
-    ("usage", ("prompt_tokens", "completion_tokens", "total_tokens"), {}),
+# By dialect: prompt tokens, those of the answer, all of them, and what of the answer (True) or of the prompt (False) is
+# counted apart from these. Anthropic gives no sum.
+_FORMS: tuple[tuple[tuple[str, str, str], Mapping[str, bool]], ...] = (
+    (("prompt_tokens", "completion_tokens", "total_tokens"), {}),
     (
-        "usage",
         ("input_tokens", "output_tokens", "total_tokens"),
         {"cache_creation_input_tokens": False, "cache_read_input_tokens": False},
     ),
     (
-        "usageMetadata",
         ("promptTokenCount", "candidatesTokenCount", "totalTokenCount"),
         {"thoughtsTokenCount": True, "toolUsePromptTokenCount": False},
     ),
 )
+_OF_PROMPT = {*(names[0] for names, _ in _FORMS), *(name for _, apart in _FORMS for name in apart if not apart[name])}
+_OF_ANSWER = {*(names[1] for names, _ in _FORMS), *(name for _, apart in _FORMS for name in apart if apart[name])}
 _REASONING = (
     ("completion_tokens_details", "reasoning_tokens"),
     ("output_tokens_details", "reasoning_tokens"),
@@ -38,11 +38,15 @@ _REASONING = (
 
 @dataclass(frozen=True)
 class Usage:
-    """Tokens of a call; completion holds the reasoning, which may be unknown."""
+    """Tokens of a call; completion holds the reasoning, which may be unknown.
+
+    believed: whether the fields are whole and possible; otherwise these are the most that any of them says.
+    """
 
     prompt: int
     completion: int
     reasoning: int | None = None
+    believed: bool = True
 
 
 @dataclass(frozen=True)
@@ -59,15 +63,25 @@ class Sizes:
         return usage.prompt < least or usage.completion < max(1, -(-self.text_bytes // BYTES_A_TOKEN))
 
 
-def read_usage(body: Any, sizes: Sizes) -> Usage | None:
-    """The usage in an answer's body. None where it is not there, not whole, not possible, or below what prompt and text
-    take by our own count."""
-    for name, (prompt, completion, total), apart in _FORMS:
-        fields = body.get(name) if isinstance(body, Mapping) else None
-        if isinstance(fields, Mapping) and prompt in fields:
+def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
+    """Return the usage in an answer's counts; None where they hold none.
+
+    It is not believed where it is not whole, not possible, or below what prompt and text take by our own count.
+    """
+    for (prompt, completion, total), apart in _FORMS:
+        if prompt in fields:
             usage = _whole(fields, prompt, completion, total, apart)
-            return None if usage is None or sizes.contradict(usage) else usage
-    return None
+            return usage if usage and not sizes.contradict(usage) else _at_least(fields)
+    return _at_least(fields)
+
+
+def _at_least(fields: Mapping[str, Any]) -> Usage | None:
+    """Return the most that the counts of a usage say which cannot be believed as a whole."""
+    counts = {name: value for name, value in fields.items() if _is_count(value)}
+    prompt = sum(counts.get(name, 0) for name in _OF_PROMPT)
+    completion = sum(counts.get(name, 0) for name in _OF_ANSWER)
+    total = max(counts.get(names[2], 0) for names, _ in _FORMS)
+    return Usage(prompt, max(completion, total - prompt), believed=False) if counts else None
 
 
 def _whole(

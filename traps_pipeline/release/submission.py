@@ -32,6 +32,7 @@ from traps_pipeline.models.judges import RULES_VERSION, load_panel, panel_id
 from traps_pipeline.models.prompts import prompt_version
 from traps_pipeline.models.reading import READING
 from traps_pipeline.models.tables import RESPONSES
+from traps_pipeline.models.thinking import Marks
 from traps_pipeline.scoring.tables import LEADERBOARD, METRICS
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
@@ -58,6 +59,7 @@ class SeatEntry(_Strict):
     backend: str = Field(max_length=50)
     endpoint: str = Field(max_length=300)
     params: dict[str, Any]
+    thinking: Marks | None = Field(default=None, strict=False)
 
 
 class About(_Strict):
@@ -110,7 +112,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
     frames["votes.parquet"] = frames["votes.parquet"].loc[lambda votes: votes["panel"] == panel_id(study.panel)]
     content = {file: table_bytes(TABLES[file], frame) for file, frame in frames.items()}
     seats = [
-        SeatEntry(id=seat.id, backend=seat.backend, endpoint=seat.endpoint, params=dict(seat.params))
+        SeatEntry.model_validate({name: getattr(seat, name) for name in SeatEntry.model_fields})
         for seat in load_panel(study.panel)
     ]
     try:

@@ -56,6 +56,7 @@ OPTIONAL = {
     Column("n_refused", "Refused", "count"): "n_refused",
     Column("n_empty", "Empty", "count"): "n_empty",
     Column("n_truncated", "Cut off", "count"): "n_truncated",
+    Column("n_unfinished", "Unfinished", "count"): "n_unfinished",
     Column("n_degenerate", "Degenerate", "count"): "n_degenerate",
     Column("n_unread", "Unread", "count"): "n_unread",
     Column("broken", "Broken %", "percent"): "broken",
@@ -82,11 +83,13 @@ LEGEND = {
     "Empty": "items over all runs answered with no text; they are among the missing ones",
     "Cut off": "items over all runs whose text reached the limit of tokens before an answer; they are among the "
     "missing ones",
+    "Unfinished": "items over all runs whose answer ended for an unknown reason (column finish_reason of the "
+    "answers); they are among the missing ones",
     "Degenerate": "items over all runs answered with punctuation alone or with a text that repeats itself; they are "
     "among the missing ones, and no judge takes them for abstentions",
     "Unread": "items over all runs answered with a text in a form that the rule judges do not read; they are among the "
     "missing ones: neither abstentions nor correct",
-    "Broken %": "share of items whose text is empty, cut off, degenerate or unread",
+    "Broken %": "share of items whose text is empty, cut off, unfinished, degenerate or unread",
     "Not JSON": "items of the JSON regime, over all runs, whose text is not the object that the prompt asks for; they "
     "are judged as they stand",
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
@@ -273,17 +276,8 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         main = by_dataset.get(dataset)
         counted = list(by_dataset.values()) if main is None else [main]
         entry: dict[str, Any] = {name: counted[0][name] for name in ("model", "regime")} | (main or {})
-        summed = (
-            "n_pairs",
-            "n_missing",
-            "n_refused",
-            "n_empty",
-            "n_truncated",
-            "n_degenerate",
-            "n_unread",
-            "n_not_json",
-        )
-        entry |= {n: sum(row[n] for row in counted) for n in summed}
+        summed = ("n_pairs", "n_missing", "n_refused", "n_empty", "n_truncated", "n_unfinished", "n_degenerate")
+        entry |= {n: sum(row[n] for row in counted) for n in (*summed, "n_unread", "n_not_json")}
         entry["mark"] = _mark(main) if main else ""
         entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted) else ""
         entry["model_mark"] = BROKEN_MARK if any(row["is_broken"] for row in counted) else ""

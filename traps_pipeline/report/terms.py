@@ -28,7 +28,8 @@ MISSING_MARK = "†"
 INCOMPLETE_MARK = "‡"
 BROKEN_MARK = "§"
 BROKEN_TEXTS = (
-    f"more than {100 * BROKEN_ABOVE:g} % of the texts are empty, degenerate, unread or cut off before an answer"
+    f"more than {100 * BROKEN_ABOVE:g} % of the texts are empty, degenerate, unread, unfinished or cut off before an "
+    "answer"
 )
 MARKS = {
     MISSING_MARK: "some items have no answer or no majority; shares are over the other items",

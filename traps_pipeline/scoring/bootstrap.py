@@ -100,7 +100,7 @@ def interval(
     """
     low = np.fmin(quantile(ends[..., 0, :], (1 - level) / 2), observed)
     high = np.fmax(quantile(ends[..., 1, :], (1 + level) / 2), observed)
-    nothing = np.isnan(ends).all(axis=(-2, -1))[..., None]
+    nothing = np.all(np.isnan(ends), axis=(-2, -1), keepdims=True)[..., 0]
     return np.where(nothing, np.nan, np.clip(np.stack([low, high], axis=-1), *limits))
 
 

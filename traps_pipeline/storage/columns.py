@@ -17,8 +17,12 @@ MediaDigest = Annotated[str, "digest of the clip's file"]
 Model = Annotated[str, "id in assets/models.yaml"]
 Regime = Annotated[str, "standard, guided or json"]
 Run = Annotated[int, "independent repetition, from 1"]
-Outcome = Annotated[str, "answer, truncated, empty, refused, error or malformed"]
-AnswerOutcome = Annotated[str, "answer, truncated (before an answer), degenerate, empty, refused, error or malformed"]
+Outcome = Annotated[str, "answer, truncated, unfinished, empty, refused, error or malformed"]
+AnswerOutcome = Annotated[
+    str,
+    "answer, truncated (before an answer), unfinished (ended for an unknown reason), degenerate, empty, refused, error "
+    "or malformed",
+]
 Tokens = Annotated[int | None, "tokens"]
 LedgerKey = Annotated[str, "ledger key"]
 Panel = Annotated[str, "the panel and the version of its judges and their prompts: name@version, .1 for one judge"]

@@ -103,7 +103,7 @@ def _request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], e
 
 
 def _row(call: _Asked, row: Row, epoch: str) -> CanaryRow:
-    read = read_answer(row, None, REGIME, inline_thinking=call.entry.inline_thinking)
+    read = read_answer(row, None, REGIME, thinking=call.entry.thinking)
     statement = None if read.text is None else read_statement(read.text, call.item["question"])
     return CanaryRow(
         model=call.entry.id,

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -25,19 +26,30 @@ from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.models.answers import prepare_media, wanted_questions
+from traps_pipeline.models.endings import ending_of
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.participants import ledger_row
 from traps_pipeline.models.registry import Entry, ModelEntry, account_of, get_model, load_models
-from traps_pipeline.models.request import WITH_TEXT, Outcome, OutcomeKind, Request
+from traps_pipeline.models.request import UNFINISHED, WITH_TEXT, Outcome, OutcomeKind, Request
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.storage.ledger import Ledger, Stored
 from traps_pipeline.storage.rows import MOST_TOKENS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.study.experiment import Experiment
-from traps_pipeline.study.harness_logs import LOG, Given, reader_of
+from traps_pipeline.study.harness_logs import LOG, OUTCOMES, Given, reader_of
 
 REQUESTS, MEDIA = "requests.jsonl", "media"
+# How a text begins that a harness put in the place of an answer when its call failed.
+_ERROR_TEXT = re.compile(
+    r"\W*(?:(?:\w+\.)*(?:\w*error|\w*exception)\b\s*(?:code)?\s*[:(\[\d-]|traceback \(most recent|an error occurred"
+    r"|(?:\w+\.)+exceptions?\.\w+\b"
+    r"|(?:http|status|code)\W*[45]\d\d\b|[45]\d\d (?:client|server) error|too many requests|rate limit"
+    r"|internal server error|service unavailable"
+    r"|bad gateway|gateway time-?out|(?:request|connection|read) (?:failed|error|refused|reset|timed out))",
+    re.IGNORECASE,
+)
+MOST_LOOKED_AT = 200  # characters of a text
 SHOWN = 5  # number of wrong lines that an error names
 
 
@@ -56,12 +68,21 @@ class Answer(BaseModel):
     reasoning_tokens: int | None = Field(default=None, ge=0, le=MOST_TOKENS)
     latency_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _outcome_follows_the_reason(cls, data: Any) -> Any:
+        """Take the outcome of a line that gives none from its finish reason: half a sentence is no answer."""
+        if isinstance(data, dict) and "outcome" not in data and isinstance(data.get("finish_reason"), str):
+            return data | {"outcome": OUTCOMES.get(ending_of(data["finish_reason"]), UNFINISHED)}
+        return data
+
     @model_validator(mode="after")
     def _text_goes_with_outcome(self) -> Answer:
         if self.outcome in ("error", "malformed"):
             raise ValueError("outcome: an error is no answer; remove the line, so that the item stays missing")
-        if (self.outcome in WITH_TEXT) != bool((self.text or "").strip()):
-            needs = "needs a text" if self.outcome in WITH_TEXT else "must have no text"
+        has_text = self.outcome in (*WITH_TEXT, UNFINISHED)
+        if has_text != bool((self.text or "").strip()):
+            needs = "needs a text" if has_text else "must have no text"
             raise ValueError(f"text: outcome {self.outcome!r} {needs}")
         return self
 
@@ -77,11 +98,12 @@ class Answer(BaseModel):
 @dataclass(frozen=True)
 class Imported:
     """The result of an import: the numbers of new answers, and of answers that the ledger had already; the calls that
-    failed, in words, which stay missing."""
+    failed, in words, which stay missing; the number of error messages that were left out."""
 
     new: int
     known: int
     failed: str = ""
+    dropped: int = 0
 
 
 @dataclass(frozen=True)
@@ -170,12 +192,22 @@ class Whose:
     key: bytes | None = None
 
 
-def import_answers(workspace: Workspace, experiment: Experiment, path: Path, whose: Whose | None = None) -> Imported:
+def import_answers(
+    workspace: Workspace,
+    experiment: Experiment,
+    path: Path,
+    whose: Whose | None = None,
+    errors: Literal["drop", "keep"] | None = None,
+) -> Imported:
     """Import answers (JSON lines, see `Answer`; or by item, see `study.harness_logs`) into the ledger; `traps run` then
     makes tables from them.
 
     All lines are checked before any is written. Raises TrapsError naming lines that are not answers, that have a key
-    outside the experiment (another question, clip, parameter or run), or that answer a key a second time differently.
+    outside the experiment (another question, clip, parameter or run), or that answer a key a second time differently;
+    and for a file without answers.
+
+    errors: whether texts that look like error messages are left out or are answers; TrapsError shows them where it is
+    not said.
     """
     cells = _cells(workspace, experiment)
     prepare_media(workspace, cells)
@@ -185,12 +217,28 @@ def import_answers(workspace: Workspace, experiment: Experiment, path: Path, who
         return _import_batch(workspace, workspace.answers, load_models(), wanted, path)
     reader = reader_of(path)
     answers = checked_answers(path, wanted) if reader is None else _by_item(reader(path), wanted, whose or Whose())
+    if not answers:
+        raise TrapsError(f"{path}: holds no answers; nothing was imported")
+    like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MOST_LOOKED_AT])]
+    if like_errors and errors is None:
+        raise TrapsError(_said_of_errors(path, {key: answers[key] for key in like_errors}, wanted))
+    for key in like_errors if errors == "drop" else ():
+        del answers[key]
     found = [
         _Stored(wanted[key], answer.as_outcome(get_model(wanted[key].participant)), answer.latency_s)
         for key, answer in answers.items()
     ]
     new = asyncio.run(_store(workspace, workspace.answers, found))
-    return Imported(new, len(answers) - new)
+    return Imported(new, len(answers) - new, dropped=len(like_errors) if errors == "drop" else 0)
+
+
+def _said_of_errors(path: Path, answers: Mapping[str, Answer], wanted: Mapping[str, Request]) -> str:
+    """Return how many texts look like error messages, some of them, and what to do."""
+    shown = [f"{wanted[key].about['item_id']}: {plain(one.text)[:60]!r}" for key, one in answers.items()][:SHOWN]
+    return (
+        f"{path}: {len(answers)} of its texts look like error messages and no answers ({'; '.join(shown)}): say "
+        "--errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
+    )
 
 
 def export_request_batches(
@@ -236,6 +284,7 @@ def _wanted_votes(workspace: Workspace, experiment: Experiment) -> Iterator[tupl
 
 
 def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
+    outcome = replace(outcome, client=None)  # what built the call is not known: another version may have exported it
     if outcome.cost_usd is None:
         return outcome
     return replace(outcome, cost_usd=outcome.cost_usd * account_of(entry).batch_price)
@@ -244,9 +293,12 @@ def _at_batch_price(entry: Entry, outcome: Outcome) -> Outcome:
 def _import_batch(
     workspace: Workspace, ledger: Ledger, entries: Mapping[str, Entry], wanted: Mapping[str, Request], path: Path
 ) -> Imported:
+    returned = read_batch(path, wanted)
+    if not returned:
+        raise TrapsError(f"{path}: holds no answers; nothing was imported")
     found = [
         _Stored(request, _at_batch_price(entries[request.participant], outcome), 0.0)
-        for request, outcome in outcomes_of(entries, wanted, read_batch(path, wanted))
+        for request, outcome in outcomes_of(entries, wanted, returned)
     ]
     new = asyncio.run(_store(workspace, ledger, found))
     failed = sum(one.outcome.kind in ("error", "malformed") for one in found)

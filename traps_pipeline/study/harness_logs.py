@@ -18,10 +18,12 @@ from typing import Any
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import read_lines
-from traps_pipeline.models.request import WITH_TEXT
+from traps_pipeline.models.endings import ending_of
+from traps_pipeline.models.request import UNFINISHED, WITH_TEXT
 
 MOST_SAMPLE_BYTES, MOST_LOG_BYTES, MOST_SAMPLES = 2**28, 2 * 2**30, 1_000_000
-_OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_filter": "refused"}
+# What an ending means of an answer in a log; one that is asked again is an error.
+OUTCOMES = {"complete": "answer", "truncated": "truncated", "refused": "refused", "transient": "error"}
 _ZSTD, _LOCAL_HEADER = 93, struct.Struct("<4s5H3I2H")
 _NO_ZIP = (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, EOFError, NotImplementedError, struct.error)
 LOG = ".eval"  # ends the name of a log of inspect_ai in its own format
@@ -115,7 +117,7 @@ def _sample(where: str, sample: Any) -> Given:
         about, output = sample["metadata"], sample["output"]
         stop = (output.get("choices") or [{}])[0].get("stop_reason")
         usage = output.get("usage") or {}
-        outcome = "error" if sample.get("error") else _OUTCOMES.get(str(stop), "answer")
+        outcome = "error" if sample.get("error") else OUTCOMES.get(ending_of(str(stop)), UNFINISHED)
         answer = _answer(outcome, output.get("completion"))
         answer |= {"finish_reason": stop, "served_model": output.get("model") or None}
         counts = {"prompt_tokens": "input_tokens", "completion_tokens": "output_tokens"}
@@ -158,6 +160,6 @@ def _own_lines(path: Path) -> Iterator[Given]:
 
 def _answer(outcome: str, text: str | None) -> dict[str, Any]:
     """Outcome and text as the ledger has them: no text without an outcome that has one."""
-    if outcome in WITH_TEXT and not (text or "").strip():
+    if outcome in (*WITH_TEXT, UNFINISHED) and not (text or "").strip():
         outcome = "empty"
-    return {"outcome": outcome, "text": text if outcome in WITH_TEXT else None}
+    return {"outcome": outcome, "text": text if outcome in (*WITH_TEXT, UNFINISHED) else None}

@@ -32,9 +32,10 @@ from traps_pipeline.models.budget import check_money
 from traps_pipeline.models.judges import JudgeEntry, Task
 from traps_pipeline.models.participants import Row
 from traps_pipeline.models.prompts import system_prompt
-from traps_pipeline.models.reading import THINKS, degenerate, read_answer
+from traps_pipeline.models.reading import degenerate, read_answer
 from traps_pipeline.models.registry import NETWORK, Account, Entry, ModelEntry, account_of, effective_params
-from traps_pipeline.models.request import WITH_TEXT, Outcome, Request, TransientError
+from traps_pipeline.models.request import MALFORMED, UNFINISHED, WITH_TEXT, Outcome, Request, TransientError
+from traps_pipeline.models.thinking import how_to_declare, split_thinking, undeclared_mark
 from traps_pipeline.scenes.encode import encode
 from traps_pipeline.storage.media import Media, MediaSpec, MediaStore
 from traps_pipeline.storage.workspace import Workspace
@@ -211,11 +212,14 @@ def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], re
             slow = outcome.error == "timeout"
             (notes if slow else problems).append(_failure(entry, account, name, str(outcome.error)))
         elif outcome.kind == "malformed":
-            problems.append("its answer has a shape that no OpenAI-compatible server sends")
+            odd = "its answers have no shape of its API; what they are stands above"
+            problems.append(odd if outcome.error in (None, MALFORMED) else f"{name}: {outcome.error}")
+        elif outcome.kind == UNFINISHED:
+            problems.append(f"{name}: it ends its answers for a reason that is not known ({outcome.finish_reason!r})")
         elif outcome.kind == "refused":
             problems.append(f"{name}: it refuses to answer ({outcome.finish_reason or outcome.error})")
     if isinstance(entry, JudgeEntry):
-        problems += _wrong_votes(outcomes)
+        problems += _wrong_votes(entry, outcomes)
     elif isinstance(entry, ModelEntry):
         for found, into in ((_wrong_answers(entry, outcomes), problems), (_seen(entry, outcomes, notes), problems)):
             into += found
@@ -233,6 +237,8 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
             return _wrong_key(account)
         case "http_404":
             return f"{where} knows no model {served_name(entry)!r}, or has another path (is /v1 missing?)"
+        case _ if error.startswith("ended_"):
+            return f"{name}: its answer breaks off ({error.removeprefix('ended_')}), which the server's log explains"
         case "timeout":
             return f"{name}: no answer within {TIMEOUT_S:.0f} s; a model that thinks for long may need more"
         case "server_error" if name != "schema":
@@ -240,18 +246,30 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
         case _ if name == "schema":
             return f"it refuses structured output ({error}): say `json_schema: false` and why under waivers"
         case _:
-            return f"{name}: it refuses what the entry declares ({error}); what it said stands above"
+            return (
+                f"{name}: it refuses what the entry declares ({error}); what it said stands above. "
+                "`params: {NAME: null}` leaves a parameter out, and a waiver says why"
+            )
 
 
-def _wrong_votes(outcomes: Mapping[str, Outcome]) -> list[str]:
+def _undeclared_thinking(entry: Entry, outcome: Outcome) -> str | None:
+    """Return what to declare where an answer shows its thinking between usual marks."""
+    text = outcome.text or ""
+    mark = undeclared_mark(split_thinking(text, entry.thinking).answer if entry.thinking else text)
+    return f"it thinks between marks in its answer: say `{how_to_declare(mark)}` in its entry" if mark else None
+
+
+def _wrong_votes(entry: JudgeEntry, outcomes: Mapping[str, Outcome]) -> list[str]:
     wrong = []
     for name, outcome in outcomes.items():
-        if outcome.kind in ("error", "malformed", "refused"):
+        if outcome.kind in ("error", "malformed", "refused", UNFINISHED):
             continue
         task: Task = "abstention" if name.startswith("abstention") else "correctness"
         _, abstained, correct = _JUDGED[int(name[-1])]
-        vote = parse_vote(task, {"outcome": outcome.kind, "text": outcome.text}, _ITEM)
-        if not vote.valid:
+        vote = parse_vote(task, {"outcome": outcome.kind, "text": outcome.text}, _ITEM, entry.thinking)
+        if not vote.valid and (marked := _undeclared_thinking(entry, outcome)):
+            wrong.append(marked)
+        elif not vote.valid:
             wrong.append(f"its vote on {task} does not meet the schema ({vote.invalid_reason})")
         elif vote.decision is not (abstained if task == "abstention" else correct):
             wrong.append(f"its vote on {task} of the plain answer {_JUDGED[int(name[-1])][0]!r} is wrong")
@@ -266,11 +284,11 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
             wrong.append(f"{name}: its answer is empty (finish reason {outcome.finish_reason})")
         if outcome.kind not in WITH_TEXT:
             continue
-        if THINKS.search(text) and not entry.inline_thinking:
-            wrong.append("it thinks between <think> tags in its answer: say `inline_thinking: true` in its entry")
+        if marked := _undeclared_thinking(entry, outcome):
+            wrong.append(marked)
             continue
         row = {"outcome": outcome.kind, "text": text}
-        read = read_answer(row, None, "json" if name == "schema" else "standard", inline_thinking=entry.inline_thinking)
+        read = read_answer(row, None, "json" if name == "schema" else "standard", thinking=entry.thinking)
         if read.outcome == "degenerate":
             wrong.append(f"its answer is {plain(text)[:40]!r}, which {degenerate(text)}")
         elif read.is_json is False and read.outcome == "answer":
@@ -323,7 +341,7 @@ def check_live(entries: Iterable[Entry]) -> list[Live]:
                 async with asyncio.timeout(TIMEOUT_S):
                     return await backend.ask(request)
             except TransientError as error:
-                return Outcome("error", error=error.kind)
+                return replace(error.outcome, error=error.why or error.kind)
             except TimeoutError:
                 return Outcome("error", error="timeout")
 

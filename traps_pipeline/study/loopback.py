@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 from traps_pipeline.base.progress import Progress, reporting
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.registry import Account, Entry, load_accounts
-from traps_pipeline.models.request import MALFORMED, Outcome, Request, TransientError
+from traps_pipeline.models.request import Outcome, Request, TransientError
 from traps_pipeline.study.wire_body import WireBody
 
 PLACEHOLDER_KEY = "placeholder-of-a-key"
@@ -99,7 +99,7 @@ def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[in
             try:
                 return await backend.ask(request)
             except TransientError as error:
-                return Outcome("malformed" if error.kind == MALFORMED else "error", error=error.kind, raw=error.raw)
+                return error.outcome
 
         async def read_all() -> list[Outcome]:
             return [await read(request) for request in requests]  # one after the other: answers come in order

@@ -50,7 +50,7 @@ def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) 
     The three seats of the panel `rules` read by the same rules, so that one reading is their majority.
     """
     row = {"outcome": outcome if (text or "").strip() or outcome not in ("answer", "truncated") else "empty"}
-    read = read_answer({**row, "text": text}, None, regime, inline_thinking=False)
+    read = read_answer({**row, "text": text}, None, regime)
     names = {name: item[name] for name in ("item_id", "dataset", "side")}
     if read.outcome not in JUDGED or read.text is None:
         return Judged(**names, outcome=read.outcome)

@@ -29,6 +29,8 @@ _CODE = Path(__file__).parents[2]
 _COPIED = {
     "base/digests.py": "digests.py",
     "models/request.py": "request.py",
+    "models/endings.py": "endings.py",
+    "models/thinking.py": "thinking.py",
     "models/reading.py": "reading.py",
     "judging/answers.py": "answers.py",
     "judging/rules.py": "rules.py",

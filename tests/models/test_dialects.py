@@ -1,0 +1,180 @@
+"""What a provider's own bytes say of an answer, in each of four dialects, as their documentation has it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply
+
+LEFT = "The ball rolls to the left."
+ROUTES = {
+    "chat": "openai/m",
+    "responses": "openai/responses/m",
+    "anthropic": "anthropic/m",
+    "gemini": "gemini/gemini-2.5-pro",
+}
+
+
+def chat(finish: Any = "stop", **message: Any) -> dict[str, Any]:
+    choice = {"index": 0, "message": {"role": "assistant", "content": LEFT} | message, "finish_reason": finish}
+    return {"object": "chat.completion", "model": "m-1", "choices": [choice], "usage": {"prompt_tokens": 9}}
+
+
+def responses(status: str = "completed", reason: str | None = None, *content: dict[str, Any]) -> dict[str, Any]:
+    parts = list(content) or [{"type": "output_text", "text": LEFT, "annotations": []}]
+    thought = {"type": "reasoning", "summary": [{"type": "summary_text", "text": "I look."}]}
+    output = [thought, {"type": "message", "role": "assistant", "content": parts}]
+    why = {"reason": reason} if reason else None
+    body = {"object": "response", "status": status, "incomplete_details": why, "model": "m-1", "output": output}
+    return body | {"usage": {"input_tokens": 9}}
+
+
+def anthropic(finish: Any = "end_turn", *content: dict[str, Any]) -> dict[str, Any]:
+    parts = list(content) or [{"type": "text", "text": LEFT}]
+    return {"type": "message", "model": "m-1", "content": parts, "stop_reason": finish, "usage": {"input_tokens": 9}}
+
+
+def gemini(finish: Any = "STOP", *parts: dict[str, Any]) -> dict[str, Any]:
+    content = {"role": "model", "parts": list(parts) or [{"text": LEFT}]}
+    candidate = {"content": content, "finishReason": finish, "index": 0}
+    return {"candidates": [candidate], "modelVersion": "m-1", "usageMetadata": {"promptTokenCount": 9}}
+
+
+MAKERS = {"chat": chat, "responses": responses, "anthropic": anthropic, "gemini": gemini}
+
+
+def read(dialect: str, body: dict[str, Any]) -> Reply:
+    return read_reply(parse_body(json.dumps(body).encode()), ROUTES[dialect])
+
+
+@pytest.mark.parametrize(
+    ("dialect", "finish", "ending"),
+    [
+        ("chat", "stop", "complete"), ("chat", "eos_token", "complete"),
+        ("chat", "length", "truncated"), ("chat", "max_tokens", "truncated"), ("chat", "MAX_TOKENS", "truncated"),
+        ("chat", "model_length", "truncated"), ("chat", "time_limit", "truncated"),
+        ("chat", "content_filter", "refused"), ("chat", "SAFETY", "refused"),
+        ("chat", "error", "transient"), ("chat", "abort", "transient"),
+        ("chat", "insufficient_system_resource", "transient"),
+        ("chat", "tool_calls", "unknown"), ("chat", "function_call", "unknown"), ("chat", "stopped", "unknown"),
+        ("responses", "completed", "complete"), ("responses", "incomplete", "unknown"),
+        ("responses", "failed", "transient"), ("responses", "cancelled", "transient"),
+        ("responses", "in_progress", "transient"), ("responses", "queued", "transient"),
+        ("anthropic", "end_turn", "complete"), ("anthropic", "stop_sequence", "complete"),
+        ("anthropic", "max_tokens", "truncated"), ("anthropic", "model_context_window_exceeded", "truncated"),
+        ("anthropic", "pause_turn", "truncated"), ("anthropic", "refusal", "refused"),
+        ("anthropic", "tool_use", "unknown"),
+        ("gemini", "STOP", "complete"), ("gemini", "MAX_TOKENS", "truncated"), ("gemini", "SAFETY", "refused"),
+        ("gemini", "RECITATION", "refused"), ("gemini", "LANGUAGE", "refused"), ("gemini", "BLOCKLIST", "refused"),
+        ("gemini", "PROHIBITED_CONTENT", "refused"), ("gemini", "SPII", "refused"),
+        ("gemini", "IMAGE_SAFETY", "refused"), ("gemini", "MALFORMED_RESPONSE", "transient"),
+        ("gemini", "OTHER", "unknown"), ("gemini", "FINISH_REASON_UNSPECIFIED", "unknown"),
+    ],
+)  # fmt: skip
+def test_a_finish_reason_is_kept_as_it_came_and_has_its_documented_meaning(
+    dialect: str, finish: str, ending: str
+) -> None:
+    reply = read(dialect, MAKERS[dialect](finish))
+    assert (reply.finish, reply.ending, reply.text, reply.served_model) == (finish, ending, LEFT, "m-1")
+    assert [*reply.usage.values()] == [9]
+
+
+def test_an_incomplete_response_says_why() -> None:
+    cut_off = read("responses", responses("incomplete", "max_output_tokens"))
+    assert (cut_off.finish, cut_off.ending, cut_off.reasoning) == ("max_output_tokens", "truncated", "I look.")
+    assert read("responses", responses("incomplete", "content_filter")).ending == "refused"
+    assert read("responses", responses("incomplete", "of_the_weather")).ending == "unknown"
+
+
+@pytest.mark.parametrize("dialect", ["chat", "anthropic", "gemini"])
+@pytest.mark.parametrize("finish", [None, "", 7, ["stop"]])
+def test_an_answer_that_does_not_say_why_it_ended_is_no_complete_answer(dialect: str, finish: Any) -> None:
+    with pytest.raises(OddShapeError, match="gives no finish reason"):
+        read(dialect, MAKERS[dialect](finish))
+
+
+THINKING_PARTS = [
+    {"type": "thinking", "thinking": [{"type": "text", "text": "maybe right"}]},
+    {"type": "text", "text": LEFT},
+]
+
+
+CLAUDE_PARTS = [
+    {"type": "thinking", "thinking": "maybe right", "signature": "s"},
+    {"type": "redacted_thinking", "data": "x"},
+    {"type": "text", "text": LEFT},
+]
+
+
+@pytest.mark.parametrize(
+    ("dialect", "body", "reasoning"),
+    [
+        ("chat", chat(content=[{"type": "text", "text": LEFT}]), ""),
+        ("chat", chat(content=[{"type": "text", "text": LEFT[:9]}, {"type": "text", "text": LEFT[9:]}]), ""),
+        ("chat", chat(content=THINKING_PARTS), "maybe right"),
+        ("chat", chat(content=[{"type": "reference", "reference_ids": [1]}, {"type": "text", "text": LEFT}]), ""),
+        ("chat", chat(reasoning_content="maybe right"), "maybe right"),
+        ("chat", chat(reasoning="maybe right", reasoning_details=[{"text": "maybe right"}]), "maybe right"),
+        ("anthropic", anthropic("end_turn", *CLAUDE_PARTS), "maybe right"),
+        ("gemini", gemini("STOP", {"text": "maybe right", "thought": True}, {"text": LEFT}), "maybe right"),
+    ],
+)  # fmt: skip
+def test_text_and_trace_are_told_apart_by_the_parts(dialect: str, body: dict[str, Any], reasoning: str) -> None:
+    reply = read(dialect, body)
+    assert (reply.text, reply.reasoning) == (LEFT, reasoning)
+
+
+def test_a_refusal_has_words_of_its_own() -> None:
+    assert read("chat", chat(content=None, refusal="I can't help.")).refusal == "I can't help."
+    assert read("chat", chat(refusal="")).refusal == ""
+    refused = read("responses", responses("completed", None, {"type": "refusal", "refusal": "I can't help."}))
+    assert (refused.refusal, refused.text) == ("I can't help.", "")
+    blocked = read("gemini", {"promptFeedback": {"blockReason": "OTHER"}, "usageMetadata": {"promptTokenCount": 9}})
+    assert (blocked.ending, blocked.finish, blocked.text) == ("refused", "OTHER", "")
+
+
+def test_what_a_model_says_on_the_way_is_no_answer() -> None:
+    body = responses()
+    said = {"type": "message", "phase": "commentary", "content": [{"type": "output_text", "text": "Let me see."}]}
+    body["output"].insert(1, said)
+    assert (read("responses", body).text, read("responses", body).reasoning) == (LEFT, "I look.\n\nLet me see.")
+
+
+def test_the_first_choice_is_the_one_that_says_so() -> None:
+    body = chat()
+    body["choices"].insert(0, {"index": 1, "message": {"content": "right"}, "finish_reason": "stop"})
+    assert read("chat", body).text == LEFT
+
+
+def test_a_response_is_read_as_one_where_the_route_says_chat() -> None:
+    assert read_reply(responses(), "openai/gpt-5-pro").text == LEFT
+    assert read_reply(anthropic(), "vertex_ai/claude-opus-4-6").text == LEFT
+
+
+@pytest.mark.parametrize(
+    ("content", "shape"),
+    [
+        (b"", "an empty body"),
+        (b"\n<!doctype html><h1>Sign in</h1>", "a page of HTML"),
+        (b'data: {"choices": []}\n\ndata: [DONE]\n', "a stream of events"),
+        (b'{"choices": [{"ind', "a text that breaks off or is no JSON"),
+        (b"[" * 100_000, "a text that breaks off or is no JSON"),
+        (b"[1]", "a JSON list and no object"),
+        (b"{}", "OpenAI's chat API: it has no list `choices` (it holds nothing)"),
+        (b'{"model": "m", "message": {"content": "left"}, "done": true}', "(it holds model, message, done)"),
+        (json.dumps(chat(content={"text": "left"})).encode(), "neither a text nor a list of parts but dict"),
+        (json.dumps(chat(content=["left"])).encode(), "a part of its content is no object but str"),
+    ],
+)
+def test_an_odd_shape_is_named_in_one_sentence(content: bytes, shape: str) -> None:
+    with pytest.raises(OddShapeError) as raised:
+        read_reply(parse_body(content), "openai/m")
+    assert shape in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_bytes_that_are_no_text_lose_no_answer() -> None:
+    content = json.dumps(chat(content="left @@")).encode().replace(b"@@", b"\xff\xfe")
+    assert read_reply(parse_body(b"\xef\xbb\xbf\n  " + content), "openai/m").text == "left ��"
