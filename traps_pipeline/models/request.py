@@ -17,7 +17,7 @@ OutcomeKind = Literal["answer", "truncated", "empty", "refused", "error", "malfo
 WITH_TEXT: tuple[OutcomeKind, ...] = ("answer", "truncated")  # docs/models.md, "Request -> Outcome"
 JUDGED: tuple[str, ...] = ("answer",)  # of the responses table, whose outcomes are those of `models.reading`
 RATE_LIMITED = "rate_limited"  # the kind of a 429
-UNREACHABLE = "unreachable"  # the kind of a connection that was never made
+UNREACHABLE = "unreachable"  # the kind of a call that never left: no byte of it reached a server
 MALFORMED = "malformed"  # the kind of an answer whose shape is out of order
 _VERBATIM = 600  # a text up to this long stands in the key's components as it is, so that `traps why` can show it
 
@@ -86,14 +86,20 @@ class Outcome:
 class TransientError(Exception):
     """A failure worth another try: time-out, 408, 409, 429, 5xx, a cut connection, an answer out of order.
 
-    billed: whether the provider may charge for it; raw: see `Outcome`.
+    billed: whether the provider may charge for it; raw: see `Outcome`; why: what kept a call from leaving.
     """
 
     def __init__(
-        self, kind: str, retry_after_s: float | None = None, *, billed: bool = True, raw: str | None = None
+        self,
+        kind: str,
+        retry_after_s: float | None = None,
+        *,
+        billed: bool = True,
+        raw: str | None = None,
+        why: str = "",
     ) -> None:
         super().__init__(kind)
-        self.kind, self.retry_after_s, self.billed, self.raw = kind, retry_after_s, billed, raw
+        self.kind, self.retry_after_s, self.billed, self.raw, self.why = kind, retry_after_s, billed, raw, why
 
 
 class Backend(Protocol):
