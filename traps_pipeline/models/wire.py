@@ -9,6 +9,7 @@ compressed is asked for.
 from __future__ import annotations
 
 import asyncio
+import os
 import ssl
 import zlib
 from collections.abc import Mapping
@@ -76,15 +77,17 @@ class Wire(httpx.AsyncBaseTransport):
     async def _send(self, request: httpx.Request, exchange: Exchange) -> aiohttp.ClientResponse:
         request.headers["accept-encoding"] = "identity"
         content, url, times = await request.aread(), str(request.url), request.extensions.get("timeout", {})
+        if request.url.scheme not in ("http", "https"):
+            raise TrapsError(f"{url}: {request.url.scheme}:// is no scheme of HTTP; write http:// or https://")
         proxy = proxy_of(url)
         if proxy is not None:
             exchange.proxy = proxy.variable
             if proxy.problem:
                 raise TrapsError(proxy.problem)
-        if self._tls is None:
-            if problem := request.url.scheme == "https" and certificate_problem():
+        if request.url.scheme == "https" and self._tls is not False:
+            if problem := certificate_problem():
                 raise TrapsError(problem)
-            self._tls = httpx.create_ssl_context()
+            self._tls = self._tls or httpx.create_ssl_context()
         return await self._session().request(
             request.method,
             URL(url, encoded=True),
@@ -95,7 +98,7 @@ class Wire(httpx.AsyncBaseTransport):
                 total=None, sock_connect=min(times.get("connect") or CONNECT_S, CONNECT_S), sock_read=times.get("read")
             ),
             proxy=proxy and proxy.url,
-            ssl=self._tls,
+            ssl=True if self._tls is None else self._tls,
         )
 
     def _session(self) -> aiohttp.ClientSession:
@@ -163,8 +166,8 @@ def _explain(error: BaseException, url: httpx.URL, exchange: Exchange) -> str:
         return f"the connection to {where} broke after the request was sent: {text}"
     if exchange.proxy:
         proxy = proxy_of(str(url))
-        return f"no connection to {where} through the proxy {proxy and proxy.address} of {exchange.proxy}: {text}"
-    return f"no connection to {where}: {text}"
+        return f"nothing was sent to {where} through the proxy {proxy and proxy.address} of {exchange.proxy}: {text}"
+    return f"nothing was sent to {where}: {text}"
 
 
 def cause_of(error: BaseException) -> str:
@@ -180,6 +183,8 @@ def cause_of(error: BaseException) -> str:
         return f"TLS failed ({error.reason or error}): if the server speaks plain HTTP, write http:// in its address"
     if isinstance(error, aiohttp.ClientHttpProxyError):
         return f"the proxy answered {error.status} {error.message}"
+    if isinstance(error, OSError) and error.errno and error.errno > 0:
+        return os.strerror(error.errno)
     return getattr(error, "strerror", None) or str(error) or type(error).__name__
 
 
