@@ -110,12 +110,19 @@ ODD = {
     "byte-order-mark": "\ufeff\ufeff" + body(),
     "deep": "[" * 100_000,
     "many-digits": usage(completion_tokens=21).replace("21", "9" * 5000),
-    "error-in-200": json.dumps({"error": {"message": "overloaded", "code": 503}}),
+    "error-in-200": json.dumps({"error": {"message": "upstream failed", "code": 502}}),
     "cost-by-name": body(usage={"cost_usd": -1000}),
     "model-and-no-usage": body(model=5, usage=None),
 }
 STATUSES = {f"status-{status}": status for status in (500, 502, 504, 520, 522, 524, 599, 408, 302, 307, 204)}
 UNBILLED = {f"status-{status}": status for status in (400, 401, 403, 404, 409, 422, 429, 503)}
+REFUSED_IN_200 = {  # by what a provider says in a 200, and what it amounts to
+    "number": ({"code": 429, "message": "slow down"}, "rate_limited"),
+    "word": ({"code": "rate_limit_exceeded", "message": "slow down"}, "rate_limited"),
+    "anthropic": ({"type": "overloaded_error", "message": "Overloaded"}, "server_error"),
+    "gemini": ({"code": 403, "status": "PERMISSION_DENIED", "message": "no permission"}, "http_403"),
+    "final": ({"code": "404", "message": "no such model"}, "http_404"),
+}
 
 
 @pytest.fixture
@@ -125,6 +132,8 @@ def odd(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
     raw: dict[str, Any] = {name: {"content": content} for name, content in ODD.items()}
     raw["event-stream"]["type"] = "text/event-stream"
     raw |= {name: {"content": body(), "status": status} for name, status in (STATUSES | UNBILLED).items()}
+    for name, (error, _) in REFUSED_IN_200.items():
+        raw[f"in-200-{name}"] = {"content": json.dumps({"error": error}), "billed": False}
     return shared_provider.afresh(raw_by_model=raw, usd_a_token=USD_A_TOKEN)
 
 
@@ -179,6 +188,14 @@ def test_what_a_provider_bills_for_an_odd_answer_is_booked(odd: Provider, shape:
 def test_a_call_that_a_provider_did_not_take_costs_nothing(odd: Provider, shape: str) -> None:
     outcome, booked_usd = booked_for(odd, shape)
     assert outcome and booked_usd == odd.stats()["billed_usd"] == 0.0
+
+
+@pytest.mark.parametrize("name", REFUSED_IN_200)
+def test_an_error_object_in_a_200_follows_the_code_that_it_carries(odd: Provider, name: str) -> None:
+    outcome, booked_usd = booked_for(odd, f"in-200-{name}")
+    assert outcome and (outcome.kind, outcome.error) == ("error", REFUSED_IN_200[name][1])
+    assert booked_usd == odd.stats()["billed_usd"] == 0.0
+    assert odd.stats()["requests"] == (1 if outcome.error.startswith("http_") else 2)  # what may pass is tried again
 
 
 def test_an_answer_is_paid_as_its_usage_says(odd: Provider) -> None:

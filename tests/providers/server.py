@@ -91,7 +91,8 @@ class Config:
     spare a body that was seen that often. scripts: by model, what it says to a request whose text holds a phrase (the
     first that fits), in the place of a good answer. Latency delays 200s only, error statuses come at once; `slow_s`
     replaces it.
-    raw_by_model: the very bytes (`content`), `status` and `type` of what a model answers. fuzzed: answers of the chat
+    raw_by_model: the very bytes (`content`), `status`, `type` and `headers` of what a model answers, and whether it is
+    `billed`. fuzzed: answers of the chat
     API come with a few of their values, or their end, replaced. usd_a_token: what the server bills for prompt and
     completion; an attempt that its status does not refuse is billed, and one that is odd as the most that it may take.
     hang_s: when even the server gives up. served_suffix goes behind the model's name, as real ones answer with a date.
@@ -652,7 +653,7 @@ def reply_to(question: Question, fault: str | None, config: Config) -> Reply:
     if raw := config.raw_by_model.get(question.model):
         status = int(raw.get("status", 200))
         content = raw["content"].encode("utf-8", "surrogatepass")
-        refused = (400 <= status < 500 and status != 408) or status == 503
+        refused = (400 <= status < 500 and status != 408) or status == 503 or not raw.get("billed", True)
         kind = raw.get("type", "application/json")
         return Reply(
             status, content, kind, raw.get("headers", {}), config.latency_s, tokens=(0, 0) if refused else most

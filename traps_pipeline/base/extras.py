@@ -22,7 +22,7 @@ class Extra:
 
 
 EXTRAS: Mapping[ExtraName, Extra] = {
-    "api": Extra("asking models over the network", ("litellm", "mcp")),
+    "api": Extra("asking models over the network", ("litellm", "mcp", "aiohttp")),
     "local": Extra("a model on this machine", ("torch", "torchvision", "transformers", "safetensors")),
     "nf4": Extra("quantisation nf4", ("bitsandbytes", "accelerate")),
     "sign": Extra("a signature", ("model_signing",)),

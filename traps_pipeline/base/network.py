@@ -1,51 +1,117 @@
-"""Check what the environment says of the network: proxies and certificates, which every client library reads by itself.
+"""What the environment says of a connection: which proxy it names, which certificates, and what is wrong with them.
 
-A wrong variable would otherwise end in an error of a library, which names no variable, at each call.
+Client libraries read these variables by themselves, and their errors name none.
 """
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import ssl
-from importlib.util import find_spec
+import urllib.request
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from traps_pipeline.base.errors import TrapsError
 
 PROXIES = ("http_proxy", "https_proxy", "all_proxy")  # in small or capital letters
-CERTIFICATES = ("SSL_CERT_FILE", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE", "SSL_CERT_DIR")
+PROXY_SCHEMES = ("http", "https")  # SOCKS takes a package of its own, in every client library
+TLS_VARIABLES = ("SSL_CERT_FILE", "SSL_CERT_DIR")  # of calls
+CERTIFICATES = (*TLS_VARIABLES, "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")  # of some library
+
+
+@dataclass(frozen=True)
+class Proxy:
+    """A proxy as the environment names it. variable: the variable's name, or "the system's settings"."""
+
+    variable: str
+    url: str
+
+    @property
+    def address(self) -> str:
+        """Scheme, host and port, without the name and password that the URL may hold."""
+        scheme, _, rest = self.url.partition("://")
+        return f"{scheme}://{rest.rpartition('@')[2].partition('/')[0]}"
+
+    @property
+    def problem(self) -> str | None:
+        """Return why no call can go through this proxy; None if one may."""
+        if not _is_address(self.url):
+            return f"{self.variable} is no address of a proxy: write it as http://HOST:PORT, or unset it"
+        if urlsplit(self.url).scheme in PROXY_SCHEMES:
+            return None
+        return (
+            f"{self.variable} names the proxy {self.address}, and calls go through http:// and https:// proxies alone: "
+            "name one of these there, or add the host to NO_PROXY"
+        )
+
+
+def _is_address(url: str) -> bool:
+    try:
+        address = urlsplit(url)
+        is_scheme = address.scheme in (*PROXY_SCHEMES, "socks5", "socks5h")
+        return (
+            is_scheme and bool(address.hostname) and (address.port is None or address.port > 0) and not url.split()[1:]
+        )
+    except ValueError:
+        return False
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host name or address is this machine's own."""
+    host = host.strip("[]").rstrip(".").lower()
+    if host == "localhost" or host.endswith(".localhost"):
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def proxy_of(url: str) -> Proxy | None:
+    """Return the proxy that the environment names for a URL; None for loopback addresses, whatever it says."""
+    parts = urlsplit(url)
+    host = parts.hostname or ""
+    proxies = urllib.request.getproxies()
+    address = proxies.get(parts.scheme) or proxies.get("all")
+    if not address or is_loopback(host) or urllib.request.proxy_bypass(host):
+        return None
+    names = (f"{parts.scheme}_proxy", "all_proxy")
+    variables = [name for name, value in os.environ.items() if name.lower() in names and value == address]
+    variable = variables[0] if variables else "the system's settings"
+    return Proxy(variable, address if "://" in address else f"http://{address}")
 
 
 def check_network() -> str:
     """Return what the environment says of proxies and certificates, in words.
 
-    Raises TrapsError, which names the variable, for a proxy that cannot be used and certificates that are not there.
+    Raises TrapsError, which names the variable, for what is no address of a proxy and certificates that are not there.
+    A SOCKS proxy is refused where a call would go through it, since loopback addresses do not.
     """
     proxies = [name for name, value in os.environ.items() if name.lower() in PROXIES and value]
+    for name in proxies:
+        value = os.environ[name]
+        proxy = Proxy(name, value if "://" in value else f"http://{value}")
+        if not _is_address(proxy.url):
+            raise TrapsError(str(proxy.problem))
+    if problem := certificate_problem(CERTIFICATES):
+        raise TrapsError(problem)
     certificates = [name for name in CERTIFICATES if os.environ.get(name)]
-    for problem in (*map(_proxy_problem, proxies), *map(_certificates_problem, certificates)):
-        if problem:
-            raise TrapsError(problem)
     return f"{', '.join(proxies) or 'no proxy'}; {', '.join(certificates) or 'the usual certificates'}"
 
 
-def _proxy_problem(variable: str) -> str:
-    value = os.environ[variable]
-    try:
-        address = urlsplit(value if "://" in value else f"http://{value}")
-        is_address = bool(address.hostname) and (address.port is None or address.port > 0) and not value.split()[1:]
-    except ValueError:
-        is_address, address = False, urlsplit("")
-    if not is_address or address.scheme not in ("http", "https", "socks5", "socks5h"):
-        return f"{variable} is no address of a proxy: write it as http://HOST:PORT, or unset it"
-    if address.scheme.startswith("socks") and find_spec("socksio") is None:
-        return f"{variable} names a SOCKS proxy, which needs the package socksio: pip install socksio, or unset it"
-    return ""
+def certificate_problem(variables: Sequence[str]) -> str | None:
+    """Return the sentence about a variable that names no certificates; None if there is none."""
+    for variable in variables:
+        value = os.environ.get(variable)
+        if value and (problem := _certificates_problem(variable, value)):
+            return problem
+    return None
 
 
-def _certificates_problem(variable: str) -> str:
-    value = os.environ[variable]
+def _certificates_problem(variable: str, value: str) -> str:
     if variable == "SSL_CERT_DIR":
         gone = [folder for folder in value.split(os.pathsep) if not Path(folder).is_dir()]
         return f"{variable} names the folder {gone[0]}, which is not there: mend or unset it" if gone else ""

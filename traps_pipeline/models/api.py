@@ -17,12 +17,12 @@ from typing import Any
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.network import check_network
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.models.budget import worst_case_usd
 from traps_pipeline.models.dialects import OddShapeError, Reply, parse_body, read_reply
 from traps_pipeline.models.endings import Ending
+from traps_pipeline.models.provider_errors import ProviderError, read_error, retry_after_s
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import (
     MALFORMED,
@@ -35,11 +35,13 @@ from traps_pipeline.models.request import (
     Request,
     TransientError,
 )
-from traps_pipeline.models.transport import WATCHED, Exchange, watch
+from traps_pipeline.models.transport import Exchange, watching
 from traps_pipeline.models.usage import Sizes, Usage, read_usage
 from traps_pipeline.storage.media import Media, data_uris
 
-UNREADABLE = 422  # what litellm makes of a page that is no JSON; no provider here sends it
+UNKNOWN_ERROR = 500  # the status of an error object in a 200 that names none
+REFUSED_CONTENT = "content_policy"  # the error of a call whose content a provider's filter stopped
+DENIED = "http_403_denied"  # of a 403 that is not about the key
 MOST_KEPT = 4000  # characters of an answer that is out of order
 TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 
@@ -48,6 +50,8 @@ TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 def load_litellm() -> Any:
     """The library, told to send and to fetch nothing of its own. Raises TrapsError where it is not installed."""
     require("api")
+    from traps_pipeline.models.wire import use_in
+
     os.environ["LITELLM_MODE"] = "PRODUCTION"  # else it takes variables from a .env of any folder above
     os.environ["LITELLM_LOCAL_MODEL_COST_MAP"] = "True"
     os.environ["LITELLM_LOCAL_ANTHROPIC_BETA_HEADERS"] = "True"
@@ -58,7 +62,7 @@ def load_litellm() -> Any:
     litellm.suppress_debug_info = True
     litellm.drop_params = False  # a parameter that a provider refuses is an error, never left out in silence
     litellm.callbacks = [_hook()]
-    watch(import_module("litellm.llms.custom_httpx.http_handler").AsyncHTTPHandler)
+    use_in(import_module("litellm.llms.custom_httpx.http_handler").AsyncHTTPHandler)
     # Its import makes connections of its own, unwatched, and keeps them for whoever has the same time-out.
     litellm.in_memory_llm_clients_cache.flush_cache()
     return litellm
@@ -117,7 +121,6 @@ class ApiBackend:
 
     def __init__(self, entry: Entry, account: Account | None = None) -> None:
         account = account or load_accounts()[str(entry.account)]
-        check_network()
         self._entry = entry
         self._fixed: dict[str, Any] = {
             "model": entry.provider_id,
@@ -132,17 +135,20 @@ class ApiBackend:
 
     async def ask(self, request: Request) -> Outcome:
         """One attempt; see `Backend`."""
-        asked, exchange = messages(self._entry, request), Exchange()
+        asked = messages(self._entry, request)
         _internal_call().set(True)
-        watched = WATCHED.set(exchange)
-        try:
-            await self._litellm.acompletion(messages=asked, **request.params, **self._fixed)
-        except Exception as error:  # noqa: BLE001 - litellm's, the SDKs' and httpx's errors
-            if not exchange.answered or exchange.content is None:
-                return self._failure(error, exchange)
-        finally:
-            WATCHED.reset(watched)
-        return self._read(request, exchange)  # whatever the library makes of it
+        with watching() as exchange:
+            exchange.sent = False  # until the wire says otherwise
+            try:
+                await self._litellm.acompletion(messages=asked, **request.params, **self._fixed)
+            except Exception as error:  # noqa: BLE001 - litellm's, the SDKs' and httpx's errors
+                if not exchange.is_answered or exchange.content is None:
+                    return self._failure(error, exchange)
+            if exchange.status is None:  # a defect of ours, or of a new version of the client library
+                exchange.sent = None
+            elif (reported := read_error(exchange.content)) is not None:
+                return self._reported(reported, exchange)
+            return self._read(request, exchange)  # whatever the library makes of it
 
     def _read(self, request: Request, exchange: Exchange) -> Outcome:
         """Return what the provider's own bytes say."""
@@ -198,19 +204,43 @@ class ApiBackend:
         return cost if usage.believed else max(cost, worst)
 
     def _failure(self, error: Exception, exchange: Exchange) -> Outcome:
-        """A failure as TransientError or as an outcome. Its text goes to a person, never into the ledger."""
-        status = getattr(error, "status_code", None)
-        billed = exchange.may_be_billed(status if isinstance(status, int) else None)
-        free = None if billed else 0.0
-        if isinstance(error, self._litellm.ContentPolicyViolationError):
-            return Outcome("refused", error="content_policy", cost_usd=free)
-        kind = failure_kind(error, self._litellm, exchange)
-        if kind == "connection" and exchange.unsent:
-            kind = UNREACHABLE
-        self._tell(kind, str(error))
+        """Return a failure as an outcome, or raise it as TransientError. Its text is for a person and never stored."""
+        from traps_pipeline.models.wire import cause_of
+
+        if exchange.never_left:
+            why = redact(plain(exchange.problem or cause_of(error)))
+            self._tell(UNREACHABLE, why)
+            raise TransientError(UNREACHABLE, billed=False, why=why) from None
+        if (reported := read_error(exchange.content)) is not None:
+            return self._reported(reported, exchange)
+        if exchange.status is not None and not exchange.is_answered:
+            return self._reported(ProviderError(self._beginning(exchange)), exchange)
+        kind = "timeout" if isinstance(error, self._litellm.Timeout) else "connection"
+        self._tell(kind, exchange.problem or cause_of(error))
+        raise TransientError(kind) from None
+
+    def _reported(self, reported: ProviderError, exchange: Exchange) -> Outcome:
+        """Return what a provider reports as an outcome, or raise it as TransientError. The status is the one on the
+        wire, or the one in the body where that came with a 200."""
+        status = (reported.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
+        assert status is not None
+        billed = exchange.may_be_billed(status)
+        through = f" (through the proxy of {exchange.proxy})" if exchange.proxy else ""
+        if reported.is_filtered and status not in TRANSIENT_STATUSES:
+            self._tell(REFUSED_CONTENT, f"{reported}{through}")
+            return Outcome("refused", error=REFUSED_CONTENT, cost_usd=None if billed else 0.0)
+        kind = failure_kind(status, reported)
+        self._tell(kind, f"{reported}{through}")
         if kind.startswith("http_"):
-            return Outcome("error", error=kind, cost_usd=free)
-        raise TransientError(kind, retry_after_s(error), billed=billed) from None
+            return Outcome("error", error=kind, cost_usd=None if billed else 0.0)
+        raise TransientError(kind, retry_after_s(exchange.headers, reported), billed=billed) from None
+
+    def _beginning(self, exchange: Exchange) -> str:
+        """Return how an answer without an error object begins, for a person."""
+        text = redact((exchange.content or b"").decode("utf-8", "replace"))  # before it is cut
+        kind = exchange.headers.get("Content-Type", "no content type").partition(";")[0]
+        begins = f", beginning {text[:60]!r}" if text.strip() else ""
+        return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{begins}"
 
     def _tell(self, kind: str, said: str) -> None:
         """Say once for each kind what the provider said, without the key."""
@@ -220,44 +250,13 @@ class ApiBackend:
             progress.current().note(f"{self._entry.id}: {kind}: {plain(said)[:300]}")
 
 
-def failure_kind(error: Exception, litellm: Any, exchange: Exchange) -> str:
-    """What went wrong in a word: http_<status> is final, anything else is worth another try. A status that was seen
-    counts more than what litellm makes of it."""
-    if exchange.answered:
-        return "connection"  # the answer was not read to its end
-    status = exchange.status
-    if status is None:
-        if isinstance(error, litellm.Timeout):
-            return "timeout"
-        if isinstance(error, litellm.APIConnectionError) or _broke_off(error):
-            return "connection"
-        status = getattr(error, "status_code", None)
-    if not isinstance(status, int) or status < 300 or status == UNREADABLE:
-        return "bad_response"
+def failure_kind(status: int, reported: ProviderError) -> str:
+    """Return what went wrong in a word: http_<status> is final, anything else is worth another try."""
     if status in TRANSIENT_STATUSES:
         return TRANSIENT_STATUSES[status]
-    return f"http_{status}" if status < 500 else "server_error"
-
-
-def _broke_off(error: BaseException | None) -> bool:
-    """Whether the connection failed below what litellm calls a server error: the answer may have been on its way."""
-    while error is not None:
-        if (
-            type(error).__module__.split(".")[0] in ("httpx", "httpcore", "aiohttp")
-            and "Status" not in type(error).__name__
-        ):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
-
-
-def retry_after_s(error: Exception) -> float | None:
-    """Seconds that the provider asks to wait; None if it does not say so in seconds."""
-    headers: Mapping[str, str] = getattr(error, "litellm_response_headers", None) or {}
-    try:
-        return max(0.0, float(headers.get("retry-after", "")))
-    except ValueError:
-        return None
+    if status >= 500:
+        return "server_error"
+    return DENIED if status == 403 and not reported.is_about_key else f"http_{status}"
 
 
 def _kind(reply: Reply) -> OutcomeKind:

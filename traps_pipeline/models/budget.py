@@ -25,6 +25,7 @@ from traps_pipeline.storage.lines import NOT_WHOLE, append_whole, checked_line, 
 from traps_pipeline.storage.study import Study
 
 OVERHEAD_TOKENS = 200  # roles, separators, JSON around the text
+RELEASED = "released.jsonl"  # beside the journal: what a person gave back, and why (`models.release`)
 UNKNOWN = "unknown"  # the participant of money that nobody can tell whose call it was
 BYTES_A_TOKEN = 1  # some tokenizers make a token of every digit, and judges are shown arbitrary text
 
@@ -98,6 +99,16 @@ class Journal:
     def close(self) -> None:
         """Close the file; it stays."""
         os.close(self._file)
+
+
+def released_usd(path: Path) -> dict[str, float]:
+    """Return the dollars that a person released by participant (`models.release`). A damaged line releases nothing."""
+    released = defaultdict[str, float](float)
+    for line in read_checked(path) if path.exists() else ():
+        if line.whole:
+            record = json.loads(line.content)
+            released[record["participant"]] += record["usd"]
+    return released
 
 
 def _line(participant: str, dollars: float) -> bytes:

@@ -30,6 +30,7 @@ from traps_pipeline.models.request import (
     TransientError,
 )
 from traps_pipeline.models.traffic import Breaker, Gate, Meter
+from traps_pipeline.models.transport import watching
 from traps_pipeline.storage.ledger import ASIDES
 from traps_pipeline.storage.study import Study
 
@@ -150,7 +151,7 @@ async def attempt(participant: Participant, request: Request, allowed: Allowed) 
         if failure.kind == RATE_LIMITED:
             participant.gate.slow_down()
         if failure.kind == UNREACHABLE and not lost_usd:  # what may be billed goes into the ledger first
-            participant.breaker.no_connection()
+            participant.breaker.no_connection(failure.why)
         elif failure.kind != UNREACHABLE:
             participant.breaker.connected()
         if failure.billed:
@@ -179,31 +180,38 @@ def _given_up(
 async def _send(participant: Participant, request: Request, allowed: Allowed) -> Outcome:
     """One attempt under a reservation. Raises TransientError and BudgetReached, and TrapsError before it is sent.
 
-    A call that was sent costs its worst case until the provider says otherwise, and in a way that can be believed: one
-    that timed out may be billed.
+    A call costs its worst case from the moment that bytes of it are handed to a server until the provider says
+    otherwise, and in a way that can be believed: one that timed out may be billed. One that never left costs nothing.
     """
     entry = participant.entry
     worst_usd = worst_case_usd(entry, request)
     await allowed.budget.reserve(entry.id, worst_usd)
     cost_usd = 0.0
-    try:
-        # Last of all: waiting for a connection, the pace or the budget may have taken long, and a host may have slept.
-        await allowed.require()
-        cost_usd = worst_usd
-        async with asyncio.timeout(entry.limits.timeout_s):
-            outcome = await participant.backend.ask(request)
-        if entry.prices is not None:
-            cost_usd = _believed(outcome.cost_usd, worst_usd)
-            outcome = replace(outcome, cost_usd=cost_usd)
-        return outcome
-    except TimeoutError:
-        raise TransientError("timeout") from None
-    except TransientError as failure:
-        if not failure.billed:
-            cost_usd = 0.0
-        raise
-    finally:
-        await allowed.budget.settle(entry.id, worst_usd, cost_usd)
+    with watching() as exchange:
+        try:
+            # Last of all: waiting for a connection, the pace or the budget may have taken long, and a host may have
+            # slept.
+            await allowed.require()
+            cost_usd = worst_usd
+            async with asyncio.timeout(entry.limits.timeout_s):
+                outcome = await participant.backend.ask(request)
+            if entry.prices is not None:
+                cost_usd = _believed(outcome.cost_usd, worst_usd)
+                outcome = replace(outcome, cost_usd=cost_usd)
+            return outcome
+        except TimeoutError:
+            if exchange.never_left:
+                why = f"no connection was made within {entry.limits.timeout_s:g} s"
+                raise TransientError(UNREACHABLE, billed=False, why=why) from None
+            raise TransientError("timeout") from None
+        except TransientError as failure:
+            if not failure.billed:
+                cost_usd = 0.0
+            raise
+        finally:
+            if exchange.never_left:  # a call that is cancelled before it is sent, too
+                cost_usd = 0.0
+            await allowed.budget.settle(entry.id, worst_usd, cost_usd)
 
 
 def _believed(cost_usd: float | None, worst_usd: float) -> float:

@@ -19,7 +19,7 @@ WITH_TEXT: tuple[OutcomeKind, ...] = ("answer", "truncated")  # docs/models.md, 
 JUDGED: tuple[str, ...] = ("answer",)  # of the responses table, whose outcomes are those of `models.reading`
 UNFINISHED = "unfinished"  # ended for a reason that no reader knows: no answer, whatever its text says
 RATE_LIMITED = "rate_limited"  # the kind of a 429
-UNREACHABLE = "unreachable"  # the kind of a connection that was never made
+UNREACHABLE = "unreachable"  # the kind of a call that never left: no byte of it reached a server
 MALFORMED = "malformed"  # the kind of an answer whose shape is out of order
 _VERBATIM = 600  # a text up to this long stands in the key's components as it is, so that `traps why` can show it
 
@@ -97,7 +97,8 @@ class Outcome:
 class TransientError(Exception):
     """A failure worth another try: time-out, 408, 409, 429, 5xx, a cut connection, an answer out of order.
 
-    billed: whether the provider may charge for it; raw: see `Outcome`; why: what is wrong, for a person.
+    billed: whether the provider may charge for it; raw: see `Outcome`; why: what is wrong, or what kept a call from
+    leaving, for a person.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class TransientError(Exception):
         *,
         billed: bool = True,
         raw: str | None = None,
-        why: str | None = None,
+        why: str = "",
     ) -> None:
         super().__init__(kind)
         self.kind, self.retry_after_s, self.billed, self.raw, self.why = kind, retry_after_s, billed, raw, why

@@ -13,7 +13,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import require_in_place, try_lock
 from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.budget import Budget, Journal
+from traps_pipeline.models.budget import RELEASED, Budget, Journal, released_usd
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import Entry, load_accounts, load_models
 from traps_pipeline.models.shared_budget import SharedBudget
@@ -65,7 +65,7 @@ def sharing(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Cal
 
 def _accounts(workspace: Workspace, spent: Mapping[str, float], opened: ExitStack) -> dict[str, AccountBudget]:
     """By participant, the budget of its account where that spans several studies; closed with the stack."""
-    shared = _shared_budgets(workspace, spent)
+    shared = account_budgets(workspace, spent)
     for account in shared.values():
         opened.callback(account.close)
     return shared
@@ -89,15 +89,17 @@ def alone(workspace: Workspace) -> Iterator[Callable[[], None]]:
 
 def spent_usd(workspace: Workspace, journal: Journal) -> Mapping[str, float]:
     """Dollars by participant: what the ledgers hold, and calls that were in flight when a process of this machine
-    died."""
+    died, less what a person released."""
     spent = defaultdict[str, float](float, journal.lost_usd)
     for ledger in (workspace.answers, workspace.votes):
         for participant, its in ledger.totals().items():
             spent[participant] += its.dollars + its.unknown * _at_most_usd(workspace, participant, its)
+    for participant, usd in released_usd(workspace.ledger_folder / RELEASED).items():
+        spent[participant] = max(0.0, spent[participant] - usd)
     return spent
 
 
-def _shared_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[str, AccountBudget]:
+def account_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[str, AccountBudget]:
     """By participant, the budget of its account where `study.yaml` names a folder for it. Raises TrapsError."""
     study, shared = workspace.study, dict[str, AccountBudget]()
     entries: list[Entry] = [*load_models().values(), *load_judges().values()]

@@ -14,7 +14,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.request import Outcome
 
 SAME_REFUSALS = 20
-UNMADE_IN_A_ROW, UNMADE_S = 5, 12.0  # connections, and seconds since the first of them
+UNMADE_IN_A_ROW, UNMADE_S = 5, 12.0  # calls that never left, and seconds since the first of them
 MALFORMED_IN_A_ROW = 3
 ERROR_WINDOW, ERROR_SHARE = 100, 0.10
 LOOK_S = 0.2  # how often a waiting call looks whether it is still wanted
@@ -134,7 +134,7 @@ class Breaker:
 
     def __init__(self, participant: str, address: str | None = None) -> None:
         self._participant, self._address = participant, address
-        self._unmade, self._unmade_since = 0, 0.0  # connections in a row, and when the first was tried
+        self._unmade, self._unmade_since = 0, 0.0  # calls that never left in a row, and when the first was tried
         self._refusal, self._in_a_row = "", 0
         self._malformed = 0  # in a row
         self._window: deque[bool] = deque(maxlen=ERROR_WINDOW)
@@ -145,17 +145,17 @@ class Breaker:
             if self._participant in stopped:
                 raise Stopped(stopped[self._participant])
 
-    def no_connection(self) -> None:
-        """Raises Stopped after five connections in a row that were not made, the first of them a while ago: a server
-        that is started again has that long."""
+    def no_connection(self, why: str = "") -> None:
+        """Raises Stopped after five calls in a row that never left, the first of them a while ago: a server that is
+        started again has that long. why: what kept the last one."""
         self._unmade += 1
         self._unmade_since = self._unmade_since or time.monotonic()
         if self._unmade >= UNMADE_IN_A_ROW and time.monotonic() - self._unmade_since >= UNMADE_S:
             where = f" to {self._address}" if self._address else ""
-            self._stop(f"{self._unmade} connections in a row{where} were not made: nothing listens there")
+            self._stop(f"{self._unmade} calls in a row{where} could not be sent{why and f': {why}'}")
 
     def connected(self) -> None:
-        """A connection was made."""
+        """Note that a call was sent."""
         self._unmade, self._unmade_since = 0, 0.0
 
     def watch(self, outcome: Outcome) -> None:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from psycopg import Connection
 
 CENT = 1e-9  # below this, dollars are rounding
+_RELEASED = """create table if not exists traps.released (
+    study int not null references traps.studies, participant text not null, usd float8 not null,
+    why text not null, "by" text not null, at timestamptz not null)"""
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,29 @@ class Purse:
                     add_spent(connection, self._session, participant, more)
 
         self._session.run(work)
+
+    def release(self, record: Mapping[str, Any]) -> None:
+        """Count dollars of a participant as spent no more, and keep the record of it (`models.release`)."""
+
+        def work(connection: Connection[Any]) -> None:
+            self._hold(connection)
+            connection.execute(_RELEASED)
+            sql = 'insert into traps.released (study, participant, usd, why, "by", at) values (%s, %s, %s, %s, %s, %s)'
+            values = [record[name] for name in ("participant", "usd", "why", "by", "at")]
+            connection.execute(sql, [self._session.study_id, *values])
+            add_spent(connection, self._session, record["participant"], -record["usd"])
+
+        self._session.run(work)
+
+    def released(self) -> dict[str, float]:
+        """Return the dollars that were released by participant."""
+
+        def work(connection: Connection[Any]) -> dict[str, float]:
+            connection.execute(_RELEASED)
+            sql = "select participant, sum(usd) from traps.released where study = %s group by participant"
+            return dict(connection.execute(sql, [self._session.study_id]).fetchall())
+
+        return self._session.run(work)
 
     def close(self) -> None:
         """Count what is left of this process's blocks as spent, and end them."""

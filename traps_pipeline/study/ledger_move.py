@@ -131,6 +131,8 @@ def _clear(connection: Connection[Any], session: Session) -> None:
     connection.execute("delete from traps.totals where study = %s", mine)
     connection.execute("delete from traps.spent where study = %s", mine)
     connection.execute("delete from traps.blocks where study = %s", mine)
+    if connection.execute("select to_regclass('traps.released')").fetchall() != [(None,)]:
+        connection.execute("delete from traps.released where study = %s", mine)
 
 
 def move_back(workspace: Workspace) -> Moved:

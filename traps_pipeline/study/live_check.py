@@ -145,7 +145,7 @@ class Reached:
 
 def reach(entry: Entry, account: Account) -> Reached:
     """Look at the key, the address, and the server's own list of models if it has one."""
-    import httpx
+    from traps_pipeline.models.wire import get
 
     try:
         check_network()
@@ -156,10 +156,9 @@ def reach(entry: Entry, account: Account) -> Reached:
         return Reached()
     headers = {"Authorization": f"Bearer {secret}"} if secret else {}
     try:
-        with httpx.Client(timeout=REACH_S, follow_redirects=False) as client:
-            answer = client.get(f"{account.base_url.rstrip('/')}/models", headers=headers)
-    except (httpx.HTTPError, httpx.InvalidURL) as error:
-        return Reached(nobody_at(account.base_url, plain(str(error))[:100]))
+        answer = get(f"{account.base_url.rstrip('/')}/models", headers, REACH_S)
+    except TrapsError as error:
+        return Reached(nobody_at(account.base_url, plain(str(error))))
     if answer.status_code in (401, 403):
         return Reached(_wrong_key(account))
     if answer.status_code == BAD_REQUEST and account.key:
@@ -172,7 +171,7 @@ def reach(entry: Entry, account: Account) -> Reached:
     return Reached()
 
 
-def nobody_at(address: str, why: str = "connections are refused") -> str:
+def nobody_at(address: str, why: str = "the cause stands above") -> str:
     """The sentence about an address at which nobody answers."""
     return f"nothing answers at {address} ({why}): start the server there, or mend its `base_url`"
 
@@ -217,7 +216,8 @@ def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], re
         elif outcome.kind == UNFINISHED:
             problems.append(f"{name}: it ends its answers for a reason that is not known ({outcome.finish_reason!r})")
         elif outcome.kind == "refused":
-            problems.append(f"{name}: it refuses to answer ({outcome.finish_reason or outcome.error})")
+            why = outcome.finish_reason or f"{outcome.error}; what it said stands above"
+            problems.append(f"{name}: it refuses to answer ({why})")
     if isinstance(entry, JudgeEntry):
         problems += _wrong_votes(entry, outcomes)
     elif isinstance(entry, ModelEntry):
@@ -235,6 +235,8 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
             return nobody_at(where)
         case "http_401" | "http_403":
             return _wrong_key(account)
+        case "http_403_denied":
+            return f"{name}: {where} refuses the call (HTTP 403), and not for its key; what it said stands above"
         case "http_404":
             return f"{where} knows no model {served_name(entry)!r}, or has another path (is /v1 missing?)"
         case _ if error.startswith("ended_"):

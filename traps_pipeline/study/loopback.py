@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from traps_pipeline.base.progress import Progress, reporting
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import Outcome, Request, TransientError
+from traps_pipeline.models.transport import watching
 from traps_pipeline.study.wire_body import WireBody
 
 PLACEHOLDER_KEY = "placeholder-of-a-key"
@@ -68,24 +68,10 @@ def _listening(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[t
     server = ThreadingHTTPServer(("127.0.0.1", 0), Catcher)
     Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
     try:
-        with _no_proxy("127.0.0.1"):
-            yield f"http://127.0.0.1:{server.server_port}", caught
+        yield f"http://127.0.0.1:{server.server_port}", caught
     finally:
         server.shutdown()
         server.server_close()
-
-
-@contextmanager
-def _no_proxy(host: str) -> Iterator[None]:
-    """Let clients ask a host directly, even if the environment names a proxy."""
-    names = ("no_proxy", "NO_PROXY")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update({name: ",".join(filter(None, (before[name], host))) for name in names})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[int, bytes]]) -> list[Outcome]:
@@ -124,6 +110,8 @@ async def _ask(
 ) -> WireBody | str:
     caught.clear()
     backend = ApiBackend(entry, account)  # a new one for each call, because it notes each kind of failure only once
-    with suppress(TransientError):
+    with watching() as exchange, suppress(TransientError):
         await backend.ask(request)
+    if caught and not exchange.sent:
+        return "the request went over a connection that is not watched, so that nobody knows what is billed"
     return caught[0] if len(caught) == 1 else f"{len(caught)} requests were sent, not one ({notes.texts[-1:]})"

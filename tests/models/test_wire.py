@@ -1,0 +1,314 @@
+"""A call is billed from the moment that bytes of it were handed to a server, and its true cause is told before that."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import KEY, ROOT, SECRET
+from tests.models.test_shapes import allowed_by, body, entry_of, request
+from tests.providers.servers import answering, closed_port, self_signed, silent
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.models import traffic
+from traps_pipeline.models.api import ApiBackend
+from traps_pipeline.models.budget import Budget, worst_case_usd
+from traps_pipeline.models.participants import Participants, attempt
+from traps_pipeline.models.registry import Account
+from traps_pipeline.models.request import Outcome, TransientError
+from traps_pipeline.models.traffic import Stopped
+from traps_pipeline.models.wire import get
+from traps_pipeline.storage.study import Study
+
+PROXIES = ("http_proxy", "https_proxy", "all_proxy", "no_proxy")
+MODEL = "m"
+
+
+@pytest.fixture(autouse=True)
+def environment(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """A key and no word about proxies and certificates."""
+    for name in (*PROXIES, *(name.upper() for name in PROXIES), "SSL_CERT_FILE", "SSL_CERT_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(KEY, SECRET)
+    return monkeypatch
+
+
+async def asking(base_url: str, budget: Budget, timeout_s: float = 20.0, **limits: int) -> Outcome | None:
+    """One call to an address with its retries."""
+    account, entry = Account(key=KEY, base_url=base_url), entry_of(MODEL)
+    entry = entry.model_copy(update={"limits": entry.limits.model_copy(update={"timeout_s": timeout_s, **limits})})
+    asked = Participants({"m": entry}, lambda e: ApiBackend(e, account), Study(budget_usd=10.0), {"a": Account()})
+    attempted = await attempt(asked["m"], request(), allowed_by(budget))
+    return attempted and attempted[0]
+
+
+def call(base_url: str, timeout_s: float = 20.0, **limits: int) -> tuple[Outcome | None, float]:
+    """What came of one call, and what the budget says that it cost."""
+    budget = Budget(10.0, {}, {})
+    return asyncio.run(asking(base_url, budget, timeout_s, **limits)), budget.spent_usd
+
+
+def unsent(capsys: pytest.CaptureFixture[str], base_url: str, timeout_s: float = 20.0) -> str:
+    """What is said of a call that never left; it cost nothing, and its row says no cost."""
+    with progress.reporting(progress.Progress()):
+        outcome, booked_usd = call(base_url, timeout_s)
+    assert (outcome, booked_usd) == (Outcome("error", error="unreachable"), 0.0)
+    said = capsys.readouterr().err
+    assert SECRET not in said
+    return said
+
+
+WORST_USD = worst_case_usd(entry_of(MODEL), request())
+
+
+def test_a_refused_connection_a_name_that_is_none_and_a_scheme_that_is_none_cost_nothing(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    port = closed_port()
+    assert f"nothing was sent to 127.0.0.1:{port}: Connection refused" in unsent(capsys, f"http://127.0.0.1:{port}/v1")
+    assert "nothing was sent to no-such-host.invalid:80: " in unsent(capsys, "http://no-such-host.invalid/v1")
+    assert "htp:// is no scheme of HTTP; write http://" in unsent(capsys, f"htp://127.0.0.1:{port}/v1")
+
+
+@pytest.mark.parametrize("variable", ["HTTP_PROXY", "http_proxy", "ALL_PROXY"])
+def test_a_dead_proxy_costs_nothing_and_is_named_by_its_variable_without_its_password(
+    environment: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], variable: str
+) -> None:
+    proxy = f"127.0.0.1:{closed_port()}"
+    environment.setenv(variable, f"http://me:passw0rd@{proxy}")
+    said = unsent(capsys, "http://provider.invalid/v1")
+    assert f"to provider.invalid:80 through the proxy http://{proxy} of {variable}: Connection refused" in said
+    assert "passw0rd" not in said
+
+
+@pytest.mark.parametrize("status", [407, 502])
+def test_what_reached_only_a_proxy_that_makes_no_tunnel_costs_nothing(
+    environment: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], status: int
+) -> None:
+    with answering(status) as proxy:
+        environment.setenv("HTTPS_PROXY", f"http://127.0.0.1:{proxy.port}")
+        said = unsent(capsys, "https://provider.invalid/v1")
+    assert "of HTTPS_PROXY: the proxy answered" in said and str(status) in said
+    assert {*proxy.requests} == {"CONNECT provider.invalid:443"}
+
+
+def test_a_plain_request_that_a_proxy_took_may_have_been_passed_on(environment: pytest.MonkeyPatch) -> None:
+    with answering(502) as proxy:
+        environment.setenv("HTTP_PROXY", f"http://127.0.0.1:{proxy.port}")
+        outcome, booked_usd = call("http://provider.invalid/v1")
+        assert outcome and outcome.error == "server_error" and booked_usd == pytest.approx(2 * WORST_USD)
+    assert proxy.requests == ["POST http://provider.invalid/v1/chat/completions"] * 2
+
+
+def test_a_socks_proxy_costs_nothing_and_is_named(
+    environment: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    environment.setenv("ALL_PROXY", "socks5://127.0.0.1:9")
+    assert "ALL_PROXY names the proxy socks5://127.0.0.1:9, and calls go" in unsent(
+        capsys, "http://provider.invalid/v1"
+    )
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
+def test_loopback_addresses_are_asked_directly_whatever_the_environment_says(
+    environment: pytest.MonkeyPatch, host: str
+) -> None:
+    environment.setenv("HTTP_PROXY", f"http://127.0.0.1:{closed_port()}")
+    environment.setenv("ALL_PROXY", "socks5://127.0.0.1:9")
+    environment.setenv("NO_PROXY", "example.org")
+    with answering(200, body().encode()) as provider:
+        outcome, _ = call(f"http://{host}:{provider.port}/v1")
+        assert outcome and outcome.kind == "answer"
+        assert get(f"http://{host}:{provider.port}/v1/models", {}, 20.0).status_code == 200
+    assert provider.requests == ["POST /v1/chat/completions", "GET /v1/models"]
+
+
+def test_a_certificate_that_nobody_trusts_and_one_that_is_gone_cost_nothing(
+    environment: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    tls, _ = self_signed(tmp_path)
+    with answering(200, body().encode(), tls=tls) as provider:
+        address = f"https://localhost:{provider.port}/v1"
+        said = unsent(capsys, address)
+        assert "its certificate is not trusted (self-signed certificate): have SSL_CERT_FILE name" in said
+        environment.setenv("SSL_CERT_FILE", "/nonexistent.pem")
+        assert "SSL_CERT_FILE names the file /nonexistent.pem, which is not there" in unsent(capsys, address)
+    assert provider.requests == []
+
+
+def test_a_certificate_that_a_variable_names_is_trusted(environment: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    tls, certificate = self_signed(tmp_path)
+    environment.setenv("SSL_CERT_FILE", str(certificate))
+    with answering(200, b"{}", tls=tls) as provider:
+        assert get(f"https://localhost:{provider.port}/v1/models", {}, 20.0).status_code == 200
+
+
+def test_https_to_a_plain_port_costs_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with answering(200, body().encode()) as provider:
+        said = unsent(capsys, f"https://127.0.0.1:{provider.port}/v1")
+    assert "TLS failed" in said and "write http://" in said and provider.requests == []
+
+
+@pytest.mark.parametrize("key", [SECRET + "\nX-Evil: 1", SECRET + "é"])
+def test_a_key_that_no_header_takes_is_refused_before_anything_is_sent(
+    environment: pytest.MonkeyPatch, key: str
+) -> None:
+    environment.setenv(KEY, key)
+    with answering(200, body().encode()) as provider, pytest.raises(TrapsError, match=f"^{KEY} "):
+        call(f"http://127.0.0.1:{provider.port}/v1", 20.0)
+    assert provider.requests == []
+
+
+async def cancelled(base_url: str, reached: asyncio.Event) -> float:
+    """What is booked for a call that is cancelled once a server was reached."""
+    budget = Budget(10.0, {}, {})
+    task = asyncio.create_task(asking(base_url, budget))
+    await reached.wait()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    return budget.spent_usd
+
+
+@pytest.mark.parametrize(("scheme", "worst_cases"), [("https", 0), ("http", 1)])
+def test_a_call_that_is_cancelled_is_billed_once_it_was_sent_and_not_in_a_handshake(
+    scheme: str, worst_cases: int
+) -> None:
+    async def run() -> float:
+        reached = asyncio.Event()
+
+        async def take(reader: asyncio.StreamReader, _: asyncio.StreamWriter) -> None:
+            await reader.readexactly(64)  # of a request, or of the first message of TLS
+            reached.set()
+
+        async with await asyncio.start_server(take, "127.0.0.1", 0) as server:
+            port = server.sockets[0].getsockname()[1]
+            return await cancelled(f"{scheme}://127.0.0.1:{port}/v1", reached)
+
+    assert asyncio.run(run()) == pytest.approx(worst_cases * WORST_USD)
+
+
+def test_a_time_out_is_billed_where_the_call_was_sent_and_not_where_no_connection_was_made(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with silent() as port:
+        unsent(capsys, f"https://127.0.0.1:{port}/v1", timeout_s=0.5)
+        outcome, booked_usd = call(f"http://127.0.0.1:{port}/v1", timeout_s=0.5)
+    assert outcome and outcome.error == "timeout" and booked_usd == pytest.approx(2 * WORST_USD)
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A breaker that waits for no server to be started again."""
+    monkeypatch.setattr(traffic, "UNMADE_S", 0.0)
+    with traffic.remembering_stops():
+        yield
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("base_url", ["http://no-such-host.invalid/v1", "http://provider.invalid/v1"])
+def test_calls_that_never_left_stop_a_model_with_the_cause_of_the_last_one(
+    environment: pytest.MonkeyPatch, base_url: str
+) -> None:
+    environment.setenv("HTTP_PROXY", f"http://127.0.0.1:{closed_port()}")
+    environment.setenv("NO_PROXY", "no-such-host.invalid")
+    cause = "nothing was sent to" if "no-such" in base_url else "of HTTP_PROXY: Connection refused"
+    with pytest.raises(Stopped, match=rf"m is stopped: 5 calls in a row could not be sent: .*{cause}"):
+        call(base_url, retries=9)
+
+
+def error(status: int, content: object, **headers: str) -> tuple[Outcome | None, float]:
+    """What one answer of a provider becomes."""
+    with answering(status, json.dumps(content).encode(), headers) as provider:
+        return call(f"http://127.0.0.1:{provider.port}/v1", retries=0)
+
+
+def retry_info(delay: str) -> dict[str, object]:
+    """Gemini's way to ask for a pause."""
+    details = [{"@type": "type.googleapis.com/google.rpc.RetryInfo", "retryDelay": delay}]
+    return {"error": {"code": 429, "status": "RESOURCE_EXHAUSTED", "message": "quota", "details": details}}
+
+
+DATES = {"date": "Wed, 25 Nov 2026 08:00:00 GMT", "retry-after": "Wed, 25 Nov 2026 08:00:07 GMT"}
+SPENT = {"x-ratelimit-remaining-requests": "0", "x-ratelimit-reset-requests": "1m7s"}
+NOT_SPENT = {"x-ratelimit-remaining-tokens": "9", "x-ratelimit-reset-tokens": "6m0s"}
+ANTHROPIC = {"anthropic-ratelimit-tokens-remaining": "0", "anthropic-ratelimit-tokens-reset": "2026-11-25T08:00:07Z"}
+
+
+@pytest.mark.parametrize(
+    ("headers", "content", "seconds"),
+    [
+        ({"Retry-After": "7"}, {}, 7.0),
+        ({"Retry-After": "7.5"}, {}, 7.5),
+        ({"Retry-After": "7s"}, {}, 7.0),
+        (DATES, {}, 7.0),
+        ({"retry-after-ms": "1500", "Retry-After": "2"}, {}, 1.5),
+        ({}, retry_info("7s"), 7.0),
+        ({}, retry_info("0.250s"), 0.25),
+        (SPENT | NOT_SPENT, {}, 67.0),
+        ({"date": DATES["date"]} | ANTHROPIC, {}, 7.0),
+        ({"Retry-After": "nan"}, {}, None),
+        ({"Retry-After": "inf"}, {}, None),
+        ({"Retry-After": "-1"}, {}, None),
+        ({"Retry-After": "soon"}, {}, None),
+        (NOT_SPENT, {}, None),
+    ],
+)
+@pytest.mark.parametrize("status", [429, 200])
+def test_a_pause_that_a_provider_asks_for_is_read_in_all_its_forms(
+    headers: dict[str, str], content: dict[str, object], seconds: float | None, status: int
+) -> None:
+    content = content or {"error": {"code": "rate_limit_exceeded", "message": "slow down"}}
+    with answering(status, json.dumps(content).encode(), headers) as provider:
+        backend = ApiBackend(entry_of(MODEL), Account(key=KEY, base_url=f"http://127.0.0.1:{provider.port}/v1"))
+        with pytest.raises(TransientError) as raised:
+            asyncio.run(backend.ask(request()))
+    assert (raised.value.kind, raised.value.billed) == ("rate_limited", False)
+    assert raised.value.retry_after_s == pytest.approx(seconds)
+
+
+AZURE = {
+    "error": {
+        "message": "The response was filtered due to the prompt triggering content management policy.",
+        "param": "prompt",
+        "code": "content_filter",
+        "status": 400,
+        "innererror": {"code": "ResponsibleAIPolicyViolation"},
+    }
+}
+FLAGGED = {"error": {"message": "Your input was flagged", "code": 403, "metadata": {"flagged_input": "x"}}}
+REGION = {"error": {"message": "Country, region, or territory not supported", "code": "unsupported_country"}}
+NO_ACCESS = {"error": {"message": "You have no access to this model", "type": "permission_error"}}
+
+
+def test_a_content_filter_is_a_refusal_and_other_403s_are_told_from_those_about_a_key(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    refused = Outcome("refused", error="content_policy", cost_usd=0.0)
+    with progress.reporting(progress.Progress()):
+        assert error(400, AZURE)[0] == refused
+        assert error(403, FLAGGED)[0] == refused
+        assert error(403, REGION)[0] == Outcome("error", error="http_403_denied", cost_usd=0.0)
+        assert error(403, NO_ACCESS)[0] == Outcome("error", error="http_403", cost_usd=0.0)
+    said = capsys.readouterr().err
+    assert "Your input was flagged" in said and "Country, region, or territory not supported" in said
+
+
+def test_an_answer_that_is_none_is_told_in_a_sentence_of_ours(capsys: pytest.CaptureFixture[str]) -> None:
+    page = f"<h1>Sign in, {SECRET}</h1>".encode()
+    with answering(200, page, {"content-type": "text/html"}) as provider, progress.reporting(progress.Progress()):
+        outcome, _ = call(f"http://127.0.0.1:{provider.port}/v1", retries=0)
+    assert outcome and (outcome.kind, outcome.raw) == ("malformed", "<h1>Sign in, ***</h1>")
+    said = capsys.readouterr().err
+    assert "m: malformed: it sent a page of HTML" in said
+    assert "Traceback" not in said and "litellm" not in said and SECRET not in said
+
+
+def test_nothing_is_decided_by_a_list_of_exceptions() -> None:
+    names = ("ConnectError", "ConnectTimeout", "ClientConnector", "ConnectionTimeoutError", "APIConnectionError")
+    sources = [path.read_text() for path in (ROOT / "traps_pipeline").rglob("*.py")]
+    assert [name for name in names if any(name in source for source in sources)] == []

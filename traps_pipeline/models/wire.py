@@ -1,0 +1,215 @@
+"""The one way in which calls leave this machine: a transport for httpx on aiohttp, which says where bytes are written.
+
+`use_in` makes litellm's clients take it, whichever route they serve. An attempt finds in its `Exchange` whether its
+request was sent, with what status it was answered, and the answer's bytes. Loopback addresses are asked directly, a
+redirect is never followed, an attempt sends one request at most, an answer is read up to a bound, and nothing
+compressed is asked for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import ssl
+import zlib
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any
+
+import aiohttp
+import httpx
+from aiohttp.abc import AbstractStreamWriter
+from yarl import URL
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.network import TLS_VARIABLES, certificate_problem, proxy_of
+from traps_pipeline.models.transport import Exchange, watching
+
+MOST_BYTES = 16 * 2**20  # of an answer; 8,000 tokens with their reasoning take less than a hundredth of it
+CONNECT_S = 60.0  # for a connection with its TLS handshake
+KEEPALIVE_S, NAMES_KEPT_S = 120.0, 300  # an idle connection; an address of a name
+_ASKED_ANEW = ("content-encoding", "content-length", "transfer-encoding", "location")
+
+
+class _Body(aiohttp.BytesPayload):
+    """A request's body. aiohttp keeps the headers back until it is written, on a connection whose handshakes (of a
+    proxy's tunnel, of TLS) are done: so the first byte of a request is written here and nowhere else."""
+
+    def __init__(self, content: bytes, exchange: Exchange) -> None:
+        super().__init__(content, content_type="application/json")
+        self._exchange = exchange
+
+    async def write_with_length(self, writer: AbstractStreamWriter, content_length: int | None) -> None:
+        """Write the headers and the body, and note that bytes are handed over unless the connection is closed."""
+        transport = getattr(writer, "transport", None)
+        if transport is None or transport.is_closing():
+            raise aiohttp.ClientConnectionResetError("the connection was closed before the request was written")
+        self._exchange.sent = True
+        await super().write_with_length(writer, content_length)
+
+
+class Wire(httpx.AsyncBaseTransport):
+    """Sends requests with aiohttp, a session for each event loop. tls: a context, or False to trust every certificate;
+    None: the certificates that SSL_CERT_FILE or certifi names."""
+
+    def __init__(self, tls: ssl.SSLContext | bool | None = None) -> None:
+        self._tls = tls
+        self._certificates: list[str | None] = []  # what the environment named when `tls` was made
+        self._sessions: dict[asyncio.AbstractEventLoop, aiohttp.ClientSession] = {}
+
+    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
+        """Send a request and read the answer to its end. Raises httpx.ReadTimeout, and NetworkError for anything else:
+        neither makes a client library try again. `Exchange.problem` says what happened."""
+        with watching() as exchange:
+            if exchange.sent:
+                raise httpx.NetworkError("a client library wanted to send a second request in one attempt")
+            exchange.sent = False
+            try:
+                response = await self._send(request, exchange)
+                exchange.status, exchange.headers = response.status, dict(response.headers)
+                exchange.content = await _read(response)
+            except Exception as error:
+                exchange.problem = _explain(error, request.url, exchange)
+                kind = httpx.ReadTimeout if isinstance(error, TimeoutError) and exchange.sent else httpx.NetworkError
+                raise kind(exchange.problem) from error
+        headers = [(name, value) for name, value in response.headers.items() if name.lower() not in _ASKED_ANEW]
+        return httpx.Response(response.status, headers=headers, content=exchange.content)
+
+    async def _send(self, request: httpx.Request, exchange: Exchange) -> aiohttp.ClientResponse:
+        request.headers["accept-encoding"] = "identity"
+        content, url, times = await request.aread(), str(request.url), request.extensions.get("timeout", {})
+        if request.url.scheme not in ("http", "https"):
+            raise TrapsError(f"{url}: {request.url.scheme}:// is no scheme of HTTP; write http:// or https://")
+        proxy = proxy_of(url)
+        if proxy is not None:
+            exchange.proxy = proxy.variable
+            if proxy.problem:
+                raise TrapsError(proxy.problem)
+        named = [os.environ.get(name) for name in TLS_VARIABLES]
+        if request.url.scheme == "https" and self._certificates != named and (self._tls is None or self._certificates):
+            if problem := certificate_problem(TLS_VARIABLES):
+                raise TrapsError(problem)
+            self._tls, self._certificates = httpx.create_ssl_context(), named
+        return await self._session().request(
+            request.method,
+            URL(url, encoded=True),
+            headers=request.headers,
+            data=_Body(content, exchange) if content else None,
+            allow_redirects=False,
+            timeout=aiohttp.ClientTimeout(
+                total=None, sock_connect=min(times.get("connect") or CONNECT_S, CONNECT_S), sock_read=times.get("read")
+            ),
+            proxy=proxy and proxy.url,
+            ssl=True if self._tls is None else self._tls,
+        )
+
+    def _session(self) -> aiohttp.ClientSession:
+        loop = asyncio.get_running_loop()
+        for other in [each for each in self._sessions if each.is_closed()]:
+            _dispose(self._sessions.pop(other))
+        if loop not in self._sessions:
+            connector = aiohttp.TCPConnector(limit=0, keepalive_timeout=KEEPALIVE_S, ttl_dns_cache=NAMES_KEPT_S)
+            cookies = aiohttp.DummyCookieJar()
+            self._sessions[loop] = aiohttp.ClientSession(
+                connector=connector, cookie_jar=cookies, auto_decompress=False, trust_env=False
+            )
+        return self._sessions[loop]
+
+    async def aclose(self) -> None:
+        """Close the connections of the running loop, and of loops that are closed."""
+        running = self._sessions.pop(asyncio.get_running_loop(), None)
+        if running is not None:
+            await running.close()
+        for session in [self._sessions.pop(each) for each in list(self._sessions) if each.is_closed()]:
+            _dispose(session)
+
+    def __del__(self) -> None:
+        for loop, session in self._sessions.items():
+            if loop.is_closed():
+                _dispose(session)
+
+
+def _dispose(session: aiohttp.ClientSession) -> None:
+    """Close a session whose loop is closed: nothing is waited for then, and aiohttp complains of no open session."""
+    with suppress(StopIteration):
+        session.close().send(None)
+
+
+async def _read(response: aiohttp.ClientResponse) -> bytes:
+    chunks, size = list[bytes](), 0
+    async with response:
+        async for chunk in response.content.iter_chunked(2**16):
+            size += len(chunk)
+            if size > MOST_BYTES:
+                raise ValueError(f"the answer is larger than {MOST_BYTES} bytes")
+            chunks.append(chunk)
+    return _decoded(b"".join(chunks), response.headers.get("content-encoding", "identity"))
+
+
+def _decoded(content: bytes, encoding: str) -> bytes:
+    if encoding.lower() == "identity":
+        return content
+    if encoding.lower() not in ("gzip", "deflate"):
+        raise ValueError(f"the answer is encoded as {encoding[:40]!r}, which was not asked for")
+    unpacking = zlib.decompressobj(47 if encoding.lower() == "gzip" else 15)
+    unpacked = unpacking.decompress(content, MOST_BYTES)
+    if unpacking.unconsumed_tail:
+        raise ValueError(f"the answer is larger than {MOST_BYTES} bytes")
+    return unpacked
+
+
+def _explain(error: BaseException, url: httpx.URL, exchange: Exchange) -> str:
+    """Return in words what kept a request or its answer from arriving."""
+    if isinstance(error, TrapsError):
+        return str(error)
+    where = f"{url.host}:{url.port or {'http': 80, 'https': 443}.get(url.scheme, '?')}"
+    text = cause_of(error)
+    if exchange.sent:
+        return f"the connection to {where} broke after the request was sent: {text}"
+    if exchange.proxy:
+        proxy = proxy_of(str(url))
+        return f"nothing was sent to {where} through the proxy {proxy and proxy.address} of {exchange.proxy}: {text}"
+    return f"nothing was sent to {where}: {text}"
+
+
+def cause_of(error: BaseException) -> str:
+    """Return the words of the error at the root of another one, with what to do about the usual ones."""
+    while (deeper := error.__cause__ or (None if error.__suppress_context__ else error.__context__)) is not None:
+        error = deeper
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return (
+            f"its certificate is not trusted ({error.verify_message}): have SSL_CERT_FILE name the file of the "
+            "authority that signed it"
+        )
+    if isinstance(error, ssl.SSLError):
+        return f"TLS failed ({error.reason or error}): if the server speaks plain HTTP, write http:// in its address"
+    if isinstance(error, aiohttp.ClientHttpProxyError):
+        return f"the proxy answered {error.status} {error.message}"
+    if isinstance(error, OSError) and error.errno and error.errno > 0:
+        return os.strerror(error.errno)
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
+
+
+def use_in(handler: Any) -> None:
+    """Make every client that litellm creates from now on send through a `Wire`. handler: its class AsyncHTTPHandler,
+    which both its own client and the one that it hands to OpenAI's library get their transport from."""
+
+    def create(ssl_context: ssl.SSLContext | None = None, ssl_verify: bool | None = None, **_: Any) -> Wire:
+        return Wire(ssl_context if ssl_context is not None else False if ssl_verify is False else None)
+
+    handler.create_async_transport = staticmethod(create)
+
+
+def get(url: str, headers: Mapping[str, str], timeout_s: float) -> httpx.Response:
+    """Return the answer to a GET without a body, for callers outside of an event loop. Raises TrapsError that says
+    why there is none."""
+
+    async def answer() -> httpx.Response:
+        async with httpx.AsyncClient(transport=Wire(), timeout=timeout_s, follow_redirects=False) as client:
+            return await client.get(url, headers=headers)
+
+    with watching() as exchange:
+        try:
+            return asyncio.run(answer())
+        except Exception as error:
+            raise TrapsError(exchange.problem or cause_of(error)) from error
