@@ -54,7 +54,7 @@ class Wire(httpx.AsyncBaseTransport):
 
     def __init__(self, tls: ssl.SSLContext | bool | None = None) -> None:
         self._tls = tls
-        self._certificates: list[str | None] = []  # what the environment named when `tls` was made
+        self._certificates: list[str | None] = []  # what the environment named when that was looked at
         self._sessions: dict[asyncio.AbstractEventLoop, aiohttp.ClientSession] = {}
 
     async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
@@ -86,10 +86,10 @@ class Wire(httpx.AsyncBaseTransport):
             if proxy.problem:
                 raise TrapsError(proxy.problem)
         named = [os.environ.get(name) for name in TLS_VARIABLES]
-        if request.url.scheme == "https" and self._certificates != named and (self._tls is None or self._certificates):
+        if request.url.scheme == "https" and self._tls is not False and self._certificates != named:
             if problem := certificate_problem(TLS_VARIABLES):
                 raise TrapsError(problem)
-            self._tls, self._certificates = httpx.create_ssl_context(), named
+            self._tls, self._certificates = self._tls or httpx.create_ssl_context(), named
         return await self._session().request(
             request.method,
             URL(url, encoded=True),

@@ -222,9 +222,8 @@ def contrasts(results: Results) -> list[PrintedTable]:
         *COUNTS, Column("refused", "Refused"),
     ]  # fmt: skip
     notes = ["left minus right; the other figures and datasets are in the workspace's table `contrasts`"]
-    notes += [f"{TOO_FEW}: no answers to so few scenarios could differ significantly"] * rows["separable"].eq(
-        TOO_FEW
-    ).any()
+    if TOO_FEW in set(rows["separable"]):
+        notes.append(f"{TOO_FEW}: no answers to so few scenarios could differ significantly")
     notes += ["missing: items of both sides", *marks(rows)] if len(rows) else []
     trace: Trace = lambda row, field: Behind("", row["left_model"], row["left_regime"])  # noqa: E731
     why = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
