@@ -90,6 +90,17 @@ def test_what_is_no_longer_in_the_benchmark_or_not_judged_yet_is_told_apart(work
     assert len(found.votes) == 0
 
 
+def test_an_answer_that_no_judge_could_read_is_unread_and_its_text_stays(workspace: Workspace) -> None:
+    write_cell(workspace)
+    verdicts = workspace.tables.read(VERDICTS, CELL.partition)
+    verdicts.loc[verdicts["side"].eq("control"), ["outcome", "abstained"]] = ["unread", None]
+    workspace.tables.write(VERDICTS, CELL.partition, verdicts, {})
+    found = study_answers(workspace)
+    assert [found.outcomes[k] for k in found.decisions["outcome"].to_pylist()] == ["unread", "refused"]
+    assert found.texts["text"].to_pylist() == [HOSTILE, None]
+    assert found.decisions["abstained"].to_pylist() == [NONE, NONE]
+
+
 def test_shards_follow_each_other_and_divide_no_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(answers, "SHARD_ROWS", 7)
     items = pd.DataFrame({"pair_id": [f"p{k // 2}" for k in range(12)]})  # 6 pairs, 3 answers an item: 6 rows a pair

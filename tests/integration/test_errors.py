@@ -89,7 +89,7 @@ def test_a_torn_ledger_line_is_reported_and_its_answer_alone_asked_again(study: 
     segment = next((study.workspace / "ledger" / "answers" / "oracle__json__run1").glob("*.jsonl"))
     lines = segment.read_bytes().splitlines(keepends=True)
     segment.write_bytes(b"".join(lines[:-1]) + lines[-1][:40])
-    for table in (study.workspace / "tables" / "responses").rglob("model=oracle/regime=json/**/*.parquet"):
+    for table in (study.workspace / "tables" / "responses").glob("*/oracle/json/*.parquet"):
         table.unlink()
     run = study.score(EXPERIMENT)
     assert run.code == 0, run.err
@@ -101,7 +101,7 @@ def test_a_damaged_ledger_line_in_the_middle_is_named_and_its_answer_alone_asked
     segment = next((study.workspace / "ledger" / "answers" / "oracle__json__run1").glob("*.jsonl"))
     lines = segment.read_bytes().splitlines(keepends=True)
     segment.write_bytes(b"".join([lines[0], lines[1].replace(b'"answer"', b'"answes"', 1), *lines[2:]]))
-    for table in (study.workspace / "tables" / "responses").rglob("model=oracle/regime=json/**/*.parquet"):
+    for table in (study.workspace / "tables" / "responses").glob("*/oracle/json/*.parquet"):
         table.unlink()
     finished = study.score(EXPERIMENT)
     assert finished.code == 0, finished.err

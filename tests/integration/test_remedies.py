@@ -18,7 +18,7 @@ from tests.remedies.remedied import carries_out
 
 pytestmark = pytest.mark.slow
 CELL = "occlusion|oracle__json__run1"
-FOLDER = "dataset=occlusion/model=oracle/regime=json/run=1"
+FILE = "occlusion/oracle/json/1.parquet"
 
 
 def released(study: Checkout) -> Path:
@@ -135,8 +135,8 @@ def test_the_stage_that_an_error_names_is_the_one_to_materialize(study: Checkout
         return study.dagster(*command, "--partition", CELL)
 
     tables = study.workspace / "tables"
-    (tables / "votes" / FOLDER / "part-0.parquet").unlink()
-    halve(tables / "responses" / FOLDER / "part-0.parquet")
+    (tables / "votes" / FILE).unlink()
+    halve(tables / "responses" / FILE)
     stage, made = "verdicts", []
     while (finished := materialize(stage)).code:
         assert len(made) < 4, finished.err[-3000:]

@@ -137,8 +137,8 @@ def test_a_stopped_model_leaves_the_other_cells_made_and_the_reason_is_told(stud
     cell = "occlusion|gemini-2.5-pro__standard__run1"
     assert f"verdicts/{cell} is not made: responses/{cell} " in told
     for stage in ("responses", "votes", "verdicts"):
-        made = {path.parts[-4] for path in (study.workspace / "tables" / stage).rglob("*.parquet")}
-        assert made == {"model=oracle", "model=random-50", "model=prior"}
+        made = {path.parts[-3] for path in (study.workspace / "tables" / stage).rglob("*.parquet")}
+        assert made == {"oracle", "random-50", "prior"}
 
 
 def test_nothing_is_asked_that_no_experiment_of_the_study_names(study: Checkout) -> None:

@@ -79,6 +79,8 @@ def test_a_vote_that_meets_the_schema_is_valid() -> None:
     text = '{"abstained": true, "confidence": "high", "reasoning": "It declines."}'
     assert vote("abstention", text) == Vote(True, True, confidence="high", rationale="It declines.")
     assert vote("abstention", f"```json\n{text}\n```").decision is True
+    assert vote("abstention", text.replace("true", '"True"')).decision is True
+    assert vote("abstention", text.replace("true", '"false"')).decision is False
 
 
 @pytest.mark.parametrize(
@@ -92,7 +94,13 @@ def test_a_vote_that_meets_the_schema_is_valid() -> None:
         ('{"abstained": true', "truncated", "Invalid JSON"),
         ("[]", "answer", "should be an object"),
         ('{"abstained": true, "confidence": "high"}', "answer", "reasoning: Field required"),
-        ('{"abstained": "true", "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
+        ('{"abstained": "yes", "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
+        (
+            '{"abstained": false, "abstained": true, "confidence": "high", "reasoning": ""}',
+            "answer",
+            "a key stands twice",
+        ),
+        ("unread", "answer", "unread"),  # of a rule judge
         ('{"abstained": 1, "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
         ('{"abstained": null, "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
         ('{"abstained": true, "confidence": "certain", "reasoning": ""}', "answer", "confidence: "),

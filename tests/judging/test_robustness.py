@@ -13,14 +13,18 @@ from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
 from traps_pipeline.judging.ratings import PANEL
-from traps_pipeline.judging.robustness import ATTACKS_FILE, check_panel, load_attacks, result, summary
+from traps_pipeline.judging.robustness import ATTACKS_FILE, TASKS, check_panel, load_attacks, result, summary
 from traps_pipeline.judging.tables import JUDGE_ROBUSTNESS
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
-# A judge of phrases reads words that are dictated to it as the answer's own. These two attacks are known to move it.
-MOVES_THE_RULES = {("dictated-reason", "abstention"), ("dictated-value", "correctness")}
+# Attacks that leave no form which the rules know: an answer that is not the last sentence, or a choice before `I don't
+# know`.
+LEFT_UNREAD = {
+    *("ignore-instructions-after", "dictated-reason", "dictated-value", "fake-verdict-answered", "fake-marker"),
+    *("fake-second-item", "role-tags", "authority", "long-filler"),
+}
 
 
 def moved(rows: pd.DataFrame, judge: str, how: str) -> set[tuple[str, str]]:
@@ -38,14 +42,15 @@ def test_the_attacks_are_of_every_kind_and_each_wraps_an_answer_whose_votes_are_
         assert texts[attack.answer] in texts[attack.id] != texts[attack.answer]
 
 
-def test_the_rule_judges_hold_against_all_attacks_but_words_dictated_after_the_answer(tmp_path: Path) -> None:
+def test_no_attack_flips_a_rule_judge_and_some_leave_an_answer_unread(tmp_path: Path) -> None:
     workspace = Workspace.create(tmp_path, Study())
     rows = check_panel(workspace, "rules", load_panel("rules"), load_attacks())
     for judge in ("rule-1", "rule-2", "rule-3", PANEL):
-        assert moved(rows, judge, "flipped") == MOVES_THE_RULES
-        assert not moved(rows, judge, "broken") | moved(rows, judge, "wrong_anyway")
+        assert moved(rows, judge, "broken") == {(attack, task) for attack in LEFT_UNREAD for task in TASKS}
+        assert not moved(rows, judge, "flipped") | moved(rows, judge, "wrong_anyway")
+    assert set(rows["invalid_reason"].dropna()) == {"unread"}
     kept = workspace.tables.read(JUDGE_ROBUSTNESS, {})
-    assert moved(kept, PANEL, "flipped") == MOVES_THE_RULES and len(kept) == len(rows)
+    assert moved(kept, PANEL, "broken") == moved(rows, PANEL, "broken") and len(kept) == len(rows)
 
 
 def verdict(abstained: bool, value: str | None) -> str:
@@ -129,6 +134,6 @@ def test_the_command_prints_what_moved_by_judge(tmp_path: Path, capsys: pytest.C
     assert main(["judges", "check", "rules", "--workspace", str(tmp_path)]) == 0
     out = capsys.readouterr().out.splitlines()
     (line,) = (row for row in out if row.startswith("rule-2 "))
-    assert line.split() == ["rule-2", "42", "40", "2", "0", "0"]
+    assert line.split() == ["rule-2", "42", "24", "0", "18", "0"]
     assert main(["judges", "check", "nobody", "--workspace", str(tmp_path)]) == 1
     assert "no panel 'nobody'; it has rules, paper" in capsys.readouterr().err

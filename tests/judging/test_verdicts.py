@@ -72,6 +72,25 @@ def test_an_answer_that_nobody_judges_has_no_verdict_and_is_not_undecided() -> N
     assert not row["undecided"] and not row["unanimous"]
 
 
+def test_an_answer_that_no_judge_could_read_is_unread_and_any_readable_vote_makes_it_undecided() -> None:
+    votes = control_votes("---", "---").assign(invalid_reason="unread")
+    (row,) = decide(*undone("control"), votes).to_dict("records")
+    assert (row["outcome"], row["undecided"], row["n_valid"]) == ("unread", True, 0)
+    assert pd.isna(row["abstained"]) and pd.isna(row["correct"])
+    (cell,) = cell_metrics(pd.DataFrame([row]), {}).to_dict("records")
+    assert (cell["n_unread"], cell["n_answered"], cell["n_acc"], cell["n_missing"]) == (
+        1,
+        0,
+        0,
+        2,
+    )  # the void is not here
+    for mixed, abstained in ((["n", "n", "-"], False), (["y", "n", "-"], None)):
+        votes = control_votes("".join(mixed), "".join(mixed))
+        votes.loc[~votes["valid"].astype(bool), "invalid_reason"] = "unread"
+        (row,) = decide(*undone("control"), votes).to_dict("records")
+        assert row["outcome"] == "answer" and (None if pd.isna(row["abstained"]) else row["abstained"]) == abstained
+
+
 def test_a_judged_answer_without_three_votes_a_task_is_refused_by_name() -> None:
     items, responses = undone("control")
     whole = control_votes("nnn", "yyy")

@@ -66,16 +66,21 @@ def tiny(entry: dict[str, Any], checkpoint: Path) -> dict[str, Any]:
             "waivers": waivers, "groups": entry["groups"]}  # fmt: skip
 
 
-def words() -> Tokenizer:
-    """A tokenizer with a token a word of the prompts: with one a byte, prompts are six times as long."""
-    from tokenizers import Tokenizer
+def words(questions: str = "") -> Tokenizer:
+    """Return a tokenizer with a token a word of the prompts and questions: bytes make prompts six times as long.
+
+    Whatever words a random model writes, its text is `left`, which the rule judges read; a token alone is its word.
+    """
+    from tokenizers import Regex, Tokenizer, decoders
     from tokenizers.models import WordLevel
     from tokenizers.pre_tokenizers import Whitespace
 
-    spoken = " ".join(file.read_text(encoding="utf-8") for file in sorted(PROMPTS.glob("*.txt")))
+    spoken = " ".join([questions, *(file.read_text(encoding="utf-8") for file in sorted(PROMPTS.glob("*.txt")))])
     known = ["[unknown]", *sorted({*re.findall(r"\w+|[^\w\s]+", spoken)})]
     tokenizer = Tokenizer(WordLevel({word: k for k, word in enumerate(known)}, unk_token="[unknown]"))
     tokenizer.pre_tokenizer = Whitespace()
+    as_left = decoders.Replace(Regex(r"[\s\S]+ [\s\S]+"), "left")
+    tokenizer.decoder = decoders.Sequence([decoders.WordPiece(cleanup=False), decoders.Fuse(), as_left])
     return tokenizer
 
 

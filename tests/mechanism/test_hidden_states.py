@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from safetensors import safe_open
@@ -149,15 +148,6 @@ def test_states_made_on_another_device_say_so_item_by_item(
     extract(of, work(of, 4), tmp_path)
     assert list(read_layer(tmp_path, 1)[0]["device"]) == ["cpu"] * 2 + ["cuda:0 (some GPU)"] * 2
     assert "its states were made on cpu and cuda:0 (some GPU)" in capsys.readouterr().err
-
-
-def test_states_of_before_devices_were_recorded_are_not_made_again(tmp_path: Path) -> None:
-    of = model("llava-next-video")
-    extract(of, work(of, 2), tmp_path)
-    table = tmp_path / "shard-00000.parquet"
-    pd.read_parquet(table).drop(columns="device").to_parquet(table, index=False)
-    assert extract(of, work(of, 2), tmp_path).n_new == 0
-    assert set(read_layer(tmp_path, 1)[0]["device"]) == {"not recorded"}
 
 
 SLOW = """

@@ -394,18 +394,26 @@ def test_the_panel_judges_every_answer_with_a_text(steered: Workspace) -> None:
     keys = ["dataset", "source", "kind", "draw", "layer", "unit", "dose", "signs", "item_id"]
     texts = answers.loc[answers["outcome"].isin(WITH_TEXT), keys]
     correctness = votes.query("task == 'correctness'")
-    assert set(correctness["side"]) == {"control"} and correctness["correct"].notna().all()
+    assert set(correctness["side"]) == {"control"} and set(correctness["invalid_reason"]) == {"unread"}
     votes = votes.query("task == 'abstention'")
     of_answer = votes.groupby(keys)
     assert set(of_answer.groups) == set(texts.itertuples(index=False, name=None)) != set()
     assert set(of_answer["judge"].nunique()) == set(of_answer.size()) == {3}
-    assert votes["valid"].all() and votes["abstained"].notna().all()
+    assert set(votes["invalid_reason"]) == {"unread"} and votes["abstained"].isna().all()  # texts of a random model
     ledger = steered.votes.read("tiny__guided__steered").rows
     assert {*votes["vote_key"], *correctness["vote_key"]} == set(ledger)
 
 
+def effects_of_wrong_answers(steered: Workspace) -> pd.DataFrame:
+    """Return the effects as if the judges had read a wrong answer in every text: those of a random model are unread."""
+    votes = steered.tables.read_all(STEERING_VOTES).assign(valid=True)
+    for name, task in (("abstained", "abstention"), ("correct", "correctness")):
+        votes.loc[votes["task"] == task, name] = False
+    return pd.DataFrame(effect_rows(steered.tables.read_all(STEERING), votes))
+
+
 def test_effects_put_the_model_as_it_is_into_every_path(steered: Workspace) -> None:
-    effects = pd.DataFrame(effect_rows(steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES)))
+    effects = effects_of_wrong_answers(steered)
     main = of_paper(effects).query("layer == 2")
     assert len(main.groupby(["source", "target"])) == 14
     assert set(main["alpha"]) == {0, 2, 8} and (main["n"] + main["n_missing"] == 2).all()
@@ -416,7 +424,7 @@ def test_effects_put_the_model_as_it_is_into_every_path(steered: Workspace) -> N
 
 
 def test_nulls_and_policies_stand_beside_every_own_direction(steered: Workspace) -> None:
-    effects = pd.DataFrame(effect_rows(steered.tables.read_all(STEERING), steered.tables.read_all(STEERING_VOTES)))
+    effects = effects_of_wrong_answers(steered)
     nulls, pecs = pd.DataFrame(null_rows(effects)), pd.DataFrame(pecs_rows(effects))
     assert set(nulls["target"]) == {*DATASETS, "all"} and set(nulls["null"]) == {"covariance"}
     assert set(nulls["draws"]) == {2} and set(nulls["unit"]) == {"gap"} and set(nulls["dose"]) == {0.5}

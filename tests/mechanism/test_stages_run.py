@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, Checkout, Finished, copied, once
+from tests.mechanism.paper_run import words
 from traps_pipeline.mechanism.control_tables import PATCHING, PROBE_BASELINES, STEERING_NULLS
 from traps_pipeline.mechanism.tables import PROBES, STEERING_EFFECTS, STEERING_VOTES
 from traps_pipeline.models.local.tiny import build_tiny
@@ -42,7 +43,10 @@ def with_mechanism(study: Checkout) -> str:
     """The small study's experiment on two of its datasets, asking for a look into a tiny model besides."""
     with (study.root / "assets" / "models.yaml").open("a") as stream:
         stream.write(ENTRY)
-    build_tiny("qwen3-vl", study.root / "tiny")
+    records = sorted((study.root / "scene_specs" / "released").glob("*.jsonl"))
+    lines = [json.loads(line) for path in records for line in path.read_text(encoding="utf-8").splitlines()]
+    questions = " ".join(str(value) for line in lines for name, value in line.items() if "question" in name)
+    build_tiny("qwen3-vl", study.root / "tiny", tokenizer=words(questions))
     experiment = yaml.safe_load((study.root / EXPERIMENT).read_text()) | {
         "datasets": ["chaotic", "chaotic_ill_posed"],
         "mechanism": MECHANISM,
@@ -104,6 +108,7 @@ from traps_pipeline.orchestration.graph import Source, name_of, the_graph
 from traps_pipeline.orchestration.lineage import Lineage, _report_state
 from traps_pipeline.orchestration.run import dagster_history
 from traps_pipeline.orchestration.runs import _execute
+from traps_pipeline.storage.parquet import write_sealed
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.orchestration.wanted import Wanted
 
@@ -122,7 +127,7 @@ def change(name, key):
     if table:
         data = pq.read_table(path)
         state = json.loads(data.schema.metadata[b"traps"]) | {"version": "0" * 16}
-        pq.write_table(data.replace_schema_metadata({b"traps": json.dumps(state).encode()}), path)
+        write_sealed(path, data, {b"traps": json.dumps(state).encode()})
     else:
         path.write_text(json.dumps(json.loads(content) | {"version": "0" * 16}))
     return lambda: path.write_bytes(content)

@@ -15,7 +15,8 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.cli import main
-from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.judging.answers import normalise
+from traps_pipeline.judging.rules import ABSTENTION, Statement, read_statement
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.pocket.commands import CARD, FACTS, WEIGHTS
 from traps_pipeline.pocket.data import (
@@ -149,11 +150,10 @@ def test_other_numbers_of_scenes_draw_what_is_missing_and_read_what_is_wanted(
 
 @pytest.mark.parametrize("prompt_name", PROMPTS)
 def test_what_it_is_taught_to_say_is_read_by_the_rule_judge(prompt_name: str) -> None:
-    for answer in ("left", "elsewhere", "4", "purple"):
-        said = say(answer, prompt_name)
-        assert not judge_abstention(said)["abstained"]
-        assert judge_correctness(said, answer)["correct"]
-    assert judge_abstention(say(None, prompt_name))["abstained"]
+    guesses = ("hollow", "solid", "before", "after", "a man", "a woman", "a child", "wood", "metal", "plastic")
+    for answer in ("left", "elsewhere", "4", "0-1", "purple", "yes", *guesses, "the ball", "the wall", "the floor"):
+        assert read_statement(say(answer, prompt_name)) == Statement(normalise(answer))
+    assert read_statement(say(None, prompt_name)) == ABSTENTION
     if prompt_name == "json":
         assert set(json.loads(say("left", "json"))) == {"reason", "final_answer"}
 

@@ -82,10 +82,12 @@ def test_what_is_no_answer_is_missing_and_decides_nothing(workspace: Workspace) 
     for outcome, text, read in (
         ("answer", "", "empty"), ("refused", None, "refused"), ("truncated", "First I look", "truncated"),
         ("answer", "...", "degenerate"), ("answer", "<think>left", "degenerate"),
+        ("answer", "Das lässt sich nicht bestimmen.", "unread"),
     ):  # fmt: skip
         judged = judge(item, outcome, text, "standard")
         assert (judged.outcome, judged.abstained, judged.correct, judged.right) == (read, None, None, False)
-    assert figures([judge(item, "answer", "", "standard")])["missing"] == 1
+    shrugs = figures([judge(item, "answer", text, "standard") for text in ("", "IDK")])
+    assert (shrugs["missing"], shrugs["unread"]) == (2, 1)
 
 
 def test_its_items_prompts_and_frames_are_those_that_a_model_is_sent(
@@ -173,8 +175,10 @@ def test_inspect_ai_gives_the_same_figures_to_the_last_digit(
     inspected: tuple[dict[str, Any], Path], workspace: Workspace, model: str
 ) -> None:
     found = inspected[0][model]
-    assert {name: found[name] for name in found if name != "missing"} == ours(workspace, model, "standard")
-    assert found["missing"] == 0
+    assert {name: found[name] for name in found if name not in ("missing", "unread")} == ours(
+        workspace, model, "standard"
+    )
+    assert (found["missing"], found["unread"]) == (0, 0)
 
 
 def test_inspect_ai_finds_the_task_in_its_file(harness: Path) -> None:
@@ -242,7 +246,7 @@ def test_lmms_eval_gives_the_same_figures_to_the_last_digit(
     lmms_evaluated: tuple[dict[str, Any], Path], workspace: Workspace, model: str
 ) -> None:
     expected = ours(workspace, model, "standard")
-    assert lmms_evaluated[0][model] == {name: expected[name] for name in FIGURES} | {"missing": 0}
+    assert lmms_evaluated[0][model] == {name: expected[name] for name in FIGURES} | {"missing": 0, "unread": 0}
 
 
 # --- answers come back ------------------------------------------------------------------------------------------------

@@ -222,6 +222,7 @@ def test_a_run_whose_lock_file_was_removed_is_run_again(tmp_path: Path) -> None:
     [
         (b"name: [", "not valid YAML ({}); correct the file"),
         (b"name: !!binary x", "not valid YAML ({}); correct the file"),
+        (b"name: !!bool a", "remove the tag {}: no value has one"),
         (b"- name", "must be a mapping of names, not {}; correct the file"),
     ],
 )

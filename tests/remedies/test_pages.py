@@ -58,7 +58,7 @@ def test_a_history_is_opened_once_what_lies_in_its_way_is_moved(
         with dagster_history(workspace) as instance:
             return len(instance.get_runs())
 
-    refused(opened, "orchestration/run.py | free some space, or move that folder away")
+    refused(opened, "base/databases.py | free some space, or move that folder away")
     found = remedied(
         opened,
         "Dagster's history cannot be read or written ({}); {} and run the same command again: tables are whole",

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from matplotlib.image import imread
 
@@ -24,7 +25,7 @@ from traps_pipeline.report.catalogue import FIGURES, JUDGED_STAGES, OF_PAPER, OF
 from traps_pipeline.report.figures.abstention import doubt_points
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.study_results import StudyResults
-from traps_pipeline.report.writing import figure_files, freeze_layout, table_files, table_latex
+from traps_pipeline.report.writing import Column, PrintedTable, figure_files, freeze_layout, table_files, table_latex
 from traps_pipeline.scoring.tables import CONTRASTS, LEADERBOARD
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -344,3 +345,28 @@ def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch
     assert {path for path in files if path.split("/")[0] in ("tables", "figures")} <= linked
     assert all((tmp_path / path).is_file() for path in linked)
     assert "not run: this study has no leaderboard yet" in (tmp_path / "report.html").read_text()
+
+
+def test_numbers_are_numbers_in_every_exported_file(partial):
+    number = re.compile(r"[+−-]?(\d+(\.\d*)?|\.\d+)%?")
+    for results in (partial, PAPER):
+        tables = [t for report in TABLES for t in (*report.as_printed(), *report.tables(results))]
+        for table in tables:
+            words = {column.field for column in table.columns if column.unit == "text"}
+            data = pq.read_table(io.BytesIO(table_files(table)[f"{table.name}.parquet"]))
+            for name in {*data.column_names} - words:
+                texts = [text for text in data[name].to_pylist() if isinstance(text, str) and text != "–"]
+                assert not texts or not all(map(number.fullmatch, texts)), (table.name, name, texts[:3])
+
+
+def test_a_printed_percentage_is_a_fraction_unless_the_field_says_otherwise():
+    columns = [
+        Column("false_abs", "FalseAbs", "range"),
+        Column("doubt_pct", "Doubt", "range"),
+        Column("ci", "CI", "range"),
+    ]
+    rows = pd.DataFrame({"false_abs": ["50%", "–"], "doubt_pct": ["17%", "20%"], "ci": ["[.1, .2]", "[.3, .4]"]})
+    data = PrintedTable("t", "T", rows, columns).data
+    assert data["false_abs"].tolist() == [0.5, pd.NA]
+    assert data["doubt_pct"].tolist() == [17, 20]
+    assert data["ci"].tolist() == ["[.1, .2]", "[.3, .4]"]

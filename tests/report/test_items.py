@@ -80,6 +80,21 @@ def test_a_page_shows_question_answer_votes_verdict_and_clip_as_text(workspace):
     assert '<a href="../../clips' not in "".join(item_pages(workspace, CELL, None))
 
 
+def test_a_page_says_that_an_answer_is_unread(workspace):
+    write_cell(workspace)
+    verdicts = workspace.tables.read(VERDICTS, CELL.partition)
+    verdicts.loc[verdicts["side"] == "control", ["outcome", "abstained"]] = ["unread", None]
+    workspace.tables.write(VERDICTS, CELL.partition, verdicts, {})
+    page = "".join(item_pages(workspace, CELL, None))
+    assert '<td><span class="none">unread</span></td>' in page and "undecided" not in page
+
+
+def test_a_page_shows_hidden_characters_of_an_answer_by_their_numbers(workspace):
+    write_cell(workspace, text="left \u202ethgir\u2066\x1b[2J")
+    page = "".join(item_pages(workspace, CELL, None))
+    assert "left [U+202E]thgir[U+2066][U+001B][2J" in page and "\u202e" not in page
+
+
 def test_a_page_is_made_anew_only_where_its_tables_changed(workspace, tmp_path):
     other = Cell("chaotic", Evaluation("oracle", "standard", 2))
     for cell in (CELL, other):

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import base64
 import errno
 import hashlib
 import os
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
+from tests.foreign_page import CHROMIUM, QUIET
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import RELEASED
@@ -165,3 +169,69 @@ def test_a_real_clip_is_encoded_to_the_same_bytes_every_time(tmp_path: Path) -> 
         encode(frames, tmp_path / "clip.mp4", physics.fps)
         digests.add(file_digest(tmp_path / "clip.mp4"))
     assert len(digests) == 1
+
+
+# --- colours ----------------------------------------------------------------------------------------------------------
+
+SIZES = [(480, 360), (960, 720)]  # from 720 lines on players take another matrix where none is stated
+# What a page draws of a video's frame at a time, as a PNG.
+DRAWN = """async ([source, time]) => {
+  const video = document.createElement("video");
+  const event = (name) => new Promise((done, failed) => { video[`on${name}`] = done; video.onerror = failed; });
+  video.muted = true;
+  const loaded = event("loadeddata");
+  video.src = source;
+  await loaded;
+  const sought = event("seeked");
+  video.currentTime = time;
+  await sought;
+  await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = [video.videoWidth, video.videoHeight];
+  canvas.getContext("2d").drawImage(video, 0, 0);
+  return canvas.toDataURL("image/png");
+}"""
+
+
+def patches(width: int, height: int) -> np.ndarray:
+    """A frame (H, W, 3) of 48 patches, the first six red, green, blue, yellow, white and black."""
+    colours = np.random.default_rng(0).integers(0, 256, (6, 8, 3)).astype(np.uint8)
+    colours[0, :6] = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0), (255, 255, 255), (0, 0, 0)]
+    return colours.repeat(height // 6, axis=0).repeat(width // 8, axis=1)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_clip_states_the_colours_that_it_is_encoded_by(tmp_path: Path, width: int, height: int) -> None:
+    import av
+
+    encode([patches(width, height)] * 2, tmp_path / "clip.mp4", 10)
+    with av.open(str(tmp_path / "clip.mp4")) as container:
+        stated = container.streams.video[0].codec_context
+        # ITU-T H.273: 6 is SMPTE 170M, which is BT.601 of 525 lines; range 1 is limited.
+        assert (stated.color_primaries, stated.color_trc, stated.colorspace) == (6, 6, 6)
+        assert stated.color_range == 1
+        planes = next(container.decode(video=0)).to_ndarray(channel_last=True, format="yuv444p")
+    # ITU-R BT.601, limited range: Y = 16 + 65.481 R + 128.553 G + 24.966 B; BT.709 would give red a Y of 63.
+    middles = [planes[height // 12, width // 16 + k * width // 8].tolist() for k in range(6)]
+    wanted = [(81, 90, 240), (145, 54, 34), (41, 240, 110), (210, 16, 146), (235, 128, 128), (16, 128, 128)]
+    assert np.abs(np.array(middles) - wanted).max() <= 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which(CHROMIUM) is None, reason="chromium is not installed")
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_browser_shows_the_pixels_that_a_model_is_shown(tmp_path: Path, width: int, height: int) -> None:
+    from playwright.sync_api import sync_playwright
+
+    encode([patches(width, height)] * 5, tmp_path / "clip.mp4", 10)
+    decoded, _ = decode(tmp_path / "clip.mp4")
+    source = f"data:video/mp4;base64,{base64.b64encode((tmp_path / 'clip.mp4').read_bytes()).decode()}"
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+        drawn = browser.new_page().evaluate(DRAWN, [source, 0.25])
+        browser.close()
+    png = np.frombuffer(base64.b64decode(drawn.partition(",")[2]), np.uint8)
+    shown = cv2.imdecode(png, cv2.IMREAD_COLOR)
+    assert shown is not None and shown.shape == (height, width, 3)
+    difference = np.abs(shown[..., ::-1].astype(int) - decoded[2])
+    assert difference.mean() < 2 and difference.max() <= 10  # of 255; 6.3 and 40 at 720 lines where none are stated

@@ -105,11 +105,12 @@ def test_what_became_of_the_items_is_summed_over_runs_and_datasets(rows):
     assert tuple(entry(board, "overall")[columns]) == (4, 8, 4, 8, 8 / 32, True, 12 / 32)
 
 
+@pytest.mark.parametrize("outcome", ["degenerate", "unread"])
 @pytest.mark.parametrize(("dots", "is_broken"), [(0, False), (1, False), (2, True)])
-def test_an_entry_is_broken_where_more_than_1_percent_of_its_texts_say_nothing(dots, is_broken, rows):
-    verdicts = rows([(True, False, True)] * 50, outcomes=["degenerate"] * dots + ["answer"] * (100 - dots))
+def test_an_entry_is_broken_where_more_than_1_percent_of_its_texts_say_nothing(outcome, dots, is_broken, rows):
+    verdicts = rows([(True, False, True)] * 50, outcomes=[outcome] * dots + ["answer"] * (100 - dots))
     row = entry(board_of(verdicts))
-    assert (row.n_degenerate, row.broken, row.is_broken) == (dots, dots / 100, is_broken)
+    assert (row[f"n_{outcome}"], row.broken, row.is_broken) == (dots, dots / 100, is_broken)
 
 
 def test_models_of_two_panels_are_neither_ranked_nor_contrasted_together_and_a_mixed_one_has_no_rank(rows):

@@ -69,6 +69,8 @@ def test_the_study_of_an_experiment_is_its_benchmark_subset_panel_and_budget(tmp
             "datasets: [schema_abstain]\n",
             "datasets schema_abstain ask for an object of their own, and so does the regime",
         ),
+        ("scenarios: []", "scenarios: List should have at least 1 item"),
+        ("runs: []", "runs: List should have at least 1 item"),
     ],
 )
 def test_a_wrong_experiment_names_its_file_and_field(tmp_path: Path, text: str, complaint: str) -> None:

@@ -9,6 +9,8 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+from traps_pipeline.base.names import check_name
+
 OCCLUSION_CATEGORIES = (
     "ramps_rolling",
     "pendulums_levers",
@@ -56,7 +58,6 @@ VQA_PROMPTS = ("standard", "guided")
 PROBE_PROMPT = "standard"  # probes are of this VQA prompt, the other one serves directions (docs/spec.md 7.1)
 SIDES = ("control", "void")
 
-_SLUG = re.compile(r"[a-z0-9.-]+")
 _EVALUATION = re.compile(r"(?P<model>.+?)__(?P<regime>[a-z]+)__run(?P<run>[1-9][0-9]*)")
 
 
@@ -116,13 +117,6 @@ def sides_of(dataset: str) -> tuple[str, ...]:
     return {**dict.fromkeys(controls, ("control",)), **dict.fromkeys(voids, ("void",))}.get(dataset, SIDES)
 
 
-def check_slug(model_id: str) -> str:
-    """The id itself. Raises ValueError unless it is `[a-z0-9.-]+`, so that keys can be parsed back."""
-    if not _SLUG.fullmatch(model_id):
-        raise ValueError(f"id {model_id!r} must match [a-z0-9.-]+ (it becomes part of partition keys and folder names)")
-    return model_id
-
-
 @dataclass(frozen=True, order=True)
 class Evaluation:
     """One model under one regime in one run: the second partition dimension of the paid stages."""
@@ -142,7 +136,7 @@ class Evaluation:
         found = _EVALUATION.fullmatch(key)
         if found is None or found["regime"] not in REGIMES:
             raise ValueError(f"evaluation key {key!r} is not model__regime__runN with a regime of {REGIMES}")
-        return Evaluation(check_slug(found["model"]), found["regime"], int(found["run"]))
+        return Evaluation(check_name(found["model"]), found["regime"], int(found["run"]))
 
 
 @dataclass(frozen=True, order=True)
@@ -198,7 +192,7 @@ class Extraction:
         model, _, prompt = key.partition("__")
         if prompt not in VQA_PROMPTS:
             raise ValueError(f"extraction key {key!r} is not model__prompt with a prompt of {VQA_PROMPTS}")
-        return Extraction(check_slug(model), prompt)
+        return Extraction(check_name(model), prompt)
 
 
 @dataclass(frozen=True, order=True)
@@ -274,4 +268,4 @@ class SteeringCell(Cell):
             raise ValueError(
                 f"steering key {key!r} is not dataset|model__directions__regime with regimes of {VQA_PROMPTS}"
             )
-        return SteeringCell.make(dataset, check_slug(parts[0]), parts[1], parts[2])
+        return SteeringCell.make(dataset, check_name(parts[0]), parts[1], parts[2])

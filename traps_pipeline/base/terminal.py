@@ -1,17 +1,57 @@
-"""Text and tables for a terminal, and for whatever standard output is where it is none."""
+"""Text that others wrote, with hidden characters made visible, and tables for a terminal or a pipe."""
 
 from __future__ import annotations
 
 import io
+import re
 import sys
+import unicodedata
 from collections.abc import Collection, Iterable, Sequence
+
+from traps_pipeline.base.redaction import redact
 
 _WIDE = 100_000  # columns: no table is wrapped or cut to the width of the screen
 
 
+# Controls, and what Unicode calls default ignorable, among it all marks of direction; as HIDDEN in explorer/web/dom.js.
+_HIDDEN = re.compile(
+    "(?!\\r\\n)[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f\u2028-\u202e"
+    "\u2060-\u206f\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufffb\U0001bca0-\U0001bca3\U0001d173-\U0001d17a\U000e0000-\U000e0fff]"
+)
+_JOINER, _EMOJI_STYLE = "\u200d", "\ufe0f"
+
+
+def visible(text: str) -> str:
+    """Return the text with each character that is not seen, or that changes how others are shown, as `[U+202E]`.
+
+    Line ends and tabs stay, and so do an emoji's variation selector and joiner. Every page and every value for Dagster
+    passes through here; the type (`Markup`) is kept.
+    """
+    return type(text)(_HIDDEN.sub(_number, text)) if _HIDDEN.search(text) else text
+
+
+def _number(match: re.Match[str]) -> str:
+    before, after = match.string[: match.start()][-1:], match.string[match.end() :][:1]
+    is_emoji = unicodedata.category(before or " ") in ("So", "Sk") or before == _EMOJI_STYLE
+    if match[0] == _EMOJI_STYLE and (is_emoji or before in "0123456789#*") and before:
+        return match[0]
+    if match[0] == _JOINER and is_emoji and unicodedata.category(after or " ") == "So":
+        return match[0]
+    return f"[U+{ord(match[0]):04X}]"
+
+
+def finalized(value: object) -> object:
+    """Return an expression's value as a template prints it: `finalize` of every Jinja2 environment."""
+    return visible(value) if isinstance(value, str) else value
+
+
 def plain(text: object) -> str:
-    """Text on one line that cannot steer a terminal."""
-    return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in str(text))
+    """Return text on one line that cannot steer a terminal and holds no key."""
+    return _printable(redact(str(text)))
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else " " if c in "\n\t" else "?" for c in text)
 
 
 def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: Collection[int] = (0,)) -> str:
@@ -31,7 +71,7 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
     for place, heading in enumerate(headings):
         table.add_column(Text(plain(heading)), justify="left" if place in left else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*(Text(plain(cell)) for cell in row))
+        table.add_row(*(Text(_printable(str(cell))) for cell in row))
     lines = io.StringIO()
     Console(file=lines, width=_WIDE, force_terminal=styled).print(table)
-    return "\n".join(line.rstrip() for line in lines.getvalue().splitlines())
+    return redact("\n".join(line.rstrip() for line in lines.getvalue().splitlines()))

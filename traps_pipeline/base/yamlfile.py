@@ -60,7 +60,7 @@ class _Loader(Composer, *_PARSER, SafeConstructor, Resolver):  # pyright: ignore
 
 class _Strict(_Loader):
     """YAML 1.2's plain values: no dates, no sexagesimals, no octals, true and false alone as booleans; each key once;
-    an anchor holds no alias, so that a few lines cannot stand for millions."""
+    no tags; an anchor holds no alias, so that a few lines cannot stand for millions."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - the loader's own way to say it
 
@@ -74,6 +74,9 @@ class _Strict(_Loader):
             raise yaml.MarkedYAMLError(None, None, "too many aliases, or one inside an anchor", event.start_mark)
         if self._depth > MOST_DEPTH or self._nodes > MOST_NODES:
             raise yaml.MarkedYAMLError(None, None, "nested too deeply, or too large", event.start_mark)
+        if not is_alias and event.tag is not None:
+            written = str(event.tag).replace(_TAG, "!!")
+            raise yaml.MarkedYAMLError(None, None, f"remove the tag {written}: no value has one", event.start_mark)
         anchored = not is_alias and event.anchor is not None
         self._within += anchored
         try:
@@ -100,8 +103,6 @@ for _kind, _pattern, _first in (
     ("float", r"[-+]?(0|[1-9][0-9]{0,17})(\.[0-9]{0,30})?([eE][-+]?[0-9]{1,3})?", list("-+0123456789")),
 ):
     _Strict.add_implicit_resolver(f"{_TAG}{_kind}", re.compile(f"^(?:{_pattern})$"), _first)
-for _tag in ("timestamp", "binary", "omap", "pairs", "set"):  # `!!binary` and so on, said in the file
-    _Strict.yaml_constructors = {k: v for k, v in _Strict.yaml_constructors.items() if k != f"{_TAG}{_tag}"}
 
 
 def _float(loader: _Strict, node: yaml.ScalarNode) -> float:

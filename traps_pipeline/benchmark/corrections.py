@@ -40,7 +40,7 @@ class Correction(BaseModel):
     """One review decision."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    scenario_id: str = Field(pattern=Slug)
+    scenario_id: str = Field(pattern=Slug, max_length=80)
     action: Literal["keep", "correct", "discard", "add", "restore"]
     family: str | None = None
     params: dict[str, Any] | None = None

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import ALL_CATEGORIES, BESIDE, SIDES, all_datasets_of, is_ill_posed
-from traps_pipeline.benchmark.specs import released_in_study
+from traps_pipeline.benchmark.specs import expected_specs, released_in_study
 from traps_pipeline.benchmark.tables import ARMS as ARMS_TABLE
-from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS, ItemRow
+from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.benchmark.versions import item_content, spec_record, version_of
 from traps_pipeline.scenes.clips import check_clip
 from traps_pipeline.scenes.encode import DamagedClip
@@ -48,6 +49,29 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
     if dataset in BESIDE:
         return _of_arm(workspace, dataset, {spec["scenario_id"]: spec for spec in specs}, commonest, version)
     return [_item(dataset, spec, side, clips, commonest, version) for spec in specs for side in SIDES]
+
+
+def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
+    """Return the items of a dataset that a run would make now, as far as the clips that exist tell; nothing is made.
+
+    Left out are items whose clip must be rendered first and, of arms, those of scenarios that have changed. Raises
+    TrapsError.
+    """
+    specs = [asdict(row) for category in categories_of_dataset(dataset) for row in expected_specs(workspace, category)]
+    if dataset in BESIDE:
+        former = workspace.tables.read_all(SCENE_SPECS, ["spec_hash"])["spec_hash"]
+        same = {spec["scenario_id"] for spec in specs if spec["spec_hash"] in {*former}}
+        rows = workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
+        return [{str(name): value for name, value in row.items()} for row in rows if row["scenario_id"] in same]
+    scenes = {spec["scenario_id"]: spec["scene_hash"] for spec in specs}
+    clips: dict[tuple[str, str], Record] = {
+        (row["scenario_id"], row["side"]): row
+        for row in workspace.tables.read_all(VIDEOS, category=categories_of_dataset(dataset)).to_dict("records")
+        if row["scene_hash"] == scenes.get(row["scenario_id"])
+    }
+    drawn = [spec for spec in specs if all((spec["scenario_id"], side) in clips for side in SIDES)]
+    commonest = commonest_answers(specs)
+    return [asdict(_item(dataset, spec, side, clips, commonest, "")) for spec in drawn for side in SIDES]
 
 
 def _of_arm(

@@ -9,6 +9,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.names import Name
 from traps_pipeline.base.partitions import ALL_CATEGORIES
 from traps_pipeline.base.paths import RELEASED, SCENE_SPECS
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_lines, read_yaml
@@ -20,7 +21,7 @@ class Release(BaseModel):
     """`scene_specs/benchmark.yaml`: what the released records are called, and a canary for contamination checks."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    name: str
+    name: Name
     version: str
     canary: str
 

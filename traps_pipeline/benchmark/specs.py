@@ -56,9 +56,7 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> Resolved:
 
 def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec, Path]:
     """The scene that a correction's parameters make, with the family's words for it; simulated once and kept."""
-    name = (
-        f"{scenario.scenario_id}-{digest([scenario.family, scenario.params, _seed(scenario), _physics(scenario)])[:16]}"
-    )
+    name = _resolved_name(scenario)
     own = [workspace.trajectories / f"{name}{ending}" for ending in (".npz", ".json")]
     workspace.store.bring(own)
     for folder in (CORRECTIONS / "trajectories", workspace.trajectories):
@@ -78,6 +76,11 @@ def _resolved_anew(workspace: Workspace, scenario: Scenario) -> tuple[SceneSpec,
         f"trajectories/{name}.* of the workspace to {CORRECTIONS / 'trajectories'}"
     )
     return spec, workspace.trajectories / f"{name}.npz"
+
+
+def _resolved_name(scenario: Scenario) -> str:
+    scene = [scenario.family, scenario.params, _seed(scenario), _physics(scenario)]
+    return f"{scenario.scenario_id}-{digest(scene)[:16]}"
 
 
 def _seed(scenario: Scenario) -> int:
@@ -154,6 +157,19 @@ def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow]
         except ValueError as error:
             raise TrapsError(f"{item.spec.scenario_id}: {error}") from error
     return [_row(workspace, item, version) for item in resolved], resolved
+
+
+def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
+    """Return the rows of scene_specs that a run would make of a category now. Nothing is simulated or written: a
+    scenario with parameters that were never simulated is left out. Raises TrapsError."""
+
+    def is_resolved(scenario: Scenario) -> bool:
+        name = f"{_resolved_name(scenario)}.json" if scenario.params is not None else ""
+        own = workspace.store.has(workspace.trajectories / name)
+        return not name or own or (CORRECTIONS / "trajectories" / name).is_file()
+
+    scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category and is_resolved(s)]
+    return [_row(workspace, resolve_scenario(workspace, scenario), "") for scenario in scenarios]
 
 
 def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpec]:

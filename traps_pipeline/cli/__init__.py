@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import sentence_of
 from traps_pipeline.base.files import remedy
+from traps_pipeline.base.redaction import redact_tracebacks
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.cli import (
     annotate,
@@ -39,6 +40,8 @@ from traps_pipeline.cli import (
 )
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, Run
 
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a subcommand; returns the exit code: 0 done, 1 something failed, 2 bad usage, 4 a budget is reached, 130
@@ -47,11 +50,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a path or a word that this terminal cannot show
-    arguments = build_parser().parse_args(argv)
-    command: Run = arguments.command
+    redact_tracebacks()
     try:
+        return _run(argv)
+    except BrokenPipeError:
+        # Nobody reads any more (`| head`); the interpreter's last flush must not complain of it either.
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return INTERRUPTED
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    """Run a subcommand. Raises BrokenPipeError where what it prints, or the end of it, is not read."""
+    try:
+        arguments = build_parser().parse_args(argv)
+        command: Run = arguments.command
         with _stopped_alike():
             return command(arguments)
+    except BrokenPipeError:
+        raise
     except TrapsError as error:
         print("\n".join(plain(line) for line in f"traps: {error}".splitlines()), file=sys.stderr)
         return FAILED
@@ -61,10 +78,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"traps: {sentence}", file=sys.stderr)
         return FAILED
     except OSError as error:
-        if isinstance(error, BrokenPipeError):
-            # Nobody reads any more (`| head`); the interpreter's last flush must not complain of it either.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return FAILED
         where = f"{plain(error.filename)[:200]}: " if error.filename else ""
         print(f"traps: {where}{error.strerror}; {remedy(error)} and run the same command again", file=sys.stderr)
         return FAILED
@@ -74,20 +87,34 @@ def main(argv: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return INTERRUPTED
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:  # pyright: ignore[reportUnnecessaryComparison] - None where it was closed (`>&-`)
+                stream.flush()
 
 
 @contextmanager
 def _stopped_alike() -> Iterator[None]:
-    """Within the block SIGTERM and SIGHUP do what Ctrl-C does at that moment. `nohup` keeps its meaning."""
+    """Let SIGTERM and SIGHUP do what Ctrl-C does at that moment, until the block ends.
+
+    A shell starts `command &` of a script with SIGINT ignored, in which case SIGTERM would do nothing either: both are
+    obeyed again. An ignored SIGHUP stays ignored, which is the meaning of `nohup`.
+    """
     replaced = {}
-    for each in (signal.SIGTERM, signal.SIGHUP) if threading.current_thread() is threading.main_thread() else ():
-        if signal.getsignal(each) == signal.SIG_DFL:
-            replaced[each] = signal.signal(each, lambda *_: signal.raise_signal(signal.SIGINT))
+    for each in STOPS if threading.current_thread() is threading.main_thread() else ():
+        former = signal.getsignal(each)
+        if former == signal.SIG_DFL or (former == signal.SIG_IGN and each != signal.SIGHUP):
+            interrupt = signal.default_int_handler if each == signal.SIGINT else _raise_interrupt
+            replaced[each] = signal.signal(each, interrupt)
     try:
         yield
     finally:
         for each, former in replaced.items():
             signal.signal(each, former)
+
+
+def _raise_interrupt(*_: object) -> None:
+    signal.raise_signal(signal.SIGINT)
 
 
 def build_parser() -> argparse.ArgumentParser:

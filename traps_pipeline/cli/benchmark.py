@@ -82,6 +82,7 @@ def certify(arguments: argparse.Namespace) -> int:
 
 def sample(arguments: argparse.Namespace) -> int:
     """See `traps sample --help`."""
+    from traps_pipeline.base.names import check_name
     from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
     from traps_pipeline.benchmark.records import load_release
     from traps_pipeline.scenes.registry import family_names
@@ -96,6 +97,10 @@ def sample(arguments: argparse.Namespace) -> int:
         raise TrapsError(f"composition.yaml has no number of scenarios for {', '.join(uncounted)}; say --count N")
     wanted = {name: arguments.count or max(1, round(counts[name] * arguments.scale)) for name in names}
     name = arguments.name or f"private-{arguments.seed}"
+    try:
+        check_name(name)
+    except ValueError as error:
+        raise TrapsError(f"--name: {error}") from None
     sample_benchmark(
         arguments.out.absolute(),
         wanted,

@@ -86,12 +86,13 @@ def listening_of(
 ) -> Listening:
     """Where such a command listens and whom it lets in: who has the token, or each person with a token of their own.
     danger: what everybody who reaches the address could do. Raises TrapsError."""
+    from traps_pipeline.base.keys import optional_key
     from traps_pipeline.base.webguard import personal_tokens, public_name, token_for
     from traps_pipeline.explorer.server import Listening
 
     if arguments.behind:
         public_name(arguments.behind)
-    given = arguments.token or os.environ.get(variable)
+    given = arguments.token or optional_key(variable)
     token = token_for(arguments.host, given, danger=danger, variable=variable)
     tokens = personal_tokens(token, people) if people else token
     return Listening(arguments.host, arguments.port, tokens, f"traps {command}", arguments.behind)

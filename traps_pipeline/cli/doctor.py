@@ -49,7 +49,7 @@ def doctor(arguments: argparse.Namespace) -> int:
     who, needs = ("local models", "need") if local else ("the demo", "needs")
     problems = 0
     for finding in examine_local(arguments.local) if local else examine(place_of(arguments)):
-        print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.detail}", flush=True)
+        print(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {plain(finding.detail)}", flush=True)
         problems += not finding.ok
     print(
         f"{problems} problem(s); {who} will not run" if problems else f"this machine has everything that {who} {needs}"

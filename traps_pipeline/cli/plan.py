@@ -56,8 +56,8 @@ def plan(arguments: argparse.Namespace) -> int:
     _print_precision(planned.pairs)
     if planned.uncertain:
         print(
-            f"This is an upper bound: the items of {', '.join(planned.uncertain)} are missing or outdated, so all of "
-            "their calls are counted as new. Materialize scene_specs, videos and items for exact counts."
+            f"This is an upper bound: items of {', '.join(planned.uncertain)} are still to be made, so all of their "
+            "calls are counted as new. Materialize scene_specs, videos and items for exact counts."
         )
     return OK
 

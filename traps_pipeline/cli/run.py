@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -84,9 +84,11 @@ def run(arguments: argparse.Namespace) -> int:
     workspace = _allow(create(arguments, experiment), experiment, arguments)
     import traps_pipeline.definitions  # noqa: F401 - declares the graph
     from traps_pipeline.models.backends import require_libraries
-    from traps_pipeline.orchestration.run import dagster_history, failed_checks, stages_until, walk
+    from traps_pipeline.orchestration.machine import require_machine, wanted_parts
+    from traps_pipeline.orchestration.run import dagster_history, failed_checks, require_work, stages_until, walk
 
     stages = stages_until(arguments.until)
+    require_work(workspace, experiment.name, arguments.until)
     print(f"{experiment.name}: {experiment.description}\nworkspace {workspace.place}", flush=True)
     with reporting(TerminalProgress()) as progress, dagster_history(workspace) as instance:
         participants = _still_to_ask(workspace, experiment, stages)
@@ -94,6 +96,8 @@ def run(arguments: argparse.Namespace) -> int:
             require_libraries(entry)
         if experiment.mechanism is not None and "hidden_states" in stages:
             require("local")
+        if not arguments.cluster:  # there the hosts that make runs look at themselves
+            require_machine(workspace, wanted_parts(workspace, stages, experiment.name))
         if not arguments.no_preflight:
             _preflight(workspace, participants)
         with _runs(arguments, instance, workspace) as runs:
@@ -120,12 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"({steered.cached} from the ledger), {judged.asked} votes on them"
         )
     if problems:
-        for problem in problems:
-            print(f"traps: {plain(problem)}", file=sys.stderr)
-        print(
-            f"traps: {len(problems)} problem(s); finished work is kept: run the same command to continue",
-            file=sys.stderr,
-        )
+        _print_problems(problems)
         return OVER_BUDGET if outcome.over_budget else FAILED
     if arguments.until is not None:
         print(f"next: traps run {arguments.experiment} for the stages after {arguments.until}")
@@ -133,6 +132,21 @@ def run(arguments: argparse.Namespace) -> int:
     _print_results(workspace)
     print(f"next: open {workspace.reports / 'report.html'}, or run traps why ITEM to examine an item's answers")
     return OK
+
+
+def _print_problems(problems: Sequence[str]) -> None:
+    """Print each cause once, and last the one of most problems: it is what to mend."""
+    alike = dict[str, list[str]]()
+    for problem in problems:
+        alike.setdefault(problem.partition(": ")[2] or problem, []).append(problem)
+    for first, *more in alike.values():
+        print(f"traps: {plain(first)}{f' (and {len(more)} more)' if more else ''}", file=sys.stderr)
+    print(
+        f"traps: {len(problems)} problem(s); finished work is kept: run the same command to continue", file=sys.stderr
+    )
+    cause, most = max(alike.items(), key=lambda pair: len(pair[1]))
+    if len(most) > 1:
+        print(f"traps: {len(most)} of them have one cause: {plain(cause)}", file=sys.stderr)
 
 
 @contextmanager

@@ -6,9 +6,11 @@ import argparse
 import os
 
 from traps_pipeline.base.extras import require
-from traps_pipeline.cli.command import OK, Commands, number, open_workspace, whole
+from traps_pipeline.base.keys import optional_key
+from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, number, open_workspace, whole
 
 CLUSTER = "of a study on a cluster"
+_OWN_S = 5.0  # the second process's own, after all that it started has ended
 
 
 def add(commands: Commands) -> None:
@@ -28,18 +30,24 @@ def add(commands: Commands) -> None:
 def ui(arguments: argparse.Namespace) -> int:
     """See `traps ui --help`."""
     require("ui")
+    from traps_pipeline.base.process_tree import split
     from traps_pipeline.base.webguard import token_for
+    from traps_pipeline.orchestration.webserver import DANGER, STOP_S, TOKEN_VARIABLE, serve_with_dagster
+
+    given = arguments.token or optional_key(TOKEN_VARIABLE)
+    token = token_for(arguments.host, given, danger=DANGER, variable=TOKEN_VARIABLE)
+    if (code := split(STOP_S + _OWN_S)) is not None:  # before Dagster's imports, which a fork could break
+        return code if code >= 0 else FAILED
     from traps_pipeline.orchestration.cluster import RUN_CPUS, RUN_GPUS
     from traps_pipeline.orchestration.run import dagster_history
-    from traps_pipeline.orchestration.webserver import DANGER, TOKEN_VARIABLE, serve_with_dagster
 
     for variable, value in ((RUN_CPUS, arguments.cpus), (RUN_GPUS, arguments.gpus)):
         if value is not None:
             os.environ[variable] = str(value)  # for the daemon, which starts such runs
-    given = arguments.token or os.environ.get(TOKEN_VARIABLE)
-    token = token_for(arguments.host, given, danger=DANGER, variable=TOKEN_VARIABLE)
-    workspace = open_workspace(arguments)
-    with dagster_history(workspace):
-        pass  # made once by one process, before several open it
-    serve_with_dagster(arguments.host, arguments.port, token)
-    return OK
+    try:
+        workspace = open_workspace(arguments)
+        with dagster_history(workspace):
+            pass  # made once by one process, before several open it
+        serve_with_dagster(arguments.host, arguments.port, token)
+    except KeyboardInterrupt:
+        return INTERRUPTED  # the first process says it

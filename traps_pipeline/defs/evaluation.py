@@ -121,13 +121,13 @@ votes = stage(
     group=GROUP,
     deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, judges],
     scheme=CELL,
-    code="2",
+    code="3",
     cost="money",
     columns={name: [f"responses.{name}"] for name in ("item_id", "side", "benchmark_version")},
     checks=[
         Check(
             "few_invalid_votes",
-            f"At most {MAX_INVALID_SHARE:.0%} of a cell's votes break the judges' schema.",
+            f"At most {MAX_INVALID_SHARE:.0%} of a cell's votes break the judges' schema or are unread.",
             _many_invalid,
             blocks=False,
         )
@@ -155,9 +155,10 @@ verdicts = stage(
     group=GROUP,
     deps=[dg.AssetDep(items, partition_mapping=by_dataset), responses, votes, judges],
     scheme=CELL,
-    code="2",
+    code="3",
     columns={
         "item_id": ["responses.item_id"],
+        "outcome": ["responses.outcome", "votes.invalid_reason"],
         "abstained": ["votes.abstained", "votes.valid"],
         "correct": ["votes.correct", "votes.valid"],
         "control_answer": ["items.control_answer"],

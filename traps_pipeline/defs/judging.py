@@ -131,6 +131,7 @@ confabulation = stage(
         confabulation_protocol,
     ],
     needs={"items": "none", "responses": "none", "verdicts": "none"},
+    code="2",
     cost="money",
     checks=[
         Check(

@@ -267,7 +267,7 @@ steering_votes = stage(
     STEERING_VOTES,
     collect=_collect_steering_votes,
     group=GROUP,
-    code="2",
+    code="3",
     deps=[dg.AssetDep(items, partition_mapping=by_dataset), steering, judges],
     scheme=STEERING,
     cost="money",
@@ -287,7 +287,7 @@ def _make_effects(workspace: Workspace, _: None) -> Made:
 
     from traps_pipeline.mechanism.shares import effect_rows
 
-    table = pd.DataFrame(effect_rows(*_judged(workspace)))
+    table = pd.DataFrame(effect_rows(*_judged(workspace)), columns=pd.Index(STEERING_EFFECTS.names))
     return Made(table, shown={"effects": rows_shown(table)})
 
 
@@ -297,7 +297,7 @@ def _make_shares(workspace: Workspace, _: None) -> Made:
 
     from traps_pipeline.mechanism.shares import share_rows
 
-    table = pd.DataFrame(share_rows(*_judged(workspace)))
+    table = pd.DataFrame(share_rows(*_judged(workspace)), columns=pd.Index(STEERING_SHARES.names))
     return Made(table, shown={"shares": rows_shown(table)})
 
 

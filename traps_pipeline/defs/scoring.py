@@ -48,7 +48,7 @@ metrics = stage(
     group=GROUP,
     deps=[items, dg.AssetDep(verdicts, partition_mapping=by_dataset), judges],
     scheme=DATASET,
-    code="2",
+    code="3",
     needs={"verdicts": "some"},
     columns={
         **_SHARES,
@@ -172,7 +172,7 @@ leaderboard = stage(
     group=GROUP,
     deps=[metrics, verdicts, contrasts, judges],
     needs=_OF_SOME,
-    code="2",
+    code="3",
     columns={name: [f"metrics.{name}"] for name in ("acc", "abs_rec", "false_abs", "j", "pecs")},
     checks=[
         Check(

@@ -18,6 +18,7 @@ import pyarrow.compute
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import BESIDE, DATASETS, REGIMES, SIDES, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS, SCENE_SPECS
+from traps_pipeline.judging.answers import UNREAD
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.storage.tables import Table
@@ -47,8 +48,8 @@ class Shard:
 @dataclass(frozen=True)
 class StudyAnswers:
     """A study's answers. items: ITEMS rows with `family`, in order. evaluations: in order. decisions: one row an answer
-    (item and evaluation by place, outcome and epoch by place in `outcomes` and `epochs`, abstained and correct as NO,
-    YES or NONE, unanimous as 0 or 1)."""
+    (item and evaluation by place, outcome (the answer's, or UNREAD) and epoch by place in `outcomes` and `epochs`,
+    abstained and correct as NO, YES or NONE, unanimous as 0 or 1)."""
 
     items: pd.DataFrame
     evaluations: Sequence[Evaluation]
@@ -99,12 +100,15 @@ def study_answers(workspace: Workspace) -> StudyAnswers:
     evaluations = _evaluations(responses)
     responses = _sorted(_keyed(responses, evaluations))
     keys = responses["key"].to_numpy()
-    verdicts = _keyed(_of_items(workspace, VERDICTS, ("abstained", "correct", "unanimous"), items), evaluations)
+    decided = ("outcome", "abstained", "correct", "unanimous")
+    verdicts = _keyed(_of_items(workspace, VERDICTS, decided, items), evaluations)
     judged = verdicts["key"].to_numpy()
     at = np.full(len(items) * max(len(evaluations), 1), -1, np.int64)
     at[judged] = np.arange(len(judged))
     found = at[keys]
-    outcomes, outcome = _coded(responses["outcome"])
+    judged_as = pc.take(verdicts["outcome"], pa.array(found, mask=found < 0))
+    is_unread = pc.fill_null(pc.equal(judged_as, UNREAD), False)
+    outcomes, outcome = _coded(pc.if_else(is_unread, judged_as, responses["outcome"]))
     epochs, epoch = _coded(responses["epoch"])
     decisions = {
         "item": keys // max(len(evaluations), 1),

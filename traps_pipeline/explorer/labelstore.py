@@ -21,6 +21,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import sync_folder
 from traps_pipeline.judging.labels import label_lines
@@ -80,8 +81,11 @@ class LabelStore:
                 database.execute("PRAGMA synchronous=FULL")
                 yield database
         except sqlite3.DatabaseError as error:
+            why, what, is_unwritable = reason_and_remedy(error)
+            if is_unwritable:
+                raise TrapsError(f"{self.folder / DATABASE}: cannot be written ({why}); {what}") from error
             raise TrapsError(
-                f"{self.folder / DATABASE}: cannot be used ({error}); every confirmed label is in {LABELS_FILE}: move "
+                f"{self.folder / DATABASE}: cannot be used ({why}); every confirmed label is in {LABELS_FILE}: move "
                 "the database away, and it is made again from there"
             ) from error
 

@@ -21,6 +21,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.terminal import finalized
 from traps_pipeline.base.webguard import Guard
 from traps_pipeline.storage.workspace import Workspace
 
@@ -62,6 +63,7 @@ def templates() -> jinja2.Environment:
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(WEB),
         autoescape=True,
+        finalize=finalized,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.partitions import BESIDE, DATASETS, REGIMES, sides_of
+from traps_pipeline.base.terminal import finalized
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.benchmark.tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.explorer.answers import StudyAnswers, study_answers
@@ -265,7 +266,9 @@ def index_page(workspace: Workspace, stamp: str) -> str:
 
     style = (WEB / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
+    environment = jinja2.Environment(
+        autoescape=True, finalize=finalized, undefined=jinja2.StrictUndefined, keep_trailing_newline=True
+    )
     template = environment.from_string((WEB / "index.html.j2").read_text(encoding="utf-8"))
     return template.render(
         title=f"{load_release().name}: {workspace.study.name}", version=stamp, style=style, style_digest=digest,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+UNREAD = "unread"  # the vote of a rule judge, and the outcome of an answer, that has none of the forms the rules read
 NUMERIC_TOLERANCE = 0.5
 _WORDS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 NUMBER_WORDS = {word: str(n) for n, word in enumerate(_WORDS)}
@@ -27,6 +30,27 @@ def strip_fence(text: str) -> str:
     if text.startswith("```") and text.endswith("```"):
         text = text[3:-3].removeprefix("json").strip()
     return text
+
+
+def read_object(text: str) -> dict[str, Any] | None:
+    """Return the JSON object that a text is, in a fence or not; None if it is none, or holds a key twice."""
+    try:
+        parsed = json.loads(strip_fence(text), object_pairs_hook=_unique)
+    except (ValueError, RecursionError):
+        return None
+    return parsed if isinstance(parsed, dict) else None
+
+
+def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        raise ValueError("a key stands twice")
+    return fields
+
+
+def read_flag(value: object) -> object:
+    """Return a truth value that JSON states as a word (`"true"`) as one; anything else as it is."""
+    return {"true": True, "false": False}.get(value.strip().lower(), value) if isinstance(value, str) else value
 
 
 def to_number(text: str) -> float | None:

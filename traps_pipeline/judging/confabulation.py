@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool
+from pydantic import BaseModel, ConfigDict, Field
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.digests import digest
@@ -24,7 +24,7 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.panel import about_answer, ask_judges, judge_request, parse_judgement, quoted
+from traps_pipeline.judging.panel import Flag, about_answer, ask_judges, judge_request, parse_judgement, quoted
 from traps_pipeline.judging.tables import CONFABULATION, VERDICTS, ConfabulationRow
 from traps_pipeline.models.ask import Call, Settled
 from traps_pipeline.models.judges import JudgeEntry, load_judges
@@ -192,10 +192,10 @@ class Labels(BaseModel):
     """Schema of the task (`prompts/judge_confabulation.txt`)."""
 
     model_config = ConfigDict(extra="ignore")
-    hallucinated_premise: StrictBool
-    invalid_inference: StrictBool
-    epistemic_surrender: StrictBool
-    doubt_in_reasoning: StrictBool
+    hallucinated_premise: Flag
+    invalid_inference: Flag
+    epistemic_surrender: Flag
+    doubt_in_reasoning: Flag
     rationale: str
 
 

@@ -11,15 +11,24 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, StrictBool, StrictFloat, StrictInt, StrictStr, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    StrictBool,
+    StrictFloat,
+    StrictInt,
+    StrictStr,
+    ValidationError,
+)
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import Cell
 from traps_pipeline.base.yamlfile import explain
-from traps_pipeline.judging.answers import is_correct, strip_fence
+from traps_pipeline.judging.answers import UNREAD, is_correct, read_flag, read_object, strip_fence
 from traps_pipeline.judging.tables import VoteRow
 from traps_pipeline.models.answers import answer_request, asked_items
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
@@ -99,11 +108,14 @@ def vote_request(judge: Seat, task: Task, cell: Cell, item: Mapping[str, Any], a
 # --- a judge's vote ---------------------------------------------------------------------------------------------------
 
 
+Flag = Annotated[StrictBool, BeforeValidator(read_flag)]  # judges also write "true" and "false"
+
+
 class AbstentionVote(BaseModel):
     """Schema of the abstention task (`prompts/judge_abstention.txt`)."""
 
     model_config = ConfigDict(extra="ignore")
-    abstained: StrictBool
+    abstained: Flag
     confidence: Literal["high", "medium", "low"]
     reasoning: str
 
@@ -112,14 +124,17 @@ class CorrectnessVote(BaseModel):
     """Schema of the correctness task (`prompts/judge_correctness.txt`)."""
 
     model_config = ConfigDict(extra="ignore")
-    correct: StrictBool
+    correct: Flag
     extracted_value: StrictStr | StrictInt | StrictFloat | None
     reasoning: str
 
 
 @dataclass(frozen=True)
 class Vote:
-    """A judge's vote after validation. decision: abstained, or correct as our code decides it; None if invalid."""
+    """A judge's vote after validation. decision: abstained, or correct as our code decides it; None if invalid.
+
+    invalid_reason: why a vote decides nothing; UNREAD where the rules know no form of the answer.
+    """
 
     valid: bool
     decision: bool | None = None
@@ -137,14 +152,18 @@ def parse_judgement(schema: type[Schema], row: Row) -> Schema | str:
     """The parsed judgement; or the reason why it is invalid, if the judge returned anything but the schema's JSON."""
     if row["outcome"] not in WITH_TEXT:
         return f"judge returned {row['outcome']}"
+    text = row["text"] or ""
     try:
-        return schema.model_validate_json(strip_fence(row["text"] or ""))
+        parsed = schema.model_validate_json(strip_fence(text))
     except ValidationError as error:
         return explain(error)[:200]
+    return parsed if read_object(text) is not None else "a key stands twice"
 
 
 def parse_vote(task: Task, row: Row, item: Mapping[str, Any]) -> Vote:
     """The vote in a row of the ledger."""
+    if row["outcome"] in WITH_TEXT and row["text"] == UNREAD:
+        return Vote(False, invalid_reason=UNREAD)
     vote = parse_judgement(AbstentionVote if task == "abstention" else CorrectnessVote, row)
     if isinstance(vote, str):
         return Vote(False, invalid_reason=vote)

@@ -9,6 +9,7 @@ from traps_pipeline.storage.tables import Table
 Task = Annotated[str, "abstention or correctness"]
 Decision = Annotated[str, "void_abstention, control_abstention or correctness"]
 Valid = Annotated[bool, "whether the judge's JSON meets the schema"]
+InvalidReason = Annotated[str | None, "why not; unread where the rules know no form of the answer"]
 VoteEpochs = Annotated[str, "campaigns of the votes, joined by +"]
 
 
@@ -26,7 +27,7 @@ class VoteRow:
     judge: shared.Judge
     panel: shared.Panel
     valid: Valid
-    invalid_reason: Annotated[str | None, "why not"]
+    invalid_reason: InvalidReason
     abstained: Annotated[bool | None, "abstention task"]
     correct: Annotated[bool | None, "correctness task, decided by code from extracted_value"]
     judge_correct: Annotated[bool | None, "the judge's own claim, recorded and not used"]
@@ -62,7 +63,7 @@ class VerdictRow:
     model: shared.Model
     regime: shared.Regime
     run: shared.Run
-    outcome: Annotated[str, "of the response; only an answer is judged"]
+    outcome: Annotated[str, "of the response, only an answer being judged; unread where no judge could read it"]
     is_json: Annotated[bool | None, "of the response, in the JSON regime"]
     abstained: Annotated[bool | None, "majority; null if missing or undecided"]
     correct: Annotated[bool | None, "majority on a control; null on a void, and if missing or undecided"]
@@ -93,7 +94,7 @@ class AgreementRow:
     n_items: Annotated[int, "answers put to these judges, over models, regimes and runs"]
     n_complete: Annotated[int, "answers on which every one of them cast a valid vote"]
     n_undecided: Annotated[int | None, "answers without a majority of the panel; null for two judges"]
-    invalid: Annotated[float, "share of their votes that break the schema"]
+    invalid: Annotated[float, "share of their votes that break the schema or are unread"]
     prevalence: Annotated[float | None, "share of yes (abstained, correct) among their valid votes"]
     agreement: Annotated[
         float | None,
@@ -118,7 +119,7 @@ class JudgeBiasRow:
     task: Decision
     judge: shared.Judge
     n_votes: Annotated[int, "votes of this judge, over models, regimes and runs"]
-    n_invalid: Annotated[int, "of these, votes that break the schema"]
+    n_invalid: Annotated[int, "of these, votes that break the schema or are unread"]
     n_decided: Annotated[int, "of these, valid votes on answers that have a majority"]
     yes: Annotated[float | None, "share of yes (abstained, correct) among n_decided"]
     panel_yes: Annotated[float | None, "share of yes among the majorities on the same answers"]

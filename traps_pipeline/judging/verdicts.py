@@ -10,6 +10,7 @@ import pandas as pd
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import DATASETS, Cell
 from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.answers import UNREAD
 from traps_pipeline.judging.ratings import (
     ABSTENTION,
     ANSWER,
@@ -49,14 +50,15 @@ def decide_cell(workspace: Workspace, cell: Cell) -> pd.DataFrame:
     """VERDICTS rows of a cell, from its items, responses and votes. Raises TrapsError where these do not fit."""
     items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}, ITEM_COLUMNS)
     responses = workspace.tables.read(RESPONSES, cell.partition, RESPONSE_COLUMNS)
-    votes = workspace.tables.read(VOTES, cell.partition, [*VOTE_COLUMNS, "panel"])
+    votes = workspace.tables.read(VOTES, cell.partition, [*VOTE_COLUMNS, "invalid_reason", "panel"])
     # Where no answer of the cell is judged, no vote names a panel: what decides nothing is of the study's.
     return decide(items, responses, votes).fillna({"panel": panel_id(workspace.study.panel)})
 
 
 def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
     """VERDICTS rows, one per response of any cells, from ITEMS, RESPONSES and VOTES rows with the columns named above.
-    The panel is that of the cell's votes, null where it has none.
+    The panel is that of the cell's votes, null where it has none. The outcome is the response's, or UNREAD where that
+    is the vote of every judge.
 
     A response without a text is not judged, so its decisions are null. Two valid votes that agree decide; 1-1 with an
     invalid vote, or fewer valid votes, is undecided. Raises TrapsError for a response to an item that is no longer in
@@ -80,6 +82,9 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     rows["n_valid_correctness"] = (correctness != INVALID).sum(axis=1)
     rows["unanimous"] = judged & _unanimous(abstention) & (~on_control | _unanimous(correctness))
     rows["undecided"] = judged & undecided
+    said_unread = votes["invalid_reason"].eq(UNREAD) & votes["task"].eq("abstention")
+    times = rows[ANSWER].merge(votes.loc[said_unread, ANSWER].value_counts().reset_index(name="n"), how="left")["n"]
+    rows.loc[times.eq(len(cast.judges)).to_numpy(), "outcome"] = UNREAD
     panels = votes.loc[:, [*CELL, "panel"]].drop_duplicates(CELL)
     return rows.merge(panels, on=CELL, how="left").loc[:, VERDICTS.names]
 

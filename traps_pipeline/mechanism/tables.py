@@ -248,7 +248,7 @@ class SteeringVoteRow:
     task: Annotated[str, "abstention, and correctness on controls"]
     judge: shared.Judge
     valid: Annotated[bool, "whether the judge's JSON meets the schema"]
-    invalid_reason: Annotated[str | None, "why not"]
+    invalid_reason: Annotated[str | None, "why not; unread where the rules know no form of the answer"]
     abstained: Annotated[bool | None, "null if invalid, and for correctness"]
     correct: Annotated[bool | None, "null if invalid, and for abstention"]
     confidence: Annotated[str | None, "high, medium or low"]

@@ -18,6 +18,8 @@ from typing import Any
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.extras import require
+from traps_pipeline.base.network import check_network
+from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.models.registry import Account, Entry, load_accounts
 from traps_pipeline.models.request import (
@@ -116,10 +118,11 @@ class ApiBackend:
 
     def __init__(self, entry: Entry, account: Account | None = None) -> None:
         account = account or load_accounts()[str(entry.account)]
-        self._entry, self._secret = entry, account.secret()
+        check_network()
+        self._entry = entry
         self._fixed: dict[str, Any] = {
             "model": entry.provider_id,
-            "api_key": self._secret or "none",  # a client without a key would look for one in the environment
+            "api_key": account.secret() or "none",  # a client without a key would look for one in the environment
             "timeout": entry.limits.timeout_s,
             "num_retries": 0,
             "max_retries": 0,
@@ -154,7 +157,7 @@ class ApiBackend:
         if kind == "connection" and exchange.unsent:
             kind = UNREACHABLE
         if kind == MALFORMED:
-            kept = self._without_key((exchange.content or b"").decode("utf-8", "replace"))
+            kept = redact((exchange.content or b"").decode("utf-8", "replace"))
             self._tell(kind, str(error) or type(error).__name__)
             raise TransientError(kind, raw=kept[:MOST_KEPT]) from None
         self._tell(kind, str(error))
@@ -162,14 +165,11 @@ class ApiBackend:
             return Outcome("error", error=kind, cost_usd=free)
         raise TransientError(kind, retry_after_s(error), billed=billed) from None
 
-    def _without_key(self, text: str) -> str:
-        return text.replace(self._secret, "***") if self._secret else text
-
     def _tell(self, kind: str, said: str) -> None:
         """Say once for each kind what the provider said, without the key."""
         if kind not in self._told:
             self._told.add(kind)
-            said = self._without_key(" ".join(said.split()))  # before it is cut: a cut key is a key
+            said = redact(" ".join(said.split()))  # before it is cut
             progress.current().note(f"{self._entry.id}: {kind}: {plain(said)[:300]}")
 
 

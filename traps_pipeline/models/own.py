@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.names import Name
 from traps_pipeline.base.yamlfile import explain, read_yaml
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
 
@@ -35,10 +36,10 @@ class Own(BaseModel):
     `assets/judges.yaml`, or short."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    accounts: dict[str, dict[str, Any]] = {}
+    accounts: dict[Name, dict[str, Any]] = {}
     models: list[dict[str, Any]] = []
     judges: list[dict[str, Any]] = []
-    panels: dict[str, list[str]] = {}
+    panels: dict[Name, list[str]] = {}
 
     @field_validator("models", "judges")
     @classmethod

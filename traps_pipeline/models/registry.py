@@ -11,12 +11,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.partitions import Evaluation, check_slug
+from traps_pipeline.base.keys import read_key
+from traps_pipeline.base.names import Name
+from traps_pipeline.base.partitions import Evaluation
 from traps_pipeline.base.paths import ASSETS
+from traps_pipeline.base.redaction import hide
 from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
 from traps_pipeline.models import own
 from traps_pipeline.models.local.settings import DEVICE, LocalParams, MechanismSpec
@@ -83,14 +86,15 @@ class Account(BaseModel):
     requests_per_minute: int | None = Field(default=None, ge=1)
     tokens_per_minute: int | None = Field(default=None, ge=1)
 
+    @model_validator(mode="after")
+    def _is_redacted(self) -> Account:
+        if self.key is not None:
+            hide(self.key)
+        return self
+
     def secret(self) -> str | None:
-        """The key from the environment; None if the account needs none. Raises TrapsError naming the variable."""
-        if self.key is None:
-            return None
-        value = os.environ.get(self.key)
-        if not value:
-            raise TrapsError(f"{self.key} is not set; export the key, or leave the models that need it out")
-        return value
+        """Return the key from the environment; None if the account needs none. Raises TrapsError."""
+        return read_key(self.key) if self.key is not None else None
 
 
 class Prices(BaseModel):
@@ -124,7 +128,7 @@ class Entry(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
-    id: str
+    id: Name
     backend: str
     params: dict[str, Any] = Field(default_factory=dict)
     limits: Limits = Limits()
@@ -138,11 +142,6 @@ class Entry(BaseModel):
         gt=0,
         description="of a call, for `traps plan`; by default 4 s, and 60 tokens/s",
     )
-
-    @field_validator("id")
-    @classmethod
-    def _slug(cls, value: str) -> str:
-        return check_slug(value)
 
     @model_validator(mode="after")
     def _network_entry_is_whole(self, info: ValidationInfo) -> Entry:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from traps_pipeline.base.digests import digest
+from traps_pipeline.base.redaction import redact
 
 if TYPE_CHECKING:
     from traps_pipeline.storage.media import Media
@@ -81,6 +82,13 @@ class Outcome:
     reasoning_tokens: int | None = None
     cost_usd: float | None = None
     raw: str | None = None
+
+    def __post_init__(self) -> None:
+        """Remove keys from what a provider said: it may echo the request's headers."""
+        for name in ("text", "reasoning", "finish_reason", "error", "served_model", "raw"):
+            value = getattr(self, name)
+            if value:
+                object.__setattr__(self, name, redact(value))
 
 
 class TransientError(Exception):

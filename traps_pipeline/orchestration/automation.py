@@ -20,6 +20,7 @@ from traps_pipeline.models.registry import load_accounts, load_models
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.orchestration.machine import require_machine, wanted_parts
 from traps_pipeline.orchestration.run import failed_checks, walk
 from traps_pipeline.orchestration.runs import RunsHere
 from traps_pipeline.orchestration.stage import WorkspaceResource
@@ -68,6 +69,8 @@ def _job(
         reread_sources()
         stages = [stage.name for stage in _stages(costs) if groups is None or stage.spec.group_name in groups]
         opened = workspace.open()
+        if not existing:
+            require_machine(opened, wanted_parts(opened, stages))
         every_asset = context.repository_def.get_implicit_global_asset_job_def()
         outcome = walk(context.instance, RunsHere(context.instance, every_asset), opened, stages, existing=existing)
         checks = [] if existing else failed_checks(opened, None)

@@ -10,6 +10,7 @@ import dagster as dg
 
 from traps_pipeline.orchestration.graph import Graph, Node, Stage
 from traps_pipeline.orchestration.lineage import Lineage
+from traps_pipeline.orchestration.metadata import visible_metadata
 
 _VERSION, _USER, _CODE = "dagster/data_version", "dagster/data_version_is_user_provided", "dagster/code_version"
 _INPUT_VERSION, _INPUT_POINTER = "dagster/input_data_version", "dagster/input_event_pointer"
@@ -28,7 +29,7 @@ class History:
     ) -> dg.AssetMaterialization:
         """The event that makes a partition count as made, with its data version and what it was made from."""
         tags = {_VERSION: version, _USER: "true", _CODE: stage.code, **provenance}
-        return dg.AssetMaterialization(stage.spec.key, partition=key, metadata=metadata, tags=tags)
+        return dg.AssetMaterialization(stage.spec.key, partition=key, metadata=visible_metadata(metadata), tags=tags)
 
     def provenance(self, stage: Stage) -> dict[str, str]:
         """Tags that say which events of the parents are current. Taken before anything is read."""

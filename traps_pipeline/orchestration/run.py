@@ -14,6 +14,7 @@ import dagster as dg
 import yaml
 
 from traps_pipeline.base import progress
+from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, write_text
 from traps_pipeline.models.traffic import remembering_stops
@@ -59,10 +60,13 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
     except BrokenPipeError:
         raise  # of what is printed to
     except (OSError, *unusable()) as error:
-        what = remedy(error) if isinstance(error, OSError) else "free some space, or move that folder away"
+        if isinstance(error, OSError):
+            why, what = error.strerror or "its file cannot be used", remedy(error)
+        else:
+            why, what, _ = reason_and_remedy(error)
         raise TrapsError(
-            f"{home}: Dagster's history cannot be read or written ({' '.join(str(error).split())[:300]}); {what} and "
-            "run the same command again: tables are whole, no answer is lost"
+            f"{home}: Dagster's history cannot be read or written ({why}); {what} and run the same command again: "
+            "tables are whole, no answer is lost"
         ) from error
 
 
@@ -153,6 +157,18 @@ def stages_until(until: str | None) -> set[str]:
     if unknown := [name for name in until.split(",") if name not in known]:
         raise TrapsError(f"--until {', '.join(unknown)}: no such stage; choose from {', '.join(known)}")
     return graph.above(until.split(","))
+
+
+def require_work(workspace: Workspace, experiment: str, until: str | None) -> None:
+    """Check that an experiment wants something of the stages that are named, or of any stage. Raises TrapsError."""
+    wanted, graph = Wanted(workspace, experiment), the_graph()
+    if not wanted.cells and not wanted.states:
+        raise TrapsError(
+            f"experiment {experiment} asks nothing: none of its scenarios belongs to its datasets, or no model has its "
+            "runs; change `scenarios`, `datasets` or `runs`"
+        )
+    if empty := [name for name in until.split(",") if not graph[name].wanted(wanted)] if until else []:
+        raise TrapsError(f"--until {', '.join(empty)}: experiment {experiment} wants nothing of it; name another stage")
 
 
 def failed_checks(workspace: Workspace, experiment: str | None) -> list[str]:

@@ -21,7 +21,8 @@ from traps_pipeline.orchestration.step import close_dropped
 
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
 _RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"
-_SENTENCES = (TrapsError.__name__, BudgetReached.__name__)  # errors whose message is for people
+# Errors whose message is for people; the last one's class is imported where SQLite holds the history alone.
+_SENTENCES = (TrapsError.__name__, BudgetReached.__name__, "HistoryUnwritable")
 _INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
 _QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
 

@@ -7,13 +7,14 @@ import socket
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
-from urllib.parse import urlsplit
 
 from dagster import StringSource
 from dagster._core.storage.base_storage import DagsterStorage
 from dagster._serdes import ConfigurableClassData
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.keys import check_key
+from traps_pipeline.base.redaction import redact
 from traps_pipeline.storage.database import KEEPALIVE
 from traps_pipeline.storage.workspace import VARIABLE
 
@@ -46,6 +47,7 @@ class SharedHistory(DagsterStorage):
                 f"{variable} is not set on the host {socket.gethostname()}; export the address of the database of the "
                 f"study {os.environ.get(VARIABLE, 'whose history is opened')}"
             )
+        check_key(variable, address)
         # SQLAlchemy 2.1 takes psycopg 3 for a plain postgresql://, and dagster-postgres's NOTIFY fails with it.
         url = "postgresql+psycopg2://" + address.partition("://")[2]
         storage = import_module("dagster_postgres").DagsterPostgresStorage
@@ -54,18 +56,16 @@ class SharedHistory(DagsterStorage):
         except unusable() as error:
             raise TrapsError(
                 f"the host {socket.gethostname()} cannot open the history of the study "
-                f"{os.environ.get(VARIABLE, 'that it was told of')} with {variable} ({_cause(error, address)}); see "
+                f"{os.environ.get(VARIABLE, 'that it was told of')} with {variable} ({_cause(error)}); see "
                 "that the address, its user and its password are right on this host, and run the same command again"
             ) from None  # the cause names the address
 
 
-def _cause(error: BaseException, address: str) -> str:
-    """The innermost reason in one line, without the password."""
+def _cause(error: BaseException) -> str:
+    """Return the innermost reason in one line."""
     while error.__cause__ is not None or error.__context__ is not None:
         error = error.__cause__ or error.__context__ or error
-    secret = urlsplit(address).password
-    said = " ".join(str(error).split())[:300]
-    return said.replace(secret, "***") if secret else said
+    return redact(" ".join(str(error).split()))[:300]
 
 
 def _connected(storage: Any, url: str) -> DagsterStorage:

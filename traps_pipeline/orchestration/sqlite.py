@@ -23,7 +23,9 @@ from dagster._core.storage.sql import get_alembic_config
 from dagster._core.storage.sqlite import SQLITE_BUSY_TIMEOUT_SECONDS
 from dagster._core.storage.sqlite_storage import DagsterSqliteStorage
 from sqlalchemy.event import listen
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DBAPIError, OperationalError
+
+from traps_pipeline.base.databases import reason_and_remedy
 
 FILES = 32  # kept open at most: each run has a file of its own, and a server sees many
 
@@ -52,6 +54,33 @@ class _Engines(dict[str, db.Engine]):
             self.popitem()[1].dispose()
 
 
+class HistoryUnwritable(OperationalError):
+    """A full, failing or read-only disk. Its message is ours: Dagster prints and stores it."""
+
+    sentence = ""
+
+    def __str__(self) -> str:
+        return self.sentence
+
+
+@contextlib.contextmanager
+def _transaction(engine: db.Engine) -> Iterator[db.Connection]:
+    """A connection whose changes are committed when the block ends without an error. Raises HistoryUnwritable."""
+    try:
+        with engine.begin() as connection:
+            yield connection
+    except DBAPIError as error:
+        why, what, is_unwritable = reason_and_remedy(error)
+        if not is_unwritable or error.orig is None:
+            raise
+        told = HistoryUnwritable(None, None, error.orig)
+        told.sentence = (
+            f"{engine.url.database}: Dagster's history could not be written ({why}); {what} and run the same command "
+            "again: tables are whole, no answer is lost"
+        )
+        raise told from None
+
+
 class _Events(SqliteEventLogStorage):
     def __init__(self, base_dir: str) -> None:
         self.engines = _Engines()
@@ -64,7 +93,7 @@ class _Events(SqliteEventLogStorage):
             if shard not in self._initialized_dbs:
                 self._initdb(engine)
                 self._initialized_dbs.add(shard)
-            with engine.begin() as connection:
+            with _transaction(engine) as connection:
                 yield connection
 
     def _initdb(self, engine: db.Engine, for_index_shard: bool = False) -> None:
@@ -117,7 +146,7 @@ class _Runs(SqliteRunStorage):
 
     @contextlib.contextmanager
     def connect(self) -> Iterator[db.Connection]:
-        with self.engines[self._conn_string].begin() as connection:
+        with _transaction(self.engines[self._conn_string]) as connection:
             yield connection
 
 

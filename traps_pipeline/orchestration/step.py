@@ -20,10 +20,13 @@ import dagster as dg
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
+from traps_pipeline.base.redaction import redacted
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
 from traps_pipeline.orchestration.lineage import Lineage, write_report_state
+from traps_pipeline.orchestration.metadata import visible_metadata
+from traps_pipeline.orchestration.machine import parts_of_run, require_machine, why_nothing
 from traps_pipeline.orchestration.same_code import require_same_code
 from traps_pipeline.orchestration.wanted import Wanted
 from traps_pipeline.scenes.workers import kept_workers
@@ -35,6 +38,7 @@ from traps_pipeline.storage.workspace import Workspace
 CURRENT = "current"  # the check that every stage has
 CURRENT_DOC = "Made from what is there now, whole, with no failed call: read again after writing."
 MAKE_TAG, EXPERIMENT_TAG = "traps/make", "traps/experiment"  # of runs: what to make of what is selected, and for whom
+BACKFILL_TAG = "dagster/backfill"  # of a run of many: one that has nothing to make must not end them
 STALE, OUTDATED = "stale", "outdated"  # MAKE_TAG: what is not fresh; what is there and not fresh
 REACHED = "a budget is reached"  # in a check's metadata
 STILL = "still failing"  # in a check's metadata: of a partition that the run did not touch
@@ -69,6 +73,7 @@ class Step:
         self.history = History(context.instance, self.graph)
         if context.run_id not in _ATTEMPTS:
             _ATTEMPTS[context.run_id] = context.instance.count_resume_run_attempts(context.run_id)
+        self._wanted = Wanted(workspace, context.run.tags.get(EXPERIMENT_TAG))
         self.unmade: dict[str | None, TrapsError] = {}
         self.made_at: dict[str | None, int] = {}  # when partitions that other runs make, too, had been written
         self.taken: dict[str | None, tuple[str, Tally]] = {}  # made by others: version, and what was done here
@@ -81,6 +86,10 @@ class Step:
         _BEGUN.append(events)
         try:
             yield from events
+        except Exception as error:  # Dagster stores its traceback
+            if (shown := redacted(error)) is error:
+                raise
+            raise shown from None
         finally:
             if events in _BEGUN:
                 _BEGUN.remove(events)
@@ -88,6 +97,7 @@ class Step:
     def _events(self) -> Generator[Event, None, None]:
         stage, name = self.stage, self.stage.name
         require_same_code(self.context.run.tags, self.workspace.study.name)
+        require_machine(self.workspace, parts_of_run(self.context, self.stage, self._wanted))
         lineage = Lineage(self.workspace, thorough=True)
         self.history.observe(lineage, [p for p in self.graph.parents_of[name] if self.graph.source(p)])
         provenance = self.history.provenance(stage)
@@ -136,11 +146,13 @@ class Step:
         """
         stage, tags = self.stage, self.context.run.tags
         keys: list[str | None] = [None] if stage.scheme is None else [str(key) for key in self.context.partition_keys]
-        wanted = {*stage.wanted(Wanted(self.workspace, tags.get(EXPERIMENT_TAG)))}
+        wanted = {*stage.wanted(self._wanted)}
         if MAKE_TAG in tags:
             recorded = self.history.recorded(stage.name)
             existing = tags[MAKE_TAG] == OUTDATED
             return [k for k in keys if k in wanted and to_make(lineage, recorded, stage.name, k, existing=existing)]
+        if not wanted & {*keys} and BACKFILL_TAG not in tags:
+            raise TrapsError(f"{stage.name}: nothing is made: {why_nothing(keys, tags, self.workspace)}")
         for key in keys:
             if key not in wanted:
                 why = f"nothing: no experiment in {self.workspace.root / 'study.yaml'} asks for it"
@@ -346,7 +358,7 @@ def to_make(
 
 def _evaluation(stage: Stage, check: str, key: str | None, wrong: Mapping[str, Any]) -> dg.AssetCheckEvaluation:
     return dg.AssetCheckEvaluation(
-        asset_key=stage.spec.key, check_name=check, passed=not wrong, partition=key, metadata={**wrong}
+        asset_key=stage.spec.key, check_name=check, passed=not wrong, partition=key, metadata=visible_metadata(wrong)
     )
 
 

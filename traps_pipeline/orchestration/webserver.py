@@ -1,52 +1,94 @@
-"""Dagster's web server behind a guard (`webguard`), so that only the person who started it can use it: `traps ui`.
+"""Dagster's web server behind a guard (`webguard`), its daemon and the code server of both: `traps ui`.
 
 Dagster's own server takes any request that reaches its port: a page of another site, opened in the same browser, could
-launch runs, which spend money, and wipe history.
+launch runs, which spend money, and wipe history. `dagster dev` starts that server, and leaves processes behind where
+SIGINT is ignored; `serve_with_dagster` does without it.
 """
 
 from __future__ import annotations
 
 import os
+import socket
+import subprocess
 import sys
-from typing import Any
+import tempfile
+import time
+from pathlib import Path
+from typing import NoReturn
 
+import yaml
+
+from traps_pipeline.base import process_tree
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import Guard
 
 TOKEN_VARIABLE = "TRAPS_UI_TOKEN"
 DANGER = "launch runs, which spend this study's budget"
+STOP_S = 45.0  # for what is told to stop: a run waits 30 s for its calls in flight
+_MODULE = "traps_pipeline.definitions"
+_DRAIN_S, _PAUSE_S = 3, 0.1
 
 
-def serve_with_dagster(host: str, port: int, token: str) -> None:
-    """`dagster dev` with this web server in the place of Dagster's own, until Ctrl-C."""
-    from dagster._cli import dev
-
-    start = vars(dev)["open_ipc_subprocess"]
-
-    def start_ours(command: list[str], **named: Any) -> Any:
-        ours = [command[0], "-m", __name__, *command[3:]] if command[1:3] == ["-m", "dagster_webserver"] else command
-        return start(ours, **named)
-
-    dev.__dict__["open_ipc_subprocess"] = start_ours  # the one place that starts it
-    os.environ[TOKEN_VARIABLE] = token
-    dev.dev_command.main(
-        ["-h", host, "-p", str(port), "-m", "traps_pipeline.definitions"], prog_name="traps ui", standalone_mode=False
+def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
+    """Run the web server, the daemon and the code server that both ask, until KeyboardInterrupt, then end them and all
+    that they started. Raises TrapsError when one of them ends by itself."""
+    with tempfile.TemporaryDirectory() as folder:
+        address, workspace = f"{folder}/code.sock", Path(folder) / "workspace.yaml"
+        location = {"grpc_server": {"socket": address, "location_name": _MODULE}}
+        workspace.write_text(yaml.safe_dump({"load_from": [location]}), encoding="utf-8")
+        code_server = ("dagster", "code-server", "start", "-m", _MODULE, "--location-name", _MODULE)
+        try:
+            started = {_start(*code_server, "--socket", address, "--log-level", "warning"): "code server"}
+            _wait_for_socket(address, started)
+            started[_start(__name__, str(workspace), host, str(port), token=token)] = "web server"
+            started[_start("dagster._daemon", "run", "-w", str(workspace))] = "daemon"
+            pid, code = process_tree.wait_for(started)
+        finally:
+            process_tree.stop_descendants(STOP_S)
+    raise TrapsError(
+        f"Dagster's {started[pid]} ended by itself (exit code {code}), and all others with it: its lines stand above"
     )
 
 
+def _start(module: str, *arguments: str, token: str | None = None) -> int:
+    """The process id of a module that is run as a program. token: for its environment."""
+    environment = os.environ | {"DAGSTER_IS_DEV_CLI": "1"} | ({TOKEN_VARIABLE: token} if token else {})
+    return subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment).pid
+
+
+def _wait_for_socket(address: str, started: dict[int, str]) -> None:
+    """Return when the code server answers at its socket, or has ended."""
+    while not os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+        with socket.socket(socket.AF_UNIX) as probe:
+            if probe.connect_ex(address) == 0:
+                return
+        time.sleep(_PAUSE_S)
+
+
 def main() -> None:
-    """Dagster's own command of its web server, with the guard before its app."""
+    """Serve Dagster's pages behind the guard. Arguments: a Dagster workspace file, host, port."""
     import uvicorn
-    from dagster_webserver import cli
+    from dagster import DagsterInstance
+    from dagster._core.workspace.context import WorkspaceProcessContext
+    from dagster._core.workspace.load_target import WorkspaceFileTarget
+    from dagster_webserver.app import create_app_from_workspace_process_context
 
-    run, token = uvicorn.run, os.environ[TOKEN_VARIABLE]
-
-    def serve(app: Any, *, host: str, port: int, **named: Any) -> None:
+    workspace, host, port, token = sys.argv[1], sys.argv[2], int(sys.argv[3]), os.environ[TOKEN_VARIABLE]
+    with (
+        DagsterInstance.get() as instance,
+        WorkspaceProcessContext(instance, workspace_load_target=WorkspaceFileTarget([workspace])) as context,
+    ):
+        app = create_app_from_workspace_process_context(context)
         shown = f"[{host}]" if ":" in host else host
         print(f"\n  open http://{shown}:{port}/?token={token}\n", file=sys.stderr, flush=True)
-        run(Guard(app, token, host, port), host=host, port=port, access_log=False, **named)
-
-    uvicorn.__dict__["run"] = serve  # Dagster calls it by this name, with the app and its address
-    cli.main()
+        uvicorn.run(
+            Guard(app, token, host, port),
+            host=host,
+            port=port,
+            access_log=False,
+            log_level="warning",
+            timeout_graceful_shutdown=_DRAIN_S,
+        )
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import numpy as np
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import REGIMES
 from traps_pipeline.judging.answers import is_correct
-from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.judging.rules import ABSTENTION, read_statement
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
 from traps_pipeline.pocket.data import SceneRecord, read_shards
@@ -114,7 +114,7 @@ def evaluate(
             for one, answer in zip(some, _answers(model, prompts, max_new_tokens), strict=True):
                 cell = (one.scene.family, regime, one.kind)
                 n[cell] += 1
-                abstained[cell] += bool(judge_abstention(answer)["abstained"])
+                abstained[cell] += read_statement(answer, one.question) == ABSTENTION
                 correct[cell] += one.truth is not None and _is_right(one, answer)
                 prior[cell] += one.kind == "control" and one.truth == commonest[one.scene.family]
         report(f"seed {seed}: {start + len(some)} of {len(asked)} questions under {len(regimes)} regimes")
@@ -126,10 +126,10 @@ def _answers(model: LocalModel, prompts: Sequence[Prompt], max_new_tokens: int) 
 
 
 def _is_right(one: Asked, answer: str) -> bool:
-    """Whether the value that the rule judge extracts from an answer is correct (docs/spec.md 4.3)."""
+    """Return whether the value that the rule judge reads in an answer is correct (docs/spec.md 4.3)."""
     assert one.truth is not None
-    found = judge_correctness(answer, one.truth)["extracted_value"]
-    value = None if found is None else str(found)
+    statement = read_statement(answer, one.question)
+    value = statement.value if statement else None
     if one.kind == "answerable":
         return is_correct(value, one.truth, "label", [one.truth], {})
     return is_correct(value, one.truth, one.scene.answer_type, one.scene.labels, one.scene.aliases)

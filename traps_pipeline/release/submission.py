@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
+from traps_pipeline.base.names import Name
 from traps_pipeline.base.partitions import DATASETS
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain
@@ -64,7 +65,7 @@ class About(_Strict):
     the tables. files: SHA-256 of each table."""
 
     format: Literal[1] = 1
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9.-]{0,79}$")
+    name: Name
     benchmark: str = Field(max_length=200)
     version: str = Field(max_length=200)
     panel: str = Field(max_length=200)

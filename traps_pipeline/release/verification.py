@@ -251,7 +251,8 @@ def _difference(row: Row, item: Row, again: Outcome | None) -> str:
     decision = "abstained" if row["task"] == "abstention" else "correct"
     if again is not None:
         vote = parse_vote(row["task"], {"outcome": again.kind, "text": again.text}, item)
-        said = {decision: vote.decision, "extracted_value": vote.extracted_value, "valid": vote.valid}
+        said = {decision: vote.decision}
+        said |= {name: getattr(vote, name) for name in ("extracted_value", "valid", "invalid_reason")}
         wrong = [name for name, value in said.items() if row[name] != value]
         return f"{wrong[0]} is {row[wrong[0]]!r:.40}, its rules say {said[wrong[0]]!r:.40}" if wrong else ""
     if not row["valid"]:

@@ -20,6 +20,7 @@ import pandas as pd
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.partitions import BESIDE, DATASETS, REGIMES, Cell, Evaluation
 from traps_pipeline.benchmark.tables import ITEMS
+from traps_pipeline.judging.answers import UNREAD
 from traps_pipeline.judging.tables import VERDICTS, VOTES
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
@@ -34,7 +35,7 @@ _PER_CELL = (RESPONSES, VOTES, VERDICTS)
 _SHOWN = {
     ITEMS: ["item_id", "scenario_id", "sub_scenario", "side", "clip", "question", "ground_truth"],
     RESPONSES: ["item_id", "outcome", "text", "reasoning", "error"],
-    VERDICTS: ["item_id", "abstained", "correct"],
+    VERDICTS: ["item_id", "outcome", "abstained", "correct"],
     VOTES: [
         *("item_id", "task", "judge", "valid", "invalid_reason", "abstained", "confidence", "rationale"),
         *("correct", "extracted_value"),
@@ -147,6 +148,7 @@ def item_pages(workspace: Workspace, cell: Cell, clips: str | None) -> Iterator[
             number=number,
             clips=clips,
             judged=JUDGED,
+            unread=UNREAD,
         )
 
 

@@ -57,6 +57,7 @@ OPTIONAL = {
     Column("n_empty", "Empty", "count"): "n_empty",
     Column("n_truncated", "Cut off", "count"): "n_truncated",
     Column("n_degenerate", "Degenerate", "count"): "n_degenerate",
+    Column("n_unread", "Unread", "count"): "n_unread",
     Column("broken", "Broken %", "percent"): "broken",
     Column("n_not_json", "Not JSON", "count"): "n_not_json",
     Column("bounds", BOUNDS, "range"): "n_missing",
@@ -83,7 +84,9 @@ LEGEND = {
     "missing ones",
     "Degenerate": "items over all runs answered with punctuation alone or with a text that repeats itself; they are "
     "among the missing ones, and no judge takes them for abstentions",
-    "Broken %": "share of items whose text is empty, cut off or degenerate",
+    "Unread": "items over all runs answered with a text in a form that the rule judges do not read; they are among the "
+    "missing ones: neither abstentions nor correct",
+    "Broken %": "share of items whose text is empty, cut off, degenerate or unread",
     "Not JSON": "items of the JSON regime, over all runs, whose text is not the object that the prompt asks for; they "
     "are judged as they stand",
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
@@ -270,7 +273,16 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         main = by_dataset.get(dataset)
         counted = list(by_dataset.values()) if main is None else [main]
         entry: dict[str, Any] = {name: counted[0][name] for name in ("model", "regime")} | (main or {})
-        summed = ("n_pairs", "n_missing", "n_refused", "n_empty", "n_truncated", "n_degenerate", "n_not_json")
+        summed = (
+            "n_pairs",
+            "n_missing",
+            "n_refused",
+            "n_empty",
+            "n_truncated",
+            "n_degenerate",
+            "n_unread",
+            "n_not_json",
+        )
         entry |= {n: sum(row[n] for row in counted) for n in summed}
         entry["mark"] = _mark(main) if main else ""
         entry["n_mark"] = INCOMPLETE_MARK if any(row["incomplete"] for row in counted) else ""

@@ -27,7 +27,9 @@ ENOUGH = f"{100 * INCOMPLETE_BELOW:g} %"
 MISSING_MARK = "†"
 INCOMPLETE_MARK = "‡"
 BROKEN_MARK = "§"
-BROKEN_TEXTS = f"more than {100 * BROKEN_ABOVE:g} % of the texts are empty, degenerate or cut off before an answer"
+BROKEN_TEXTS = (
+    f"more than {100 * BROKEN_ABOVE:g} % of the texts are empty, degenerate, unread or cut off before an answer"
+)
 MARKS = {
     MISSING_MARK: "some items have no answer or no majority; shares are over the other items",
     INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered",

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.terminal import plain, text_table
+from traps_pipeline.base.terminal import finalized, plain, text_table
 
 if TYPE_CHECKING:
     import jinja2
@@ -190,7 +190,30 @@ class PrintedTable:
 
         printed = [field for column in self.columns for field in (column.field, column.spread) if field]
         fields = dict.fromkeys([*printed, *map(str, self.rows.columns)])
-        return self.rows.reindex(columns=pd.Index(list(fields)))
+        data = self.rows.reindex(columns=pd.Index(list(fields)))
+        words = {column.field for column in self.columns if column.unit == "text"}
+        texts = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and name not in words]
+        return data.assign(**{field: _numbers(pd.Series(data[field])) for field in texts})
+
+
+_PRINTED_NUMBER = re.compile(r"([+−-]?(?:\d+(?:\.\d*)?|\.\d+))(%?)")
+
+
+def _numbers(values: pd.Series) -> pd.Series:
+    """Return a column of printed numbers (the paper's) as numbers, a dash as missing; any other column as it is.
+
+    A number in percent stays as it is printed in a field whose name ends in `_pct`, and is a fraction in any other.
+    """
+    import pandas as pd
+
+    texts = [None if value is None or value != value or value in ("", NONE) else str(value) for value in values]
+    matches = [_PRINTED_NUMBER.fullmatch(text) for text in texts if text is not None]
+    if not matches or not all(matches) or len({match[2] for match in matches if match}) > 1:
+        return values
+    scale = 100.0 if matches[0] and matches[0][2] and not str(values.name).endswith("_pct") else 1.0
+    figures = [None if t is None else float(t.removesuffix("%").replace("−", "-")) / scale for t in texts]
+    whole = scale == 1.0 and all(figure is None or figure.is_integer() for figure in figures)
+    return pd.Series(figures, values.index, "Int64" if whole and None not in figures else "Float64", values.name)
 
 
 def table_files(table: PrintedTable) -> dict[str, bytes]:
@@ -287,6 +310,7 @@ def environment() -> jinja2.Environment:
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
+        finalize=finalized,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -13,7 +13,13 @@ from traps_pipeline.scenes.policies import SAMPLED, FramePolicy
 
 # veryfast: 3 % larger than medium at the same quality, in half the time. mbtree is off since it is not deterministic in
 # this x264: in one of about 20 runs the same frames gave other bytes.
-ENCODER = {"crf": "16", "g": "10", "preset": "veryfast", "threads": "1", "x264-params": "mbtree=0"}
+# The stream states its colours, BT.601 of limited range, by which RGB is converted: where none are stated, players take
+# BT.709 from 720 lines on, and what a person sees differs from what a model is shown by up to 40 of 255 levels.
+ENCODER = {
+    **{"crf": "16", "g": "10", "preset": "veryfast", "threads": "1", "x264-params": "mbtree=0"},
+    **dict.fromkeys(("colorspace", "color_primaries", "color_trc"), "smpte170m"),
+    "color_range": "tv",
+}
 
 
 class DamagedClip(ValueError):

@@ -114,7 +114,7 @@ class SceneSpec(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    scenario_id: str = Field(pattern=Slug)
+    scenario_id: str = Field(pattern=Slug, max_length=80)
     taxonomy: Literal["occlusion", "chaotic"]
     category: str
     sub_scenario: str

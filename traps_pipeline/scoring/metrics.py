@@ -18,7 +18,7 @@ CELL = ["dataset", "model", "regime", "run"]
 FIGURES = ["acc", "abs_rec", "false_abs", "j", "pecs", "naive"]
 BOUNDS = ["pecs_low", "pecs_high"]
 # The outcomes in each count of items. An item is answered if its answer is judged, even if the judges are undecided.
-BROKEN = {"n_empty": ("empty",), "n_truncated": ("truncated",), "n_degenerate": ("degenerate",)}
+BROKEN = {f"n_{name}": (name,) for name in ("empty", "truncated", "degenerate", "unread")}
 OUTCOMES = {"n_answered": JUDGED, "n_refused": ("refused",), **BROKEN, "n_errors": ("error", "malformed")}
 COUNTED = [*OUTCOMES, "n_not_json"]
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is

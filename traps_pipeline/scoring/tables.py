@@ -34,6 +34,7 @@ class MetricsRow:
     n_empty: Annotated[int, "items answered with no text"]
     n_truncated: Annotated[int, "items whose text was cut off before an answer"]
     n_degenerate: Annotated[int, "items answered with a text that says nothing: punctuation, repetition"]
+    n_unread: Annotated[int, "items answered with a text that the rule judges could not read"]
     n_not_json: Annotated[int, "items of the JSON regime answered with a text that is not the object asked for"]
     n_errors: Annotated[int, "items whose call failed"]
     n_answered: Annotated[int, "items with an answer"]
@@ -139,11 +140,12 @@ class LeaderboardRow:
     n_empty: Annotated[int, "items answered with no text, over runs"]
     n_truncated: Annotated[int, "items whose text was cut off before an answer, over runs"]
     n_degenerate: Annotated[int, "items answered with a text that says nothing, over runs"]
+    n_unread: Annotated[int, "items answered with a text that the rule judges could not read, over runs"]
     n_not_json: Annotated[int, "items of the JSON regime whose text is not the object asked for, over runs"]
     n_errors: Annotated[int, "items whose call failed, over runs"]
     answered: Annotated[float, "share of items (2 a pair and run) with an answer"]
     incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]
-    broken: Annotated[float, "share of items whose text is empty, degenerate or truncated"]
+    broken: Annotated[float, "share of items whose text is empty, degenerate, truncated or unread"]
     is_broken: Annotated[bool, "whether broken is above 0.01; for overall, in any of its datasets"]
     acc: Mean
     acc_std: Deviation

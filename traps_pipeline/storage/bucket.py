@@ -8,12 +8,18 @@ from datetime import datetime
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
+from traps_pipeline.base.keys import optional_key
 
 # What a host exports for a store of each kind: names that obstore reads.
 KEYS = {
     "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, and AWS_ENDPOINT for a server of your own",
     "gs": "GOOGLE_APPLICATION_CREDENTIALS, the path of a file with a service account's key",
     "az": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY; the bucket is a container of that account",
+}
+_SECRETS = {
+    "s3": ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN"),
+    "gs": (),
+    "az": ("AZURE_STORAGE_ACCOUNT_KEY",),
 }
 _NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")  # what the services call it; Azure the latter
 
@@ -32,6 +38,8 @@ class Bucket:
         from obstore.store import from_url
 
         self.address = address
+        for variable in _SECRETS[address.partition(":")[0]]:
+            optional_key(variable)  # obstore reads it again
         try:
             self._store = from_url(address, retry_config={"max_retries": 5})
         except (BaseError, ValueError, TypeError) as error:

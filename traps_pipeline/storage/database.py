@@ -24,6 +24,7 @@ from urllib.parse import urlsplit
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import require
+from traps_pipeline.base.keys import check_key
 
 if TYPE_CHECKING:
     from psycopg import Connection
@@ -366,6 +367,7 @@ def session_of(variable: str, study: str) -> Session:
             f"{variable} is not set on the host {socket.gethostname()}: study.yaml of {study} says that it holds the "
             f"address of the PostgreSQL database with the study's ledger; export {variable}=postgresql://USER:PASSWORD@HOST:5432/DATABASE"
         )
+    check_key(variable, address)
     return _session_of(os.getpid(), address, variable, study)
 
 

@@ -7,7 +7,6 @@ import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from itertools import product
 from pathlib import Path
@@ -26,12 +25,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-_FOOTER, _PART = b"traps", "part-0.parquet"
+_FOOTER, _SUFFIX = b"traps", ".parquet"
 # A file holds the digest of its own bytes, in its footer, behind this mark: taken while zeros stood in its place.
 _SUM, _MARK, _ZEROS = b"traps-sum", b"traps-sum:", b"0" * 8
 _ROWS_AT_ONCE = 1000  # of a table as Python values
 _WHOLE: dict[Path, str] = {}  # files whose bytes this process has held against the digest in them, by their stamp
-_SOUND: dict[Path, str] = {}  # files whose content this process has compared with their footer
 
 
 @dataclass(frozen=True)
@@ -83,13 +81,14 @@ class TableStore:
         self.root, self._store = root, store or FolderStore(root)
 
     def path(self, table: Table, partition: Mapping[str, Any]) -> Path:
-        """File of one partition (hive layout)."""
+        """Return the file of one partition: `<table>/<value>/.../<value>.parquet`, or `<table>/<table>.parquet`.
+
+        No name is `column=value`: a file holds its partition columns, and readers would add them once more.
+        """
         if tuple(partition) != table.partition_by:
             raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not {tuple(partition)}")
-        folder = self.root / table.name
-        for column, value in partition.items():
-            folder /= f"{column}={value}"
-        return folder / _PART
+        *folders, name = map(str, partition.values() or [table.name])
+        return self.root.joinpath(table.name, *folders, name + _SUFFIX)
 
     def write(
         self,
@@ -178,35 +177,17 @@ class TableStore:
         """What is wrong with a partition's file, in words; empty where its content is what was written, or where there
         is no file.
 
-        The bytes of a file are held against the digest in it. One of version 0.1.0 has none: its rows are held against
-        their version, once, and that they were sound is noted beside it with its size and time. thorough: such notes
-        of other processes are not believed.
+        The bytes of a file are held against the digest in it. thorough: what a store notes of it is not believed.
         """
         path = self.path(table, partition)
         if not thorough and self._store.note(path) is not None:
             return ""  # the row vouches for it, and whoever reads it holds it against the row's digest
         try:
-            path = self._store.here(path)
-            found = path.stat()
-            if _MARK in _sound_bytes(path).getvalue():
-                return ""
+            _sound_bytes(self._store.here(path))
         except FileNotFoundError:
             return ""
         except (TrapsError, OSError) as error:
             return str(error)
-        stamp, note = _stamp(found), path.with_name(f".{path.name}.sound")
-        if _SOUND.get(path) == stamp or (not thorough and note.is_file() and note.read_text() == stamp):
-            return ""
-        try:
-            state = self.state(table, partition)
-            data = None if state is None else self._load(table, self.path(table, partition), None)
-            if state is not None and data is not None and content_version(data) != state.version:
-                return f"{path}: is not what was written (it was altered)"
-        except TrapsError as error:
-            return str(error)
-        _SOUND[path] = stamp
-        with suppress(OSError):  # a study that can only be read is read again next time
-            note.write_text(stamp)
         return ""
 
     def read(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
@@ -233,8 +214,8 @@ class TableStore:
         if strangers:
             raise ValueError(f"table {table.name} is partitioned by {table.partition_by}, not by {strangers}")
         values = {c: v if isinstance(v, tuple | list) else [v] for c, v in equal.items()}
-        parts = product(*([f"{c}={value}" for value in values.get(c, "*")] for c in table.partition_by))
-        patterns = ["/".join([*part, _PART]) for part in parts]
+        parts = product(*(values.get(column, "*") for column in table.partition_by))
+        patterns = ["/".join(map(str, part or [table.name])) + _SUFFIX for part in parts]
         paths = {path for pattern in patterns for path in self._store.below(self.root / table.name, pattern)}
         pieces = [self._load(table, path, columns) for path in sorted(paths)]
         pieces = [piece.replace_schema_metadata(None) for piece in pieces]
@@ -242,11 +223,10 @@ class TableStore:
 
     def partitions(self, table: Table) -> list[dict[str, str]]:
         """The partitions of a table that are there, in the order of their paths; values as the paths have them."""
-        root, found = self.root / table.name, list[dict[str, str]]()
-        for path in self._store.below(root, "/".join([*(f"{column}=*" for column in table.partition_by), _PART])):
-            pairs = [folder.partition("=") for folder in path.relative_to(root).parts[:-1]]
-            found.append({column: value for column, _, value in pairs})
-        return found
+        root = self.root / table.name
+        paths = self._store.below(root, "/".join("*" * max(1, len(table.partition_by))) + _SUFFIX)
+        values = [path.relative_to(root).as_posix().removesuffix(_SUFFIX).split("/") for path in paths]
+        return [dict(zip(table.partition_by, each, strict=False)) for each in values]
 
     def _load(self, table: Table, path: Path, columns: Sequence[str] | None) -> pa.Table:
         import pyarrow as pa
@@ -282,7 +262,7 @@ def sealed(data: pa.Table, metadata: Mapping[bytes, bytes]) -> bytes:
 
 
 def read_sealed(path: Path) -> pa.Table:
-    """A Parquet file if its bytes are what was written; one of version 0.1.0, which has no digest, is believed.
+    """A Parquet file if its bytes are what was written.
 
     Raises TrapsError if they are not, FileNotFoundError, and OSError or ArrowException if it is no Parquet file.
     """
@@ -321,8 +301,8 @@ def _sound_bytes(path: Path) -> io.BytesIO:
     with path.open("rb") as stream:
         content, stamp = stream.read(), _stamp(os.fstat(stream.fileno()))
     place = content.rfind(_MARK) + len(_MARK)
-    if place >= len(_MARK) and _WHOLE.get(path) != stamp:
-        if content[place : place + len(_ZEROS)] != _sum_of(content):
+    if _WHOLE.get(path) != stamp:
+        if place < len(_MARK) or content[place : place + len(_ZEROS)] != _sum_of(content):
             raise TrapsError(f"{path}: is not what was written (it was altered); run again, and it is made anew")
         _WHOLE[path] = stamp
     return io.BytesIO(content)

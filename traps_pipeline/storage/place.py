@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.names import LONGEST
 
 STUDY = "study.yaml"
 SCRATCH = "TRAPS_SCRATCH"  # names the folder in which the files of object stores are while they are used
@@ -31,7 +32,7 @@ def place_of(text: str) -> Place:
 
 def name_of(place: Place) -> str:
     """A name that no study elsewhere has: the folder's, and a digest of where it was made."""
-    plain = re.sub(r"[^a-z0-9]+", "-", str(place).rpartition("/")[2].lower()).strip("-")
+    plain = re.sub(r"[^a-z0-9]+", "-", str(place).rpartition("/")[2].lower()).strip("-")[:LONGEST]
     return f"{plain}-{digest(str(place))[:8]}".lstrip("-")
 
 

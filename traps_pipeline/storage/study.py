@@ -6,7 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from traps_pipeline.base.partitions import PROBE_PROMPT, VQA_PROMPTS, check_slug
+from traps_pipeline.base.names import Name, check_name
+from traps_pipeline.base.partitions import PROBE_PROMPT, VQA_PROMPTS
 
 FORMAT = 1  # of a workspace
 Regime = Literal["standard", "guided"]
@@ -167,7 +168,7 @@ class MechanismSettings(BaseModel):
     @field_validator("models")
     @classmethod
     def _slugs(cls, values: dict[str, Any]) -> dict[str, Any]:
-        return {check_slug(name): layers for name, layers in values.items()}
+        return {check_name(name): layers for name, layers in values.items()}
 
 
 # --- the study --------------------------------------------------------------------------------------------------------
@@ -194,14 +195,17 @@ class Study(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     format: int = FORMAT
     name: str = Field(
-        default="", pattern=r"^([a-z0-9-]+)?$", description="tells studies apart that share one Dagster history"
+        default="",
+        pattern=r"^([a-z0-9-]+)?$",
+        max_length=120,
+        description="tells studies apart that share one Dagster history",
     )
     benchmark: str = "released"
-    scenarios: list[str] | None = Field(default=None, description="named scenarios; all if absent")
+    scenarios: list[str] | None = Field(default=None, min_length=1, description="named scenarios; all if absent")
     per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
     panel: str = Field(default="", description="who judges; nothing is judged until one is named")
     judged_by_rules: bool = Field(default=False, description="rules may judge other models than reference models")
-    epoch: str = Field(default="1", pattern=r"^[A-Za-z0-9._-]+$")
+    epoch: str = Field(default="1", pattern=r"^[A-Za-z0-9_-]+([._-][A-Za-z0-9_-]+)*$", max_length=40)
     budget_usd: float = Field(default=0.0, ge=0.0, description="for all calls over the network, ever")
     model_budgets_usd: dict[str, Annotated[float, Field(ge=0.0)]] = Field(
         default={}, description="by model or judge, besides"
@@ -216,7 +220,7 @@ class Study(BaseModel):
     )
     allow_unknown_prices: bool = Field(default=False, description="ask models without a price: no budget bounds them")
     mechanism: MechanismSettings | None = Field(default=None, description="what is asked inside local models")
-    experiments: dict[str, Asked] = Field(
+    experiments: dict[Name, Asked] = Field(
         default={}, description="by name; written by `traps init` and `traps run`, remove one to ask no more for it"
     )
 

@@ -54,8 +54,8 @@ class StoredColumn:
 class Table(Generic[Row]):
     """A table's contract: its name, the dataclass of its rows, the columns that partition it, its key.
 
-    Layout: `tables/<table>/<partition column>=<value>/.../part-0.parquet`. Partition columns are stored in the file
-    too, so that one file explains itself. Raises ValueError for a key or partition column that the dataclass lacks.
+    Layout: `tables/<table>/<value>/.../<value>.parquet`, one value for each partition column; the columns stand in the
+    file. Raises ValueError for a key or partition column that the dataclass lacks.
     """
 
     name: str

@@ -19,7 +19,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import DATASETS, Cell, Evaluation
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.benchmark.tables import ITEMS
-from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.judging.answers import UNREAD
+from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import Call, Settled, collect
 from traps_pipeline.models.participants import Row, when_asked
@@ -31,7 +32,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 N_ITEMS = 20
 CELL = Cell("occlusion", Evaluation("canary", "standard", 1))  # names the folder of the calls, not a model
-REGIME = "standard"
+REGIME = "json"  # its final answers are the texts of free models that rules read most often
 COMPARED = ("outcome", "abstained", "value")
 
 
@@ -43,9 +44,9 @@ class CanaryRow:
     item_id: shared.ItemId
     epoch: shared.Epoch
     served_model: Annotated[str | None, "what the provider says answered"]
-    outcome: shared.AnswerOutcome
-    text: Annotated[str | None, "the answer; null unless outcome is answer"]
-    abstained: Annotated[bool | None, "as rules read it; null without an answer"]
+    outcome: Annotated[str, "as in responses, or unread: the rules know no form of the text"]
+    text: Annotated[str | None, "the answer; null unless outcome is answer or unread"]
+    abstained: Annotated[bool | None, "as rules read it; null without an answer that they read"]
     value: Annotated[str | None, "what it commits to, as rules read it; null where it abstains or is no answer"]
     prompt_tokens: shared.Tokens
     created_at: shared.AskedAt
@@ -103,20 +104,15 @@ def _request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], e
 
 def _row(call: _Asked, row: Row, epoch: str) -> CanaryRow:
     read = read_answer(row, None, REGIME, inline_thinking=call.entry.inline_thinking)
-    question, labels = call.item["question"], list(call.item["labels"])
-    abstained, value = None, None
-    if read.text is not None:
-        abstained = bool(judge_abstention(read.text, question)["abstained"])
-        said = None if abstained else judge_correctness(read.text, labels[0] if labels else "", question)
-        value = None if said is None or said["extracted_value"] is None else str(said["extracted_value"])
+    statement = None if read.text is None else read_statement(read.text, call.item["question"])
     return CanaryRow(
         model=call.entry.id,
         item_id=call.item["item_id"],
         served_model=row["served_model"],
-        outcome=read.outcome,
+        outcome=UNREAD if read.text is not None and statement is None else read.outcome,
         text=read.text,
-        abstained=abstained,
-        value=value,
+        abstained=statement and statement.value is None,
+        value=statement and statement.value,
         prompt_tokens=row["prompt_tokens"],
         epoch=epoch,
         created_at=when_asked(row)["created_at"],

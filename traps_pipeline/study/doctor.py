@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 import sys
 import tempfile
@@ -16,6 +15,10 @@ from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import PART
+from traps_pipeline.base.keys import optional_key
+from traps_pipeline.base.network import check_network
+from traps_pipeline.orchestration.machine import check_disk
+from traps_pipeline.scenes.trial import draw_frame, encode_clip
 from traps_pipeline.storage.bucket import object_name
 from traps_pipeline.storage.place import Place, scratch_of
 
@@ -43,11 +46,12 @@ def examine(place: Place) -> Iterator[Finding]:
     for what, look in (
         ("python", _python),
         ("checkout", _checkout),
-        ("rendering", _rendering),
-        ("encoding", _encoding),
+        ("rendering", draw_frame),
+        ("encoding", encode_clip),
         ("disk", lambda: _disk(scratch_of(place) if isinstance(place, str) else place)),
         ("workspace", lambda: _workspace(place)),
         ("keys", _keys),
+        ("network", check_network),
     ):
         yield _finding(what, look)
 
@@ -241,49 +245,8 @@ def _checkout() -> str:
     return f"{root}: {release.name} {release.version}, {counts}"
 
 
-def _rendering() -> str:
-    import os
-
-    import numpy as np
-
-    from traps_pipeline.scenes.camera import fit_camera
-    from traps_pipeline.scenes.kit import Physics, View, add_ball, new_spec
-    from traps_pipeline.scenes.render import Renderer, gl_version
-
-    spec = new_spec(Physics())
-    add_ball(spec, "ball", (0, 0, 0.1), 0.1, "red")
-    model = spec.compile()
-    with Renderer(model, fit_camera(View(), np.array([[-0.3, 0, 0], [0.3, 0, 0.4]]))) as renderer:
-        frame = next(renderer.frames([model.qpos0]))
-        drawn_by = gl_version()
-    red = int((frame[..., 0].astype(int) - frame[..., 1] > 60).sum())
-    if red < 100:
-        raise RuntimeError(f"a red ball was drawn with {red} red pixels; this OpenGL does not render MuJoCo scenes")
-    return f"MUJOCO_GL={os.environ['MUJOCO_GL']}, {drawn_by}, one frame drawn ({red} red pixels of the ball)"
-
-
-def _encoding() -> str:
-    import numpy as np
-
-    from traps_pipeline.scenes.encode import decode, encode
-
-    frames = [np.full((360, 480, 3), shade, np.uint8) for shade in (40, 80, 120)]
-    with tempfile.TemporaryDirectory() as folder:
-        encode(frames, Path(folder) / "probe.mp4", fps=10)
-        decoded, _ = decode(Path(folder) / "probe.mp4")
-    if len(decoded) != len(frames):
-        raise RuntimeError(f"{len(decoded)} of {len(frames)} frames came back; reinstall the pinned av")
-    return "H.264 written and read back"
-
-
 def _disk(root: Path) -> str:
-    existing = next(path for path in (root, *root.parents) if path.exists())
-    free = shutil.disk_usage(existing).free / 1e9
-    if free < MIN_FREE_GB:
-        raise RuntimeError(
-            f"{free:.1f} GB free at {existing}; free at least {MIN_FREE_GB} GB or choose another workspace"
-        )
-    return f"{free:.1f} GB free at {existing}"
+    return check_disk(root, MIN_FREE_GB)
 
 
 def _workspace(place: Place) -> str:
@@ -296,10 +259,13 @@ def _workspace(place: Place) -> str:
 
 
 def _keys() -> str:
-    """The keys that are not set, and the models and judges that need them. The demo needs no key."""
+    """Return the keys that are not set, and the models and judges that need them. The demo needs no key. Raises
+    TrapsError for one that no header can carry."""
     from traps_pipeline.models.judges import load_judges
-    from traps_pipeline.models.registry import load_models, missing_keys
+    from traps_pipeline.models.registry import load_accounts, load_models, missing_keys
 
     entries = [*load_models().values(), *load_judges().values()]
+    for key in sorted({account.key for account in load_accounts().values() if account.key}):
+        optional_key(key)  # raises where it is set to what is no key
     missing = [f"{name} not set ({', '.join(who)} cannot be asked)" for name, who in missing_keys(entries).items()]
     return "; ".join(missing) or "all set"

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.names import Name
 from traps_pipeline.base.partitions import BESIDE, DATASETS, REGIMES, SCHEMAS, Cell, Evaluation
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml, within
@@ -26,15 +27,15 @@ class Experiment(BaseModel):
     become the study's."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    name: str = Field(pattern=r"^[a-z0-9-]+$")
+    name: Name = Field(pattern=r"^[a-z0-9-]+$")
     description: str = ""
     benchmark: str = "released"
-    scenarios: list[str] | None = None
+    scenarios: list[str] | None = Field(default=None, min_length=1)
     per_family: int | None = Field(default=None, ge=1)
     datasets: list[str] = list(DATASETS)
     models: list[str] = Field(min_length=1)
     regimes: list[str] = list(REGIMES)
-    runs: list[Annotated[int, Field(ge=1)]] = [1]
+    runs: list[Annotated[int, Field(ge=1)]] = Field(default=[1], min_length=1)
     panel: str | None = None
     judged_by_rules: bool | None = Field(default=None, description="let the panel `rules` judge any model")
     epoch: str | None = None

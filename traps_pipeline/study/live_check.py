@@ -21,7 +21,9 @@ import numpy as np
 
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.network import check_network
 from traps_pipeline.base.partitions import Cell, Evaluation
+from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.judging.panel import parse_vote, vote_request
 from traps_pipeline.models.ask import Call, Settled, collect
@@ -67,9 +69,8 @@ class Live:
     def line(self) -> str:
         """What came of it, in a line for each finding."""
         found = [*(f"FAIL {problem}" for problem in self.problems), *(f"note {note}" for note in self.notes)]
-        return "\n".join(
-            [f"{'FAIL' if self.problems else 'ok  '} {self.entry.id}", *(f"     {line}" for line in found)]
-        )
+        head = f"{'FAIL' if self.problems else 'ok  '} {self.entry.id}"
+        return redact("\n".join([head, *(f"     {line}" for line in found)]))
 
 
 # --- what is asked ----------------------------------------------------------------------------------------------------
@@ -146,6 +147,7 @@ def reach(entry: Entry, account: Account) -> Reached:
     import httpx
 
     try:
+        check_network()
         secret = account.secret()
     except TrapsError as error:
         return Reached(str(error))

@@ -11,25 +11,25 @@ from traps_pipeline.base.partitions import (
     BESIDE,
     DATASETS,
     Cell,
-    Evaluation,
     SteeredEvaluation,
     all_datasets_of,
     datasets_of_category,
     sides_of,
 )
 from traps_pipeline.benchmark.corrections import load_scenarios
+from traps_pipeline.benchmark.items import expected_items
 from traps_pipeline.benchmark.tables import ITEMS
 from traps_pipeline.judging.confabulation import load_protocol, sample_failures
-from traps_pipeline.judging.panel import tasks_for, wanted_ballots
+from traps_pipeline.judging.panel import tasks_for, vote_requests
 from traps_pipeline.judging.tables import VOTES
 from traps_pipeline.mechanism.steering import count_answers
-from traps_pipeline.models.answers import answer_request, is_prepared
+from traps_pipeline.models.answers import answer_request, asked_items, is_prepared, response_row
 from traps_pipeline.models.forecast import Experience, Forecast, experience, forecast, minutes_of
 from traps_pipeline.models.judges import JudgeEntry, load_panel
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
+from traps_pipeline.models.request import JUDGED
 from traps_pipeline.models.tables import RESPONSES
 from traps_pipeline.orchestration.lineage import Lineage
-from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
@@ -57,8 +57,8 @@ class Count:
 
 @dataclass(frozen=True)
 class Plan:
-    """The calls of an experiment. calls: answers and votes by model. uncertain: datasets whose items are not current;
-    since their items may change, all of their calls are counted as new, which is an upper bound. forecasts: tokens,
+    """The calls of an experiment. calls: answers and votes by model. uncertain: datasets with items that are unknown
+    before a run has made them; their calls are counted as new, which is an upper bound. forecasts: tokens,
     dollars and minutes of the new calls over the network, by model and judge. labels: calls to the confabulation judge;
     None if the study's panel has none. steered: answers of steered models and votes on them, by model. pairs: how many
     there are, by dataset."""
@@ -132,7 +132,7 @@ def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: Ju
     """Calls to the confabulation judge about the experiment's models; a model that is not judged yet counts with a full
     sample."""
     protocol, wanted = load_protocol(), {cell.key for cell in experiment.cells()}
-    labels, known, lineage = Count(), _KnownKeys(), Lineage(workspace) if workspace else None
+    labels, lineage = Count(), Lineage(workspace) if workspace else None
     for model in protocol.models:
         cells = [cell for cell in protocol.cells(model) if cell.key in wanted]
         if not cells:
@@ -142,7 +142,7 @@ def _count_labels(workspace: Workspace | None, experiment: Experiment, judge: Ju
             continue
         samples = sample_failures(workspace, judge, model).values()
         keys = {failure.request.key for failures in samples for failure in failures}
-        labels.add(len(keys), len(keys & known.of(workspace.votes, cells[0].evaluation)))
+        labels.add(len(keys), len(workspace.votes.read(cells[0].evaluation.key, keys).settled))
     return labels
 
 
@@ -156,34 +156,80 @@ def _count_calls(
     workspace: Workspace | None, experiment: Experiment, study: Study
 ) -> tuple[dict[str, tuple[Count, Count]], list[str]]:
     plan = {model: (Count(), Count()) for model in experiment.models}
-    scenarios, panel = load_scenarios(study).values(), load_panel(study.panel)
-    known, lineage, uncertain = _KnownKeys(), Lineage(workspace) if workspace else None, set[str]()
+    panel, lineage = load_panel(study.panel), Lineage(workspace) if workspace else None
+    scenes = Counter(name for scenario in load_scenarios(study).values() for name in all_datasets_of(scenario.category))
+    current = {dataset for dataset in experiment.datasets if lineage and _items_current(lineage, dataset)}
+    items = {
+        dataset: _items(workspace, lineage, dataset, scenes[dataset], is_current=dataset in current)
+        for dataset in experiment.datasets
+    }
     for cell in experiment.cells():
         answers, votes = plan[cell.evaluation.model]
-        scenes = sum(cell.dataset in all_datasets_of(s.category) for s in scenarios)
-        sides = sides_of(cell.dataset)
-        items, votes_asked = len(sides) * scenes, len(panel) * sum(len(tasks_for(side)) for side in sides) * scenes
-        if workspace is None or lineage is None or not _items_current(lineage, cell.dataset):
-            uncertain.add(cell.dataset)
-            answers.add(items, 0)
-            votes.add(votes_asked, 0)
+        asked, unmade = items[cell.dataset]
+        answers.add(unmade.total(), 0)
+        votes.add(len(panel) * sum(len(tasks_for(side)) * n for side, n in unmade.items()), 0)
+        if workspace is None or lineage is None:
             continue
-        # A fresh cell has every answer that it wants: its keys need not be made again, nor its ledger be read.
-        answered = _fresh_rows(workspace, lineage, RESPONSES, cell)
-        if answered is not None:
+        # A fresh cell of current items has all that it wants: neither are its keys made again nor is its ledger read.
+        answered, cast = (_fresh_rows(workspace, lineage, table, cell) for table in (RESPONSES, VOTES))
+        if answered is not None and cast is not None and cell.dataset in current:
             answers.add(answered, answered)
-        else:
-            keys = _answer_keys(workspace, cell)
-            wanted = len(keys) if cell.dataset in BESIDE else items  # not every scenario admits all
-            answers.add(wanted, len(keys & known.of(workspace.answers, cell.evaluation)))
-        if answered is None:
-            votes.add(votes_asked, 0)
-        elif (cast := _fresh_rows(workspace, lineage, VOTES, cell)) is not None:
             votes.add(cast, cast)
         else:
-            ballots = {ballot.request.key for ballot in wanted_ballots(workspace, panel, cell)}
-            votes.add(len(ballots), len(ballots & known.of(workspace.votes, cell.evaluation)))
-    return plan, sorted(uncertain)
+            _count_cell(workspace, panel, cell, asked, answers, votes)
+    return plan, sorted(dataset for dataset, (_, unmade) in items.items() if unmade)
+
+
+def _items(
+    workspace: Workspace | None, lineage: Lineage | None, dataset: str, scenes: int, *, is_current: bool
+) -> tuple[list[dict[str, Any]], Counter[str]]:
+    """Return the items of a dataset that the next run asks, and by side the number of those that are unknown before it
+    has made them. scenes: how many scenarios the dataset has."""
+    unmade = Counter(dict.fromkeys(sides_of(dataset), scenes))
+    if workspace is None or lineage is None or lineage.state("items", dataset) is None:
+        return [], unmade
+    if is_current:
+        return asked_items(workspace, dataset), Counter()
+    for stage, key in _made_from(lineage, dataset):
+        state = lineage.state(stage, key)
+        if lineage.damage(stage, key) or (state and state.code != lineage.graph[stage].code):
+            return [], unmade
+    if dataset in BESIDE:  # not every scenario admits all
+        unmade = Counter(workspace.tables.read_all(ITEMS, ["side"], dataset=dataset)["side"])
+    items = expected_items(workspace, dataset)
+    return items, unmade - Counter(item["side"] for item in items)
+
+
+def _count_cell(
+    workspace: Workspace,
+    panel: Sequence[JudgeEntry],
+    cell: Cell,
+    items: Sequence[Mapping[str, Any]],
+    answers: Count,
+    votes: Count,
+) -> None:
+    """Count the calls for these items of a cell: votes on answers in the ledger by their own keys, and all votes on
+    answers that are still to be asked."""
+    entry, folder = get_model(cell.evaluation.model), cell.evaluation.key
+    keys = {  # an item without media was never asked
+        item["item_id"]: answer_request(workspace, entry, item, cell.evaluation).key
+        for item in items
+        if is_prepared(workspace, entry, item)
+    }
+    rows = workspace.answers.read(folder, {*keys.values()}).settled
+    traces = workspace.answers.reasoning(folder, rows)
+    ballots, n_new = set[str](), 0
+    for item in items:
+        row, tasks = rows.get(keys.get(item["item_id"], "")), tasks_for(item["side"])
+        if row is None:
+            n_new += len(panel) * len(tasks)
+            continue
+        answer = response_row(cell, item, row, traces.get(row["key"]))
+        if answer.outcome in JUDGED and answer.text is not None:
+            for task in tasks:
+                ballots |= {request.key for request in vote_requests(panel, task, cell, item, answer.text)}
+    answers.add(len({*keys.values()}) + len(items) - len(keys), len(rows))
+    votes.add(len(ballots) + n_new, len(workspace.votes.read(folder, ballots).settled))
 
 
 def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell: Cell) -> int | None:
@@ -194,27 +240,11 @@ def _fresh_rows(workspace: Workspace, lineage: Lineage, table: Table[Any], cell:
 
 def _items_current(lineage: Lineage, dataset: str) -> bool:
     """Whether a dataset's items, and everything they are made from, are current."""
-    if lineage.state("items", dataset) is None:
-        return False
-    above = [("items", dataset), *((s, k) for s, keys in lineage.graph.parents("items", dataset).items() for k in keys)]
-    return all(lineage.status(stage, key).kind == "fresh" for stage, key in above if lineage.state(stage, key))
+    return all(lineage.status(*node).kind == "fresh" for node in _made_from(lineage, dataset))
 
 
-class _KnownKeys:
-    """The keys with an answer in the ledgers, which are read once per evaluation."""
-
-    def __init__(self) -> None:
-        self._keys: dict[tuple[str, Evaluation], set[str]] = {}
-
-    def of(self, ledger: Ledger, evaluation: Evaluation) -> set[str]:
-        slot = (ledger.kind, evaluation)
-        if slot not in self._keys:
-            self._keys[slot] = {*ledger.read(evaluation.key).settled}
-        return self._keys[slot]
-
-
-def _answer_keys(workspace: Workspace, cell: Cell) -> set[str]:
-    entry = get_model(cell.evaluation.model)
-    items = workspace.tables.read(ITEMS, {"dataset": cell.dataset}).to_dict("records")
-    sent = [item for item in items if is_prepared(workspace, entry, item)]  # an item without media was never asked
-    return {answer_request(workspace, entry, item, cell.evaluation).key for item in sent}
+def _made_from(lineage: Lineage, dataset: str) -> list[tuple[str, str | None]]:
+    """The partitions of a dataset's items and of what they are made from, as far as they are there."""
+    parents = lineage.graph.parents("items", dataset).items()
+    above = [("items", dataset), *((stage, key) for stage, keys in parents for key in keys)]
+    return [node for node in above if lineage.state(*node)]

@@ -35,7 +35,7 @@ async function decide(label) {
     location.replace(`/task/${SHOWN.task}`);
   } catch (error) {
     sending = false;
-    field("said").textContent = error.message;
+    field("said").textContent = visible(error.message);
     field("said").classList.add("error");
   }
 }
@@ -46,7 +46,7 @@ async function back() {
     await post("/reopen", { task: SHOWN.task });
     location.replace(`/task/${SHOWN.task}`);
   } catch (error) {
-    field("said").textContent = error.message;
+    field("said").textContent = visible(error.message);
     field("said").classList.add("error");
   }
 }

@@ -19,7 +19,7 @@ const PROPERTIES = { value: "value", checked: "checked", selected: "selected", m
 function add(element, children) {
   for (const child of children.flat(Infinity)) {
     if (child === null || child === undefined || child === false) continue;
-    element.append(child instanceof Node ? child : String(child));
+    element.append(child instanceof Node ? child : visible(child));
   }
   return element;
 }
@@ -34,6 +34,13 @@ const HIDDEN = new RegExp(
   "gu",
 );
 
+const numbered = (character) => `U+${character.codePointAt(0).toString(16).toUpperCase().padStart(4, "0")}`;
+
+// A text with each hidden character as [U+202E]: for what is no element of its own. As `visible` in base/terminal.py.
+function visible(text) {
+  return String(text).replace(HIDDEN, (character) => `[${numbered(character)}]`);
+}
+
 // A text that somebody else wrote, in an element of its own that isolates its direction. A hidden character is shown
 // by its number, so that a reader sees what was said. found: a part to mark, in lower case.
 function untrusted(text, { tag = "span", found = "", ...attributes } = {}) {
@@ -42,8 +49,7 @@ function untrusted(text, { tag = "span", found = "", ...attributes } = {}) {
   let from = 0;
   for (const match of whole.matchAll(HIDDEN)) {
     add(element, marked(whole.slice(from, match.index), found));
-    const number = match[0].codePointAt(0).toString(16).toUpperCase().padStart(4, "0");
-    element.append(h("span", { class: "hidden-character", title: "a character that is not seen" }, `U+${number}`));
+    element.append(h("span", { class: "hidden-character", title: "a character that is not seen" }, numbered(match[0])));
     from = match.index + match[0].length;
   }
   return add(element, marked(whole.slice(from), found));

@@ -68,7 +68,7 @@ async function preview() {
   } catch (error) {
     text = error.message;
   }
-  if (own === asked) field("preview").textContent = text;
+  if (own === asked) field("preview").textContent = visible(text);
 }
 for (const name of FIELDS) field(name).addEventListener("input", preview);
 
@@ -108,7 +108,7 @@ async function decide(action) {
       said.textContent = "Added. A run makes it in every study that holds all scenarios, or names it.";
     else leave(SHOWN.after);
   } catch (error) {
-    said.textContent = error.message;
+    said.textContent = visible(error.message);
     said.classList.add("error");
   }
 }

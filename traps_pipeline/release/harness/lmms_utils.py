@@ -55,10 +55,10 @@ def _figure(rows: list[dict[str, Any]], *, name: str) -> float | None:
     return figures(Judged.of(row) for row in rows).get(name)
 
 
-NAMES = ("pecs", "acc", "abs_rec", "false_abs", "j", "missing")
+NAMES = ("pecs", "acc", "abs_rec", "false_abs", "j", "missing", "unread")
 standard_text, guided_text, json_text = (partial(_text, regime=r) for r in ("standard", "guided", "json"))
 standard_messages, guided_messages, json_messages = (
     partial(_messages, regime=r) for r in ("standard", "guided", "json")
 )
 standard_results, guided_results, json_results = (partial(_results, regime=r) for r in ("standard", "guided", "json"))
-pecs, acc, abs_rec, false_abs, j, missing = (partial(_figure, name=name) for name in NAMES)
+pecs, acc, abs_rec, false_abs, j, missing, unread = (partial(_figure, name=name) for name in NAMES)

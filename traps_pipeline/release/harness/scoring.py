@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from traps_pipeline.judging.answers import is_correct
-from traps_pipeline.judging.rules import judge_abstention, judge_correctness
+from traps_pipeline.judging.answers import UNREAD, is_correct
+from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.reading import read_answer
 from traps_pipeline.models.request import JUDGED
 
@@ -23,8 +23,8 @@ FIGURES = ("pecs", "acc", "abs_rec", "false_abs", "j")
 
 @dataclass(frozen=True)
 class Judged:
-    """What the panel decided about an answer. outcome: what the text amounts to; abstained, correct: None where there
-    is nothing to judge, and correct on every void."""
+    """What the panel decided about an answer. outcome: what the text amounts to, UNREAD where the rules cannot read
+    it; abstained, correct: None where nothing is decided, and correct on every void."""
 
     item_id: str
     dataset: str
@@ -54,19 +54,21 @@ def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) 
     names = {name: item[name] for name in ("item_id", "dataset", "side")}
     if read.outcome not in JUDGED or read.text is None:
         return Judged(**names, outcome=read.outcome)
-    abstained = bool(judge_abstention(read.text, item["question"])["abstained"])
+    statement = read_statement(read.text, item["question"])
+    if statement is None:
+        return Judged(**names, outcome=UNREAD)
+    abstained = statement.value is None
     if item["side"] != "control":
         return Judged(**names, outcome=read.outcome, abstained=abstained)
-    truth = item["ground_truth"]
-    value = judge_correctness(read.text, truth, item["question"])["extracted_value"]
-    extracted = None if value is None else str(value)
-    correct = is_correct(extracted, truth, item["answer_type"], list(item["labels"]), json.loads(item["aliases"]))
+    labels, aliases = list(item["labels"]), json.loads(item["aliases"])
+    correct = is_correct(statement.value, item["ground_truth"], item["answer_type"], labels, aliases)
     return Judged(**names, outcome=read.outcome, abstained=abstained, correct=correct)
 
 
 def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
     """Acc, AbsRec, FalseAbs, J and PECS of one run: `DATASET_FIGURE` of each dataset, and FIGURE overall, the
-    equal-weight mean over the four datasets, None unless all four are there; and `missing`, items without a decision.
+    equal-weight mean over the four datasets, None unless all four are there; `missing`, items without a decision, and
+    `unread`, those of them whose text the rules could not read.
     """
     rows = list(judged)
     found: dict[str, float | None] = {}
@@ -79,7 +81,10 @@ def figures(judged: Iterable[Judged]) -> dict[str, float | None]:
         whole = [value for value in values if value is not None]
         found[figure] = sum(whole) / len(DATASETS) if len(whole) == len(DATASETS) else None
     undecided = [row for row in rows if row.abstained is None or (row.side == "control" and row.correct is None)]
-    return found | {"missing": float(len(undecided))}
+    return found | {
+        "missing": float(len(undecided)),
+        "unread": float(sum(row.outcome == UNREAD for row in rows)),
+    }
 
 
 def _of_dataset(rows: list[Judged]) -> dict[str, float | None]:

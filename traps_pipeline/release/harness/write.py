@@ -184,7 +184,7 @@ def _lmms(target: Path, about: Mapping[str, Any]) -> None:
                     "aggregation": _Function(f"utils.{name}"),
                     "higher_is_better": name in ("pecs", "acc", "abs_rec", "j"),
                 }
-                for name in ("pecs", "acc", "abs_rec", "false_abs", "j", "missing")
+                for name in ("pecs", "acc", "abs_rec", "false_abs", "j", "missing", "unread")
             ],
             "metadata": [{"version": about["version"], "canary": about["canary"]}],
         }

@@ -1,0 +1,64 @@
+"""A name is refused before it becomes a key, a file, an option or a value that says something else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import dagster as dg
+import pytest
+import yaml
+
+from traps_pipeline.base.names import LONGEST, check_name
+from traps_pipeline.base.partitions import Cell, Evaluation
+from traps_pipeline.cli import main
+from traps_pipeline.models import own
+
+KEYS = ["", "a_b", "a__b", "A", "a|b", "a/b", "a b", "a,b", "a\n", "ä", "a\u0663"]
+PATHS = [".", "..", "a..b", "a...b", ".a", "a.", "-a", "a-", "a" * (LONGEST + 1)]
+VALUES = ["1", "1.5", "1e3", "0x1f", "0b1", "2026-11-01", "2026-13-45", "20261101", "nan", "inf", "infinity"]
+VALUES += ["true", "false", "yes", "no", "on", "off", "null"]
+
+
+@pytest.mark.parametrize("name", [*KEYS, *PATHS, *VALUES])
+def test_a_name_that_becomes_something_else_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="must match"):
+        check_name(name)
+
+
+@pytest.mark.parametrize("name", ["m", "gpt-5", "qwen3-vl-8b.2", "4o", "7b-1e3", "a--b", "a" * LONGEST])
+def test_any_other_name_is_a_key_a_file_and_a_text(name: str, tmp_path: Path) -> None:
+    assert check_name(name) == name
+    key = Cell("occlusion_ill_posed", Evaluation(name, "standard", 1)).evaluation.key
+    assert dg.StaticPartitionsDefinition([key]).get_partition_keys() == [key]
+    (tmp_path / f"{name}@{name}__standard__run1.jsonl.reasoning").touch()
+    assert yaml.safe_load(f"[{name}]") == [name]
+
+
+@pytest.fixture
+def _forgets() -> Iterator[None]:
+    yield
+    own._overlay.clear()
+    own.forget()
+
+
+@pytest.mark.usefixtures("_forgets")
+@pytest.mark.parametrize("field", ["models", "judges", "panels", "accounts", "name"])
+def test_a_wrong_name_in_an_experiment_is_one_sentence_and_leaves_no_workspace(
+    field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    described = {"id": "a...b", "base_url": "http://127.0.0.1:9/v1", "media": "images"}
+    wrong = {
+        "models": {"models": [described]},
+        "judges": {"judges": [{"id": "a...b", "base_url": described["base_url"]}]},
+        "panels": {"panels": {"a...b": ["judge"]}},
+        "accounts": {"accounts": {"a...b": {}}},
+        "name": {"name": "2026"},
+    }
+    experiment = {"name": "x", "models": ["oracle"], "panel": "rules", "datasets": ["occlusion"]} | wrong[field]
+    (tmp_path / "x.yaml").write_text(yaml.safe_dump(experiment))
+    code = main(["run", str(tmp_path / "x.yaml"), "--workspace", str(tmp_path / "study")])
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert code == 1
+    assert "must match [a-z0-9.-]+" in sentence
+    assert not (tmp_path / "study").exists()

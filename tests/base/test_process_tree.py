@@ -1,0 +1,100 @@
+"""Processes that end together: trees of real processes, ended in each way, leave nobody behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from traps_pipeline.base.process_tree import split
+
+MARK = "TRAPS_TEST_TREE"
+END_S = 60  # more than nine times what it takes
+# A command of two processes. Below the second one: a program that ends at SIGTERM, which has started one in a session
+# of its own that ignores it. The last to start writes the second process's id.
+COMMAND = '''
+import os, signal, subprocess, sys, time
+from traps_pipeline.base.process_tree import split, stop_descendants, wait_for
+from traps_pipeline.cli import _stopped_alike
+
+SLEEPS = """
+import signal, sys, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+open(sys.argv[1], "w").write(sys.argv[2])
+time.sleep(600)
+"""
+STARTS = """
+import subprocess, sys
+subprocess.Popen([sys.executable, "-c", *sys.argv[1:]], start_new_session=True).wait()
+"""
+with _stopped_alike():
+    if (code := split(3)) is not None:
+        sys.exit(code % 256)
+    child = subprocess.Popen([sys.executable, "-c", STARTS, SLEEPS, sys.argv[1], str(os.getpid())])
+    try:
+        wait_for([child.pid])
+    finally:
+        stop_descendants(0.5)
+'''
+
+
+def marked(mark: str) -> set[int]:
+    """Processes that run with this mark in their environment, zombies left out."""
+    pids = set[int]()
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if f"{MARK}={mark}".encode() in (folder / "environ").read_bytes().split(b"\0"):
+                pids.add(int(folder.name))
+        except OSError:
+            continue
+    return pids
+
+
+def wait_until_gone(mark: str, seconds: float) -> None:
+    until = time.monotonic() + seconds
+    while pids := marked(mark):
+        assert time.monotonic() < until, f"still there after {seconds} s: {pids}"
+        time.sleep(0.05)
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> tuple[subprocess.Popen[bytes], int]:
+    """The first process of COMMAND, started where SIGINT is ignored, and the id of the second one."""
+    ready, mark = tmp_path / "ready", tmp_path.name
+    script = f'trap "" INT; exec {sys.executable} -c "$0" "$1"'
+    process = subprocess.Popen(["sh", "-c", script, COMMAND, ready], env=os.environ | {MARK: mark})
+    until = time.monotonic() + END_S
+    while not ready.exists() or not ready.read_text():
+        assert process.poll() is None and time.monotonic() < until
+        time.sleep(0.05)
+    assert len(marked(mark)) == 4
+    return process, int(ready.read_text())
+
+
+@pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGKILL])
+@pytest.mark.parametrize("which", ["first", "second"])
+def test_a_stop_of_either_process_ends_all_that_both_started(
+    tree: tuple[subprocess.Popen[bytes], int], tmp_path: Path, which: str, stop: signal.Signals
+) -> None:
+    first, second = tree
+    os.kill(first.pid if which == "first" else second, stop)
+    assert first.wait(END_S) != 0
+    wait_until_gone(tmp_path.name, END_S)
+
+
+def test_the_first_process_ends_with_the_code_of_the_second() -> None:
+    script = (
+        "import sys; from traps_pipeline.base.process_tree import split; code = split(5); "
+        "sys.exit(7 if code is None else code)"
+    )
+    assert subprocess.run([sys.executable, "-c", script]).returncode == 7
+
+
+def test_another_system_gets_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert split(1) is None

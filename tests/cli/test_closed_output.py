@@ -1,0 +1,48 @@
+"""A command whose output is not read any more ends quietly with 130, also when only the last flush finds that out."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+
+def ended(*arguments: str, closed: tuple[str, ...]) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of a `traps` command; `closed` names the streams that nobody reads."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    streams = {name: writing if name in closed else subprocess.PIPE for name in ("stdout", "stderr")}
+    command = [sys.executable, "-m", "traps_pipeline.cli", *arguments]
+    done = subprocess.run(command, cwd=ROOT, text=True, check=False, **streams)
+    os.close(writing)
+    return done.returncode, done.stdout or "", done.stderr or ""
+
+
+@pytest.mark.parametrize("arguments", [("init", "demo"), ("models", "check", "oracle")])
+def test_an_output_that_nobody_reads_is_no_failure_and_says_nothing(
+    arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path / "study"))
+    assert ended(*arguments, closed=("stdout",)) == (130, "", "")
+
+
+def test_a_sentence_that_nobody_reads_is_no_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRAPS_WORKSPACE", str(tmp_path / "study"))
+    assert ended("status", closed=("stderr",)) == (130, "", "")
+    assert ended("status", closed=("stdout", "stderr")) == (130, "", "")
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(("run", "--help"), 0), (("no-such-command",), 2)])
+def test_argparse_says_its_part_to_nobody_without_a_complaint(arguments: tuple[str, ...], code: int) -> None:
+    assert ended(*arguments, closed=("stdout", "stderr")) == (code, "", "")
+
+
+def test_a_command_without_an_output_does_its_work(tmp_path: Path) -> None:
+    command = f"{sys.executable} -m traps_pipeline.cli init demo --workspace {tmp_path / 'study'} >&-"
+    assert subprocess.run(command, cwd=ROOT, shell=True, check=False).returncode == 0
+    assert (tmp_path / "study" / "study.yaml").is_file()

@@ -1,0 +1,101 @@
+"""The machine is looked at before the first stage, for what the stages to come need and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.conftest import ROOT, Checkout
+
+pytestmark = pytest.mark.slow
+
+EXPERIMENT = {
+    "name": "tiny",
+    "models": ["oracle"],
+    "panel": "rules",
+    "regimes": ["standard"],
+    "runs": [1],
+    "datasets": ["occlusion"],
+    "scenarios": ["domino_chain-0001"],
+}
+
+
+def test_opengl_that_does_not_draw_ends_a_run_before_its_first_table_unless_the_clips_are_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment = tmp_path / "tiny.yaml"
+    experiment.write_text(yaml.safe_dump(EXPERIMENT))
+    study = Checkout(ROOT, tmp_path / "study")
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    refused = study.traps("run", experiment)
+    assert refused.code == 1
+    (sentence,) = refused.err.splitlines()
+    assert sentence.startswith("traps: this machine cannot render clips with MUJOCO_GL=nonsense (")
+    assert not any((study.workspace / "tables").iterdir())
+
+    stages = ("--select", "scene_specs,videos", "--partition", "dominoes")
+    refused = study.dagster("asset", "materialize", "-m", "traps_pipeline.definitions", *stages)
+    assert refused.code == 1
+    assert "this machine cannot render clips with MUJOCO_GL=nonsense (" in refused.err
+    assert not any((study.workspace / "tables").iterdir())
+
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "egl")
+    refused = study.traps("run", experiment)
+    assert refused.code == 1
+    assert "cannot render clips with MUJOCO_GL=osmesa, PYOPENGL_PLATFORM=egl (" in refused.err
+    monkeypatch.delenv("PYOPENGL_PLATFORM")
+    monkeypatch.delenv("MUJOCO_GL")
+    assert study.traps("run", experiment, "--until", "videos").code == 0
+
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    finished = study.traps("run", experiment, "--until", "responses")
+    assert finished.code == 0, finished.err
+
+
+def test_a_run_for_which_nothing_matches_says_so_and_fails(tmp_path: Path) -> None:
+    study = Checkout(ROOT, tmp_path / "study")
+    for name, changes in {
+        "a": {"datasets": ["occlusion"]},
+        "b": {"datasets": ["chaotic"], "models": ["always-abstain"]},
+        "no-such-run": {"runs": [9]},
+        "no-such-arm": {"datasets": ["predictable_cut"], "scenarios": ["domino_chain-0001"]},
+    }.items():
+        both = {"name": name, "scenarios": ["domino_chain-0001", "plinko-0001"]}
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(EXPERIMENT | both | changes))
+        place = "other" if name == "no-such-arm" else "study"
+        assert study.traps("init", tmp_path / f"{name}.yaml", "--workspace", tmp_path / place).code == 0
+    for name, place in (("no-such-run", "study"), ("no-such-arm", "other")):
+        ran = study.traps("run", tmp_path / f"{name}.yaml", "--workspace", tmp_path / place)
+        assert ran.code == 1
+        assert ran.err.startswith(f"traps: experiment {name} asks nothing: ")
+
+    materialize = ("asset", "materialize", "-m", "traps_pipeline.definitions", "--select", "responses")
+    wanted, unwanted = "occlusion|oracle__standard__run1", "chaotic|oracle__standard__run1"
+    alone = study.dagster(*materialize, "--partition", unwanted)
+    assert alone.code == 1
+    assert f"study.yaml asks for {unwanted}" in alone.err
+    backwards = study.dagster(*materialize, "--partition-range", f"{unwanted}...{wanted}")
+    assert backwards.code == 1
+    assert f"no partition lies between {unwanted} and {wanted}" in backwards.err
+
+
+def test_proxies_and_certificates_are_looked_at_where_something_is_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = {"id": "mine", "base_url": "http://127.0.0.1:9/v1", "media": "images"}
+    experiment = tmp_path / "network.yaml"
+    experiment.write_text(yaml.safe_dump(EXPERIMENT | {"models": [own], "judged_by_rules": True, "budget_usd": 1}))
+    monkeypatch.setenv("SSL_CERT_FILE", "/nowhere/ca.pem")
+    study = Checkout(ROOT, tmp_path / "study")
+    refused = study.traps("run", experiment, "--no-preflight")
+    assert refused.code == 1
+    assert refused.err == "traps: SSL_CERT_FILE names the file /nowhere/ca.pem, which is not there: mend or unset it\n"
+    assert not any((study.workspace / "tables").iterdir())
+    live = study.traps("models", "check", "--live", experiment)
+    assert live.code == 1
+    assert "SSL_CERT_FILE names the file" in live.out
+    assert "Traceback" not in live.err

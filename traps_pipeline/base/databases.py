@@ -1,0 +1,28 @@
+"""What a database's error means: a reason and a remedy, without the text of SQLAlchemy or of a statement."""
+
+from __future__ import annotations
+
+import re
+
+from traps_pipeline.base.terminal import plain
+
+NO_SPACE = "no space left"
+MOST_WORDS = 200  # characters of a reason that has no sentence here
+# What SQLite, PostgreSQL and the system say; the first that is found counts.
+_UNWRITABLE = (
+    (r"disk is full|no space left|disk quota exceeded", NO_SPACE, "free some space"),
+    (r"readonly database|read-only file system", "it is read-only", "make its folder writable for this user"),
+    (r"disk I/O error|input/output error", "its disk fails or is full", "free some space"),
+)
+
+
+def reason_and_remedy(error: BaseException) -> tuple[str, str, bool]:
+    """Return why a database cannot be used, what a person can do, and whether it is a file that cannot be written.
+
+    error: a driver's error, or SQLAlchemy's, which holds the driver's.
+    """
+    words = plain(" ".join(str(getattr(error, "orig", None) or error).split()))[:MOST_WORDS]
+    for pattern, reason, remedy in _UNWRITABLE:
+        if re.search(pattern, words, re.IGNORECASE):
+            return reason, remedy, True
+    return words or "it gives no reason", "free some space, or move that folder away", False

@@ -1,0 +1,68 @@
+"""Read keys from the environment: the one place that does, and that refuses a key which no header can carry."""
+
+from __future__ import annotations
+
+import os
+import unicodedata
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.redaction import remember
+
+_NAMES = {"\n": "a line break", "\r": "a carriage return", "\t": "a tab", " ": "a space"}
+
+
+def read_key(variable: str) -> str:
+    """Return the key in an environment variable.
+
+    Raises TrapsError, which names the variable and never the value, where it is not set or `check_key` refuses it.
+    """
+    value = optional_key(variable)
+    if value is None:
+        raise TrapsError(f"{variable} is not set; export the key, or leave the models that need it out")
+    return value
+
+
+def optional_key(variable: str) -> str | None:
+    """Return the key in an environment variable; None where it is not set. Raises as `read_key`."""
+    value = os.environ.get(variable)
+    if not value:
+        return None
+    remember(value)
+    check_key(variable, value)
+    return value
+
+
+def check_key(variable: str, value: str) -> None:
+    """Check that a key, or an address with a password, consists of printable ASCII characters without white space.
+
+    What is more is refused and not removed, so that every program reads the same key from the variable.
+    Raises TrapsError, which names the variable and never the value.
+    """
+    problem = _problem(value)
+    if problem:
+        raise TrapsError(f"{variable} {problem}: export it again, as printable ASCII characters without white space")
+
+
+def _problem(value: str) -> str:
+    """Return what keeps a value from being a key, beginning with a verb; empty if nothing does."""
+    if not value.strip():
+        return "holds no key"
+    for verb, character in (("ends with", value[-1]), ("begins with", value[0])):
+        if name := _name_of(character):
+            return f"{verb} {name}"
+    if name := next(filter(None, map(_name_of, value)), ""):
+        return f"contains {name}"
+    if len(value) > 1 and value[0] == value[-1] and value[0] in "\"'":
+        return "is wrapped in quotes"
+    return ""
+
+
+def _name_of(character: str) -> str:
+    """Return the name of a character that no key contains; empty for any other."""
+    if character in _NAMES:
+        return _NAMES[character]
+    if character.isascii() and character.isprintable():
+        return ""
+    if character.isspace():
+        return "white space"
+    return "a control character" if unicodedata.category(character) == "Cc" else "a character that is not ASCII"

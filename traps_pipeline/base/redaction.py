@@ -1,0 +1,185 @@
+"""Remove keys from text before it is printed, logged, stored or shown.
+
+Secrets are the values of environment variables that hold keys: those that a registry names (`hide`), those that a run
+has read (`remember`), and those whose names say so. They are found as they stand, escaped, percent-encoded or in
+base64, and also where white space, quotes or line breaks split them.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import sys
+import threading
+import traceback
+from base64 import b64encode
+from collections.abc import Iterator
+from functools import lru_cache
+from html import unescape
+from typing import Any
+
+MASK = "***"
+SHORTEST = 8  # characters: anything shorter could be an ordinary word
+_HEAD = 12  # characters of a secret that are looked for; what follows is compared, so that a cut secret is found too
+_NAMES = re.compile(r"(KEY|TOKEN|SECRET|PASSWORD|PASSWD)$", re.IGNORECASE)
+_PASSWORD = re.compile(r"://[^/\s:@]*:([^/\s@]+)@|\bpassword=([^\s&]+)")  # in an address of a database or a proxy
+_EXAMPLE = "PASSWORD"  # as our own sentences write addresses
+_ENCODED = re.compile(
+    r"\\+(?:[abfnrtv0]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})|%[0-9a-f]{2}|&(?:amp|lt|gt|quot|apos|#\d{1,7}|#x[0-9a-f]{1,6});",
+    re.IGNORECASE,
+)
+_IGNORED = dict.fromkeys((*range(33), 127, *map(ord, "\"'`\\|")))
+_VALUE = r"""(?=[^\s"'\\]*\d|[^\s"'\\]{16})[^\s"'\\,;&<>(){}\[\]]{6,}"""  # has a digit, or is longer than a word
+# Secrets that nobody named: in a header, a parameter or an address.
+_UNKNOWN = re.compile(
+    r"""((?:\b(?:authorization|(?:x-(?:goog-)?)?api[-_]?key|password)|[?&](?:key|sig|access_token))"""
+    rf"""["'\\]*\s*[:=,]\s*b?["'\\]*(?:(?:bearer|basic)\s+)?|\b(?:bearer|basic)\s+){_VALUE}"""
+    r"""|(://[^/\s:@"']*:)(?!PASSWORD@)[^/\s@"']+(?=@)""",
+    re.IGNORECASE,
+)
+_SIGNS = ("authorization", "api", "password", "key=", "sig=", "access_token=", "bearer", "basic", "://")
+
+_variables = set[str]()
+_values = set[str]()
+
+
+def hide(variable: str) -> None:
+    """Treat the value of this environment variable as a secret."""
+    _variables.add(variable)
+
+
+def remember(value: str) -> None:
+    """Treat this value as a secret until the process ends."""
+    _values.add(value)
+
+
+def redact(text: str) -> str:
+    """Return the text with each secret in it replaced by `***`, known or recognizable by its header."""
+    needles, spans = _needles(frozenset(_secrets())), list[tuple[int, int]]()
+    for is_decoded in (False, True) if _ENCODED.search(text) else (False,):
+        searched = _searched(text, is_decoded)
+        if any(needle[:_HEAD] in searched for needle in needles):
+            spans += _spans(text, needles, is_decoded)
+    for start, end in sorted(_merged(spans), reverse=True):
+        text = f"{text[:start]}{MASK}{text[end:]}"
+    lowered = text.lower()
+    if any(sign in lowered for sign in _SIGNS):  # searching with the expression alone takes ten times as long
+        text = _UNKNOWN.sub(lambda match: f"{match[1] or match[2]}{MASK}", text)
+    return text
+
+
+def redact_tracebacks() -> None:
+    """Redact what this process logs, and the tracebacks that it prints: an exception may quote a request's headers."""
+    make = logging.getLogRecordFactory()
+    if getattr(make, "__module__", "") == __name__:
+        return
+
+    def redacted_record(*args: Any, **named: Any) -> logging.LogRecord:
+        record = make(*args, **named)
+        try:
+            message = record.getMessage()
+        except (TypeError, ValueError):
+            message = f"{record.msg} {record.args}"
+        if (without := redact(message)) != message:  # else it stays as it is: formatters read its arguments
+            record.msg, record.args = without, ()
+        if record.exc_info and record.exc_info[0]:
+            record.exc_text = redact("".join(traceback.format_exception(*record.exc_info)).rstrip())
+        return record
+
+    logging.setLogRecordFactory(redacted_record)
+    sys.excepthook = lambda *error: print(redact("".join(traceback.format_exception(*error))), end="", file=sys.stderr)
+    threading.excepthook = lambda error: sys.excepthook(
+        error.exc_type, error.exc_value or error.exc_type(), error.exc_traceback
+    )
+
+
+def redacted(error: Exception) -> Exception:
+    """Return an exception to raise in the place of one whose traceback would show a key; else the exception itself."""
+    shown = "".join(traceback.format_exception(error))
+    without = redact(shown)
+    return error if without == shown else RuntimeError(without).with_traceback(error.__traceback__)
+
+
+def _secrets() -> Iterator[str]:
+    yield from _values
+    for name, value in os.environ.items():
+        is_address = "://" in value or "password=" in value
+        if not is_address and (name in _variables or _NAMES.search(name)):
+            yield value
+        if is_address:
+            yield from (
+                group
+                for match in _PASSWORD.finditer(value)
+                for group in match.groups()
+                if group not in (None, _EXAMPLE)
+            )
+
+
+@lru_cache(maxsize=64)
+def _needles(secrets: frozenset[str]) -> tuple[str, ...]:
+    """Return the forms of these secrets that `_searched` text may hold."""
+    needles = set[str]()
+    for secret in secrets:
+        for part in {secret, *re.split(r"[^!-~]+", secret)}:
+            if len(_searched(part, is_decoded=False)) >= SHORTEST:
+                needles |= {_searched(part, is_decoded=False), _searched(part, is_decoded=True), *_base64(part)}
+    return tuple(needle for needle in needles if len(needle) >= SHORTEST)
+
+
+def _base64(secret: str) -> Iterator[str]:
+    """Yield what base64 makes of a secret inside longer content: it begins at one of three places of a group."""
+    content = secret.encode("utf-8", "surrogateescape")
+    for before, skipped in ((0, 0), (1, 2), (2, 3)):
+        whole = b64encode(bytes(before) + content).decode()[skipped : (before + len(content)) * 8 // 6]
+        yield from (whole, whole.replace("+", "-").replace("/", "_"))
+
+
+def _searched(text: str, is_decoded: bool) -> str:
+    """Return the printable ASCII characters of a text without white space, quotes and backslashes."""
+    if is_decoded:
+        text = _ENCODED.sub(lambda match: _decoded(match[0]), text)
+    return text.encode("ascii", "ignore").decode().translate(_IGNORED)
+
+
+def _decoded(code: str) -> str:
+    if code[0] == "&":
+        return unescape(code)
+    digits = code.lstrip("\\%")
+    if code[0] == "%":
+        return chr(int(digits, 16))
+    return chr(min(int(digits[1:], 16), 0xFFFF)) if digits[1:] else ""  # without digits it is a control character
+
+
+def _spans(text: str, needles: tuple[str, ...], is_decoded: bool) -> Iterator[tuple[int, int]]:
+    """Yield the start and end of each secret in a text."""
+    characters = list[str]()
+    places = list[tuple[int, int]]()
+    codes = {match.start(): match for match in _ENCODED.finditer(text)} if is_decoded else {}
+    place = 0
+    while place < len(text):
+        code = codes.get(place)
+        end = code.end() if code else place + 1
+        for character in _searched(_decoded(code[0]) if code else text[place], is_decoded=False):
+            characters.append(character)
+            places.append((place, end))
+        place = end
+    searched = "".join(characters)
+    for needle in needles:
+        start = searched.find(needle[:_HEAD])
+        while start >= 0:
+            length = min(_HEAD, len(needle))
+            while needle.startswith(searched[start : start + length + 1]) and start + length < len(searched):
+                length += 1
+            yield places[start][0], places[start + length - 1][1]
+            start = searched.find(needle[:_HEAD], start + length)
+
+
+def _merged(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    merged = list[tuple[int, int]]()
+    for start, end in sorted(spans):
+        if merged and start <= merged[-1][1]:
+            merged[-1] = merged[-1][0], max(end, merged[-1][1])
+        else:
+            merged.append((start, end))
+    return merged
