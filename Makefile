@@ -140,8 +140,8 @@ wheel: setup-core ## dist/*.whl: the same bytes whoever builds it from the same 
 
 # The time in pages that have one: any will do, as long as it is the same in every build.
 docs: export SOURCE_DATE_EPOCH ?= 1580601600
-docs: setup ## site/index.html: the documentation with its reference; every link is checked, and nothing is fetched
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+docs: setup ## site/index.html: the documentation with its reference; links, anchors and each page's place are checked
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 sbom: setup ## dist/sbom.json: what the lock installs, as CycloneDX
 	$(BIN)/python tools/sbom.py dist/sbom.json

@@ -32,7 +32,7 @@ TESTS = {path.relative_to(ROOT / "tests").as_posix(): path.read_text() for path 
 RUN_AS = {
     "traps votes import": ("integration/test_batches.py", 'study.traps(what, "import"'),
     "inspect eval": ("release/test_pocket_harness.py", '"-m", "inspect_ai", "eval"'),
-    "make docs": ("test_docs_site.py", '"mkdocs", "build"'),
+    "make docs": ("test_docs_site.py", '"make", "-C", checkout'),
     "make sbom": ("base/test_extras.py", '"tools/sbom.py"'),
     "make ui": ("integration/test_ui.py", '"ui",'),
     "make wheel": ("test_wheel.py", '"hatchling", "build"'),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,20 +15,33 @@ from tests.test_rooms import ROOMS
 
 pytestmark = pytest.mark.slow
 
+NO_SOURCE = (".*", "__pycache__", "build", "dist", "node_modules", "site", "wheels")
 
-def build(folder: Path) -> dict[str, bytes]:
-    """Every file of the site by its path, built as `make docs` builds it."""
-    environment = os.environ | {"SOURCE_DATE_EPOCH": "1580601600", "NO_MKDOCS_2_WARNING": "1"}
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", folder]
-    finished = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert finished.returncode == 0, finished.stdout + finished.stderr  # a link that leads nowhere is an error
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A copy of this checkout: pages link to any of its files."""
+    return Path(shutil.copytree(ROOT, tmp_path / "checkout", ignore=shutil.ignore_patterns(*NO_SOURCE)))
+
+
+def make_docs(checkout: Path) -> subprocess.CompletedProcess[str]:
+    """Run `make docs` with the environment of the tests instead of one that `make setup` makes."""
+    command = ["make", "-C", checkout, "-o", "setup", f"BIN={Path(sys.executable).parent}", "docs"]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def build(checkout: Path) -> dict[str, bytes]:
+    """Every file of the site by its path."""
+    finished = make_docs(checkout)
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    site = checkout / "site"
+    return {path.relative_to(site).as_posix(): path.read_bytes() for path in site.rglob("*") if path.is_file()}
 
 
 @pytest.mark.promise
-def test_the_site_is_built_twice_to_the_same_bytes_and_fetches_nothing(tmp_path: Path) -> None:
-    site = build(tmp_path / "a")
-    assert build(tmp_path / "b") == site
+def test_the_site_is_built_twice_to_the_same_bytes_and_fetches_nothing(checkout: Path) -> None:
+    site = build(checkout)
+    assert build(checkout) == site
     pages = {name: content.decode() for name, content in site.items() if name.endswith(".html")}
     for name, page in pages.items():
         loaded = re.findall(r'<(?:script|img|iframe|source)[^>]*\bsrc="?([^" >]+)', page)
@@ -39,3 +52,25 @@ def test_the_site_is_built_twice_to_the_same_bytes_and_fetches_nothing(tmp_path:
     assert {f"{path.stem}.html" for path in (ROOT / "docs").glob("*.md")} <= {*pages}
     assert {room for room in ROOMS if f"reference/{room}.html" not in pages} <= {"definitions"}
     assert "traps_pipeline.scoring.metrics" in pages["reference/scoring.html"]
+
+
+def test_broken_links_broken_anchors_and_a_page_without_a_place_each_fail_the_build(checkout: Path) -> None:
+    broken = {
+        "README.md": ["docs/missing.md"],
+        "CONTRIBUTING.md": ["docs/missing.md", "docs/install.md#missing"],
+        "docs/install.md": ["missing.md", "models.md#missing", "#missing"],
+    }
+    for page, links in broken.items():
+        with (checkout / page).open("a", encoding="utf-8") as file:
+            file.writelines(f"\n[A link]({link})\n" for link in links)
+    (checkout / "docs" / "alone.md").write_text("# A page that the navigation lacks\n", encoding="utf-8")
+
+    finished = make_docs(checkout)
+
+    warnings = finished.stderr.partition("WARNING")[2].split("WARNING")
+    assert finished.returncode != 0 and "Aborted with 7 warnings" in finished.stdout + finished.stderr
+    assert "alone.md" in warnings[0] and "cluster.md" not in warnings[0]
+    for page, links in broken.items():
+        source = {"README.md": "index.md", "CONTRIBUTING.md": "repository/CONTRIBUTING.md"}.get(page, page[5:])
+        about = [warning for warning in warnings[1:] if f"Doc file '{source}'" in warning]
+        assert len(about) == len(links) and all("missing" in warning for warning in about)
