@@ -165,9 +165,8 @@ def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = Non
     """
     if row["outcome"] not in WITH_TEXT:
         return f"judge returned {row['outcome']}"
-    text = row["text"] or ""
     try:
-        answer = strip_fence(split_thinking(text, thinking).answer if thinking else text)
+        answer = strip_fence(split_thinking(row["text"] or "", thinking).answer)
         parsed = schema.model_validate_json(answer)
     except ValidationError as error:
         return explain(error)[:200]

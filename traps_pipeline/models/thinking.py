@@ -43,12 +43,14 @@ def marks_of(declared: str | Sequence[str]) -> Marks:
     return both[0], both[1]
 
 
-def split_thinking(text: str, marks: Marks) -> Split:
-    """Split the thinking off a text.
+def split_thinking(text: str, marks: Marks | None) -> Split:
+    """Split the thinking off a text; without marks all of it is the answer.
 
     A closing mark without an opening one ends thinking that began with the text: some chat templates open it
     themselves.
     """
+    if marks is None:
+        return Split("", text, is_open=False)
     opens, closes = (re.escape(mark) for mark in marks)
     thinking, answer, is_open = "", "", False
     for piece in re.split(rf"({opens}|{closes})", text, flags=re.IGNORECASE):
