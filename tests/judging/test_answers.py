@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.judging.answers import is_correct, normalise, strip_fence, to_label, to_number
+from traps_pipeline.judging.answers import is_correct, normalise, to_label, to_number
 
 SIDES = ["left", "right", "elsewhere"]
 ALIASES = {
@@ -104,8 +104,3 @@ def test_a_value_names_one_number_one_label_or_nothing() -> None:
     numbers = {"about twelve": 12, "1.5 or so": 1.5, "1, 2": None, "many": None, "-1": -1, ".5": 0.5, "-.5": -0.5}
     assert {text: to_number(text) for text in numbers} == numbers
     assert (to_label("Blue bin", SIDES, ALIASES), to_label("green bin", SIDES, ALIASES)) == ("right", None)
-
-
-def test_json_is_taken_out_of_a_fence() -> None:
-    for text in ('{"a": 1}', '```json\n{"a": 1}\n```', '```\n{"a": 1}\n```\n', '  ```json{"a": 1}```'):
-        assert strip_fence(text) == '{"a": 1}'

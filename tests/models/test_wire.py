@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import json
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -312,3 +314,32 @@ def test_nothing_is_decided_by_a_list_of_exceptions() -> None:
     names = ("ConnectError", "ConnectTimeout", "ClientConnector", "ConnectionTimeoutError", "APIConnectionError")
     sources = [path.read_text() for path in (ROOT / "traps_pipeline").rglob("*.py")]
     assert [name for name in names if any(name in source for source in sources)] == []
+
+
+ONE, TWO = body()[:200].encode(), body()[200:].encode()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "content"),
+    [
+        ("gzip", gzip.compress(ONE) + gzip.compress(TWO)),
+        ("gzip", gzip.compress(ONE + TWO) + bytes(8)),
+        ("X-GZIP", gzip.compress(ONE + TWO)),
+        ("deflate", zlib.compress(ONE + TWO)),
+    ],
+)
+def test_a_compressed_answer_is_read_with_all_its_members(encoding: str, content: bytes) -> None:
+    with answering(200, content, {"content-encoding": encoding}) as server:
+        outcome, _ = call(f"http://127.0.0.1:{server.port}/v1")
+    assert outcome and (outcome.kind, outcome.text) == ("answer", "The answer is: left.")
+
+
+@pytest.mark.parametrize("content", [gzip.compress(ONE + TWO)[:-8], gzip.compress(ONE + TWO + b" " * 2**24)])
+def test_a_compressed_answer_that_breaks_off_or_is_a_bomb_is_no_answer(
+    content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with answering(200, content, {"content-encoding": "gzip"}) as server, progress.reporting(progress.Progress()):
+        outcome, booked_usd = call(f"http://127.0.0.1:{server.port}/v1")
+    assert outcome and (outcome.kind, outcome.text) == ("error", None) and booked_usd > 0.0
+    said = capsys.readouterr().err
+    assert "the compressed answer breaks off" in said or "is larger than 16777216 bytes" in said
