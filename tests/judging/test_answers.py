@@ -89,6 +89,8 @@ def test_a_number_inside_a_range_is_not_the_range(said: str) -> None:
         ("3 to 5 to 7", "3-5-7"),
         ("(-1.50)", "-1.50"),
         ("-.5 or .5", "-.5 or .5"),
+        ("$12,345,678.5, or 1,000-2,000", "12345678.5 or 1000-2000"),
+        ("1,2 or 0,5 or 1,23456", "1 2 or 0 5 or 1 23456"),
     ],
 )
 def test_normal_form(text: str, normal: str) -> None:

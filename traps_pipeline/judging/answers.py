@@ -15,13 +15,14 @@ _WORDS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight"
 NUMBER_WORDS = {word: str(n) for n, word in enumerate(_WORDS)}
 _FENCE = re.compile(r"(?:```|~~~)?\s*(?:json)?", re.IGNORECASE)
 _NUMBER = re.compile(r"(?:(?<![\w.])-)?(?:\d+(?:\.\d+)?|\.\d+)")
+_THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 # Punctuation that is kept: a hyphen or point inside a number or range, a minus or point that begins a number.
 _PUNCTUATION = re.compile(r"(?<=\d)[.\-](?=\d)|(?<![\w.])-(?=\.?\d)|(?<![\w.])\.(?=\d)|([^\w\s])")
 
 
 def normalise(text: str) -> str:
     """The text in lower case with single spaces, without articles and punctuation except that of numbers and ranges."""
-    text = re.sub("[–—−]", "-", text.lower())
+    text = _THOUSANDS.sub("", re.sub("[–—−]", "-", text.lower()))
     text = re.sub(r"(?<=\d)\s*(?:-|to)\s*(?=\d)", "-", text)
     text = _PUNCTUATION.sub(lambda found: " " if found[1] else found[0], text)
     return " ".join(word for word in text.split() if word not in ("a", "an", "the"))
