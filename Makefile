@@ -10,7 +10,7 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: help demo demo-mechanism check fast-tests test promises campaign test-cluster test-cluster-gate test-cluster-kills cluster-setup ui bench bench-cluster explorer-vendor lint setup setup-core lock wheel sbom docs render-packages browser test-packages clean environments
+.PHONY: help demo demo-mechanism check fast-tests test promises campaign test-cluster test-cluster-gate test-cluster-kills cluster-setup ui bench bench-cluster explorer-vendor lint setup setup-core lock wheel sbom docs render-packages browser test-packages clean environments test-newest
 
 help: ## what make can do here
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 22
@@ -174,3 +174,16 @@ environments: $(ENVIRONMENTS) ## one file of tests/release, one environment
 
 clean: ## remove the environment; studies under .workspaces stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache
+
+# The locks hold what was tested; whoever installs the wheel gets the newest of each range. Pins of `dev` are left out.
+NEWEST := .workspaces/newest
+DEV := import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; \
+	print(*(need.partition("==")[0] for need in extras["dev"] + extras["docs"]))
+test-newest: render-packages ## the wire check and the fast tests with the newest versions that pyproject.toml admits
+	$(PYTHON) -m venv --clear $(NEWEST)
+	$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check $(TORCH)
+	$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager \
+		"$(firstword $(TORCH))" --editable ".[all]" $$($(NEWEST)/bin/python -c '$(DEV)')
+	$(NEWEST)/bin/python -m pip freeze --exclude-editable
+	TRAPS_WORKSPACE=$(CURDIR)/$(NEWEST)/study $(NEWEST)/bin/traps models check
+	OMP_NUM_THREADS=1 $(NEWEST)/bin/python -m pytest --dist worksteal -n 2 $(FAST)
