@@ -175,15 +175,19 @@ environments: $(ENVIRONMENTS) ## one file of tests/release, one environment
 clean: ## remove the environment; studies under .workspaces stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache
 
-# The locks hold what was tested; whoever installs the wheel gets the newest of each range. Pins of `dev` are left out.
+# The locks hold what was tested; whoever installs the wheel gets the newest of each range. Tools come last and without
+# their pins, so that none holds a library back, as `dg` would: it is there for one version of Dagster only.
 NEWEST := .workspaces/newest
-DEV := import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; \
-	print(*(need.partition("==")[0] for need in extras["dev"] + extras["docs"]))
+TOOLS := import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; \
+	print(*(name for need in extras["dev"] + extras["docs"] if (name := need.partition("==")[0]) != "dagster-dg-cli"))
 test-newest: render-packages ## the wire check and the fast tests with the newest versions that pyproject.toml admits
 	$(PYTHON) -m venv --clear $(NEWEST)
 	$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check $(TORCH)
 	$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager \
-		"$(firstword $(TORCH))" --editable ".[all]" $$($(NEWEST)/bin/python -c '$(DEV)')
-	$(NEWEST)/bin/python -m pip freeze --exclude-editable
+		"$(firstword $(TORCH))" --editable ".[all]"
+	$(NEWEST)/bin/python -m pip freeze --exclude-editable > $(NEWEST)/libraries.txt
+	$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(NEWEST)/libraries.txt \
+		$$($(NEWEST)/bin/python -c '$(TOOLS)')
+	cat $(NEWEST)/libraries.txt
 	TRAPS_WORKSPACE=$(CURDIR)/$(NEWEST)/study $(NEWEST)/bin/traps models check
 	OMP_NUM_THREADS=1 $(NEWEST)/bin/python -m pytest --dist worksteal -n 2 $(FAST)
