@@ -48,6 +48,7 @@ test-newest: render-packages ## the newest libraries that pyproject.toml admits:
 	$(make-venv)
 	$(PIP_INSTALL) $(TORCH)
 	$(PIP_INSTALL) $(firstword $(TORCH)) --editable '.[all,dev,docs]' hatchling
+	$(compile)
 	$(BIN)/python -m pip --disable-pip-version-check list
 	$(BIN)/traps models check
 	$(PYTEST) -n auto $(FAST)
