@@ -3,7 +3,7 @@
 Studies are drawn with known shares: every scenario has a family (a shift of its difficulty), an effect that all its
 items share, an effect of each item that its runs share, and noise. Each study is resampled by the code that the
 leaderboard uses (`scoring.bootstrap`, `scoring.robust`), and by the percentile bootstrap that it replaced ("before").
-`--quick` takes seconds; the full run some minutes of CPU. `--csv FILE` keeps every setting; the printed tables have
+`--quick` takes a minute of CPU; the full run some ten. `--csv FILE` keeps every setting; the printed tables have
 the lowest coverage and the mean width over the strengths and kinds of dependence of a size.
 """
 
@@ -11,7 +11,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +68,7 @@ DEPENDENCE = {  # shares of the variance that a scenario's items and an item's r
     "clustered, 3 runs": (0.5, 0.3, 0.6, 3),
 }
 ARMS = ("decoy", "frame_out", "held_void", "twin_control")
+STUDIES, RESAMPLES, PARTS = 25, 2000, 16
 N_FAMILIES, ARM_SHARE = 8, 4  # an arm has an item of a quarter of the scenarios, of all families
 FIGURES = (
     *(f"{name}, one dataset" for name in RESAMPLED),
@@ -225,6 +230,14 @@ def measure(setting: Setting, studies: int, resamples: int, seed: int) -> Iterat
         yield row
 
 
+def mean_of_parts(setting: Setting, parts: int, seed: int) -> pd.DataFrame:
+    """Measure a setting in parts of STUDIES studies, since those of one part share the weights of scenarios, and return
+    a row a figure."""
+    rows = [row for part in range(parts) for row in measure(setting, STUDIES, RESAMPLES, seed + part)]
+    by_figure = pd.DataFrame(rows).groupby(["size", "strength", "dependence", "figure"], sort=False, as_index=False)
+    return pd.DataFrame(by_figure.mean(numeric_only=True))
+
+
 def summary(rows: pd.DataFrame) -> str:
     """Return the Markdown table of lowest coverage and mean width by size and figure, before and now."""
     shown = ("j, one dataset", "acc", "j", "pecs", "pecs_r", "difference of pecs")
@@ -249,23 +262,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer studies, four sizes")
     parser.add_argument("--csv", type=Path, help="write every setting to this file")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=1, help="processes")
     arguments = parser.parse_args()
     sizes = [*SIZES][:4] if arguments.quick else [*SIZES]
-    rows = []
-    for size in sizes:
-        studies = 50 if arguments.quick else 200
-        for strength in STRENGTHS:
-            for dependence in DEPENDENCE:
-                setting = Setting(size, strength, dependence)
-                parts = [
-                    row
-                    for part in range(max(1, studies // 50))
-                    for row in measure(setting, min(studies, 50), 1000, arguments.seed + part)
-                ]
-                frame = pd.DataFrame(parts)
-                keys = ["size", "strength", "dependence", "figure"]
-                rows.append(frame.groupby(keys, sort=False, as_index=False).mean(numeric_only=True))
-    table = pd.concat(rows, ignore_index=True)
+    settings = [Setting(*one) for one in product(sizes, STRENGTHS, DEPENDENCE)]
+    run = partial(mean_of_parts, parts=2 if arguments.quick else PARTS, seed=arguments.seed)
+    with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
+        table = pd.concat(pool.map(run, settings, chunksize=6), ignore_index=True)
     if arguments.csv:
         table.to_csv(arguments.csv, index=False)
     print(summary(table))
