@@ -68,7 +68,7 @@ DEPENDENCE = {  # shares of the variance that a scenario's items and an item's r
     "clustered, 3 runs": (0.5, 0.3, 0.6, 3),
 }
 ARMS = ("decoy", "frame_out", "held_void", "twin_control")
-STUDIES, RESAMPLES, PARTS = 25, 2000, 16
+STUDIES, RESAMPLES, PARTS = 25, 1000, 8
 N_FAMILIES, ARM_SHARE = 8, 4  # an arm has an item of a quarter of the scenarios, of all families
 FIGURES = (
     *(f"{name}, one dataset" for name in RESAMPLED),
@@ -126,23 +126,26 @@ class Setting:
         return np.stack([control > -acc, one, control < false_abs, one, void > -abs_rec, one], axis=-1).astype(float)
 
 
-def cells_of(counts: np.ndarray, drawn: Drawn, taxonomy: str, named: str) -> np.ndarray:
-    """Return the sums of one dataset or arm with its unseen scenario: (studies, runs, 12, draws)."""
+def cell_figures(counts: np.ndarray, drawn: Drawn, taxonomy: str, named: str, in_mean: bool) -> np.ndarray:
+    """Return the ends of RESAMPLED of one dataset or arm, mean over runs: (studies, 2, RESAMPLED, 1 + resamples)."""
     scenarios, studies, runs, kinds = counts.shape
     sums = resampled_sums(drawn.scenarios[taxonomy][1], counts.reshape(scenarios, studies * runs, kinds))
     having = (counts[..., 1::2] > 0).sum(axis=0)
-    return with_unseen(sums.reshape(studies, runs, kinds, -1), having, drawn.unseen(named, kinds // 2))
+    whole = with_unseen(sums.reshape(studies, runs, kinds, -1), having, drawn.unseen(named, kinds // 2))
+    return np.moveaxis(figures_of(whole, in_mean).mean(axis=2), 0, 1)
 
 
 def ends_now(counts: Mapping[str, np.ndarray], drawn: Drawn, model: str) -> dict[str, np.ndarray]:
     """Return the ends of every figure, (studies, 2, 1 + resamples), from counts by dataset and arm."""
-    sums = {name: cells_of(own, drawn, _taxonomy(name), f"{model}|{name}") for name, own in counts.items()}
-    first = next(iter(sums.values()))
-    of_one = np.moveaxis(figures_of(first).mean(axis=2), 0, 1)  # (studies, 2, RESAMPLED, draws)
+
+    def ends_of(name: str, in_mean: bool) -> np.ndarray:
+        return cell_figures(counts[name], drawn, _taxonomy(name), f"{model}|{name}", in_mean)
+
+    of_one = ends_of(next(iter(counts)), in_mean=False)
     ends = {f"{name}, one dataset": of_one[:, :, k] for k, name in enumerate(RESAMPLED)}
-    if not all(name in sums for name in DATASETS):
+    if not all(name in counts for name in DATASETS):
         return ends
-    inside = {name: np.moveaxis(figures_of(own, in_mean=True).mean(axis=2), 0, 1) for name, own in sums.items()}
+    inside = {name: ends_of(name, in_mean=True) for name in counts}
     overall = np.mean([inside[name] for name in DATASETS], axis=0)
     ends |= {name: overall[:, :, k] for k, name in enumerate(RESAMPLED)}
     robust = [run_figures({name: own[study] for name, own in inside.items()}, ARMS) for study in range(len(overall))]
