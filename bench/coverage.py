@@ -68,7 +68,7 @@ DEPENDENCE = {  # shares of the variance that a scenario's items and an item's r
     "clustered, 3 runs": (0.5, 0.3, 0.6, 3),
 }
 ARMS = ("decoy", "frame_out", "held_void", "twin_control")
-STUDIES, RESAMPLES, PARTS = 25, 1000, 8
+STUDIES, RESAMPLES, PARTS = 25, 1000, 12
 N_FAMILIES, ARM_SHARE = 8, 4  # an arm has an item of a quarter of the scenarios, of all families
 FIGURES = (
     *(f"{name}, one dataset" for name in RESAMPLED),
