@@ -3,7 +3,7 @@
 Studies are drawn with known shares: every scenario has a family (a shift of its difficulty), an effect that all its
 items share, an effect of each item that its runs share, and noise. Each study is resampled by the code that the
 leaderboard uses (`scoring.bootstrap`, `scoring.robust`), and by the percentile bootstrap that it replaced ("before").
-`--quick` takes a minute of CPU; the full run some ten. `--csv FILE` keeps every setting; the printed tables have
+`--quick` takes half a minute of CPU; the full run six. `--csv FILE` keeps every setting; the printed tables have
 the lowest coverage and the mean width over the strengths and kinds of dependence of a size.
 """
 
@@ -22,6 +22,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
+from bench.quick import parse
 from traps_pipeline.base.partitions import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
@@ -262,14 +263,14 @@ def summary(rows: pd.DataFrame) -> str:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer studies, four sizes")
+    parser.add_argument("--sizes", type=int, default=len(SIZES), help="how many sizes, the smallest first")
+    parser.add_argument("--parts", type=int, default=PARTS, help=f"studies of each setting, in parts of {STUDIES}")
     parser.add_argument("--csv", type=Path, help="write every setting to this file")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1, help="processes")
-    arguments = parser.parse_args()
-    sizes = [*SIZES][:4] if arguments.quick else [*SIZES]
-    settings = [Setting(*one) for one in product(sizes, STRENGTHS, DEPENDENCE)]
-    run = partial(mean_of_parts, parts=2 if arguments.quick else PARTS, seed=arguments.seed)
+    arguments = parse(parser, sizes=4, parts=1)
+    settings = [Setting(*one) for one in product([*SIZES][: arguments.sizes], STRENGTHS, DEPENDENCE)]
+    run = partial(mean_of_parts, parts=arguments.parts, seed=arguments.seed)
     with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
         table = pd.concat(pool.map(run, settings, chunksize=6), ignore_index=True)
     if arguments.csv:
