@@ -221,8 +221,20 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
     assert "nothing was imported" in refused.err
     assert settled(unasked) == []
 
+    failed = answers[5] | {"text": "Error: 429 Too Many Requests"}
+    given.write_text("\n".join(json.dumps(answer) for answer in [*answers[:5], failed, *answers[6:20]]))
+    stopped = unasked.traps("answers", "import", path, given)
+    assert stopped.code == 1 and "1 of its texts look like error messages" in stopped.err
+    assert "'Error: 429 Too Many Requests'" in stopped.err and settled(unasked) == []
+    dropped = unasked.traps("answers", "import", path, given, "--errors", "drop").out
+    assert "19 answers imported" in dropped and "1 error messages were left out" in dropped
+    for content, complaint in ((b"", "holds no answers"), (b"\x89PNG\xff\xfe\x00", "cannot be read as lines of text")):
+        given.write_bytes(content)
+        stopped = unasked.traps("answers", "import", path, given)
+        assert stopped.code == 1 and complaint in stopped.err
+
     given.write_text("\n".join(json.dumps(answer) for answer in answers[:20]))
-    assert "20 answers imported, 0 were there already" in unasked.traps("answers", "import", path, given).out
+    assert "1 answers imported, 19 were there already" in unasked.traps("answers", "import", path, given).out
     given.write_text("\n".join(json.dumps(answer) for answer in answers))
     assert "4 answers imported, 20 were there already" in unasked.traps("answers", "import", path, given).out
     finished = ask(unasked, path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from traps_pipeline.judging.answers import is_correct, normalise, strip_fence, to_label, to_number
+from traps_pipeline.judging.answers import is_correct, normalise, to_label, to_number
 
 SIDES = ["left", "right", "elsewhere"]
 ALIASES = {
@@ -89,6 +89,8 @@ def test_a_number_inside_a_range_is_not_the_range(said: str) -> None:
         ("3 to 5 to 7", "3-5-7"),
         ("(-1.50)", "-1.50"),
         ("-.5 or .5", "-.5 or .5"),
+        ("$12,345,678.5, or 1,000-2,000", "12345678.5 or 1000-2000"),
+        ("1,2 or 0,5 or 1,23456", "1 2 or 0 5 or 1 23456"),
     ],
 )
 def test_normal_form(text: str, normal: str) -> None:
@@ -104,8 +106,3 @@ def test_a_value_names_one_number_one_label_or_nothing() -> None:
     numbers = {"about twelve": 12, "1.5 or so": 1.5, "1, 2": None, "many": None, "-1": -1, ".5": 0.5, "-.5": -0.5}
     assert {text: to_number(text) for text in numbers} == numbers
     assert (to_label("Blue bin", SIDES, ALIASES), to_label("green bin", SIDES, ALIASES)) == ("right", None)
-
-
-def test_json_is_taken_out_of_a_fence() -> None:
-    for text in ('{"a": 1}', '```json\n{"a": 1}\n```', '```\n{"a": 1}\n```\n', '  ```json{"a": 1}```'):
-        assert strip_fence(text) == '{"a": 1}'

@@ -83,6 +83,43 @@ def test_a_vote_that_meets_the_schema_is_valid() -> None:
     assert vote("abstention", text.replace("true", '"false"')).decision is False
 
 
+VOTE = '{"abstained": true, "confidence": "high", "reasoning": "In ```a``` it declines."}'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"```json\n{VOTE}\n```\nThe response declines, as its last sentence says.",
+        f"```JSON\n{VOTE}\n```",
+        f"~~~\n{VOTE}\n~~~",
+        f"{VOTE}\n\nNote: the first sentence was ignored.",
+        f"\ufeff{VOTE}",
+        f"{VOTE}<|im_end|>\n",
+        VOTE.replace("high", " High"),
+    ],
+)
+def test_what_stands_around_a_vote_and_the_case_of_its_words_do_not_matter(text: str) -> None:
+    assert vote("abstention", text) == Vote(True, True, confidence="high", rationale="In ```a``` it declines.")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{VOTE}\nOn second thought:\n{VOTE.replace('true', 'false')}",
+        f"The response says:\n{VOTE}",  # it may be quoted from the answer that is judged
+        f"```json\n{VOTE}\n```\nThat is {{abstained}}.",
+    ],
+)
+def test_of_two_objects_or_one_that_is_quoted_none_is_a_vote(text: str) -> None:
+    assert vote("abstention", text).valid is False
+
+
+@pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity", "1e999"])
+def test_a_number_that_is_none_makes_a_vote_invalid_and_not_wrong(value: str) -> None:
+    invalid = vote("correctness", f'{{"correct": true, "extracted_value": {value}, "reasoning": ""}}')
+    assert (invalid.valid, invalid.decision) == (False, None) and "finite number" in str(invalid.invalid_reason)
+
+
 @pytest.mark.parametrize(
     ("text", "outcome", "reason"),
     [

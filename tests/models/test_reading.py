@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from traps_pipeline.models.reading import Reading, degenerate, read_answer
-from traps_pipeline.models.thinking import USUAL, how_to_declare, marks_of
+from traps_pipeline.models.thinking import USUAL, how_to_declare, marks_of, strip_fence, strip_tokens
 
 THINK = ("<think>", "</think>")
 
@@ -157,6 +157,32 @@ def test_an_answer_that_ended_for_an_unknown_reason_is_read_again_once_the_reaso
     found = read_answer(row, None, "standard")
     assert (found.outcome, found.text) == ("unfinished", None) and "'of_the_weather'" in str(found.why)
     assert read_answer(row | {"finish_reason": "stop"}, None, "standard").text == "The answer is: left."
+
+
+def test_an_answer_that_was_cut_off_before_it_began_is_truncated_and_not_empty() -> None:
+    row = {"outcome": "empty", "text": None}
+    assert read_answer(row | {"finish_reason": "length"}, "The ball", "json") == Reading(
+        "truncated", None, "The ball", False, "cut off before its answer began"
+    )
+    assert read_answer(row | {"finish_reason": "stop"}, None, "json").outcome == "empty"
+
+
+@pytest.mark.parametrize("around", ["{}<|im_end|>", "{}</s>\n", "{} <|eot_id|><|eot_id|>", "\ufeff{}", "{}\u200b"])
+def test_end_tokens_and_invisible_characters_are_no_part_of_an_answer(around: str) -> None:
+    assert read(around.format("left")).text == "left"
+    assert read(around.format('{"reason": "r", "final_answer": "left"}'), regime="json").is_json is True
+
+
+def test_an_end_token_within_an_answer_and_white_space_alone_stay() -> None:
+    assert strip_tokens("</s> is a mark.\n") == "</s> is a mark.\n"
+    assert read("</s>").outcome == "degenerate"
+
+
+def test_json_is_taken_out_of_a_fence_that_holds_all_of_a_text() -> None:
+    fenced = '```json\n{"a": 1}\n```', '```\n{"a": 1}\n```\n', '  ```json{"a": 1}```', '~~~JSON\n{"a": 1}\n~~~'
+    for text in ('{"a": 1}', *fenced):
+        assert strip_fence(text) == '{"a": 1}'
+    assert strip_fence("```") == "```" and strip_fence("```a```.") == "```a```."
 
 
 def test_an_answer_that_never_came_stays_what_it_was() -> None:

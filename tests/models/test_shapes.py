@@ -123,6 +123,7 @@ REFUSED_IN_200 = {  # by what a provider says in a 200, and what it amounts to
     "gemini": ({"code": 403, "status": "PERMISSION_DENIED", "message": "no permission"}, "http_403"),
     "final": ({"code": "404", "message": "no such model"}, "http_404"),
 }
+FLAT_IN_200 = {"code": 429, "message": "slow down", "request_id": "r"}  # an error object that is the whole body
 
 
 @pytest.fixture
@@ -131,6 +132,7 @@ def odd(shared_provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Provider:
     monkeypatch.setenv(KEY, SECRET)
     raw: dict[str, Any] = {name: {"content": content} for name, content in ODD.items()}
     raw["event-stream"]["type"] = "text/event-stream"
+    raw["in-200-flat"] = {"content": json.dumps(FLAT_IN_200), "billed": False}
     raw |= {name: {"content": body(), "status": status} for name, status in (STATUSES | UNBILLED).items()}
     for name, (error, _) in REFUSED_IN_200.items():
         raw[f"in-200-{name}"] = {"content": json.dumps({"error": error}), "billed": False}
@@ -196,6 +198,16 @@ def test_an_error_object_in_a_200_follows_the_code_that_it_carries(odd: Provider
     assert outcome and (outcome.kind, outcome.error) == ("error", REFUSED_IN_200[name][1])
     assert booked_usd == odd.stats()["billed_usd"] == 0.0
     assert odd.stats()["requests"] == (1 if outcome.error.startswith("http_") else 2)  # what may pass is tried again
+
+
+def test_an_error_object_that_is_the_whole_body_is_no_answer_out_of_order(odd: Provider) -> None:
+    outcome, booked_usd = booked_for(odd, "in-200-flat")
+    assert outcome and (outcome.kind, outcome.error) == ("error", "rate_limited")
+    assert booked_usd == odd.stats()["billed_usd"] == 0.0
+    beside = {"good": {"content": body(code=0, message="success")}}  # some gateways write a code beside an answer
+    odd.configure(raw_by_model=beside)
+    outcome, _ = booked_for(odd, "good")
+    assert outcome and outcome.text == ANSWER
 
 
 def test_an_answer_is_paid_as_its_usage_says(odd: Provider) -> None:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import json
+import threading
+import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from socketserver import StreamRequestHandler, ThreadingTCPServer
 
 import pytest
 
@@ -312,3 +317,92 @@ def test_nothing_is_decided_by_a_list_of_exceptions() -> None:
     names = ("ConnectError", "ConnectTimeout", "ClientConnector", "ConnectionTimeoutError", "APIConnectionError")
     sources = [path.read_text() for path in (ROOT / "traps_pipeline").rglob("*.py")]
     assert [name for name in names if any(name in source for source in sources)] == []
+
+
+ONE, TWO = body()[:200].encode(), body()[200:].encode()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "content"),
+    [
+        ("gzip", gzip.compress(ONE) + gzip.compress(TWO)),
+        ("gzip", gzip.compress(ONE + TWO) + bytes(8)),
+        ("X-GZIP", gzip.compress(ONE + TWO)),
+        ("deflate", zlib.compress(ONE + TWO)),
+    ],
+)
+def test_a_compressed_answer_is_read_with_all_its_members(encoding: str, content: bytes) -> None:
+    with answering(200, content, {"content-encoding": encoding}) as server:
+        outcome, _ = call(f"http://127.0.0.1:{server.port}/v1")
+    assert outcome and (outcome.kind, outcome.text) == ("answer", "The answer is: left.")
+
+
+@pytest.mark.parametrize("content", [gzip.compress(ONE + TWO)[:-8], gzip.compress(ONE + TWO + b" " * 2**24)])
+def test_a_compressed_answer_that_breaks_off_or_is_a_bomb_is_no_answer(
+    content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with answering(200, content, {"content-encoding": "gzip"}) as server, progress.reporting(progress.Progress()):
+        outcome, booked_usd = call(f"http://127.0.0.1:{server.port}/v1")
+    assert outcome and (outcome.kind, outcome.text) == ("error", None) and booked_usd > 0.0
+    said = capsys.readouterr().err
+    assert "the compressed answer breaks off" in said or "is larger than 16777216 bytes" in said
+
+
+@contextmanager
+def raw(answer: bytes) -> Iterator[str]:
+    """Serve these very bytes to every request and close; the address."""
+
+    class Handler(StreamRequestHandler):
+        def handle(self) -> None:
+            length = 0
+            while (line := self.rfile.readline()).strip():
+                name, _, value = line.partition(b":")
+                length = int(value) if name.lower() == b"content-length" else length
+            self.rfile.read(length)
+            self.wfile.write(answer)
+
+    with ThreadingTCPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/v1"
+        server.shutdown()
+
+
+WHOLE = ONE + TWO
+HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n"
+CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n"
+SIZED = HEAD + b"Content-Length: %d\r\n\r\n" % len(WHOLE) + WHOLE
+PADDING = b" " * 16 + b"\n"  # what OpenRouter sends while it waits
+
+
+def chunk(content: bytes) -> bytes:
+    return b"%x\r\n" % len(content) + content + b"\r\n"
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"HTTP/1.1 100 Continue\r\n\r\n" + SIZED,
+        b"HTTP/1.1 102 Processing\r\n\r\nHTTP/1.1 103 Early Hints\r\nLink: </a>\r\n\r\n" + SIZED,
+        CHUNKED + chunk(PADDING) + chunk(PADDING) + chunk(WHOLE) + chunk(b""),
+        HEAD + b"\r\n" + WHOLE,  # its end is that of the connection
+    ],
+)
+def test_an_answer_is_read_however_http_brings_it(answer: bytes) -> None:
+    with raw(answer) as address:
+        outcome, booked_usd = call(address)
+    assert outcome and outcome.text == "The answer is: left." and booked_usd == pytest.approx(20e-6 + 21e-5)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        CHUNKED + chunk(WHOLE),  # and no last chunk: more may have been to come
+        CHUNKED + chunk(PADDING) + chunk(b""),
+        HEAD + b"\r\n" + ONE,
+        HEAD + b"Content-Length: %d\r\n\r\n" % (len(WHOLE) + 50) + WHOLE,
+    ],
+)
+def test_half_an_answer_is_none_and_may_be_billed(answer: bytes) -> None:
+    with raw(answer) as address:
+        outcome, booked_usd = call(address)
+    assert outcome and outcome.kind in ("error", "malformed") and outcome.text is None and booked_usd > 0.1

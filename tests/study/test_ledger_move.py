@@ -13,7 +13,8 @@ from tests.postgres import Postgres
 from tests.storage.conftest import VARIABLE
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
-from traps_pipeline.models.budget import Journal
+from traps_pipeline.models.budget import Journal, read_releases
+from traps_pipeline.models.release import releasable, release
 from traps_pipeline.models.spending import spending
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
@@ -84,6 +85,25 @@ def test_a_ledger_comes_back_line_by_line_with_all_that_was_spent(study: Workspa
     assert spent_usd(outside) == pytest.approx(spent)
     assert sorted(line for path in segments(outside) for line in path.read_bytes().splitlines()) == lines
     assert inside.answers.evaluations() == [] and inside.answers.totals() == {}
+
+
+def test_what_a_person_released_stays_released_wherever_the_ledger_lies(study: Workspace) -> None:
+    spent = spent_usd(study)
+    assert release(study, "m", 0.5, "a dead proxy") == 0.5
+    move_to_database(study, VARIABLE)
+    inside = Workspace.open(study.root)
+    assert spent_usd(inside) == pytest.approx(spent - 0.5)
+    before = releasable(inside)["m"].in_flight
+    assert release(inside, "m", 1.0, "killed before it connected") == 1.0
+    assert spent_usd(inside) == pytest.approx(spent - 1.5)
+    assert releasable(inside)["m"].in_flight == pytest.approx(before - 1.0)
+    with pytest.raises(TrapsError, match="cannot be released"):
+        release(inside, "m", 100.0, "too much")
+    move_back(inside)
+    outside = Workspace.open(study.root)
+    assert spent_usd(outside) == pytest.approx(spent - 1.5)
+    records = read_releases(study.ledger_folder / "released.jsonl")
+    assert [(one["usd"], one["why"]) for one in records] == [(0.5, "a dead proxy"), (1.0, "killed before it connected")]
 
 
 def test_a_move_that_was_killed_is_done_again(study: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,12 +11,14 @@ import ssl
 import urllib.request
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from traps_pipeline.base.errors import TrapsError
 
 PROXIES = ("http_proxy", "https_proxy", "all_proxy")  # in small or capital letters
+_READ = tuple(name for low in (*PROXIES, "no_proxy") for name in (low, low.upper()))
 PROXY_SCHEMES = ("http", "https")  # SOCKS takes a package of its own, in every client library
 TLS_VARIABLES = ("SSL_CERT_FILE", "SSL_CERT_DIR")  # of calls
 CERTIFICATES = (*TLS_VARIABLES, "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")  # of some library
@@ -73,12 +75,17 @@ def is_loopback(host: str) -> bool:
 def proxy_of(url: str) -> Proxy | None:
     """Return the proxy that the environment names for a URL; None for loopback addresses, whatever it says."""
     parts = urlsplit(url)
-    host = parts.hostname or ""
+    return _proxy_of(parts.scheme, parts.hostname or "", tuple(os.environ.get(name) for name in _READ))
+
+
+@lru_cache(maxsize=256)
+def _proxy_of(scheme: str, host: str, _: tuple[str | None, ...]) -> Proxy | None:
+    """Return the proxy for a host, kept for as long as the variables have these values: each call asks."""
     proxies = urllib.request.getproxies()
-    address = proxies.get(parts.scheme) or proxies.get("all")
+    address = proxies.get(scheme) or proxies.get("all")
     if not address or is_loopback(host) or urllib.request.proxy_bypass(host):
         return None
-    names = (f"{parts.scheme}_proxy", "all_proxy")
+    names = (f"{scheme}_proxy", "all_proxy")
     variables = [name for name, value in os.environ.items() if name.lower() in names and value == address]
     variable = variables[0] if variables else "the system's settings"
     return Proxy(variable, address if "://" in address else f"http://{address}")

@@ -160,7 +160,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
     """The lines of a JSON Lines file that hold anything, with their numbers from 1. Raises TrapsError, also for JSON
     that readers would take for different things."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # some editors and shells put a byte-order mark first
     except (OSError, UnicodeDecodeError) as error:
         raise TrapsError(f"{path}: cannot be read as lines of text ({plain(error)[:MOST_SAID]}); restore it") from error
     for number, line in enumerate(text.split("\n"), start=1):  # not splitlines: JSON may hold U+2028 as it is

@@ -7,29 +7,25 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from traps_pipeline.models.thinking import strip_fence
+
 UNREAD = "unread"  # the vote of a rule judge, and the outcome of an answer, that has none of the forms the rules read
 NUMERIC_TOLERANCE = 0.5
 _WORDS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 NUMBER_WORDS = {word: str(n) for n, word in enumerate(_WORDS)}
+_FENCE = re.compile(r"(?:```|~~~)?\s*(?:json)?", re.IGNORECASE)
 _NUMBER = re.compile(r"(?:(?<![\w.])-)?(?:\d+(?:\.\d+)?|\.\d+)")
+_THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 # Punctuation that is kept: a hyphen or point inside a number or range, a minus or point that begins a number.
 _PUNCTUATION = re.compile(r"(?<=\d)[.\-](?=\d)|(?<![\w.])-(?=\.?\d)|(?<![\w.])\.(?=\d)|([^\w\s])")
 
 
 def normalise(text: str) -> str:
     """The text in lower case with single spaces, without articles and punctuation except that of numbers and ranges."""
-    text = re.sub("[–—−]", "-", text.lower())
+    text = _THOUSANDS.sub("", re.sub("[–—−]", "-", text.lower()))
     text = re.sub(r"(?<=\d)\s*(?:-|to)\s*(?=\d)", "-", text)
     text = _PUNCTUATION.sub(lambda found: " " if found[1] else found[0], text)
     return " ".join(word for word in text.split() if word not in ("a", "an", "the"))
-
-
-def strip_fence(text: str) -> str:
-    """The JSON inside a ```json fence, which some models and judges add although the prompt forbids it."""
-    text = text.strip()
-    if text.startswith("```") and text.endswith("```"):
-        text = text[3:-3].removeprefix("json").strip()
-    return text
 
 
 def read_object(text: str) -> dict[str, Any] | None:
@@ -39,6 +35,22 @@ def read_object(text: str) -> dict[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return parsed if isinstance(parsed, dict) else None
+
+
+def leading_object(text: str) -> str:
+    """Return the JSON object that a text begins with, in a fence or not, without the prose after it.
+
+    The text comes back as it is if it begins with no whole object, or if another brace follows: of two verdicts none
+    is the judge's.
+    """
+    start = text.find("{")
+    if start < 0 or _FENCE.fullmatch(text[:start].strip()) is None:
+        return text
+    try:
+        _, end = json.JSONDecoder().raw_decode(text, start)
+    except (ValueError, RecursionError):
+        return text
+    return text if "{" in text[end:] else text[start:end]
 
 
 def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from itertools import islice
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
+    AllowInfNan,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -28,7 +29,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import Cell
 from traps_pipeline.base.yamlfile import explain
-from traps_pipeline.judging.answers import UNREAD, is_correct, read_flag, read_object, strip_fence
+from traps_pipeline.judging.answers import UNREAD, is_correct, leading_object, read_flag, read_object
 from traps_pipeline.judging.tables import VoteRow
 from traps_pipeline.models.answers import answer_request, asked_items
 from traps_pipeline.models.ask import AnyCall, AnyCell, Call, Finished, Settled, collect
@@ -48,7 +49,7 @@ from traps_pipeline.models.prompts import prompt
 from traps_pipeline.models.registry import NETWORK, Entry, get_model
 from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
 from traps_pipeline.models.tables import RESPONSES
-from traps_pipeline.models.thinking import Marks, split_thinking
+from traps_pipeline.models.thinking import Marks, split_thinking, strip_tokens
 from traps_pipeline.storage.parquet import Made, joined
 from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
@@ -118,7 +119,12 @@ def vote_request(judge: Seat, task: Task, cell: Cell, item: Mapping[str, Any], a
 # --- a judge's vote ---------------------------------------------------------------------------------------------------
 
 
+def _word(value: object) -> object:
+    return value.strip().lower() if isinstance(value, str) else value
+
+
 Flag = Annotated[StrictBool, BeforeValidator(read_flag)]  # judges also write "true" and "false"
+Confidence = Annotated[Literal["high", "medium", "low"], BeforeValidator(_word)]  # and "High"
 
 
 class AbstentionVote(BaseModel):
@@ -126,7 +132,7 @@ class AbstentionVote(BaseModel):
 
     model_config = ConfigDict(extra="ignore")
     abstained: Flag
-    confidence: Literal["high", "medium", "low"]
+    confidence: Confidence
     reasoning: str
 
 
@@ -135,7 +141,7 @@ class CorrectnessVote(BaseModel):
 
     model_config = ConfigDict(extra="ignore")
     correct: Flag
-    extracted_value: StrictStr | StrictInt | StrictFloat | None
+    extracted_value: StrictStr | StrictInt | Annotated[StrictFloat, AllowInfNan(False)] | None
     reasoning: str
 
 
@@ -165,9 +171,8 @@ def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = Non
     """
     if row["outcome"] not in WITH_TEXT:
         return f"judge returned {row['outcome']}"
-    text = row["text"] or ""
     try:
-        answer = strip_fence(split_thinking(text, thinking).answer if thinking else text)
+        answer = leading_object(strip_tokens(split_thinking(row["text"] or "", thinking).answer))
         parsed = schema.model_validate_json(answer)
     except ValidationError as error:
         return explain(error)[:200]

@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from traps_pipeline.judging.answers import NUMBER_WORDS, UNREAD, normalise, read_flag, read_object, strip_fence
+from traps_pipeline.judging.answers import NUMBER_WORDS, UNREAD, normalise, read_flag, read_object
 from traps_pipeline.models.request import Outcome, Request
+from traps_pipeline.models.thinking import strip_fence
 
 # Answers that commit under any question: labels of the pairs, of questions that both sides answer, and what else the
 # pocket model guesses.

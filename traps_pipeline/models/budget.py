@@ -10,7 +10,7 @@ import asyncio
 import json
 import os
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,13 +101,25 @@ class Journal:
         os.close(self._file)
 
 
-def released_usd(path: Path) -> dict[str, float]:
-    """Return the dollars that a person released by participant (`models.release`). A damaged line releases nothing."""
-    released = defaultdict[str, float](float)
+def read_releases(path: Path) -> list[Mapping[str, Any]]:
+    """Return the records of what a person released (`models.release`). A damaged one releases nothing, and is named."""
+    records, damaged = list[Mapping[str, Any]](), list[int]()
     for line in read_checked(path) if path.exists() else ():
         if line.whole:
-            record = json.loads(line.content)
-            released[record["participant"]] += record["usd"]
+            records.append(json.loads(line.content))
+        elif not line.torn:
+            damaged.append(line.number)
+    if damaged:
+        numbers = ", ".join(map(str, damaged))
+        progress.current().note(f"{path}: line {numbers} {NOT_WHOLE}; what it released counts as spent")
+    return records
+
+
+def released_usd(records: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Return the dollars that were released, by participant."""
+    released = defaultdict[str, float](float)
+    for record in records:
+        released[record["participant"]] += record["usd"]
     return released
 
 

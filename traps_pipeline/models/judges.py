@@ -32,7 +32,7 @@ from traps_pipeline.models.thinking import Marks
 JUDGES_FILE = ASSETS / "judges.yaml"
 PANEL_SIZES = (1, 3)
 RULE = "rule"  # the backend of the rule judges
-RULES_VERSION = 4  # of judging/rules.py; when it is raised, rule judges vote again
+RULES_VERSION = 5  # of judging/rules.py; when it is raised, rule judges vote again
 RULES_PANEL = "rules"
 ONE_JUDGE = ".1"  # ends the id of a panel of one judge
 BY_RULES = "judged by rules, not comparable"

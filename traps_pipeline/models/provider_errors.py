@@ -31,7 +31,7 @@ _STATUSES: dict[int, tuple[str, ...]] = {
 }
 _STATUS_OF = {word: status for status, words in _STATUSES.items() for word in words}
 _FILTERED = re.compile(
-    r"content_filter|content_policy|responsible_?ai_?policy|moderation|safety_violation|data_inspection_failed", re.I
+    r"content_filter|content_policy|responsible_?ai_?policy|moderation|safety_violation|data_?inspection_?failed", re.I
 )
 _ABOUT_KEY = re.compile(r"\b(api[ _-]?keys?|keys?|tokens?|auth\w*|unauth\w*|credentials?|permissions?|access)\b", re.I)
 _AMOUNT = re.compile(r"(\d+(?:\.\d+)?)(ms|h|m|s)")
@@ -77,11 +77,20 @@ def read_error(content: bytes | None) -> ProviderError | None:
     if not isinstance(body, Mapping):
         return None
     error = body.get("error") or _of_choice(body.get("choices"))
-    if not error and body.get("object") == "error":  # vLLM
+    if not error and (body.get("object") == "error" or _is_flat(body)):  # vLLM; gateways
         error = body
     if isinstance(error, str):
         return ProviderError(error, tuple(_words(body)), _status(body))
     return _read(error) if isinstance(error, Mapping) else None
+
+
+def _is_flat(body: Mapping[str, Any]) -> bool:
+    """Return whether a body is an error object itself: a message with a code, and nothing that an answer has."""
+    return (
+        isinstance(body.get("message"), str)
+        and "code" in body
+        and not body.keys() & {"choices", "output", "content", "candidates"}
+    )
 
 
 def _of_choice(choices: Any) -> Any:

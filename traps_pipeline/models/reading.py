@@ -15,9 +15,16 @@ from typing import Any
 from traps_pipeline.models.endings import ending_of
 from traps_pipeline.models.prompts import fields_of
 from traps_pipeline.models.request import JUDGED, UNFINISHED, WITH_TEXT
-from traps_pipeline.models.thinking import Marks, how_to_declare, split_thinking, undeclared_mark
+from traps_pipeline.models.thinking import (
+    Marks,
+    how_to_declare,
+    split_thinking,
+    strip_fence,
+    strip_tokens,
+    undeclared_mark,
+)
 
-READING = "3"  # version of this module's rules; the answers' tables are stale when it is raised
+READING = "4"  # version of this module's rules; the answers' tables are stale when it is raised
 FINAL = re.compile(r"\banswer\W*?(?:\bis\b\s*:?|[:=])\s*", re.IGNORECASE)  # what announces the final answer
 # A final answer that is announced as such and ends before the text does: one that is cut off may be another.
 _STATED = re.compile(
@@ -61,9 +68,11 @@ def read_answer(
         outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish), UNFINISHED)
         if outcome == UNFINISHED:
             return Reading(outcome, None, reasoning, why=f"ended for the unknown reason {str(finish)[:_SHOWN]!r}")
+    if outcome == "empty" and ending_of(row.get("finish_reason")) == "truncated":
+        return Reading("truncated", None, reasoning, False if fields else None, "cut off before its answer began")
     if outcome not in WITH_TEXT or not isinstance(text, str):
         return Reading(outcome, text, reasoning)
-    is_cut_off = outcome == "truncated"
+    text, is_cut_off = strip_tokens(text), outcome == "truncated"
     if thinking:
         split = split_thinking(text, thinking)
         text, is_cut_off = split.answer, is_cut_off or split.is_open
@@ -142,11 +151,8 @@ def degenerate(text: str) -> str | None:
 def _is_json(text: str, fields: Sequence[str]) -> bool:
     """Whether a text is an object with the fields that decide, `final_answer` and `abstain` if asked for, in a fence or
     not. What reasons it gives is left to it."""
-    stripped = text.strip()
-    if stripped.startswith("```") and stripped.endswith("```"):
-        stripped = stripped[3:-3].removeprefix("json")
     try:
-        parsed = json.loads(stripped)
+        parsed = json.loads(strip_fence(text))
     except (ValueError, RecursionError):
         return False
     return isinstance(parsed, dict) and {"final_answer", *({*fields} - {"reason"})} <= parsed.keys()

@@ -19,7 +19,7 @@ from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy
-from traps_pipeline.models.budget import RELEASED, Journal, released_usd
+from traps_pipeline.models.budget import RELEASED, Journal, read_releases, released_usd
 from traps_pipeline.models.spending import account_budgets, alone, spent_usd
 from traps_pipeline.storage.ledger import FAILED, is_cost, participant_of
 from traps_pipeline.storage.lines import append_whole, checked_line
@@ -44,7 +44,6 @@ class _Booked:
     spent: Mapping[str, float]
     in_flight: Mapping[str, float]
     released: Mapping[str, float]
-    opened: ExitStack
 
 
 def releasable(workspace: Workspace) -> dict[str, Releasable]:
@@ -67,8 +66,9 @@ def release(workspace: Workspace, participant: str, usd: float | None, why: str)
                 f"flight when a process died and ${room.failed:.4f} for failed ones; give --usd with at most "
                 f"{most:.4f}, or a participant that `traps ledger release` lists"
             )
-        record = {"participant": participant, "usd": min(dollars, most), "why": why, "by": getpass.getuser()}
-        record |= {"at": datetime.now(UTC).isoformat()}
+        dollars = min(dollars, most)
+        now = datetime.now(UTC).isoformat()
+        record = {"participant": participant, "usd": dollars, "why": why, "by": _person(), "at": now}
         if workspace.session is None:
             _append(workspace, record)
         else:
@@ -76,8 +76,8 @@ def release(workspace: Workspace, participant: str, usd: float | None, why: str)
         account = account_budgets(workspace, booked.spent).get(participant)
         if account is not None:
             with closing(account):
-                account.correct(-record["usd"])
-        return record["usd"]
+                account.correct(-dollars)
+        return dollars
 
 
 @contextmanager
@@ -86,18 +86,18 @@ def _booked(workspace: Workspace) -> Iterator[_Booked]:
         if workspace.session is None:
             opened.enter_context(alone(workspace))
             journal = opened.enter_context(closing(Journal(workspace.ledger_folder / JOURNAL)))
-            released = released_usd(workspace.ledger_folder / RELEASED)
-            yield _Booked(spent_usd(workspace, journal), journal.lost_usd, released, opened)
+            released = released_usd(read_releases(workspace.ledger_folder / RELEASED))
+            yield _Booked(spent_usd(workspace, journal), journal.lost_usd, released)
             return
         purse = Purse(workspace.session)
         standing = purse.open()
         opened.callback(purse.close)
-        released, in_flight = purse.released(), dict[str, float]()
+        released, in_flight = released_usd(purse.releases()), dict[str, float]()
+        ledgers = (workspace.answers.totals(), workspace.votes.totals())
         for participant, usd in standing.spent.items():
-            ledgers = (workspace.answers.totals(), workspace.votes.totals())
             rows = sum(its[participant].dollars for its in ledgers if participant in its)
             in_flight[participant] = usd - rows + released.get(participant, 0.0)
-        yield _Booked(standing.spent, in_flight, released, opened)
+        yield _Booked(standing.spent, in_flight, released)
 
 
 def _releasable(workspace: Workspace, booked: _Booked) -> dict[str, Releasable]:
@@ -115,6 +115,14 @@ def _releasable(workspace: Workspace, booked: _Booked) -> dict[str, Releasable]:
         if room.in_flight + room.failed > CENT:
             rooms[participant] = room
     return rooms
+
+
+def _person() -> str:
+    """Return the user's name; a container may have no name for its number."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return str(os.getuid())
 
 
 def _append(workspace: Workspace, record: Mapping[str, Any]) -> None:

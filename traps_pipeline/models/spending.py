@@ -13,7 +13,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import require_in_place, try_lock
 from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.budget import RELEASED, Budget, Journal, released_usd
+from traps_pipeline.models.budget import RELEASED, Budget, Journal, read_releases, released_usd
 from traps_pipeline.models.judges import load_judges
 from traps_pipeline.models.registry import Entry, load_accounts, load_models
 from traps_pipeline.models.shared_budget import SharedBudget
@@ -94,7 +94,7 @@ def spent_usd(workspace: Workspace, journal: Journal) -> Mapping[str, float]:
     for ledger in (workspace.answers, workspace.votes):
         for participant, its in ledger.totals().items():
             spent[participant] += its.dollars + its.unknown * _at_most_usd(workspace, participant, its)
-    for participant, usd in released_usd(workspace.ledger_folder / RELEASED).items():
+    for participant, usd in released_usd(read_releases(workspace.ledger_folder / RELEASED)).items():
         spent[participant] = max(0.0, spent[participant] - usd)
     return spent
 

@@ -1,4 +1,5 @@
-"""Thinking that stands in a visible text, between marks that the entry of a model or a judge declares."""
+"""What stands around an answer in a visible text: thinking between marks that the entry of a model or a judge declares,
+a code fence, and tokens that a server did not take off."""
 
 from __future__ import annotations
 
@@ -19,6 +20,11 @@ USUAL: tuple[Marks, ...] = (
     ("<|START_THINKING|>", "<|END_THINKING|>"),  # Command A
     ("<|channel|>analysis<|message|>", "<|channel|>final<|message|>"),  # gpt-oss
 )
+_END = (  # tokens of the usual templates that end a text
+    *("</s>", "<eos>", "<|im_end|>", "<|endoftext|>", "<|end_of_text|>", "<|eot_id|>", "<|eom_id|>"),
+    *("<end_of_turn>", "<|end|>", "<|return|>", "<｜end▁of▁sentence｜>"),
+)
+_INVISIBLE = "\ufeff\u200b\u2060"  # byte-order mark, zero-width space and word joiner
 _TURN = re.compile(r"<\|start\|>assistant|<\|(?:start|end|return)\|>")  # gpt-oss writes these around its messages
 
 
@@ -43,12 +49,14 @@ def marks_of(declared: str | Sequence[str]) -> Marks:
     return both[0], both[1]
 
 
-def split_thinking(text: str, marks: Marks) -> Split:
-    """Split the thinking off a text.
+def split_thinking(text: str, marks: Marks | None) -> Split:
+    """Split the thinking off a text; without marks all of it is the answer.
 
     A closing mark without an opening one ends thinking that began with the text: some chat templates open it
     themselves.
     """
+    if marks is None:
+        return Split("", text, is_open=False)
     opens, closes = (re.escape(mark) for mark in marks)
     thinking, answer, is_open = "", "", False
     for piece in re.split(rf"({opens}|{closes})", text, flags=re.IGNORECASE):
@@ -63,6 +71,28 @@ def split_thinking(text: str, marks: Marks) -> Split:
         else:
             answer += piece
     return Split(_TURN.sub("", thinking).strip(), _TURN.sub("", answer).strip(), is_open)
+
+
+def strip_tokens(text: str) -> str:
+    """Return a text without the end-of-sequence tokens at its end and the invisible characters around it."""
+    text = text.strip(_INVISIBLE)
+    end, has_token = len(text), False
+    while True:
+        while end and text[end - 1].isspace():
+            end -= 1
+        token = next((token for token in _END if text.endswith(token, 0, end)), None)
+        if token is None:
+            return text[:end] if has_token else text
+        end, has_token = end - len(token), True
+
+
+def strip_fence(text: str) -> str:
+    """Return what is inside a code fence around a whole text, which some models and judges add; else the text."""
+    text = text.strip().strip(_INVISIBLE).strip()
+    if text[:3] not in ("```", "~~~") or not text[3:].endswith(text[:3]):
+        return text
+    inside = text[3:-3]
+    return (inside[4:] if inside[:4].lower() == "json" else inside).strip()
 
 
 def undeclared_mark(text: str) -> str | None:

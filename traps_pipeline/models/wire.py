@@ -147,14 +147,20 @@ async def _read(response: aiohttp.ClientResponse) -> bytes:
 
 
 def _decoded(content: bytes, encoding: str) -> bytes:
+    """Return a body unpacked. Raises ValueError for one that breaks off, is too large, or is in another encoding."""
     if encoding.lower() == "identity":
         return content
-    if encoding.lower() not in ("gzip", "deflate"):
+    if encoding.lower() not in ("gzip", "x-gzip", "deflate"):
         raise ValueError(f"the answer is encoded as {encoding[:40]!r}, which was not asked for")
-    unpacking = zlib.decompressobj(47 if encoding.lower() == "gzip" else 15)
-    unpacked = unpacking.decompress(content, MOST_BYTES)
-    if unpacking.unconsumed_tail:
-        raise ValueError(f"the answer is larger than {MOST_BYTES} bytes")
+    unpacked = b""
+    while content:  # gzip may have several members
+        unpacking = zlib.decompressobj(15 if encoding.lower() == "deflate" else 47)
+        unpacked += unpacking.decompress(content, MOST_BYTES + 1 - len(unpacked))
+        if len(unpacked) > MOST_BYTES:
+            raise ValueError(f"the answer is larger than {MOST_BYTES} bytes")
+        if not unpacking.eof:
+            raise ValueError("the compressed answer breaks off")
+        content = unpacking.unused_data.lstrip(b"\0")
     return unpacked
 
 

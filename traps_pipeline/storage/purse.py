@@ -7,7 +7,7 @@ process that died: its calls in flight may have cost all of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 CENT = 1e-9  # below this, dollars are rounding
 _RELEASED = """create table if not exists traps.released (
     study int not null references traps.studies, participant text not null, usd float8 not null,
-    why text not null, "by" text not null, at timestamptz not null)"""
+    why text not null, "by" text not null, at text not null)"""
+RELEASE = ("participant", "usd", "why", "by", "at")  # what is recorded of money that a person gave back
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,14 @@ class Standing:
         if participant is not None:
             return cap_usd - sum(its.get(participant, 0.0) for its in taken)
         return cap_usd - sum(sum(its.values()) for its in taken)
+
+
+def keep_releases(connection: Connection[Any], session: Session, records: Iterable[Mapping[str, Any]]) -> None:
+    """Keep records of what was released; what is spent does not change by it."""
+    connection.execute(_RELEASED)
+    for record in records:
+        sql = "insert into traps.released values (%s, %s, %s, %s, %s, %s)"
+        connection.execute(sql, [session.study_id, *(record[name] for name in RELEASE)])
 
 
 class Purse:
@@ -107,21 +116,19 @@ class Purse:
 
         def work(connection: Connection[Any]) -> None:
             self._hold(connection)
-            connection.execute(_RELEASED)
-            sql = 'insert into traps.released (study, participant, usd, why, "by", at) values (%s, %s, %s, %s, %s, %s)'
-            values = [record[name] for name in ("participant", "usd", "why", "by", "at")]
-            connection.execute(sql, [self._session.study_id, *values])
+            keep_releases(connection, self._session, [record])
             add_spent(connection, self._session, record["participant"], -record["usd"])
 
         self._session.run(work)
 
-    def released(self) -> dict[str, float]:
-        """Return the dollars that were released by participant."""
+    def releases(self) -> list[dict[str, Any]]:
+        """Return the records of what was released, the oldest first."""
 
-        def work(connection: Connection[Any]) -> dict[str, float]:
-            connection.execute(_RELEASED)
-            sql = "select participant, sum(usd) from traps.released where study = %s group by participant"
-            return dict(connection.execute(sql, [self._session.study_id]).fetchall())
+        def work(connection: Connection[Any]) -> list[dict[str, Any]]:
+            keep_releases(connection, self._session, [])
+            sql = 'select participant, usd, why, "by", at from traps.released where study = %s order by at'
+            rows = connection.execute(sql, [self._session.study_id]).fetchall()
+            return [dict(zip(RELEASE, row, strict=True)) for row in rows]
 
         return self._session.run(work)
 

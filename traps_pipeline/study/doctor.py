@@ -207,7 +207,7 @@ def _damaged_states(path: Path) -> str:
 def _damaged_history(path: Path) -> str:
     """A damaged history is no loss: it is put aside and begun anew when the next command opens it."""
     try:
-        with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as opened:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as opened:
             (said,) = opened.execute("pragma quick_check(1)").fetchone()
     except sqlite3.DatabaseError as error:
         said = str(error)

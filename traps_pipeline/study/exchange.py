@@ -216,7 +216,9 @@ def import_answers(
     if path.suffix != LOG and is_batch(path):
         return _import_batch(workspace, workspace.answers, load_models(), wanted, path)
     reader = reader_of(path)
-    answers = checked_answers(path, wanted) if reader is None else _by_item(reader(path), wanted, whose or Whose())
+    answers, n_failed = (
+        (checked_answers(path, wanted), 0) if reader is None else _by_item(reader(path), wanted, whose or Whose())
+    )
     if not answers:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
     like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MOST_LOOKED_AT])]
@@ -229,7 +231,8 @@ def import_answers(
         for key, answer in answers.items()
     ]
     new = asyncio.run(_store(workspace, workspace.answers, found))
-    return Imported(new, len(answers) - new, dropped=len(like_errors) if errors == "drop" else 0)
+    failed = f"{n_failed} samples of the log" if n_failed else ""
+    return Imported(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
 
 
 def _said_of_errors(path: Path, answers: Mapping[str, Answer], wanted: Mapping[str, Request]) -> str:
@@ -328,8 +331,12 @@ def checked_answers(path: Path, wanted: Mapping[str, Request]) -> dict[str, Answ
     return answers
 
 
-def _by_item(given: Iterable[Given], wanted: Mapping[str, Request], whose: Whose) -> dict[str, Answer]:
-    """The answers of a harness by key. Raises TrapsError naming those (up to five) that are wrong or not wanted."""
+def _by_item(given: Iterable[Given], wanted: Mapping[str, Request], whose: Whose) -> tuple[dict[str, Answer], int]:
+    """Return the answers of a harness by key, and the number of calls that failed in it and have no answer elsewhere.
+
+    Epochs of a harness are runs from `whose.run` on. Raises TrapsError naming those (up to five) that are wrong or not
+    wanted.
+    """
     models = sorted({request.participant for request in wanted.values()})
     model = whose.model or (models[0] if len(models) == 1 else None)
     if model not in models:
@@ -340,13 +347,15 @@ def _by_item(given: Iterable[Given], wanted: Mapping[str, Request], whose: Whose
         if (at := request.about)["model"] == model
     }
     names = {opaque(whose.key, item): item for item, _, _ in keys} if whose.key else {}
-    answers, wrong = dict[str, Answer](), list[str]()
+    answers, wrong, failed = dict[str, Answer](), list[str](), set[str]()
     for one in given:
-        run = whose.run if one.run is None else one.run
+        run = whose.run + one.epoch - 1 if one.run is None else one.run
         key = keys.get((names.get(one.item, one.item), one.regime, run))
         try:
             if key is None:
                 wrong.append(f"{one.where}: {one.item} under {one.regime}, run {run}, is not wanted of {model}")
+            elif one.has_failed:
+                failed.add(key)
             elif answers.setdefault(key, answer := Answer(key=key, **one.answer)) != answer:
                 wrong.append(f"{one.where}: gives another answer to {one.item} than an earlier one")
         except ValidationError as error:
@@ -356,7 +365,7 @@ def _by_item(given: Iterable[Given], wanted: Mapping[str, Request], whose: Whose
     if wrong:
         more = f"\n... and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
         raise TrapsError("\n".join(map(plain, wrong[:SHOWN])) + more + "\nnothing was imported")
-    return answers
+    return answers, len(failed - answers.keys())
 
 
 async def _store(workspace: Workspace, ledger: Ledger, found: Sequence[_Stored]) -> int:

@@ -20,6 +20,7 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import read_lines
 from traps_pipeline.models.endings import ending_of
 from traps_pipeline.models.request import UNFINISHED, WITH_TEXT
+from traps_pipeline.models.usage import Sizes, read_usage
 
 MOST_SAMPLE_BYTES, MOST_LOG_BYTES, MOST_SAMPLES = 2**28, 2 * 2**30, 1_000_000
 # What an ending means of an answer in a log; one that is asked again is an error.
@@ -33,13 +34,16 @@ Reader = Callable[[Path], Iterator["Given"]]
 @dataclass(frozen=True)
 class Given:
     """An answer to an item. where: file and line or sample, for complaints. item: its id, or its opaque name in a
-    held-out set. answer: fields of `exchange.Answer` but its key. run: None where the file does not say."""
+    held-out set. answer: fields of `exchange.Answer` but its key. run: None where the file does not say. epoch: how
+    often the harness had asked, from 1. has_failed: the call brought no answer, so that the item stays missing."""
 
     where: str
     item: str
     regime: str
     run: int | None = None
     answer: dict[str, Any] = field(default_factory=dict)
+    epoch: int = 1
+    has_failed: bool = False
 
 
 def reader_of(path: Path) -> Reader | None:
@@ -115,17 +119,47 @@ def _unpacked(raw: Any, entry: zipfile.ZipInfo) -> bytes:
 def _sample(where: str, sample: Any) -> Given:
     try:
         about, output = sample["metadata"], sample["output"]
-        stop = (output.get("choices") or [{}])[0].get("stop_reason")
-        usage = output.get("usage") or {}
-        outcome = "error" if sample.get("error") else OUTCOMES.get(ending_of(str(stop)), UNFINISHED)
+        choices, epoch = output.get("choices") or [{}], sample.get("epoch", 1)
+        stop = choices[0].get("stop_reason")
+        outcome = OUTCOMES.get(ending_of(str(stop)), UNFINISHED)
+        has_failed = bool(sample.get("error")) or not output.get("choices") or outcome == "error"
         answer = _answer(outcome, output.get("completion"))
         answer |= {"finish_reason": stop, "served_model": output.get("model") or None}
-        counts = {"prompt_tokens": "input_tokens", "completion_tokens": "output_tokens"}
-        counts |= {"reasoning_tokens": "reasoning_tokens"}
-        answer |= {ours: usage.get(theirs) for ours, theirs in counts.items()}
-        return Given(where, str(about["item_id"]), str(about["regime"]), answer=answer)
+        answer |= {"reasoning": _reasoning(choices[0].get("message")), **_tokens(output.get("usage") or {})}
+        if type(epoch) is not int:
+            raise TypeError("its epoch is no whole number")
+        return Given(where, str(about["item_id"]), str(about["regime"]), None, answer, epoch, has_failed)
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise TrapsError(f"{where}: is no sample of this benchmark's task ({plain(repr(error))[:200]})") from error
+
+
+def _reasoning(message: Any) -> str | None:
+    """Return what stands in the parts of a message that are reasoning."""
+    content = message.get("content") if isinstance(message, dict) else None
+    parts = [part for part in content if isinstance(part, dict)] if isinstance(content, list) else []
+    texts = [part.get("reasoning") for part in parts if part.get("type") == "reasoning" and not part.get("redacted")]
+    return "\n\n".join(text for text in texts if isinstance(text, str)).strip() or None
+
+
+def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
+    """Return the tokens of a call, None where they are unknown.
+
+    inspect_ai's providers count cached input and reasoning within `input_tokens` and `output_tokens` or beside them;
+    the total tells which.
+    """
+    told = {name: value for name, value in usage.items() if type(value) is int}
+    cached = told.get("input_tokens_cache_read", 0) + told.get("input_tokens_cache_write", 0)
+    counts: dict[str, Any] = {n: told[n] for n in ("input_tokens", "output_tokens", "total_tokens") if n in told}
+    if told.get("input_tokens", 0) + cached + told.get("output_tokens", 0) <= told.get("total_tokens", 0):
+        counts["cache_read_input_tokens"] = cached
+    counts["output_tokens_details"] = {"reasoning_tokens": usage.get("reasoning_tokens")}
+    read = read_usage(counts, Sizes(0, 0, 0))
+    known = read if read and read.believed else None
+    return {
+        "prompt_tokens": known and known.prompt,
+        "completion_tokens": known and known.completion,
+        "reasoning_tokens": known and known.reasoning,
+    }
 
 
 # --- lmms-eval and lines of one's own ---------------------------------------------------------------------------------

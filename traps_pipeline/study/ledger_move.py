@@ -10,7 +10,7 @@ import asyncio
 import re
 import secrets
 import time
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass
 from itertools import islice
@@ -19,12 +19,13 @@ from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import sync_folder
-from traps_pipeline.models.budget import Journal
+from traps_pipeline.base.files import sync_folder, write_bytes
+from traps_pipeline.models.budget import RELEASED, Journal, read_releases, released_usd
 from traps_pipeline.models.spending import alone, spent_usd
 from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.ledger import Ledger, LockGivenUp, Stored, settles
-from traps_pipeline.storage.purse import Purse
+from traps_pipeline.storage.lines import checked_line
+from traps_pipeline.storage.purse import Purse, keep_releases
 from traps_pipeline.storage.segments import JOURNAL, SegmentLedger
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.stream import add_spent, add_totals, encoded, insert_rows
@@ -76,13 +77,20 @@ async def _move_in(workspace: Workspace, session: Session, settle: Callable[[], 
             spent = spent_usd(workspace, journal)
             for place in (note for ledger in ledgers for note in ledger.damage()):
                 progress.current().note(f"{place}; it is not moved, and what it cost counts as spent")
-            rows = session.run(lambda connection: _fill(connection, session, ledgers, spent))
+            releases = read_releases(workspace.ledger_folder / RELEASED)
+            rows = session.run(lambda connection: _fill(connection, session, ledgers, spent, releases))
             settle()
         session.run(lambda c: c.execute("update traps.studies set is_here = true where id = %s", [session.study_id]))
         return Moved(rows, session.host, _put_aside(workspace))
 
 
-def _fill(connection: Connection[Any], session: Session, ledgers: Iterable[SegmentLedger], spent: Any) -> int:
+def _fill(
+    connection: Connection[Any],
+    session: Session,
+    ledgers: Iterable[SegmentLedger],
+    spent: Mapping[str, float],
+    releases: Iterable[Mapping[str, Any]],
+) -> int:
     """Put all rows into the database, in the place of what an unfinished move left there; how many."""
     ((is_here, holds),) = connection.execute(
         """select is_here, exists (select from traps.rows r join traps.evaluations e on e.id = r.evaluation
@@ -111,6 +119,7 @@ def _fill(connection: Connection[Any], session: Session, ledgers: Iterable[Segme
             add_totals(connection, session, ledger.kind, participant, its)
     for participant, usd in spent.items():
         add_spent(connection, session, participant, usd)
+    keep_releases(connection, session, releases)
     return count
 
 
@@ -131,8 +140,8 @@ def _clear(connection: Connection[Any], session: Session) -> None:
     connection.execute("delete from traps.totals where study = %s", mine)
     connection.execute("delete from traps.spent where study = %s", mine)
     connection.execute("delete from traps.blocks where study = %s", mine)
-    if connection.execute("select to_regclass('traps.released')").fetchall() != [(None,)]:
-        connection.execute("delete from traps.released where study = %s", mine)
+    keep_releases(connection, session, [])  # the table
+    connection.execute("delete from traps.released where study = %s", mine)
 
 
 def move_back(workspace: Workspace) -> Moved:
@@ -171,10 +180,14 @@ async def _move_out(workspace: Workspace, session: Session) -> Moved:
                                 writer.append(*one)
                         count += len(segment)
             booked = [ledger.totals() for ledger in ledgers]
+            releases = purse.releases()
+            if releases:
+                write_bytes(staged / RELEASED, b"".join(map(checked_line, releases)), durable=True)
+            released = released_usd(releases)
             with closing(Journal(staged / JOURNAL)) as journal:
                 for participant, usd in standing.spent.items():
                     told = sum(its[participant].dollars for its in booked if participant in its)
-                    if (lost := usd - told) > 1e-6:
+                    if (lost := usd - told + released.get(participant, 0.0)) > 1e-6:
                         journal.add(participant, lost)
             sync_folder(staged)
             kept = _put_aside(workspace)
@@ -204,7 +217,7 @@ def _each_key_once(rows: Iterable[Stored]) -> Iterator[list[Stored]]:
 
 def _put_aside(workspace: Workspace) -> Path | None:
     """Move the files of a ledger that counts no more to a folder of their own; None where there are none."""
-    there = [path for path in (workspace.ledger_folder / name for name in (*KINDS, JOURNAL)) if path.exists()]
+    there = [path for path in (workspace.ledger_folder / name for name in (*KINDS, JOURNAL, RELEASED)) if path.exists()]
     if not there:
         return None
     aside = workspace.ledger_folder / f"moved-{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{secrets.token_hex(2)}"

@@ -211,8 +211,8 @@ def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], re
             slow = outcome.error == "timeout"
             (notes if slow else problems).append(_failure(entry, account, name, str(outcome.error)))
         elif outcome.kind == "malformed":
-            odd = "its answers have no shape of its API; what they are stands above"
-            problems.append(odd if outcome.error in (None, MALFORMED) else f"{name}: {outcome.error}")
+            odd = "its answer has no shape of its API; what it is stands above"
+            problems.append(f"{name}: {odd if outcome.error in (None, MALFORMED) else outcome.error}")
         elif outcome.kind == UNFINISHED:
             problems.append(f"{name}: it ends its answers for a reason that is not known ({outcome.finish_reason!r})")
         elif outcome.kind == "refused":
@@ -221,8 +221,7 @@ def findings(entry: Entry, account: Account, outcomes: Mapping[str, Outcome], re
     if isinstance(entry, JudgeEntry):
         problems += _wrong_votes(entry, outcomes)
     elif isinstance(entry, ModelEntry):
-        for found, into in ((_wrong_answers(entry, outcomes), problems), (_seen(entry, outcomes, notes), problems)):
-            into += found
+        problems += [*_wrong_answers(entry, outcomes), *_seen(entry, outcomes, notes)]
     if entry.prices is None:
         notes.append("its price is unknown: no budget bounds it, and a run needs --allow-unknown-prices")
     return Live(entry, list(dict.fromkeys(problems)), notes)
@@ -256,23 +255,21 @@ def _failure(entry: Entry, account: Account, name: str, error: str) -> str:
 
 def _undeclared_thinking(entry: Entry, outcome: Outcome) -> str | None:
     """Return what to declare where an answer shows its thinking between usual marks."""
-    text = outcome.text or ""
-    mark = undeclared_mark(split_thinking(text, entry.thinking).answer if entry.thinking else text)
+    mark = undeclared_mark(split_thinking(outcome.text or "", entry.thinking).answer)
     return f"it thinks between marks in its answer: say `{how_to_declare(mark)}` in its entry" if mark else None
 
 
 def _wrong_votes(entry: JudgeEntry, outcomes: Mapping[str, Outcome]) -> list[str]:
     wrong = []
     for name, outcome in outcomes.items():
-        if outcome.kind in ("error", "malformed", "refused", UNFINISHED):
+        if outcome.kind not in (*WITH_TEXT, "empty"):
             continue
         task: Task = "abstention" if name.startswith("abstention") else "correctness"
         _, abstained, correct = _JUDGED[int(name[-1])]
         vote = parse_vote(task, {"outcome": outcome.kind, "text": outcome.text}, _ITEM, entry.thinking)
-        if not vote.valid and (marked := _undeclared_thinking(entry, outcome)):
-            wrong.append(marked)
-        elif not vote.valid:
-            wrong.append(f"its vote on {task} does not meet the schema ({vote.invalid_reason})")
+        if not vote.valid:
+            invalid = f"its vote on {task} does not meet the schema ({vote.invalid_reason})"
+            wrong.append(_undeclared_thinking(entry, outcome) or invalid)
         elif vote.decision is not (abstained if task == "abstention" else correct):
             wrong.append(f"its vote on {task} of the plain answer {_JUDGED[int(name[-1])][0]!r} is wrong")
     return wrong

@@ -1,0 +1,103 @@
+"""Money that is booked for calls which never left is given back with a reason, and a blocked study goes on."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import json
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.models.test_budget import PRICED
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.cli import main
+from traps_pipeline.models.budget import BudgetReached, Journal
+from traps_pipeline.models.release import Releasable, releasable, release
+from traps_pipeline.models.spending import spending
+from traps_pipeline.storage.study import Study
+from traps_pipeline.storage.workspace import Workspace
+
+
+def row(key: str, outcome: str, cost_usd: float) -> dict[str, object]:
+    return {"key": key, "outcome": outcome, "cost_usd": cost_usd, "components": {"participant": "m"}}
+
+
+@pytest.fixture
+def blocked(tmp_path: Path) -> Workspace:
+    """A study with a budget of $5: $1 was answered, $3 failed, $1 was in flight when a process died."""
+    workspace = Workspace.create(tmp_path / "study", Study(budget_usd=5))
+    with workspace.answers.writer("m-standard-1") as writer:  # pyright: ignore
+        for one in (row("a", "answer", 1.0), row("b", "error", 2.0), row("c", "error", 1.0)):
+            writer.append(one, {})
+    with closing(Journal(workspace.ledger_folder / "in_flight.jsonl")) as journal:
+        journal.add("m", 1.0)
+    return workspace
+
+
+def room_for(workspace: Workspace, dollars: float) -> bool:
+    """Whether a call of so many dollars fits into the study's budget."""
+    with spending(workspace, [PRICED]) as budget:
+        try:
+            asyncio.run(budget.reserve("m", dollars))
+        except BudgetReached:
+            return False
+        asyncio.run(budget.settle("m", dollars, 0.0))
+        return True
+
+
+def test_what_was_in_flight_or_failed_is_released_with_its_reason_and_the_study_goes_on(blocked: Workspace) -> None:
+    assert not room_for(blocked, 0.5)
+    assert releasable(blocked) == {"m": Releasable(in_flight=1.0, failed=3.0)}
+    assert release(blocked, "m", None, "the process was killed before it connected") == 1.0
+    assert room_for(blocked, 0.9) and not room_for(blocked, 1.1)
+    assert release(blocked, "m", 2.5, "a dead proxy") == 2.5
+    assert releasable(blocked) == {"m": Releasable(in_flight=0.0, failed=0.5)}
+    assert room_for(blocked, 3.4) and not room_for(blocked, 3.6)
+    lines = (blocked.ledger_folder / "released.jsonl").read_text().splitlines()
+    records = [json.loads(line) for line in lines]
+    assert [(one["usd"], one["why"]) for one in records] == [
+        (1.0, "the process was killed before it connected"),
+        (2.5, "a dead proxy"),
+    ]
+    assert all(one["by"] and datetime.datetime.fromisoformat(one["at"]) for one in records)
+
+
+@pytest.mark.parametrize("usd", [4.1, 0.0, -1.0, float("nan"), float("inf")])
+def test_no_more_is_released_than_is_booked_for_calls_that_may_never_have_left(blocked: Workspace, usd: float) -> None:
+    with pytest.raises(TrapsError, match=r"m: \$.* cannot be released: \$1.0000 are booked for calls in flight"):
+        release(blocked, "m", usd, "why")
+    with pytest.raises(TrapsError, match=r"nobody: \$0.0000 cannot be released"):
+        release(blocked, "nobody", None, "why")
+    assert not room_for(blocked, 0.5)
+
+
+def test_a_damaged_line_releases_nothing(blocked: Workspace) -> None:
+    release(blocked, "m", 3.0, "a dead proxy")
+    path = blocked.ledger_folder / "released.jsonl"
+    path.write_text(path.read_text().replace('"usd": 3.0', '"usd": 9.0'))
+    assert not room_for(blocked, 0.5)
+
+
+def test_an_account_that_several_studies_share_gets_the_money_back_too(blocked: Workspace, tmp_path: Path) -> None:
+    (tmp_path / "openai").mkdir()
+    (tmp_path / "openai" / "budget.yaml").write_text("usd: 100\n")
+    blocked = blocked.allow(account_budgets={"openai": str(tmp_path / "openai")})
+    with closing(Journal(blocked.ledger_folder / "in_flight.jsonl")) as journal:
+        journal.add("gpt-5-mini", 1.0)
+    assert release(blocked, "gpt-5-mini", None, "killed") == 1.0
+    lines = (tmp_path / "openai" / "spent.jsonl").read_text().splitlines()
+    assert sum(json.loads(line)["usd"] for line in lines) == 0.0
+
+
+def test_the_command_lists_and_releases_and_wants_a_reason(
+    blocked: Workspace, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["ledger", "release", "--workspace", str(blocked.root)]
+    assert main(command) == 0
+    assert capsys.readouterr().out.splitlines()[1].split() == ["m", "1.0000", "3.0000"]
+    assert main([*command, "--participant", "m", "--all-in-flight"]) == 1
+    assert "the reason with --why" in capsys.readouterr().err
+    assert main([*command, "--participant", "m", "--all-in-flight", "--why", "killed"]) == 0
+    assert "$1.0000 of m are released" in capsys.readouterr().out
