@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -9,6 +10,7 @@ from traps_pipeline.base.partitions import DATASETS, taxonomy_of
 from traps_pipeline.mechanism.paths import STEERING_PATHS
 from traps_pipeline.mechanism.shares import effect_rows, share_rows
 from traps_pipeline.mechanism.steering import UNSTEERED, shared_item
+from traps_pipeline.scoring.bootstrap import resampled_sums
 
 ABSTAINS = "s0"  # of two scenarios the one on whose void the model always abstains
 
@@ -93,3 +95,8 @@ def test_the_majority_of_the_panel_that_voted_on_a_cell_decides_its_answers() ->
     unanimous = pd.DataFrame(effect_rows(*study()))
     pd.testing.assert_frame_equal(pd.DataFrame(effect_rows(answers, votes)), unanimous)
     assert (unanimous["n_missing"] == 0).all() and unanimous["abstained"].any()
+
+
+def test_resampled_sums_of_no_cells_are_none() -> None:
+    """A study that steers one taxonomy alone has no paths of the other."""
+    assert resampled_sums(np.ones((5, 3)), np.zeros((3, 0, 2))).shape == (0, 2, 5)

@@ -180,7 +180,7 @@ def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
     scenarios, cells, kinds = counts.shape
     whole = np.array_equal(counts, np.rint(counts))
     products = counts.astype(np.float32 if whole else np.float64).reshape(scenarios, cells * kinds).T @ weights.T
-    return products.reshape(cells, kinds, -1).astype(np.float64)
+    return products.reshape(cells, kinds, len(weights)).astype(np.float64)
 
 
 def with_unseen(sums: np.ndarray, scenarios: np.ndarray, unseen: np.ndarray) -> np.ndarray:
