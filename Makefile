@@ -10,7 +10,7 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: help demo demo-mechanism check fast-tests test promises campaign test-cluster test-cluster-gate test-cluster-kills cluster-setup ui bench bench-cluster explorer-vendor lint setup setup-core lock wheel sbom docs render-packages browser test-packages clean environments test-newest
+.PHONY: help demo demo-mechanism check fast-tests test test-newest promises campaign test-cluster test-cluster-gate test-cluster-kills cluster-setup ui bench bench-cluster explorer-vendor lint setup setup-core lock wheel sbom docs render-packages browser test-packages clean environments
 
 help: ## what make can do here
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 22
@@ -23,7 +23,7 @@ demo-mechanism: setup ## the pocket model from hidden states to steering, on the
 	TRAPS_WORKSPACE=$(CURDIR)/.workspaces/mechanism $(BIN)/traps run mechanism
 
 # Threads of a worker's own would only wait for another's. Workers steal what another has yet to do.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist worksteal
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist worksteal
 # The tiers of tests (tests/tiers.py): marks, and for the fast ones no look into a folder that has none.
 FAST := -m "not slow and not promise" --ignore=tests/integration
 PROMISES := -m "promise or not slow"
@@ -39,6 +39,19 @@ fast-tests: setup
 
 test: setup browser ## check, and one real path for each promise of the documentation: eight minutes
 	$(MAKE) --no-print-directory -j2 --output-sync=line lint promises
+
+# Of the versions that pyproject.toml admits, those that pip finds today. torch stays the one of `make setup`.
+test-newest: VENV := .workspaces/newest
+test-newest: BIN := .workspaces/newest/bin
+test-newest: render-packages ## the newest libraries that pyproject.toml admits: what is sent to models, and fast tests
+	rm -rf .workspaces/newest
+	$(make-venv)
+	$(PIP_INSTALL) $(TORCH)
+	$(PIP_INSTALL) $(firstword $(TORCH)) --editable '.[all,dev,docs]' hatchling
+	$(compile)
+	$(BIN)/python -m pip --disable-pip-version-check list
+	$(BIN)/traps models check
+	$(PYTEST) -n auto $(FAST)
 
 # What is compiled is copied to the checkouts of the tests, whose commands would each compile it again. One worker more
 # than the two cores that are needed: tests of servers and of Dagster's daemon wait for much of their time.
@@ -99,7 +112,7 @@ setup-core: render-packages $(VENV)/.core ## what the demo wants: no torch, no p
 
 # The pip that comes with Python 3.11 looks twice as long for so many packages; where this one cannot be had, that one does.
 PIP := pip==25.3 --hash=sha256:9655943313a94722b7774661c21049070f6bbb0a1516bf02f7c8d5d9201514cd
-PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 # On all cores, but for the tests of the libraries. What is no code for this Python, as templates are, pip leaves out, too.
 define compile

@@ -3,7 +3,7 @@
 Studies are drawn with known shares: every scenario has a family (a shift of its difficulty), an effect that all its
 items share, an effect of each item that its runs share, and noise. Each study is resampled by the code that the
 leaderboard uses (`scoring.bootstrap`, `scoring.robust`), and by the percentile bootstrap that it replaced ("before").
-`--quick` takes seconds; the full run some minutes of CPU. `--csv FILE` keeps every setting; the printed tables have
+`--quick` takes half a minute of CPU; the full run six. `--csv FILE` keeps every setting; the printed tables have
 the lowest coverage and the mean width over the strengths and kinds of dependence of a size.
 """
 
@@ -11,13 +11,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
+from bench.quick import parse
 from traps_pipeline.base.partitions import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED,
@@ -64,6 +69,7 @@ DEPENDENCE = {  # shares of the variance that a scenario's items and an item's r
     "clustered, 3 runs": (0.5, 0.3, 0.6, 3),
 }
 ARMS = ("decoy", "frame_out", "held_void", "twin_control")
+STUDIES, RESAMPLES, PARTS = 25, 1000, 12
 N_FAMILIES, ARM_SHARE = 8, 4  # an arm has an item of a quarter of the scenarios, of all families
 FIGURES = (
     *(f"{name}, one dataset" for name in RESAMPLED),
@@ -121,23 +127,26 @@ class Setting:
         return np.stack([control > -acc, one, control < false_abs, one, void > -abs_rec, one], axis=-1).astype(float)
 
 
-def cells_of(counts: np.ndarray, drawn: Drawn, taxonomy: str, named: str) -> np.ndarray:
-    """Return the sums of one dataset or arm with its unseen scenario: (studies, runs, 12, draws)."""
+def cell_figures(counts: np.ndarray, drawn: Drawn, taxonomy: str, named: str, in_mean: bool) -> np.ndarray:
+    """Return the ends of RESAMPLED of one dataset or arm, mean over runs: (studies, 2, RESAMPLED, 1 + resamples)."""
     scenarios, studies, runs, kinds = counts.shape
     sums = resampled_sums(drawn.scenarios[taxonomy][1], counts.reshape(scenarios, studies * runs, kinds))
     having = (counts[..., 1::2] > 0).sum(axis=0)
-    return with_unseen(sums.reshape(studies, runs, kinds, -1), having, drawn.unseen(named, kinds // 2))
+    whole = with_unseen(sums.reshape(studies, runs, kinds, -1), having, drawn.unseen(named, kinds // 2))
+    return np.moveaxis(figures_of(whole, in_mean).mean(axis=2), 0, 1)
 
 
 def ends_now(counts: Mapping[str, np.ndarray], drawn: Drawn, model: str) -> dict[str, np.ndarray]:
     """Return the ends of every figure, (studies, 2, 1 + resamples), from counts by dataset and arm."""
-    sums = {name: cells_of(own, drawn, _taxonomy(name), f"{model}|{name}") for name, own in counts.items()}
-    first = next(iter(sums.values()))
-    of_one = np.moveaxis(figures_of(first).mean(axis=2), 0, 1)  # (studies, 2, RESAMPLED, draws)
+
+    def ends_of(name: str, in_mean: bool) -> np.ndarray:
+        return cell_figures(counts[name], drawn, _taxonomy(name), f"{model}|{name}", in_mean)
+
+    of_one = ends_of(next(iter(counts)), in_mean=False)
     ends = {f"{name}, one dataset": of_one[:, :, k] for k, name in enumerate(RESAMPLED)}
-    if not all(name in sums for name in DATASETS):
+    if not all(name in counts for name in DATASETS):
         return ends
-    inside = {name: np.moveaxis(figures_of(own, in_mean=True).mean(axis=2), 0, 1) for name, own in sums.items()}
+    inside = {name: ends_of(name, in_mean=True) for name in counts}
     overall = np.mean([inside[name] for name in DATASETS], axis=0)
     ends |= {name: overall[:, :, k] for k, name in enumerate(RESAMPLED)}
     robust = [run_figures({name: own[study] for name, own in inside.items()}, ARMS) for study in range(len(overall))]
@@ -225,6 +234,14 @@ def measure(setting: Setting, studies: int, resamples: int, seed: int) -> Iterat
         yield row
 
 
+def mean_of_parts(setting: Setting, parts: int, seed: int) -> pd.DataFrame:
+    """Measure a setting in parts of STUDIES studies, since those of one part share the weights of scenarios, and return
+    a row a figure."""
+    rows = [row for part in range(parts) for row in measure(setting, STUDIES, RESAMPLES, seed + part)]
+    by_figure = pd.DataFrame(rows).groupby(["size", "strength", "dependence", "figure"], sort=False, as_index=False)
+    return pd.DataFrame(by_figure.mean(numeric_only=True))
+
+
 def summary(rows: pd.DataFrame) -> str:
     """Return the Markdown table of lowest coverage and mean width by size and figure, before and now."""
     shown = ("j, one dataset", "acc", "j", "pecs", "pecs_r", "difference of pecs")
@@ -246,26 +263,16 @@ def summary(rows: pd.DataFrame) -> str:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer studies, four sizes")
+    parser.add_argument("--sizes", type=int, default=len(SIZES), help="how many sizes, the smallest first")
+    parser.add_argument("--parts", type=int, default=PARTS, help=f"studies of each setting, in parts of {STUDIES}")
     parser.add_argument("--csv", type=Path, help="write every setting to this file")
     parser.add_argument("--seed", type=int, default=1)
-    arguments = parser.parse_args()
-    sizes = [*SIZES][:4] if arguments.quick else [*SIZES]
-    rows = []
-    for size in sizes:
-        studies = 50 if arguments.quick else 200
-        for strength in STRENGTHS:
-            for dependence in DEPENDENCE:
-                setting = Setting(size, strength, dependence)
-                parts = [
-                    row
-                    for part in range(max(1, studies // 50))
-                    for row in measure(setting, min(studies, 50), 1000, arguments.seed + part)
-                ]
-                frame = pd.DataFrame(parts)
-                keys = ["size", "strength", "dependence", "figure"]
-                rows.append(frame.groupby(keys, sort=False, as_index=False).mean(numeric_only=True))
-    table = pd.concat(rows, ignore_index=True)
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    arguments = parse(parser, sizes=4, parts=1)
+    settings = [Setting(*one) for one in product([*SIZES][: arguments.sizes], STRENGTHS, DEPENDENCE)]
+    run = partial(mean_of_parts, parts=arguments.parts, seed=arguments.seed)
+    with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
+        table = pd.concat(pool.map(run, settings, chunksize=6), ignore_index=True)
     if arguments.csv:
         table.to_csv(arguments.csv, index=False)
     print(summary(table))

@@ -106,11 +106,12 @@ def ballot(asked: pd.DataFrame, judge: str, yes: np.ndarray, rng: np.random.Gene
     abstained[~on_abstention], correct[on_abstention] = None, None
     columns = asked.drop(columns=["pair_id", "scenario_id", "outcome"])
     valid = rng.random(len(asked)) > 0.01
-    return columns.assign(judge=judge, panel="three@1", valid=valid, abstained=abstained, correct=correct)
+    verdict = {"valid": valid, "invalid_reason": None, "abstained": abstained, "correct": correct}
+    return columns.assign(judge=judge, panel="three@1", **verdict)
 
 
 def straightforward(verdicts: Any, entry: tuple[str, str, str], resamples: int, found: Any) -> float:
-    """CPU seconds for one entry's five intervals, as one would write it; and that they are ours but for chance."""
+    """CPU seconds for one entry's five percentile intervals, as one would write it; and that ours are hardly wider."""
     from scipy.stats import bootstrap
 
     began = time.process_time()
@@ -147,9 +148,10 @@ def straightforward(verdicts: Any, entry: tuple[str, str, str], resamples: int, 
     seconds = time.process_time() - began
     ours = found.set_index(["model", "regime", "dataset"]).loc[entry]
     for name, end in ends.items():
-        off = max(abs(end.low - ours[f"{name}_ci_low"]), abs(end.high - ours[f"{name}_ci_high"]))
-        if off > 0.01:
-            raise SystemExit(f"{entry}: intervals of {name} differ by {off:.4f}")
+        # The unseen scenario of ours makes each end a little wider; percentiles have none.
+        wider = end.low - ours[f"{name}_ci_low"], ours[f"{name}_ci_high"] - end.high
+        if not -0.005 <= min(wider) <= max(wider) <= 0.02:
+            raise SystemExit(f"{entry}: ends of the interval of {name} are wider by {wider[0]:.4f} and {wider[1]:.4f}")
     return seconds
 
 

@@ -83,7 +83,7 @@ def test_whatever_is_wrong_with_a_model_is_named_before_anything_is_rendered_or_
         "wrong-key": f"the key in {KEY} is not accepted",
         "blind": "it does not see the clip",
         "no-schema": "it ignores the schema",
-        "thinks": "it thinks between <think> tags",
+        "thinks": "it thinks between marks in its answer",
     }
     path = tmp_path / "broken.yaml"
     address = {name: dead if name == "dead" else f"{provider.url}/v1" for name in complaints}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -9,6 +10,7 @@ from traps_pipeline.base.partitions import DATASETS, taxonomy_of
 from traps_pipeline.mechanism.paths import STEERING_PATHS
 from traps_pipeline.mechanism.shares import effect_rows, share_rows
 from traps_pipeline.mechanism.steering import UNSTEERED, shared_item
+from traps_pipeline.scoring.bootstrap import resampled_sums
 
 ABSTAINS = "s0"  # of two scenarios the one on whose void the model always abstains
 
@@ -53,12 +55,20 @@ def test_an_answer_that_stands_in_several_paths_is_one_answer_about_one_scenario
 
 
 def test_its_interval_is_as_wide_as_the_scenarios_are_few() -> None:
-    """One scenario of two abstains throughout: a resample of two has 0, 1 or 2 of it in each taxonomy, whatever the
-    number of paths; 28 independent answers would have given 0.33 to 0.67."""
+    # One scenario of two abstains throughout, in each taxonomy, whatever the number of paths: about what 2 of 4 answers
+    # say (0.07 to 0.93); 28 independent answers would have given 0.33 to 0.67.
     void = whole(share_rows(*study(), resamples=2000)).loc[("void", 10.0)]
-    assert (void["low"], void["high"]) == (0.0, 1.0)
+    assert void["low"] < 0.15 and void["high"] > 0.85
     control = whole(share_rows(*study(), resamples=2000)).loc[("control", 10.0)]
-    assert (control["low"], control["high"]) == (0.0, 0.0)
+    assert control["low"] == 0.0 and 0.4 < control["high"] < 0.9
+
+
+def test_of_64_answers_without_an_abstention_the_interval_keeps_a_width() -> None:
+    scenarios = tuple(f"s{k}" for k in range(1, 65))  # none of them is s0, which abstains
+    rows = pd.DataFrame(share_rows(*study(scenarios), resamples=2000))
+    one = rows.query("path_set == 'within_domain' and regime == 'all' and directions == 'all' and side == 'control'")
+    assert (one["low"] == 0.0).all()
+    assert one["high"].between(0.03, 0.06).all()  # two taxonomies of 64: less than 1 - 0.025^(1/64) = 0.056 of one
 
 
 def test_undecided_answers_and_the_sweep_are_left_out() -> None:
@@ -85,3 +95,8 @@ def test_the_majority_of_the_panel_that_voted_on_a_cell_decides_its_answers() ->
     unanimous = pd.DataFrame(effect_rows(*study()))
     pd.testing.assert_frame_equal(pd.DataFrame(effect_rows(answers, votes)), unanimous)
     assert (unanimous["n_missing"] == 0).all() and unanimous["abstained"].any()
+
+
+def test_resampled_sums_of_no_cells_are_none() -> None:
+    """A study that steers one taxonomy alone has no paths of the other."""
+    assert resampled_sums(np.ones((5, 3)), np.zeros((3, 0, 2))).shape == (0, 2, 5)

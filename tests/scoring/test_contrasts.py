@@ -280,6 +280,12 @@ def test_wilsons_interval_equals_statsmodels_and_is_null_without_decisions():
     assert np.isnan([low[3], high[3]]).all()
 
 
+def test_wilsons_interval_keeps_a_width_where_all_answers_agree():
+    # z^2 = 3.8415: 0 of 64 is [0, z^2 / (64 + z^2)], 1 of 1 is [1 / (1 + z^2), 1].
+    low, high = wilson(np.array([0.0, 1]), np.array([64.0, 1]))
+    assert (low[0], high[0], low[1], high[1]) == pytest.approx((0.0, 0.0566, 0.2065, 1.0), abs=5e-5)
+
+
 def coverage(acc, false_abs, abs_rec):
     """Shares of 450 simulated studies of 200 scenarios whose 95 % intervals hold the true J and PECS.
 

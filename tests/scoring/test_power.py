@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from traps_pipeline.base.partitions import DATASETS
+from traps_pipeline.cli import main
 from traps_pipeline.scoring.bootstrap import intervals, resample
 from traps_pipeline.scoring.power import Shares, precision
 
@@ -59,3 +62,15 @@ def test_the_promised_width_is_within_15_percent_of_the_bootstraps(shares: Share
         found = intervals(resample(pd.concat(parts, ignore_index=True), 400)).set_index("dataset").loc["overall"]
         widths.append(found["pecs_ci_high"] - found["pecs_ci_low"])
     assert np.mean(widths) == pytest.approx(precision(everywhere(n), shares).width, rel=0.15)
+
+
+def test_the_plan_names_the_difference_that_all_models_of_the_experiment_leave(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plan", "paper", "--workspace", str(tmp_path / "none")]) == 0
+    found = precision(dict(zip(DATASETS, (202, 202, 500, 500), strict=True)), models=16)
+    printed = capsys.readouterr().out
+    assert f"interval of PECS about {found.width:.3f} wide" in printed
+    assert (
+        f"of 16 models, after Holm's correction over their 120 pairs: a difference of {found.among_all:.3f}" in printed
+    )

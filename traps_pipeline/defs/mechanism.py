@@ -306,4 +306,4 @@ _ABOVE = [steering, steering_votes]
 steering_effects = stage(STEERING_EFFECTS, _make_effects, group=GROUP, code="2", deps=_ABOVE, needs=_SOME, wants=steers)
 
 
-steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="2", deps=_ABOVE, needs=_SOME, wants=steers)
+steering_shares = stage(STEERING_SHARES, _make_shares, group=GROUP, code="3", deps=_ABOVE, needs=_SOME, wants=steers)

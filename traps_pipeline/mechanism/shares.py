@@ -19,7 +19,16 @@ from traps_pipeline.judging.ratings import ABSTENTION, CORRECTNESS, decided, maj
 from traps_pipeline.mechanism.paths import PATH_SETS, STEERING_PATHS
 from traps_pipeline.mechanism.steering import UNSTEERED
 from traps_pipeline.mechanism.tables import SteeringEffectRow, SteeringShareRow
-from traps_pipeline.scoring.bootstrap import RESAMPLES, SEED, TAXONOMIES, percentiles, scenario_weights
+from traps_pipeline.scoring.bootstrap import (
+    RESAMPLES,
+    SEED,
+    TAXONOMIES,
+    draw_scenarios,
+    interval,
+    resampled_sums,
+    shares_of,
+    with_unseen,
+)
 from traps_pipeline.scoring.metrics import wilson
 
 ALL = "all"
@@ -100,17 +109,18 @@ def share_rows(
 ) -> list[SteeringShareRow]:
     """Rows of STEERING_SHARES, of the paper's protocol alone: mean abstention over the paths of a set, for each regime
     of directions and of answers and over all regimes, with an interval from resampled scenarios (all paths share the
-    scenarios of a resample)."""
+    scenarios of a resample, and the unseen one)."""
     decided = answers_of_paths(of_paper(answers), of_paper(votes)).dropna(subset=["abstained"])
     decided = decided.merge(decided.loc[decided["side"] == "void", ["model", "layer"]].drop_duplicates())  # no sweep
     rows: list[SteeringShareRow] = []
     for _, of_model in decided.groupby("model", sort=True):
         paths = pd.DataFrame(of_model[_PATH]).drop_duplicates(ignore_index=True)
         numbered = of_model.merge(paths.reset_index(names="path"), on=_PATH)
-        shares, draws = _shares(numbered, len(paths), resamples, seed)
+        ends = _shares(numbered, len(paths), resamples, seed)
         for pool, chosen in _pools(paths):
             of_pool = numbered.loc[np.isin(numbered["path"], chosen)]
-            low, high = percentiles(draws[chosen].mean(axis=0))
+            of_mean = ends[:, chosen].mean(axis=1)
+            low, high = interval(of_mean[:, 1:], of_mean[0, 0], (0.0, 1.0))
             rows.append(
                 SteeringShareRow(
                     **pool,
@@ -118,7 +128,7 @@ def share_rows(
                     n=len(of_pool),
                     n_answers=len(set(of_pool["request_key"])),
                     n_scenarios=len(set(of_pool["scenario_id"])),
-                    abstention=float(shares[chosen].mean()),
+                    abstention=float(of_mean[0, 0]),
                     low=float(low),
                     high=float(high),
                     epoch="+".join(sorted(set(of_pool["epoch"]))),
@@ -127,22 +137,27 @@ def share_rows(
     return rows
 
 
-def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The share of each path, (paths,), and in every resample, (paths, resamples); NaN if a resample has no answer."""
-    shares, draws = np.empty(n_paths), np.empty((n_paths, resamples))
-    taxonomies = numbered["dataset"].map(taxonomy_of)
-    for k, taxonomy in enumerate(TAXONOMIES):
-        of_taxonomy = numbered.loc[taxonomies == taxonomy]
-        scenario, names = pd.factorize(of_taxonomy["scenario_id"], sort=True)
+def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> np.ndarray:
+    """Return the ends of the share of each path, of which the first are what was observed: (2, paths, 1 + resamples).
+
+    An answer that stands in several paths is one answer, so all paths of a taxonomy have one unseen scenario.
+    """
+    ends = np.empty((2, n_paths, 1 + resamples))
+    numbered = numbered.assign(taxonomy=numbered["dataset"].map(taxonomy_of))
+    drawn = draw_scenarios(numbered, resamples, seed)
+    for taxonomy in TAXONOMIES:
+        of_taxonomy = numbered.loc[numbered["taxonomy"] == taxonomy]
+        names, weights = drawn.scenarios[taxonomy]
         path, chosen = pd.factorize(of_taxonomy["path"])
-        answers, abstained = np.zeros((2, len(chosen), len(names)), np.float32)
-        np.add.at(answers, (path, scenario), 1)
-        np.add.at(abstained, (path, scenario), of_taxonomy["abstained"].to_numpy(bool))
-        shares[chosen] = abstained.sum(axis=1) / answers.sum(axis=1)
-        weights = scenario_weights(len(names), resamples, [seed, k]).T
-        with np.errstate(invalid="ignore"):
-            draws[chosen] = (abstained @ weights) / (answers @ weights)
-    return shares, draws
+        counts = np.zeros((len(names), len(chosen), 2))
+        places = names.get_indexer(pd.Index(of_taxonomy["scenario_id"])), path
+        np.add.at(counts[..., 0], places, of_taxonomy["abstained"].to_numpy(bool))
+        np.add.at(counts[..., 1], places, 1)
+        sums = with_unseen(
+            resampled_sums(weights, counts), (counts[..., 1:] > 0).sum(axis=0), drawn.unseen(taxonomy, decisions=1)
+        )
+        ends[:, chosen] = shares_of(sums)[:, :, 0]
+    return ends
 
 
 def _pools(paths: pd.DataFrame) -> Iterator[tuple[dict[str, Any], np.ndarray]]:

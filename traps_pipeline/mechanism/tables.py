@@ -326,11 +326,8 @@ class SteeringShareRow:
     n_answers: Annotated[int, "distinct answers among them, by ledger key"]
     n_scenarios: Annotated[int, "distinct scenarios of these answers"]
     abstention: Annotated[float, "share of decided answers that abstain, mean over paths and regimes"]
-    low: Annotated[
-        float | None,
-        "95 % percentile interval from resampled scenarios; its width is 0 where all scenarios agree",
-    ]
-    high: Percentile
+    low: Annotated[float | None, "95 % interval, Bayesian bootstrap over scenarios with one unseen"]
+    high: Annotated[float | None, "95 % interval, Bayesian bootstrap over scenarios with one unseen"]
     epoch: shared.AnswerEpochs
 
 

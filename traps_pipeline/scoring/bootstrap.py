@@ -31,6 +31,7 @@ INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED for end in ("lo
 RESAMPLES, SEED = 10_000, 20260101
 _GRAIN = 256  # weights are multiples of 1/256, so that float32 sums of them are exact on every machine
 _LEVEL = 0.95
+_IN_MEAN = 0.5**0.5  # of two taxonomies: what happens in one says nothing of the other, so distances add up in squares
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Resampled:
     """The mean over runs of every figure, and of its ends in every resample.
 
     entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED) float64;
-    values: (entries, 2, RESAMPLED, resamples) float64, lower ends before upper ends. NaN where nothing is decided, and
+    values: (entries, 2, RESAMPLED, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and
     for an `overall` entry without a run that has all four datasets.
     """
 
@@ -63,15 +64,18 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
     )
     items["taxonomy"] = items["dataset"].map(taxonomy_of)
     drawn = draw_scenarios(items, resamples, seed)
-    entries, values = [], []
+    entries, observed, values = list[tuple[str, str, str]](), list[np.ndarray](), list[np.ndarray]()
     for key, group in items.groupby(["model", "regime"], sort=True):
         model, regime = cast(tuple[str, str], key)
         sums = run_sums(group, drawn, f"{model}|{regime}")
         for dataset, mean in means_over_runs(sums, figures_of, resamples + 1).items():
             entries.append((model, regime, dataset))
-            values.append(mean)
-    stacked = np.stack(values) if values else np.zeros((0, 2, len(RESAMPLED), resamples + 1))
-    return Resampled(entries, stacked[:, 1, :, 0], stacked[..., 1:])
+            observed.append(mean[1, :, 0])
+            values.append(mean[..., 1:].astype(np.float32))  # half the memory, and the time of quantiles
+    nothing = np.zeros((0, 2, len(RESAMPLED), resamples), np.float32)
+    return Resampled(
+        entries, np.array(observed).reshape(len(entries), len(RESAMPLED)), np.stack(values) if values else nothing
+    )
 
 
 def intervals(resampled: Resampled, level: float = _LEVEL) -> pd.DataFrame:
@@ -95,7 +99,7 @@ def interval(
 ) -> np.ndarray:
     """Return the interval of figures from their resampled ends: (.., 2, resamples) -> (.., 2).
 
-    Every interval that is printed comes from here. It contains `observed` (..) and lies within the limits; a NaN among
+    Every interval of a score comes from here. It contains `observed` (..) and lies within the limits; a NaN among
     the resamples is left out, and the interval is NaN where all are.
     """
     low = np.fmin(quantile(ends[..., 0, :], (1 - level) / 2), observed)
@@ -150,15 +154,10 @@ class Drawn:
     seed: int
 
     def unseen(self, figures_of: str, decisions: int) -> np.ndarray:
-        """Return the weights of an unseen scenario for each decision of what is named, (2 x decisions, 1 + resamples)
-        float64: the same for one name, unrelated for two. Those of figures come before those of means over datasets,
-        which weigh half as much: four datasets are not all unlucky at once, and their distances add up in squares."""
+        """Return the weights of an unseen scenario for each decision of what is named, (decisions, 1 + resamples)
+        float64: the same for one name, unrelated for two."""
         rng = np.random.default_rng([self.seed, len(TAXONOMIES), crc32(figures_of.encode())])
-        whole, normal = (
-            rng.standard_exponential((decisions, self.resamples)),
-            rng.standard_normal((decisions, self.resamples)),
-        )
-        return np.concatenate([np.zeros((2 * decisions, 1)), np.concatenate([whole, normal**2 / 2])], axis=1)
+        return np.concatenate([np.zeros((decisions, 1)), rng.standard_exponential((decisions, self.resamples))], axis=1)
 
 
 def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Drawn:
@@ -181,36 +180,35 @@ def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
     scenarios, cells, kinds = counts.shape
     whole = np.array_equal(counts, np.rint(counts))
     products = counts.astype(np.float32 if whole else np.float64).reshape(scenarios, cells * kinds).T @ weights.T
-    return products.reshape(cells, kinds, -1).astype(np.float64)
+    return products.reshape(cells, kinds, len(weights)).astype(np.float64)
 
 
 def with_unseen(sums: np.ndarray, scenarios: np.ndarray, unseen: np.ndarray) -> np.ndarray:
     """Return sums (.., 2 x decisions, draws) of how often each decision was yes and was made, followed by how often the
-    unseen scenario makes it: (.., 4 x decisions, draws).
+    unseen scenario makes it: (.., 3 x decisions, draws).
 
     That is as often as a scenario that has it does on average. scenarios: how many have it, (.., decisions); unseen:
     weights of `Drawn.unseen`.
     """
     size = sums[..., 1::2, 0] / np.maximum(scenarios, 1)
-    return np.concatenate([sums, np.concatenate([size, size], axis=-1)[..., None] * unseen], axis=-2)
+    return np.concatenate([sums, size[..., None] * unseen], axis=-2)
 
 
 def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
     """Return the lower and upper ends of shares from sums of `with_unseen`, of COUNTS those of Acc, FalseAbs and
-    AbsRec: (.., 4 x decisions, resamples) -> (2, .., decisions, resamples); NaN where a denominator is 0.
+    AbsRec: (.., 3 x decisions, resamples) -> (2, .., decisions, resamples); NaN where a denominator is 0.
 
-    in_mean: whether the shares enter a mean over datasets or arms (`Drawn.unseen`).
+    in_mean: whether the shares enter a mean over datasets or arms, where the unseen scenarios weigh less (_IN_MEAN).
     """
-    decisions = sums.shape[-2] // 4
+    decisions = sums.shape[-2] // 3
     yes, made = sums[..., 0 : 2 * decisions : 2, :], sums[..., 1 : 2 * decisions : 2, :]
-    first = (3 if in_mean else 2) * decisions
-    unseen = sums[..., first : first + decisions, :]
+    unseen = sums[..., 2 * decisions :, :] * (_IN_MEAN if in_mean else 1.0)
     with np.errstate(invalid="ignore"):
         return np.stack([yes, yes + unseen]) / (made + unseen)
 
 
 def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """RESAMPLED figures of sums of COUNTS: (.., 12, resamples) -> (2, .., RESAMPLED, resamples), as `shares_of`."""
+    """RESAMPLED figures of sums of COUNTS: (.., 9, resamples) -> (2, .., RESAMPLED, resamples), as `shares_of`."""
     return figures_of_shares(shares_of(sums, in_mean))
 
 
@@ -232,7 +230,7 @@ def ends_of_pecs(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
 
 
 def run_sums(group: pd.DataFrame, drawn: Drawn, named: str) -> dict[tuple[str, int], np.ndarray]:
-    """(dataset, run) -> sums of COUNTS with an unseen scenario (12, 1 + resamples), for the items of one model and
+    """(dataset, run) -> sums of COUNTS with an unseen scenario (9, 1 + resamples), for the items of one model and
     regime. A dataset (an arm) may have items of both taxonomies. named: what tells the items' unseen scenarios from
     others'."""
     totals: dict[tuple[str, int], np.ndarray] = {}

@@ -34,8 +34,7 @@ from traps_pipeline.scoring.tables import HYPOTHESES as TABLE
 VISUAL = ("occlusion", "chaotic")
 RULES = ("panel-rule", "length-rule", "wording-rule")  # each abstains by one cue alone
 SHOWN = ("acc", "false_abs", "abs_rec", "j")
-_UNSEEN = ("_unseen", "_unseen_in_mean")  # the sums of `with_unseen` after those of COUNTS
-_SUMS = (*COUNTS, *(f"{name}{kind}" for kind in _UNSEEN for name in COUNTS[::2]))
+_SUMS = (*COUNTS, *(f"{name}_unseen" for name in COUNTS[::2]))  # of `with_unseen`
 _CHANGE = (-2.0, 2.0)  # the limits of a change of J
 _KEPT = ["model", "regime", "dataset", "run", "item_id", "scenario_id", "side", "epoch", "panel", "benchmark_version"]
 
@@ -209,7 +208,7 @@ def _figures(items: pd.DataFrame, drawn: Drawn, named: str) -> np.ndarray:
     by_run = []
     for of_run in sums.values():
         rows = dict(zip(_SUMS, of_run, strict=True))
-        both = [rows[f"false_abs{kind}"] + rows[f"abs_rec{kind}"] for kind in ("", "_of", *_UNSEEN)]
+        both = [rows[f"false_abs{kind}"] + rows[f"abs_rec{kind}"] for kind in ("", "_of", "_unseen")]
         by_run.append(np.concatenate([figures_of(of_run), shares_of(np.stack(both))], axis=1))
     return np.mean(by_run, axis=0)
 

@@ -1,0 +1,132 @@
+"""Private names of libraries are few, known, and held by upper bounds: a minor version may change them."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+from tests.test_rooms import PACKAGE
+
+# Each private name of a library, with its library, the files that use it and why no public name will do.
+PRIVATE = {
+    "dagster._core.definitions.selector": ("dagster", "orchestration/cluster.py", "names the job of a submitted run"),
+    "dagster._core.launcher": ("dagster", "orchestration/lost_runs.py", "the state that a launcher gives of a run"),
+    "dagster._core.storage.base_storage": ("dagster", "orchestration/shared_history.py", "what dagster.yaml may name"),
+    "dagster._core.storage.cloud_storage_compute_log_manager": ("dagster", "orchestration/shared_logs.py", "uploads"),
+    "dagster._core.storage.compute_log_manager": ("dagster", "orchestration/shared_logs.py", "kinds of streams"),
+    "dagster._core.storage.event_log": ("dagster", "orchestration/event_storage.py", "keeps connections open"),
+    "dagster._core.storage.local_compute_log_manager": ("dagster", "orchestration/shared_logs.py", "the local copy"),
+    "dagster._core.storage.runs": ("dagster", "orchestration/event_storage.py", "keeps a connection open"),
+    "dagster._core.storage.sqlite_storage": ("dagster", "orchestration/event_storage.py", "what dagster.yaml names"),
+    "dagster._core.workspace.context": ("dagster", "orchestration/cluster.py orchestration/webserver.py", "serves"),
+    "dagster._core.workspace.load_target": ("dagster", "orchestration/cluster.py orchestration/webserver.py", "serves"),
+    "dagster._serdes": ("dagster", "orchestration/shared_history.py orchestration/shared_logs.py", "dagster.yaml"),
+    "self._db_lock": ("dagster", "orchestration/event_storage.py", "one thread opens a file of events"),
+    "self._initdb": ("dagster", "orchestration/event_storage.py", "creates the tables of a file of events"),
+    "self._initialized_dbs": ("dagster", "orchestration/event_storage.py", "files of events that have their tables"),
+    "events._base_dir": ("dagster", "orchestration/event_storage.py", "where the events are"),
+    "runs._conn_string": ("dagster", "orchestration/event_storage.py", "where the runs are"),
+    "part._engine": ("dagster-postgres", "orchestration/shared_history.py", "one connection for all parts"),
+    "super()._launch_ray_job": ("dagster-ray", "orchestration/ray_launcher.py", "the command is quoted wrongly"),
+    "dagster_postgres.utils": ("dagster-postgres", "orchestration/shared_history.py", "the error of its connections"),
+    "litellm._internal_context": ("litellm", "models/api.py", "calls are not logged twice"),
+    "litellm.integrations.custom_logger": ("litellm", "models/api.py", "calls are not priced twice"),
+    "litellm.llms.custom_httpx.http_handler": ("litellm", "models/api.py", "calls leave through models/wire.py"),
+    "response._hidden_params": ("litellm", "models/api.py", "a price there keeps litellm from looking for one"),
+    "module._forward_hooks": ("torch", "mechanism/adapter_checks.py", "whether steering leaves hooks behind"),
+    "yaml._yaml": ("pyyaml", "base/yamlfile.py", "scans in C and composes in Python, where limits are kept"),
+}
+
+
+def private_names(folder: Path) -> dict[str, set[str]]:
+    """Private names of libraries in the modules below a folder, each with the files that use it.
+
+    Counted are private modules, modules inside a library that are imported by name, and attributes with an underscore
+    that this code does not define: on `self` nowhere, on `super()` at all, on anything else not in the same file.
+    """
+    trees = {path.relative_to(folder).as_posix(): ast.parse(path.read_text()) for path in folder.rglob("*.py")}
+    defined = {name: set(_defined(tree)) for name, tree in trees.items()}
+    everywhere = set().union(*defined.values())
+    names: dict[str, set[str]] = {}
+    for file, tree in trees.items():
+        for node in ast.walk(tree):
+            for name in [*_modules(node), *_attributes(node, defined[file], everywhere)]:
+                names.setdefault(name, set()).add(file)
+    return names
+
+
+def _defined(tree: ast.AST) -> list[str]:
+    names = []
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                names.append(name)
+            case ast.Name(id=name, ctx=ast.Store()):
+                names.append(name)
+            case ast.Attribute(value=ast.Name(id="self" | "cls"), attr=name, ctx=ast.Store()):
+                names.append(name)
+    return names
+
+
+def _modules(node: ast.AST) -> list[str]:
+    match node:
+        case ast.Import(names=aliases):
+            modules = [alias.name for alias in aliases if _is_private(alias.name)]
+        case ast.ImportFrom(module=str(module), level=0, names=aliases):
+            modules = [module] if any(_is_private(f"{module}.{alias.name}") for alias in aliases) else []
+        case ast.Call(func=ast.Name(id=called) | ast.Attribute(attr=called), args=[ast.Constant(value=str(name))]):
+            modules = [name] if called == "import_module" and "." in name else []
+        case _:
+            modules = []
+    ours = {*sys.stdlib_module_names, PACKAGE.name}
+    return [module for module in modules if module.partition(".")[0] not in ours]
+
+
+def _is_private(name: str) -> bool:
+    return any(part.startswith("_") for part in name.split("."))
+
+
+def _attributes(node: ast.AST, here: set[str], everywhere: set[str]) -> list[str]:
+    if not isinstance(node, ast.Attribute) or not node.attr.startswith("_") or node.attr.endswith("__"):
+        return []
+    owner = ast.unparse(node.value)
+    own = {"self": everywhere, "cls": everywhere, "super()": set(), "os": {"_exit"}}.get(owner, here)
+    return [] if node.attr in own else [f"{owner}.{node.attr}"]
+
+
+def test_every_private_name_of_a_library_is_listed_with_its_files() -> None:
+    assert private_names(PACKAGE) == {name: set(files.split()) for name, (_, files, _) in PRIVATE.items()}
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("from dagster._core.instance import config", "dagster._core.instance"),
+        ("from dagster import _core", "dagster"),
+        ("import litellm._logging", "litellm._logging"),
+        ("x = import_module('litellm.main')", "litellm.main"),
+        ("x = model._cache", "model._cache"),
+        ("x = super()._cache", "super()._cache"),
+        ("x = self._cache", "self._cache"),
+    ],
+)
+def test_each_kind_of_private_name_is_seen(tmp_path: Path, line: str, name: str) -> None:
+    (tmp_path / "inner.py").write_text(f"import os\nself._own = os._exit\nself._own\n{line}\n")
+    assert private_names(tmp_path) == {name: {"inner.py"}}
+
+
+def test_a_library_whose_private_names_are_used_has_an_upper_bound_with_its_reason() -> None:
+    lines = (ROOT / "pyproject.toml").read_text().splitlines()
+    for library in {library for library, _, _ in PRIVATE.values()}:
+        (line,) = (line for line in lines if re.search(rf'"{library}>=', line))
+        lowest, highest = re.search(rf'"{library}>=([\d.]+),<([\d.]+)"', line).groups()  # type: ignore[union-attr]
+        major, minor = map(int, lowest.split(".")[:2])
+        # A GPU may want a later minor version of torch; none has renamed what is used of it.
+        next_one = (major + 1,) if library == "torch" else (major, minor + 1)
+        assert tuple(map(int, highest.split("."))) <= next_one, line
+        assert "# private: " in line, line
