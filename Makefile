@@ -47,7 +47,7 @@ test-newest: render-packages ## the newest libraries that pyproject.toml admits:
 	rm -rf .workspaces/newest
 	$(make-venv)
 	$(PIP_INSTALL) $(TORCH)
-	$(PIP_INSTALL) $(firstword $(TORCH)) --editable '.[all,dev,docs]' hatchling
+	$(PIP_INSTALL) $(firstword $(TORCH)) --editable '.[all,test,docs]' hatchling
 	$(compile)
 	$(BIN)/python -m pip --disable-pip-version-check list
 	$(BIN)/traps models check
@@ -187,20 +187,3 @@ environments: $(ENVIRONMENTS) ## one file of tests/release, one environment
 
 clean: ## remove the environment; studies under .workspaces stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache
-
-# The locks hold what was tested; whoever installs the wheel gets the newest of each range. Tools come last and without
-# their pins, so that none holds a library back, as `dg` would: it is there for one version of Dagster only.
-NEWEST := .workspaces/newest
-TOOLS := import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; \
-	print(*(name for need in extras["dev"] + extras["docs"] if (name := need.partition("==")[0]) != "dagster-dg-cli"))
-test-newest: render-packages ## the wire check and the fast tests with the newest versions that pyproject.toml admits
-	$(PYTHON) -m venv --clear $(NEWEST)
-	$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check $(TORCH)
-	$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager \
-		"$(firstword $(TORCH))" --editable ".[all]"
-	$(NEWEST)/bin/python -m pip freeze --exclude-editable > $(NEWEST)/libraries.txt
-	$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(NEWEST)/libraries.txt \
-		$$($(NEWEST)/bin/python -c '$(TOOLS)')
-	cat $(NEWEST)/libraries.txt
-	TRAPS_WORKSPACE=$(CURDIR)/$(NEWEST)/study $(NEWEST)/bin/traps models check
-	OMP_NUM_THREADS=1 $(NEWEST)/bin/python -m pytest --dist worksteal -n 2 $(FAST)

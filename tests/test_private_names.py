@@ -122,7 +122,8 @@ def test_each_kind_of_private_name_is_seen(tmp_path: Path, line: str, name: str)
 
 def test_a_library_whose_private_names_are_used_has_an_upper_bound_with_its_reason() -> None:
     lines = (ROOT / "pyproject.toml").read_text().splitlines()
-    for library in {library for library, _, _ in PRIVATE.values()}:
+    # Of transformers no private module is imported: what its models' blocks are called with is as private.
+    for library in {library for library, _, _ in PRIVATE.values()} | {"transformers"}:
         (line,) = (line for line in lines if re.search(rf'"{library}>=', line))
         lowest, highest = re.search(rf'"{library}>=([\d.]+),<([\d.]+)"', line).groups()  # type: ignore[union-attr]
         major, minor = map(int, lowest.split(".")[:2])
