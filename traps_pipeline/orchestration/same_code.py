@@ -16,7 +16,7 @@ from traps_pipeline.base.paths import ASSETS, PACKAGE, SCENE_SPECS, SHIPPED
 
 CODE_TAG = "traps/code"  # of runs: the code of the host that submitted them
 DISTRIBUTION = "traps-pipeline"
-_NAME, _NOT_FOR_RUNS = re.compile(r"[\w.-]+"), re.compile(r"extra == ['\"](dev|docs|sign)['\"]")
+_NAME, _NOT_FOR_RUNS = re.compile(r"[\w.-]+"), re.compile(r"extra == ['\"](dev|docs|sign|test)['\"]")
 
 
 @cache
