@@ -11,7 +11,7 @@ import pytest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.corrections import Scenario, categories_of, fold, read_corrections, subset
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.storage.study import Study
 
 RELEASED = load_released()

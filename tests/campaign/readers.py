@@ -22,7 +22,7 @@ from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.registry import load_accounts, load_models
 from traps_pipeline.models.request import Request
 from traps_pipeline.pocket.recipe import load_recipe
-from traps_pipeline.scenes.spec import load_trajectory
+from traps_pipeline.scenes.worlds.spec import load_trajectory
 from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.exchange import checked_answers

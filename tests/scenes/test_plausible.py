@@ -8,8 +8,8 @@ import pytest
 from pydantic import ValidationError
 
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.spec import SceneSpec
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.worlds.spec import SceneSpec
 
 
 def record(scenario_id: str) -> dict[str, Any]:

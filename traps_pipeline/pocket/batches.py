@@ -13,7 +13,7 @@ from traps_pipeline.pocket.data import Question, SceneRecord, read_shards
 from traps_pipeline.pocket.model import PATCH
 from traps_pipeline.pocket.recipe import Recipe, Training
 from traps_pipeline.pocket.words import COLUMNS, PROMPTS, ROWS, place_question, prompt_text, say
-from traps_pipeline.scenes.registry import get_family
+from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.storage.media import pick
 
 if TYPE_CHECKING:
@@ -271,7 +271,7 @@ def names_of(frames: np.ndarray, across: int | None = None) -> np.ndarray:
     across: the pair of frames between which a panel comes. There the colours of both count: the earlier one may be the
     only one of all that shows the outcome.
     """
-    from traps_pipeline.scenes.vision import colour_mask
+    from traps_pipeline.scenes.parts.vision import colour_mask
 
     earlier, later, square = frames[::2], frames[1::2], 2 * PATCH
     slots, rows, columns = len(later), frames.shape[1] // square, frames.shape[2] // square

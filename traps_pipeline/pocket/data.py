@@ -24,14 +24,14 @@ import numpy as np
 from traps_pipeline.base.digests import canonical_json, digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replacing, write_text
+from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.pocket.recipe import Recipe, Split
 from traps_pipeline.pocket.shots import Shot, draw_shot, render_decoy, render_shot
 from traps_pipeline.pocket.words import guess
-from traps_pipeline.scenes.encode import encode
-from traps_pipeline.scenes.kit import params_to_dict
-from traps_pipeline.scenes.outcome import Rejected
-from traps_pipeline.scenes.registry import get_family
-from traps_pipeline.scenes.workers import run_in_order
+from traps_pipeline.scenes.family_registry import get_family
+from traps_pipeline.scenes.physics.kit import params_to_dict
+from traps_pipeline.scenes.picture.encode import encode
+from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.storage.media import pick, resized
 
 SHARD = 50  # scenes

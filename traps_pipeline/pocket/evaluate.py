@@ -25,7 +25,7 @@ from traps_pipeline.storage.media import sample
 
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel
-    from traps_pipeline.models.local.prompts import Prompt
+    from traps_pipeline.models.local.prompt_batches import Prompt
 
 MODEL = "pocket"
 MAX_BATCH = 64  # prompts that are held at once

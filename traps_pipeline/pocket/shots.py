@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from traps_pipeline.pocket.recipe import Jitter
-from traps_pipeline.scenes import checks
-from traps_pipeline.scenes.camera import HEIGHT, WIDTH, Closing, View, fit_camera, fit_shot, in_frame
-from traps_pipeline.scenes.certificates import EARLIEST_CUT_S, settled_outcome, shown_points
-from traps_pipeline.scenes.closing import moments, panel_from
-from traps_pipeline.scenes.kit import Family, Wording
-from traps_pipeline.scenes.look import draw_look
-from traps_pipeline.scenes.outcome import Outcome, Rejected, compile_scene, decisive_geoms, simulated
-from traps_pipeline.scenes.pace import cut_to, lengths
-from traps_pipeline.scenes.render import Renderer
-from traps_pipeline.scenes.simulate import replay
-from traps_pipeline.scenes.wording import draw_ill_posed
-from traps_pipeline.scenes.world import World
+from traps_pipeline.scenes.certification.certificates import EARLIEST_CUT_S, settled_outcome, shown_points
+from traps_pipeline.scenes.draw.closing import moments, panel_from
+from traps_pipeline.scenes.parts.look import draw_look
+from traps_pipeline.scenes.parts.wording import draw_ill_posed
+from traps_pipeline.scenes.physics.kit import Family, Wording
+from traps_pipeline.scenes.physics.simulate import replay
+from traps_pipeline.scenes.picture import checks
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Closing, View, fit_camera, fit_shot, in_frame
+from traps_pipeline.scenes.picture.render import Renderer
+from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, compile_scene, decisive_geoms, simulated
+from traps_pipeline.scenes.worlds.pace import cut_to, lengths
+from traps_pipeline.scenes.worlds.world import World
 from traps_pipeline.storage.media import MediaSpec, pick
 
 LATEST_CUT_S = 2.0  # released cuts lie between 1.1 and 2.0 s
@@ -48,7 +48,7 @@ class Shot:
 
 
 def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = None) -> Shot:
-    """A random scene. Raises Rejected, as `scenes.resolve` does, when it gives no valid pair."""
+    """A random scene. Raises Rejected, as `scenes.draw.resolve` does, when it gives no valid pair."""
     params = family.draw(rng)
     wording = family.word(params, rng)
     if parts := LOOKS.intersection(family.looks):
@@ -79,8 +79,8 @@ def draw_shot(family: Family, rng: np.random.Generator, jitter: Jitter | None = 
 
 
 def _closed(control: World, seed: int) -> World:
-    """The control as those of released scenarios end (`scenes.closing`), but without a certificate: only the first and
-    the last frame behind the panel are looked at. The control as it is if no panel can close it."""
+    """The control as those of released scenarios end (`scenes.draw.closing`), but without a certificate: only the first
+    and the last frame behind the panel are looked at. The control as it is if no panel can close it."""
     for frame in moments(control, seed):
         closing = replace(control, closing=Closing(frame, panel_from(frame, control)))
         with closing.closed_renderer() as renderer:
