@@ -25,7 +25,6 @@ ROOMS = (
     "scoring",
     "mechanism",
     "inside",
-    "pocket",
     "report",
     "orchestration",
     "study",

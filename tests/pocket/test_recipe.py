@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from traps_pipeline.pocket.batches import NAMED, Scenes, names_of
-from traps_pipeline.pocket.data import Question, SceneRecord, draw_shard, shard_jobs
-from traps_pipeline.pocket.recipe import Jitter, Recipe, load_recipe
-from traps_pipeline.pocket.words import PROMPTS
+from tools.pocket.batches import NAMED, Scenes, names_of
+from tools.pocket.data import Question, SceneRecord, draw_shard, shard_jobs
+from tools.pocket.recipe import Jitter, Recipe, load_recipe
+from tools.pocket.words import PROMPTS
 from traps_pipeline.scenes.parts.vision import colour_mask
 
 pytestmark = pytest.mark.slow

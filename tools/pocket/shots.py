@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from traps_pipeline.pocket.recipe import Jitter
+from tools.pocket.recipe import Jitter
 from traps_pipeline.scenes.certification.certificates import EARLIEST_CUT_S, settled_outcome, shown_points
 from traps_pipeline.scenes.draw.closing import moments, panel_from
 from traps_pipeline.scenes.parts.look import draw_look

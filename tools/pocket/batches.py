@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.pocket.data import Question, SceneRecord, read_shards
-from traps_pipeline.pocket.model import PATCH
-from traps_pipeline.pocket.recipe import Recipe, Training
-from traps_pipeline.pocket.words import COLUMNS, PROMPTS, ROWS, place_question, prompt_text, say
+from tools.pocket.data import Question, SceneRecord, read_shards
+from tools.pocket.model import PATCH
+from tools.pocket.recipe import Recipe, Training
+from tools.pocket.words import COLUMNS, PROMPTS, ROWS, place_question, prompt_text, say
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.storage.media import pick
 

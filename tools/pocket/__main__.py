@@ -1,42 +1,45 @@
-"""`traps pocket`: the small model that is trained here."""
+"""Draw scenes for the pocket model, train and evaluate it, and write its card: `python -m tools.pocket`."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from traps_pipeline.cli import main
 from traps_pipeline.cli.command import OK, Commands, Run, whole
 
 if TYPE_CHECKING:
-    from traps_pipeline.pocket.recipe import Recipe
+    from tools.pocket.recipe import Recipe
 
 
-def add(commands: Commands) -> None:
-    """Add `traps pocket render`, `train`, `evaluate` and `card`."""
-    noun = commands.noun("pocket", "the small model that is trained here")
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of `render`, `train`, `evaluate` and `card`."""
+    parser = argparse.ArgumentParser(prog="python -m tools.pocket", description="the small model that is trained here")
+    commands = Commands(parser, title="commands")
     text = "draw the scenes that the pocket model is trained and tested on; continues where it was stopped"
-    parser = _add(noun, "render", render, text)
-    _add_scenes(parser)
+    command = _add(commands, "render", render, text)
+    _add_scenes(command)
 
     text = "train the pocket model from scratch (renders missing scenes); continues where it was stopped"
-    parser = _add(noun, "train", train, text)
-    _add_scenes(parser)
-    _add_weights(parser)
+    command = _add(commands, "train", train, text)
+    _add_scenes(command)
+    _add_weights(command)
 
     text = "ask a trained model about the held-out scenes, and write the counts"
-    parser = _add(noun, "evaluate", evaluate, text)
-    _add_scenes(parser)
-    _add_weights(parser)
-    parser.add_argument(
+    command = _add(commands, "evaluate", evaluate, text)
+    _add_scenes(command)
+    _add_weights(command)
+    command.add_argument(
         "--scenes", type=whole(1, 1_000_000), help="number of held-out scenes per family (default: all)"
     )
-    _add_counts(parser)
+    _add_counts(command)
 
     text = "write the counts and the mechanistic figures into the model card"
-    parser = _add(noun, "card", card, text)
-    _add_counts(parser)
-    parser.add_argument(
+    command = _add(commands, "card", card, text)
+    _add_counts(command)
+    command.add_argument(
         "--mechanism",
         type=Path,
         nargs="+",
@@ -44,10 +47,11 @@ def add(commands: Commands) -> None:
         metavar="WORKSPACE",
         help="workspaces of `traps run mechanism`, one per seed; their figures go into assets/pocket/mechanism.csv",
     )
+    return parser
 
 
-def _add(noun: Commands, name: str, run: Run, text: str) -> argparse.ArgumentParser:
-    parser = noun.add(name, run, text, workspace=False)
+def _add(commands: Commands, name: str, run: Run, text: str) -> argparse.ArgumentParser:
+    parser = commands.add(name, run, text, workspace=False)
     parser.add_argument(
         "--recipe", type=Path, help="recipe of scenes and training (default: assets/pocket/recipe.yaml)"
     )
@@ -69,16 +73,16 @@ def _add_counts(parser: argparse.ArgumentParser) -> None:
 
 
 def render(arguments: argparse.Namespace) -> int:
-    """See `traps pocket render --help`."""
-    from traps_pipeline.pocket import commands
+    """See `python -m tools.pocket render --help`."""
+    from tools.pocket import commands
 
     commands.render_data(_recipe(arguments), arguments.data, workers=arguments.workers, report=_report)
     return OK
 
 
 def train(arguments: argparse.Namespace) -> int:
-    """See `traps pocket train --help`."""
-    from traps_pipeline.pocket import commands
+    """See `python -m tools.pocket train --help`."""
+    from tools.pocket import commands
 
     commands.train(
         _recipe(arguments),
@@ -92,8 +96,8 @@ def train(arguments: argparse.Namespace) -> int:
 
 
 def evaluate(arguments: argparse.Namespace) -> int:
-    """See `traps pocket evaluate --help`."""
-    from traps_pipeline.pocket import commands
+    """See `python -m tools.pocket evaluate --help`."""
+    from tools.pocket import commands
 
     table = commands.evaluate(
         _recipe(arguments),
@@ -110,8 +114,8 @@ def evaluate(arguments: argparse.Namespace) -> int:
 
 
 def card(arguments: argparse.Namespace) -> int:
-    """See `traps pocket card --help`."""
-    from traps_pipeline.pocket import commands
+    """See `python -m tools.pocket card --help`."""
+    from tools.pocket import commands
 
     for table in commands.write_card(arguments.csv or commands.EVALUATION, arguments.mechanism):
         _report(table)
@@ -119,10 +123,14 @@ def card(arguments: argparse.Namespace) -> int:
 
 
 def _recipe(arguments: argparse.Namespace) -> Recipe:
-    from traps_pipeline.pocket.recipe import RECIPE, load_recipe
+    from tools.pocket.recipe import RECIPE, load_recipe
 
     return load_recipe(arguments.recipe or RECIPE)
 
 
 def _report(line: str) -> None:
     print(line, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main(parser=build_parser()))

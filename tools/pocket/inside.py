@@ -9,15 +9,15 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from tools.pocket.evaluate import MODEL
+from tools.pocket.planted import TRUTHS, planted
+from tools.pocket.seeds import write_seeds
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import ANSWERABLE, transfer_type
 from traps_pipeline.mechanism.paths import TRANSFER_TYPES
 from traps_pipeline.mechanism.shares import ALL
 from traps_pipeline.mechanism.tables import HIDDEN_STATES, PROBES, STEERING_SHARES
 from traps_pipeline.models.local.checkpoint import as_folder, folder_digest
-from traps_pipeline.pocket.evaluate import MODEL
-from traps_pipeline.pocket.planted import TRUTHS, planted
-from traps_pipeline.pocket.seeds import write_seeds
 from traps_pipeline.storage.workspace import Workspace
 
 FACTS = "training.json"  # beside the folder of the weights
@@ -112,7 +112,7 @@ def _seed_of(workspace: Workspace) -> dict[str, Any]:
         return {"seed": int(origin["seed"]), "weights": str(origin["weights"])[:12]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrapsError(
-            f"{facts}: does not name the seed of these weights ({error}); `traps pocket train` writes it"
+            f"{facts}: does not name the seed of these weights ({error}); `python -m tools.pocket train` writes it"
         ) from error
 
 
@@ -133,7 +133,8 @@ def read_figures(path: Path) -> list[Figure]:
             ]
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise TrapsError(
-            f"{path}: is not a table of `traps pocket card --mechanism` ({error}); write it again from the workspaces"
+            f"{path}: is not a table of `python -m tools.pocket card --mechanism` ({error}); write it again from the "
+            "workspaces"
         ) from error
 
 

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tools.pocket.batches import IGNORED, Batch, Batches, Scenes, name_tokens
+from tools.pocket.data import data_digest
+from tools.pocket.model import make_model, save, train_tokenizer
+from tools.pocket.recipe import Recipe, Training
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replacing
-from traps_pipeline.pocket.batches import IGNORED, Batch, Batches, Scenes, name_tokens
-from traps_pipeline.pocket.data import data_digest
-from traps_pipeline.pocket.model import make_model, save, train_tokenizer
-from traps_pipeline.pocket.recipe import Recipe, Training
 
 if TYPE_CHECKING:
     import torch

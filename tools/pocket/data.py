@@ -21,13 +21,13 @@ from typing import Any
 
 import numpy as np
 
+from tools.pocket.recipe import Recipe, Split
+from tools.pocket.shots import Shot, draw_shot, render_decoy, render_shot
+from tools.pocket.words import guess
 from traps_pipeline.base.digests import canonical_json, digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replacing, write_text
 from traps_pipeline.base.workers import run_in_order
-from traps_pipeline.pocket.recipe import Recipe, Split
-from traps_pipeline.pocket.shots import Shot, draw_shot, render_decoy, render_shot
-from traps_pipeline.pocket.words import guess
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import params_to_dict
 from traps_pipeline.scenes.picture.encode import encode
@@ -298,7 +298,8 @@ def read_shards(recipe: Recipe, split: Split, folder: Path) -> Iterator[tuple[Sh
     for job in shard_jobs(recipe, split, folder):
         if job.drawn < job.count:
             raise TrapsError(
-                f"{job.lines}: has {job.drawn} of {job.count} scenes; run `traps pocket render --data {folder}`"
+                f"{job.lines}: has {job.drawn} of {job.count} scenes; run `python -m tools.pocket render "
+                f"--data {folder}`"
             )
         lines = job.lines.read_text(encoding="utf-8").splitlines()[: job.count]
         yield job, [SceneRecord.read(line) for line in lines]

@@ -1,4 +1,4 @@
-"""The commands `traps pocket ...`, by the modules beside this one: draw, train, evaluate, write the model card."""
+"""What the commands of `python -m tools.pocket` do: draw, train, evaluate, write the model card."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+from tools.pocket import evaluate as evaluation
+from tools.pocket import inside
+from tools.pocket.data import data_digest, render
+from tools.pocket.inside import FACTS
+from tools.pocket.recipe import POCKET, Recipe, Split
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import require_own
-from traps_pipeline.pocket import evaluate as evaluation
-from traps_pipeline.pocket import inside
-from traps_pipeline.pocket.data import data_digest, render
-from traps_pipeline.pocket.inside import FACTS
-from traps_pipeline.pocket.recipe import POCKET, Recipe, Split
 from traps_pipeline.storage.workspace import Workspace
 
 EVALUATION = POCKET / "evaluation.csv"
@@ -24,8 +24,8 @@ MECHANISM_FIGURES = POCKET / "mechanism.csv"
 CARD = POCKET / "README.md"
 THREADS = 1  # one thread sums in the same order on any machine; layers this small gain little from a second one
 WEIGHTS = "weights"  # folder of the weights, below the folder of a seed; `checkpoint:` names it
-MARKS = "<!-- evaluation: written by `traps pocket card` -->", "<!-- end of evaluation -->"
-MECHANISM_MARKS = "<!-- inside: written by `traps pocket card` -->", "<!-- end of inside -->"
+MARKS = "<!-- evaluation: written by `python -m tools.pocket card` -->", "<!-- end of evaluation -->"
+MECHANISM_MARKS = "<!-- inside: written by `python -m tools.pocket card` -->", "<!-- end of inside -->"
 
 
 Report = Callable[[str], None]  # takes a line about the progress of the work
@@ -49,7 +49,7 @@ def train(recipe: Recipe, data: Path, out: Path, seed: int, *, workers: int | No
     """Render missing scenes, train, and record the origin of the weights in `training.json`."""
     import torch
 
-    from traps_pipeline.pocket.train import train as fit
+    from tools.pocket.train import train as fit
 
     _render(recipe, "train", data, workers, report)
     began = time.monotonic()

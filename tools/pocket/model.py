@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tools.pocket.data import SceneRecord
+from tools.pocket.words import COLUMNS, PROMPTS, ROWS, phrases, place_question, prompt_text, say
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.tiny import make_config, make_processor, make_tokenizer
-from traps_pipeline.pocket.data import SceneRecord
-from traps_pipeline.pocket.words import COLUMNS, PROMPTS, ROWS, phrases, place_question, prompt_text, say
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from tools.pocket.words import PROMPTS
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
-from traps_pipeline.pocket.words import PROMPTS
 from traps_pipeline.scenes.family_registry import family_names
 from traps_pipeline.storage.media import MediaSpec
 

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tools.pocket.data import SceneRecord, read_shards
+from tools.pocket.recipe import Recipe
+from tools.pocket.seeds import write_seeds
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import REGIMES
 from traps_pipeline.judging.answers import is_correct
 from traps_pipeline.judging.rules import ABSTENTION, read_statement
 from traps_pipeline.models.prompts import system_prompt
 from traps_pipeline.models.registry import ModelEntry, get_model
-from traps_pipeline.pocket.data import SceneRecord, read_shards
-from traps_pipeline.pocket.recipe import Recipe
-from traps_pipeline.pocket.seeds import write_seeds
 from traps_pipeline.scoring.metrics import wilson
 from traps_pipeline.storage.media import sample
 
@@ -169,7 +169,9 @@ def read_cells(path: Path) -> list[AnswerCounts]:
                 for row in csv.DictReader(stream)
             ]
     except (OSError, KeyError, ValueError) as error:
-        raise TrapsError(f"{path}: is not a table of `traps pocket evaluate` ({error}); run it again") from error
+        raise TrapsError(
+            f"{path}: is not a table of `python -m tools.pocket evaluate` ({error}); run it again"
+        ) from error
 
 
 def markdown(cells: Sequence[AnswerCounts]) -> str:
