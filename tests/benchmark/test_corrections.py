@@ -135,7 +135,7 @@ DISCARD = {"scenario_id": ID, "action": "discard"}
         ([correct(question="Q?", who="")], 1, "who: "),
         ([correct(question="Q?", when="yesterday")], 1, "when: "),
         ([correct(question="Q?", why="")], 1, "why: "),
-        ([correct(qestion="Q?")], 1, "qestion: Extra inputs"),
+        ([correct(qestion="Q?")], 1, "qestion: "),
         ([{"scenario_id": ID, "action": "improve"}], 1, "action: "),
         (["{not json"], 1, "not JSON"),
         (

@@ -57,7 +57,7 @@ def test_a_question_may_hold_any_character(tmp_path: Path) -> None:
         ({"aliases": {"maybe": "perhaps"}}, r"aliases point to unknown labels \['perhaps'\]"),
         ({"question": ""}, "question: "),
         ({"void_kind": "fog"}, "void_kind: "),
-        ({"colour": "red"}, "colour: Extra inputs"),
+        ({"colour": "red"}, "colour: "),
         ({"scenario_id": "Domino 1"}, "scenario_id: "),
         ({"family": "trebuchet"}, "unknown family 'trebuchet'; known: .*domino_chain"),
         ({"category": "magic"}, "unknown category 'magic'; known: ramps_rolling"),

@@ -111,7 +111,9 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
             try:
                 found.append((where, Correction.model_validate(json.loads(line))))
             except ValidationError as error:
-                raise TrapsError(f"{where}: not a valid correction ({explain(error)}); correct that line") from error
+                raise TrapsError(
+                    f"{where}: not a valid correction ({explain(error, Correction)}); correct that line"
+                ) from error
             except ValueError as error:
                 raise TrapsError(f"{where}: not JSON ({error}); correct that line") from error
     return found
