@@ -14,11 +14,19 @@ from pathlib import Path
 import pytest
 
 from tests.build.network import ITEMS, ask, entry, experiment, register, responses, settled
-from tests.conftest import SECRET, Checkout
+from tests.conftest import SECRET, Checkout, forget_answers
 from tests.providers.server import Provider
 from traps_pipeline.models.budget import Journal
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def unasked(own_study: Checkout) -> Checkout:
+    """A study without answers whose registry the tests change."""
+    return forget_answers(own_study)
+
+
 MANY = "TRAPS_MANY_CALLS" in os.environ  # 864 calls in the place of 288 and of 192, and five kills: for a release
 TRANSIENT = {
     "rate_limited": 0.03,
