@@ -28,6 +28,7 @@ ROOMS = (
     "pocket",
     "report",
     "orchestration",
+    "cluster",
     "study",
     "release",
     "explorer",

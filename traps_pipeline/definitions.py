@@ -7,9 +7,9 @@ import dagster as dg
 from traps_pipeline import defs as declared
 from traps_pipeline.base.paths import require_root
 from traps_pipeline.base.redaction import redact_tracebacks
+from traps_pipeline.cluster.lost_runs import lost_runs
 from traps_pipeline.orchestration.automation import jobs, sensors
 from traps_pipeline.orchestration.graph import DECLARED
-from traps_pipeline.orchestration.lost_runs import lost_runs
 from traps_pipeline.orchestration.stage import WorkspaceResource
 from traps_pipeline.storage.workspace import RAY, Workspace
 

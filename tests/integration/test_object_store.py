@@ -15,7 +15,7 @@ from tests.conftest import ROOT, SMALL, Checkout, Finished
 from tests.forked import FORKS
 from tests.objectstore import S3
 from tests.postgres import Postgres
-from traps_pipeline.storage.objects import ObjectStore
+from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
