@@ -19,7 +19,7 @@ from traps_pipeline.cluster.bucket import Bucket, object_name
 from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.cluster.removal import ENDS_S
 from traps_pipeline.cluster.unused import _tell, remove, unused
-from traps_pipeline.storage import unused as module
+from traps_pipeline.cluster import unused as module
 from traps_pipeline.storage.database import Session
 from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.study import Study
