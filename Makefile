@@ -67,7 +67,7 @@ campaign: test-packages cluster-setup ## everything else, in full or SHARD=2/6 o
 test-cluster: cluster-setup ## two studies on two nodes of Ray, one killed in mid-run, against runs of one process; tests of runs
 	$(BIN)/python bench/cluster_study.py --kill
 	$(BIN)/python bench/cluster_study.py --mechanism --kill --at hidden_states
-	$(BIN)/python -m pytest tests/cluster/test_ray_runs.py tests/remedies/test_cluster.py
+	$(BIN)/python -m pytest tests/cluster tests/remedies/test_cluster.py
 
 test-cluster-kills: cluster-setup ## a study on a cluster while this and that is killed, in about half an hour (docs/cluster.md)
 	$(BIN)/python -m bench.cluster_kills run cap node stopped postgres network head store together

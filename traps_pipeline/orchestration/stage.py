@@ -43,7 +43,7 @@ def key_of(name: str) -> dg.AssetKey:
 
 def _shared_history() -> list[str]:
     home, workspace = os.environ.get("DAGSTER_HOME"), study_here()
-    if workspace is not None and workspace.is_shared:
+    if workspace is not None and (workspace.is_shared or workspace.is_on_cluster):
         return [workspace.study.name]  # several studies share its database, and so may share its history
     if workspace is None or not home or Path(home).resolve() == workspace.dagster_home.resolve():
         return []
