@@ -37,6 +37,7 @@ from traps_pipeline.orchestration.run import dagster_history
 from traps_pipeline.orchestration.runs import broke_off, range_tags
 from traps_pipeline.orchestration.schemes import CATEGORY, DATASET
 from traps_pipeline.orchestration.step import RESUMED_ELSEWHERE, TAKEN, TALLY, end_if_resumed
+from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import RAY, Workspace
 
@@ -88,7 +89,7 @@ def test_what_a_stage_takes_is_what_ray_sets_aside_and_what_the_run_uses(
 def test_rendering_is_as_many_runs_as_the_missing_clips_are_worth(workspace: Workspace) -> None:
     """The 702 scenarios have 2,106 clips of 1.4 s; their records take 0.04 s each: 2,977 s of one core."""
     stages = [the_graph()[name] for name in (SCENE_SPECS.name, VIDEOS.name)]
-    keys = [str(key) for key in CATEGORY.definition.get_partition_keys()]
+    keys = [*CATEGORY.keys]
     with dg.DagsterInstance.ephemeral() as instance:
 
         def ranges(most: int, cpus: int = 1) -> list[Any]:
@@ -231,7 +232,7 @@ def test_a_run_that_dagsters_pages_launch_takes_and_says_what_one_of_the_command
     monkeypatch.setenv("TRAPS_RUN_GPUS", "1")
 
     def takes(stage: str, key: str) -> dict[str, Any]:
-        selected = frozenset({the_graph()[stage].spec.key})
+        selected = frozenset({asset_key(stage)})
         run = dg.DagsterRun("a job", asset_selection=selected, tags={"dagster/partition": key})
         tags = launcher.tags_of_page_run(run)
         assert tags[STUDY_TAG] == "lab"
@@ -257,11 +258,13 @@ def test_a_run_that_is_asked_for_is_created_once_for_its_own_study(
         name = submit(instance, "lab", Request(stages, {"traps/make": "stale", **range_tags(("dominoes", "plinko"))}))
         with dg.build_sensor_context(instance) as context:
             first = start_requested_runs(context)
+        assert isinstance(first, dg.SensorResult)
         with dg.build_sensor_context(instance, cursor=first.cursor) as context:
             second = start_requested_runs(context)
-    (request,) = first.run_requests
+    assert isinstance(second, dg.SensorResult)
+    (request,) = first.run_requests or ()
     assert request.run_key == request.tags[REQUEST_TAG] == name
-    assert request.asset_selection == [the_graph()[stage].spec.key for stage in stages]
+    assert request.asset_selection == [asset_key(stage) for stage in stages]
     assert request.tags["dagster/asset_partition_range_end"] == "plinko" and request.tags["traps/make"] == "stale"
     assert second.run_requests == []
 
@@ -418,7 +421,7 @@ def test_an_interrupted_command_leaves_its_runs_or_ends_them_and_the_next_one_co
 ) -> None:
     shown = Shown()
     stages = [the_graph()[name] for name in (RESPONSES.name, "votes")]
-    selected = frozenset(stage.spec.key for stage in stages)
+    selected = frozenset(asset_key(stage.name) for stage in stages)
     cells = range_tags(("occlusion|oracle__standard__run1", "chaotic|oracle__standard__run1"))
     with dg.DagsterInstance.ephemeral() as instance, reporting(shown):
         run = dg.DagsterRun("a job", asset_selection=selected, tags={**cells, STUDY_TAG: "lab"})
@@ -443,6 +446,6 @@ def test_an_interrupted_command_leaves_its_runs_or_ends_them_and_the_next_one_co
         watched = list[str]()
         with next_one:
             assert watched == [again.run_id]
-    datasets = [str(key) for key in DATASET.definition.get_partition_keys()]
+    datasets = [*DATASET.keys]
     between = abs(datasets.index("occlusion") - datasets.index("chaotic")) + 1
     assert shown.stages == [("runs that were left", 2 * between)]

@@ -14,7 +14,7 @@ from functools import cache
 
 import dagster as dg
 
-from traps_pipeline.orchestration.graph import the_graph
+from traps_pipeline.orchestration.translation import asset_key
 from traps_pipeline.storage.workspace import Workspace
 
 REQUEST_TAG = "traps/request"
@@ -54,7 +54,7 @@ def _requests(result: dg.EventRecordsResult) -> Iterator[dg.RunRequest]:
         body = json.loads(str(record.asset_observation.metadata[_BODY].value))
         yield dg.RunRequest(
             run_key=body["name"],
-            asset_selection=[the_graph()[name].spec.key for name in body["stages"]],
+            asset_selection=[asset_key(name) for name in body["stages"]],
             tags={**body["tags"], REQUEST_TAG: body["name"]},
         )
 

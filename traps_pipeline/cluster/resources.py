@@ -7,8 +7,6 @@ import os
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
-import dagster as dg
-
 from traps_pipeline.base.cores import CORES
 from traps_pipeline.base.partitions import Cell
 from traps_pipeline.cluster.same_code import CODE, code_here
@@ -46,7 +44,7 @@ def keys_in(stages: Sequence[Stage], of: Range) -> Sequence[str]:
     scheme, (first, last) = stages[0].scheme if stages else None, of
     if scheme is None or first is None:
         return []
-    return [*scheme.definition.get_partition_keys_in_range(dg.PartitionKeyRange(first, str(last)))]
+    return scheme.between(first, str(last))
 
 
 def _is_local(cell: str) -> bool:
