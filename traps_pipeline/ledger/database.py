@@ -62,7 +62,7 @@ class Batch:
     def spent(self) -> dict[str, float]:
         """Dollars spent for good, by participant; kept up to date by `spend`."""
         query = sa.select(SPENT.c.participant, SPENT.c.usd).where(SPENT.c.study == self.study)
-        spent = {participant: usd for participant, usd in self.connection.execute(query)}
+        spent = dict[str, float](self.connection.execute(query).tuples().all())
         for participant, usd in self.more_usd.items():
             spent[participant] = spent.get(participant, 0.0) + usd
         return spent
@@ -72,8 +72,7 @@ class Batch:
         """Dollars of reservations, by participant; kept up to date by those who add and remove them."""
         usd = sa.func.sum(RESERVATIONS.c.usd)
         query = sa.select(RESERVATIONS.c.participant, usd).where(RESERVATIONS.c.study == self.study)
-        found = self.connection.execute(query.group_by(RESERVATIONS.c.participant))
-        return {participant: total for participant, total in found}
+        return dict(self.connection.execute(query.group_by(RESERVATIONS.c.participant)).tuples().all())
 
     def spend(self, participant: str, usd: float) -> None:
         """Count dollars as spent, or as spent no more."""
@@ -184,7 +183,7 @@ class Database(ABC):
 
     @abstractmethod
     def try_lock(self, name: str) -> Lock | None:
-        """Take a named lock; None while another session has it. It is free when this process ends. Raises TrapsError."""
+        """Take a named lock until this process ends; None while another session has it. Raises TrapsError."""
 
     def now_s(self, connection: sa.Connection) -> float:
         """Return the seconds since 1970 of a clock that all processes of the study share."""
@@ -194,9 +193,11 @@ class Database(ABC):
     def sync(self) -> None:
         """Return when not even a power cut loses what was committed. Raises TrapsError."""
 
+    @abstractmethod
     def beat(self) -> None:
-        """Do what keeps locks this process's, where they are lost otherwise."""
+        """Do what keeps locks this process's, where they are lost otherwise. Raises TrapsError."""
 
+    @abstractmethod
     def end(self) -> None:
         """Close what writing needed."""
 
@@ -270,9 +271,10 @@ class Database(ABC):
     def _prepare(self, connection: sa.Connection) -> None:
         """Create missing tables, and the rows of the study and of this session."""
         METADATA.create_all(connection)
-        self.study = self._study(connection) or connection.execute(
-            sa.insert(STUDIES).values(name=self.study_name).returning(STUDIES.c.id)
-        ).scalar_one()
+        self.study = (
+            self._study(connection)
+            or connection.execute(sa.insert(STUDIES).values(name=self.study_name).returning(STUDIES.c.id)).scalar_one()
+        )
         if connection.execute(sa.select(SESSIONS.c.batch).where(SESSIONS.c.id == self.session)).scalar() is None:
             connection.execute(sa.insert(SESSIONS).values(id=self.session, study=self.study, batch=self._batch))
 

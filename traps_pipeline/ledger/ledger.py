@@ -15,6 +15,7 @@ from itertools import islice
 from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy import exc
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.database import Batch, Database, Lock, claim, sentence
@@ -87,7 +88,10 @@ class Ledger:
         for row in self._rows(evaluation):
             if _is_whole(row):
                 asides = {name: getattr(row, name) for name in ASIDES}
-                yield json.loads(row.content), {name: text.decode() for name, text in asides.items() if text is not None}
+                yield (
+                    json.loads(row.content),
+                    {name: text.decode() for name, text in asides.items() if text is not None},
+                )
 
     def damage(self) -> Iterator[str]:
         """Yield a sentence for each row that is not what was written. Reads all. Raises TrapsError."""
@@ -123,11 +127,11 @@ class Ledger:
         with self.database.read() as connection:
             try:
                 yield from connection.execution_options(yield_per=_FETCHED).execute(query)
-            except (sa.exc.OperationalError, sa.exc.ProgrammingError) as error:
+            except (exc.OperationalError, exc.ProgrammingError) as error:
                 if not sa.inspect(connection.engine).has_table(STUDIES.name):
                     return
                 raise sentence(error, self.database.place) from error
-            except sa.exc.DBAPIError as error:
+            except exc.DBAPIError as error:
                 raise sentence(error, self.database.place) from error
 
     def _rows(self, evaluation: str, wanted: Collection[str] | None = None) -> Iterator[sa.Row[Any]]:
@@ -150,7 +154,11 @@ class Ledger:
                 continue
             row = json.loads(stored.content)
             healed = heal(row)
-            yield self._place(stored), row, f"{', '.join(healed)}: no possible value, counted as unknown" if healed else None
+            yield (
+                self._place(stored),
+                row,
+                f"{', '.join(healed)}: no possible value, counted as unknown" if healed else None,
+            )
 
     def _place(self, row: sa.Row[Any]) -> str:
         return f"{self.database.place}: row {row.id}"
@@ -197,7 +205,10 @@ class Ledger:
         is_told = False
         while (lock := await asyncio.to_thread(self.database.try_lock, f"{self.kind}-{evaluation}")) is None:
             if not is_told:
-                waiting(f"{self.kind} of {evaluation} are being asked by {self._holder(evaluation)}; waiting for it to finish")
+                waiting(
+                    f"{self.kind} of {evaluation} are being asked by {self._holder(evaluation)}; "
+                    "waiting for it to finish"
+                )
                 is_told = True
             if give_up():
                 raise LockGivenUp(evaluation)

@@ -44,9 +44,7 @@ class Money:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def reserve(
-        self, participant: str, usd: float, caps: Mapping[str | None, float]
-    ) -> Future[str | Full]:
+    def reserve(self, participant: str, usd: float, caps: Mapping[str | None, float]) -> Future[str | Full]:
         """Reserve dollars if every cap that counts leaves room; the reservation's id. caps: of each participant that
         has one, and of the study (None)."""
         reservation = secrets.token_hex(8)
@@ -75,7 +73,10 @@ class Money:
         """Return dollars by participant: what rows cost, and what calls in flight may."""
 
         def change(batch: Batch) -> dict[str, float]:
-            return {name: batch.spent.get(name, 0.0) + batch.reserved.get(name, 0.0) for name in {*batch.spent, *batch.reserved}}
+            return {
+                name: batch.spent.get(name, 0.0) + batch.reserved.get(name, 0.0)
+                for name in {*batch.spent, *batch.reserved}
+            }
 
         return self._database.submit(change).result()
 
@@ -132,9 +133,7 @@ class Money:
             failed[row.participant] += row.failed
         for row in batch.connection.execute(sa.select(RELEASES).where(RELEASES.c.study == batch.study)):
             failed[row.participant] -= row.failed
-        rooms = {
-            name: Releasable(in_flight[name], max(0.0, failed[name])) for name in sorted({*in_flight, *failed})
-        }
+        rooms = {name: Releasable(in_flight[name], max(0.0, failed[name])) for name in sorted({*in_flight, *failed})}
         return {name: room for name, room in rooms.items() if room.in_flight + room.failed > CENT}
 
     def _reduce(self, batch: Batch, participant: str, usd: float) -> None:

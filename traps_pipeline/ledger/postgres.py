@@ -19,6 +19,7 @@ from hashlib import blake2b
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
+from sqlalchemy import exc
 
 from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
@@ -64,7 +65,7 @@ class PostgresDatabase(Database):
             if not url.drivername.startswith("postgres"):
                 raise ValueError(url.drivername)
             self._place = f"{url.host}:{url.port or 5432}/{url.database}"
-        except (sa.exc.ArgumentError, ValueError):
+        except (exc.ArgumentError, ValueError):
             raise TrapsError(
                 f"{variable}: is no address of a PostgreSQL database; write it as "
                 f"postgresql://USER:PASSWORD@HOST:5432/DATABASE (study {study}, host {socket.gethostname()})"
@@ -96,7 +97,7 @@ class PostgresDatabase(Database):
         while True:
             try:
                 return self._engine.connect()
-            except sa.exc.DBAPIError as error:
+            except exc.DBAPIError as error:
                 if time.monotonic() >= until:
                     raise self._sentence(error) from None
                 time.sleep(RETRY_S)
@@ -113,9 +114,9 @@ class PostgresDatabase(Database):
                     self._is_working = True
                     with connection.begin():
                         return work(connection)
-                except sa.exc.DBAPIError as error:
+                except exc.DBAPIError as error:
                     is_there = self._connection is not None and not self._connection.invalidated
-                    if is_there and not error.connection_invalidated and not isinstance(error, sa.exc.OperationalError):
+                    if is_there and not error.connection_invalidated and not isinstance(error, exc.OperationalError):
                         raise self._sentence(error) from None
                     self._drop()
                     if time.monotonic() >= until:
@@ -149,7 +150,9 @@ class PostgresDatabase(Database):
 
     def _is_starting(self, connection: sa.Connection) -> bool:
         up_s = "select extract(epoch from now() - pg_postmaster_start_time())"
-        if connection.execute(sa.text(up_s)).scalar_one() > GRACE_S or not sa.inspect(connection).has_table(SESSIONS.name):
+        if connection.execute(sa.text(up_s)).scalar_one() > GRACE_S or not sa.inspect(connection).has_table(
+            SESSIONS.name
+        ):
             return False
         others = sa.select(SESSIONS.c.id).where(SESSIONS.c.id != self.session).limit(1)
         return connection.execute(others).scalar() is not None
@@ -201,14 +204,19 @@ class PostgresDatabase(Database):
                 connection.execute(sa.select(sa.func.set_config(f"tcp_keepalives_{name}", value, False)))
         if not self._held:
             return
-        ending = "select pg_terminate_backend(pid) from pg_stat_activity where application_name = :name and pid <> pg_backend_pid()"
+        ending = (
+            "select pg_terminate_backend(pid) from pg_stat_activity "
+            "where application_name = :name and pid <> pg_backend_pid()"
+        )
         with connection.begin():
             connection.execute(sa.text(ending), {"name": f"traps {self.session}"})
         until = time.monotonic() + 5  # the old connection takes a moment to end
         for number in self._held:
             while True:
                 with connection.begin():
-                    self._held[number] = bool(connection.execute(sa.select(sa.func.pg_try_advisory_lock(number))).scalar())
+                    self._held[number] = bool(
+                        connection.execute(sa.select(sa.func.pg_try_advisory_lock(number))).scalar()
+                    )
                 if self._held[number] or time.monotonic() > until:
                     break
                 time.sleep(0.05)

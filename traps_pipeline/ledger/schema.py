@@ -13,6 +13,8 @@ import sqlalchemy as sa
 from traps_pipeline.ledger.rows import AVERAGED
 
 METADATA = sa.MetaData()
+
+
 def _study(**options: Any) -> sa.Column[int]:
     return sa.Column("study", sa.Integer, sa.ForeignKey("traps_studies.id"), **options)
 

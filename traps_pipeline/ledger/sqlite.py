@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 from urllib.parse import quote
 
 import sqlalchemy as sa
+from sqlalchemy import event, exc
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import remedy, require_in_place, try_lock
@@ -29,13 +30,13 @@ WAIT_S = 600.0  # for another process's transaction, on however slow a disk
 class SqliteDatabase(Database):
     """The ledger in a folder. folder: made when something is written."""
 
-    def __init__(self, folder: Path, study: str) -> None:
+    def __init__(self, folder: Path, study: str, file: str = FILE) -> None:
         super().__init__(study)
-        self.folder, self.path = folder, folder / FILE
+        self.folder, self.path = folder, folder / file
         self._connection: sa.Connection | None = None
         self._transaction = threading.RLock()
         self._engine = sa.create_engine("sqlite://", creator=self._open, poolclass=sa.NullPool)
-        sa.event.listen(self._engine, "begin", _begin)
+        event.listen(self._engine, "begin", _begin)
 
     @property
     def place(self) -> str:
@@ -60,7 +61,7 @@ class SqliteDatabase(Database):
         """See `Database.read`."""
         try:
             return self._engine.connect().execution_options(is_reading=True)
-        except sa.exc.DBAPIError as error:
+        except exc.DBAPIError as error:
             raise sentence(error, self.place) from error
 
     def run(self, work: Callable[[sa.Connection], T]) -> T:
@@ -72,7 +73,7 @@ class SqliteDatabase(Database):
                     self._connection = self._engine.connect()
                 with self._connection.begin():
                     return work(self._connection)
-            except (sa.exc.DBAPIError, sqlite3.Error) as error:
+            except (exc.DBAPIError, sqlite3.Error) as error:
                 self.end()
                 raise sentence(error, self.place) from error
             except OSError as error:
@@ -97,7 +98,7 @@ class SqliteDatabase(Database):
 
     def sync(self) -> None:
         """See `Database.sync`. SQLite syncs its log when it is copied into the file; here that is done before."""
-        for path in (self.path.with_name(f"{FILE}-wal"), self.path):
+        for path in (self.path.with_name(f"{self.path.name}-wal"), self.path):
             with suppress(FileNotFoundError):
                 try:
                     descriptor = os.open(path, os.O_RDONLY)
@@ -110,11 +111,14 @@ class SqliteDatabase(Database):
                 except OSError as error:
                     raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
 
+    def beat(self) -> None:
+        """See `Database.beat`. The kernel keeps them."""
+
     def end(self) -> None:
         """See `Database.end`."""
         with self._transaction:
             if self._connection is not None:
-                with suppress(sa.exc.SQLAlchemyError, sqlite3.Error):
+                with suppress(exc.SQLAlchemyError, sqlite3.Error):
                     self._connection.close()
                 self._connection = None
 

@@ -11,6 +11,7 @@ import json
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.money import Full, Money
@@ -117,8 +118,7 @@ class Budget:
             try:
                 result = await asyncio.wrap_future(pending)
             except asyncio.CancelledError:
-                money = self._money
-                pending.add_done_callback(lambda its: money.forget(its, participant, worst_usd))
+                pending.add_done_callback(partial(self._money.forget, participant=participant, usd=worst_usd))
                 raise
             if isinstance(result, str):
                 reservation = Reservation(result, participant, worst_usd)

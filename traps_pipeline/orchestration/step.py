@@ -21,7 +21,6 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.base.redaction import redacted
 from traps_pipeline.base.workers import kept_workers
-from traps_pipeline.cluster.same_code import require_same_code
 from traps_pipeline.models.budget import BudgetReached
 from traps_pipeline.orchestration.graph import Collect, Node, Stage, name_of, the_graph
 from traps_pipeline.orchestration.history import History
@@ -100,7 +99,6 @@ class Step:
 
     def _events(self) -> Generator[Event, None, None]:
         stage, name = self.stage, self.stage.name
-        require_same_code(self.context.run.tags, self.workspace.study.name)
         require_machine(self.workspace, parts_of_run(self.context, self.stage, self._wanted))
         lineage = Lineage(self.workspace, thorough=True)
         self.history.observe(lineage, [p for p in self.graph.parents_of[name] if self.graph.source(p)])

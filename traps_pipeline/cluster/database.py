@@ -1,0 +1,22 @@
+"""The database in which hosts share names of files and leases: the one that holds the study's ledger."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+
+from traps_pipeline.ledger.postgres import PostgresDatabase, postgres_of
+from traps_pipeline.storage.store import Lease
+
+Database = PostgresDatabase
+database_of = postgres_of
+
+
+def lease(database: Database, name: str) -> Lease | None:
+    """Take a piece of work of the study, as `Store.lease` says: an advisory lock, which this process keeps alive."""
+    with ExitStack() as opened:
+        opened.enter_context(database.writing())
+        lock = database.try_lock(f"lease/{name}")
+        if lock is None:
+            return None
+        opened.callback(lock.release)
+        return Lease(opened.pop_all().close)
