@@ -62,7 +62,7 @@ class Batch:
     def spent(self) -> dict[str, float]:
         """Dollars spent for good, by participant; kept up to date by `spend`."""
         query = sa.select(SPENT.c.participant, SPENT.c.usd).where(SPENT.c.study == self.study)
-        spent = dict[str, float](self.connection.execute(query).tuples().all())
+        spent: dict[str, float] = {row.participant: row.usd for row in self.connection.execute(query)}
         for participant, usd in self.more_usd.items():
             spent[participant] = spent.get(participant, 0.0) + usd
         return spent
@@ -70,9 +70,10 @@ class Batch:
     @cached_property
     def reserved(self) -> dict[str, float]:
         """Dollars of reservations, by participant; kept up to date by those who add and remove them."""
-        usd = sa.func.sum(RESERVATIONS.c.usd)
+        usd = sa.func.sum(RESERVATIONS.c.usd).label("usd")
         query = sa.select(RESERVATIONS.c.participant, usd).where(RESERVATIONS.c.study == self.study)
-        return dict(self.connection.execute(query.group_by(RESERVATIONS.c.participant)).tuples().all())
+        found = self.connection.execute(query.group_by(RESERVATIONS.c.participant))
+        return {row.participant: row.usd for row in found}
 
     def spend(self, participant: str, usd: float) -> None:
         """Count dollars as spent, or as spent no more."""
@@ -153,7 +154,8 @@ class Database(ABC):
     """The ledger's database of one study, as this process uses it. Its methods may be called from any thread."""
 
     def __init__(self, study: str) -> None:
-        self.study_name, self.session = study, secrets.token_hex(8)
+        self.study_name = study
+        self.session = ""  # while this process writes: a name for that, which none had before
         self.study = 0  # the study's number, once there is one
         self._queue: SimpleQueue[tuple[Change, Future[Any]] | None] = SimpleQueue()
         self._users, self._guard, self._batch = 0, threading.Lock(), 0
@@ -192,6 +194,10 @@ class Database(ABC):
     @abstractmethod
     def sync(self) -> None:
         """Return when not even a power cut loses what was committed. Raises TrapsError."""
+
+    def faults(self) -> Iterator[str]:
+        """Yield sentences on what is wrong with the database itself, where it can look. Raises TrapsError."""
+        yield from ()
 
     @abstractmethod
     def beat(self) -> None:
@@ -263,6 +269,7 @@ class Database(ABC):
         batch.connection.execute(sa.delete(SHARERS).where(gone))
 
     def _begin(self) -> None:
+        self.session = secrets.token_hex(8)
         self.run(self._prepare)
         self._session_lock = self.try_lock(f"session-{self.session}")
         self._thread = threading.Thread(target=self._work, name="ledger", daemon=True)
@@ -289,7 +296,7 @@ class Database(ABC):
             self.run(lambda connection: connection.execute(sa.delete(SESSIONS).where(SESSIONS.c.id == self.session)))
         finally:
             self._session_lock.release()
-            self._session_lock, self._batch = None, 0
+            self.session, self._session_lock, self._batch = "", None, 0
             self.end()
 
     def _work(self) -> None:

@@ -9,6 +9,7 @@ connections.
 from __future__ import annotations
 
 import os
+import secrets
 import socket
 import threading
 import time
@@ -17,6 +18,7 @@ from contextlib import suppress
 from functools import cache
 from hashlib import blake2b
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 import sqlalchemy as sa
 from sqlalchemy import exc
@@ -60,7 +62,9 @@ class PostgresDatabase(Database):
     def __init__(self, address: str, variable: str, study: str, idle_s: float = IDLE_S) -> None:
         super().__init__(study)
         self._variable, self._idle_s, self.patience_s = variable, idle_s, PATIENCE_S
+        self.application = f"traps {secrets.token_hex(8)}"  # what the server calls this process's connections
         try:
+            urlsplit(address).port  # noqa: B018 - raises ValueError
             url = sa.make_url(address)
             if not url.drivername.startswith("postgres"):
                 raise ValueError(url.drivername)
@@ -73,7 +77,7 @@ class PostgresDatabase(Database):
         self._engine = sa.create_engine(
             url.set(drivername="postgresql+psycopg"),
             poolclass=sa.NullPool,
-            connect_args={"connect_timeout": 10, "application_name": f"traps {self.session}", **KEEPALIVE},
+            connect_args={"connect_timeout": 10, "application_name": self.application, **KEEPALIVE},
         )
         self._guard_connection = threading.RLock()
         self._connection: sa.Connection | None = None
@@ -209,7 +213,7 @@ class PostgresDatabase(Database):
             "where application_name = :name and pid <> pg_backend_pid()"
         )
         with connection.begin():
-            connection.execute(sa.text(ending), {"name": f"traps {self.session}"})
+            connection.execute(sa.text(ending), {"name": self.application})
         until = time.monotonic() + 5  # the old connection takes a moment to end
         for number in self._held:
             while True:

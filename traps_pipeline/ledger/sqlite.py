@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -110,6 +110,16 @@ class SqliteDatabase(Database):
                     raise
                 except OSError as error:
                     raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
+
+    def faults(self) -> Iterator[str]:
+        """See `Database.faults`: SQLite's own check, which finds rows that its index has and the table does not."""
+        with self.read() as connection:
+            try:
+                for (fault,) in connection.exec_driver_sql("pragma integrity_check(5)"):
+                    if fault != "ok":
+                        yield f"{self.path}: {fault}; export what can be read (`traps answers export`) and begin anew"
+            except exc.DBAPIError as error:
+                raise sentence(error, self.place) from error
 
     def beat(self) -> None:
         """See `Database.beat`. The kernel keeps them."""
