@@ -35,9 +35,9 @@ def asked(tmp_path: Path) -> Ledger:
 
 
 def test_a_ledger_goes_through_a_file_with_all_that_was_paid(asked: Ledger, place: Place, tmp_path: Path) -> None:
-    assert export_ledger(asked.database, tmp_path / "ledger.sqlite") == 4
+    assert export_ledger(asked.database, tmp_path / "moved.sqlite") == 4
     other = place.open()
-    assert import_ledger(tmp_path / "ledger.sqlite", other.database) == 4
+    assert import_ledger(tmp_path / "moved.sqlite", other.database) == 4
     assert [*other.rows("m")] == [*asked.rows("m")] and other.totals() == asked.totals()
     assert [*Ledger(other.database, "votes").rows("n")] == [(answer("v", "yes"), {})]
     with other.database.writing():

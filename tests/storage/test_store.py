@@ -20,7 +20,6 @@ from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.cluster.database import Database
 from traps_pipeline.cluster.objects import OBJECTS, Bucket, ObjectStore
-from traps_pipeline.storage.database import Session
 from traps_pipeline.storage.leases import alone, leased
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.store import LEASES, FolderStore, Store
@@ -71,7 +70,7 @@ def opened(folder: str, *of_database: str) -> Store:
     if not database:
         return FolderStore(Path(folder) / "study")
     address, study = database
-    database = Database(address, Session(address, "TRAPS_TEST_DATABASE", study))
+    database = Database(address, "TRAPS_TEST_DATABASE", study)
     return ObjectStore(Path(folder) / host, Bucket(f"s3://lab/{study}"), database, study, b"anchor")
 
 

@@ -130,14 +130,11 @@ class _Asking:
             return False
         request, name = queue.popleft(), participant.entry.id
         allowed = Allowed(self.work.budget, self.stop, self.halted, self.writer.require)
-        try:
-            attempted = await attempt(participant, request, allowed)
-            if attempted is None:
-                return False
-            row, beside = ledger_row(request, *attempted, self.work.epoch)
-            await self.writer.write(row, beside, [reservation.id for reservation in allowed.paid_by])
-        finally:
-            await self.work.budget.booked(allowed.paid_by)
+        attempted = await attempt(participant, request, allowed)
+        if attempted is None:
+            return False
+        row, beside = ledger_row(request, *attempted, self.work.epoch)
+        await self.writer.write(row, beside, [reservation.id for reservation in allowed.paid_by])
         self.rows[request.key] = _Held(row)
         progress.current().called(self.work.stage, name, not settles(row), row["latency_s"], row["cost_usd"] or 0.0)
         participant.breaker.watch(attempted[0])

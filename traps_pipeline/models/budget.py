@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -126,7 +126,7 @@ class Budget:
                 if account is None or account.reserve(worst_usd):
                     self._in_flight[reservation.id] = reservation
                     return reservation
-                await self._remove(reservation)
+                await self._replace(reservation, 0.0)
                 if not self._in_flight_through(account):
                     raise BudgetReached(account.explain(worst_usd))
             elif not await self._may_make_room(result):
@@ -136,29 +136,24 @@ class Budget:
                     await asyncio.wait_for(self._changed.wait(), LOOK_S)
 
     async def settle(self, reservation: Reservation | None, cost_usd: float | None) -> None:
-        """Say what a call came to; an unknown cost counts as the worst. One that costs nothing holds no room any more;
-        what another costs is counted when its row is stored."""
+        """Put a call's cost in the place of its worst case; an unknown cost counts as the worst."""
         if reservation is None:
             return
         cost = reservation.usd if cost_usd is None else cost_usd
         if account := self._accounts.get(reservation.participant):
             account.correct(cost - reservation.usd)
-        if cost <= 0:
-            await self._remove(reservation)
-            await self.booked([reservation])
-
-    async def booked(self, reservations: Collection[Reservation]) -> None:
-        """Say that calls are in flight no more: their rows are stored, or cannot be."""
-        if reservations:
+        try:
+            if cost != reservation.usd:
+                await self._replace(reservation, cost)
+        finally:
             async with self._changed:
-                for reservation in reservations:
-                    self._in_flight.pop(reservation.id, None)
+                self._in_flight.pop(reservation.id, None)
                 self._changed.notify_all()
 
-    async def _remove(self, reservation: Reservation) -> None:
-        assert self._money is not None, "what is removed was reserved"
-        removed = self._money.settle(reservation.id, reservation.participant, reservation.usd, 0.0)
-        await asyncio.wrap_future(removed)
+    async def _replace(self, reservation: Reservation, cost_usd: float) -> None:
+        assert self._money is not None, "what is replaced was reserved"
+        settled = self._money.settle(reservation.id, reservation.participant, reservation.usd, cost_usd)
+        await asyncio.wrap_future(settled)
 
     async def _may_make_room(self, full: Full) -> bool:
         """Return whether calls are in flight, here or in another process, whose cost may be less than their worst."""
