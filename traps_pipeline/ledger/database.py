@@ -56,6 +56,8 @@ class Batch:
     totals: dict[tuple[str, str], Totals] = field(default_factory=dict)
     more_usd: dict[str, float] = field(default_factory=dict)
     reservations: list[dict[str, Any]] = field(default_factory=list)
+    covered: dict[str, None] = field(default_factory=dict)  # reservations whose calls' rows are stored
+    _open: dict[str, float] = field(default_factory=dict)  # dollars by reservation, once `reserved` is read
     _writers: dict[int, bool] = field(default_factory=dict)
 
     @cached_property
@@ -70,10 +72,13 @@ class Batch:
     @cached_property
     def reserved(self) -> dict[str, float]:
         """Dollars of reservations, by participant; kept up to date by those who add and remove them."""
-        usd = sa.func.sum(RESERVATIONS.c.usd).label("usd")
-        query = sa.select(RESERVATIONS.c.participant, usd).where(RESERVATIONS.c.study == self.study)
-        found = self.connection.execute(query.group_by(RESERVATIONS.c.participant))
-        return {row.participant: row.usd for row in found}
+        query = sa.select(RESERVATIONS.c.id, RESERVATIONS.c.participant, RESERVATIONS.c.usd)
+        reserved = dict[str, float]()
+        for reservation, participant, usd in self.connection.execute(query.where(RESERVATIONS.c.study == self.study)):
+            if reservation not in self.covered:
+                self._open[reservation] = usd
+                reserved[participant] = reserved.get(participant, 0.0) + usd
+        return reserved
 
     def spend(self, participant: str, usd: float) -> None:
         """Count dollars as spent, or as spent no more."""
@@ -95,16 +100,14 @@ class Batch:
         else:
             self.connection.execute(sa.delete(RESERVATIONS).where(its))
         if "reserved" in self.__dict__:
+            self._open[reservation] = max(usd, 0.0)
             self.reserved[participant] = self.reserved.get(participant, 0.0) + max(usd, 0.0) - was_usd
 
     def cover(self, participant: str, reservations: Sequence[str]) -> None:
         """Remove the reservations of a call whose cost stands in its row now."""
-        if not reservations:
-            return
-        mine = RESERVATIONS.c.id.in_(reservations)
-        was_usd = self.connection.execute(sa.select(sa.func.sum(RESERVATIONS.c.usd)).where(mine)).scalar() or 0.0
-        self.connection.execute(sa.delete(RESERVATIONS).where(mine))
+        self.covered |= dict.fromkeys(reservations)
         if "reserved" in self.__dict__:
+            was_usd = sum(self._open.pop(reservation, 0.0) for reservation in reservations)
             self.reserved[participant] = self.reserved.get(participant, 0.0) - was_usd
 
     def is_writer(self, evaluation: int) -> bool:
@@ -120,6 +123,9 @@ class Batch:
             self.connection.execute(sa.insert(ROWS), self.rows)
         if self.reservations:
             self.connection.execute(sa.insert(RESERVATIONS), self.reservations)
+        if self.covered:
+            gone = [{"gone": reservation} for reservation in self.covered]
+            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), gone)
         for (kind, participant), its in self.totals.items():
             self._add_totals(kind, participant, its)
         for participant, usd in self.more_usd.items():
