@@ -50,7 +50,9 @@ class SqliteDatabase(Database):
     def _open(self) -> sqlite3.Connection:
         # A folder that cannot be written holds a file that nobody changes, and SQLite could not make its log there.
         is_fixed = self.path.exists() and not os.access(self.folder, os.W_OK)
-        uri = f"file:{quote(str(self.path))}" + ("?immutable=1" if is_fixed else "")
+        # A log there is of a process that was killed: what it holds was committed, and `immutable` would not read it.
+        how = "mode=ro" if self.path.with_name(f"{self.path.name}-wal").exists() else "immutable=1"
+        uri = f"file:{quote(str(self.path))}" + (f"?{how}" if is_fixed else "")
         connection = sqlite3.connect(uri, uri=True, timeout=WAIT_S, isolation_level=None, check_same_thread=False)
         if not is_fixed:
             connection.execute("pragma journal_mode=wal")
