@@ -150,10 +150,12 @@ Change = Callable[[Batch], Any]
 
 @dataclass(frozen=True)
 class Lock:
-    """A named lock of this process. require(): raises TrapsError when it is not this process's any more."""
+    """A named lock of this process. require(): raises TrapsError when it is not this process's any more. is_fresh():
+    whether that can be told at once, without asking a server, which may be away."""
 
     release: Callable[[], None]
     require: Callable[[], None]
+    is_fresh: Callable[[], bool] = lambda: True
 
 
 class Database(ABC):
