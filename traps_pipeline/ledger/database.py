@@ -129,20 +129,34 @@ class Batch:
         for (kind, participant), its in self.totals.items():
             self._add_totals(kind, participant, its)
         for participant, usd in self.more_usd.items():
-            mine = (SPENT.c.study == self.study) & (SPENT.c.participant == participant)
-            if not self.connection.execute(sa.update(SPENT).where(mine).values(usd=SPENT.c.usd + usd)).rowcount:
+            mine = {"of_study": self.study, "of_participant": participant}
+            if not self.connection.execute(_ADD_SPENT, {**mine, "more_usd": usd}).rowcount:
                 self.connection.execute(sa.insert(SPENT).values(study=self.study, participant=participant, usd=usd))
 
     def _add_totals(self, kind: str, participant: str, its: Totals) -> None:
-        values = {"dollars": its.dollars, "failed": its.failed, "unknown": its.unknown}
+        values: dict[str, float] = {"dollars": its.dollars, "failed": its.failed, "unknown": its.unknown}
         for column in AVERAGED:
             values[f"{column}_sum"], values[f"{column}_n"] = its.means.get(column, (0.0, 0))
-        mine = {"study": self.study, "kind": kind, "participant": participant}
-        here = sa.and_(*(TOTALS.c[name] == value for name, value in mine.items()))
-        dearest = sa.case((TOTALS.c.dearest < its.dearest, its.dearest), else_=TOTALS.c.dearest)
-        sums: dict[str, Any] = {name: TOTALS.c[name] + value for name, value in values.items()}
-        if not self.connection.execute(sa.update(TOTALS).where(here).values(**sums, dearest=dearest)).rowcount:
-            self.connection.execute(sa.insert(TOTALS).values(**mine, **values, dearest=its.dearest))
+        mine = {"of_study": self.study, "of_kind": kind, "of_participant": participant}
+        more = {f"more_{name}": value for name, value in values.items()}
+        if not self.connection.execute(_ADD_TOTALS, {**mine, **more, "its_dearest": its.dearest}).rowcount:
+            new = {"study": self.study, "kind": kind, "participant": participant, "dearest": its.dearest}
+            self.connection.execute(sa.insert(TOTALS).values(**new, **values))
+
+
+def _adding(table: sa.Table, *columns: str) -> sa.Update:
+    """Return a statement that adds `more_COLUMN` to columns of the row whose key is given by `of_COLUMN`. It is made
+    once: SQLAlchemy takes longer to make such a statement than SQLite to execute it."""
+    key = [column == sa.bindparam(f"of_{column.name}") for column in table.primary_key]
+    more = {name: table.c[name] + sa.bindparam(f"more_{name}") for name in columns}
+    return sa.update(table).where(*key).values(more)
+
+
+_ADD_SPENT = _adding(SPENT, "usd")
+_DEAREST = sa.bindparam("its_dearest", type_=sa.Double)
+_ADD_TOTALS = _adding(
+    TOTALS, *("dollars", "failed", "unknown"), *(f"{column}_{what}" for column in AVERAGED for what in ("sum", "n"))
+).values(dearest=sa.case((TOTALS.c.dearest < _DEAREST, _DEAREST), else_=TOTALS.c.dearest))
 
 
 Change = Callable[[Batch], Any]
