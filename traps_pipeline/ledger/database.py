@@ -56,6 +56,8 @@ class Batch:
     totals: dict[tuple[str, str], Totals] = field(default_factory=dict)
     more_usd: dict[str, float] = field(default_factory=dict)
     reservations: list[dict[str, Any]] = field(default_factory=list)
+    covered: dict[str, None] = field(default_factory=dict)  # reservations whose calls' rows are stored
+    _open: dict[str, float] = field(default_factory=dict)  # dollars by reservation, once `reserved` is read
     _writers: dict[int, bool] = field(default_factory=dict)
 
     @cached_property
@@ -70,10 +72,13 @@ class Batch:
     @cached_property
     def reserved(self) -> dict[str, float]:
         """Dollars of reservations, by participant; kept up to date by those who add and remove them."""
-        usd = sa.func.sum(RESERVATIONS.c.usd).label("usd")
-        query = sa.select(RESERVATIONS.c.participant, usd).where(RESERVATIONS.c.study == self.study)
-        found = self.connection.execute(query.group_by(RESERVATIONS.c.participant))
-        return {row.participant: row.usd for row in found}
+        query = sa.select(RESERVATIONS.c.id, RESERVATIONS.c.participant, RESERVATIONS.c.usd)
+        reserved = dict[str, float]()
+        for reservation, participant, usd in self.connection.execute(query.where(RESERVATIONS.c.study == self.study)):
+            if reservation not in self.covered:
+                self._open[reservation] = usd
+                reserved[participant] = reserved.get(participant, 0.0) + usd
+        return reserved
 
     def spend(self, participant: str, usd: float) -> None:
         """Count dollars as spent, or as spent no more."""
@@ -95,16 +100,14 @@ class Batch:
         else:
             self.connection.execute(sa.delete(RESERVATIONS).where(its))
         if "reserved" in self.__dict__:
+            self._open[reservation] = max(usd, 0.0)
             self.reserved[participant] = self.reserved.get(participant, 0.0) + max(usd, 0.0) - was_usd
 
     def cover(self, participant: str, reservations: Sequence[str]) -> None:
         """Remove the reservations of a call whose cost stands in its row now."""
-        if not reservations:
-            return
-        mine = RESERVATIONS.c.id.in_(reservations)
-        was_usd = self.connection.execute(sa.select(sa.func.sum(RESERVATIONS.c.usd)).where(mine)).scalar() or 0.0
-        self.connection.execute(sa.delete(RESERVATIONS).where(mine))
+        self.covered |= dict.fromkeys(reservations)
         if "reserved" in self.__dict__:
+            was_usd = sum(self._open.pop(reservation, 0.0) for reservation in reservations)
             self.reserved[participant] = self.reserved.get(participant, 0.0) - was_usd
 
     def is_writer(self, evaluation: int) -> bool:
@@ -120,23 +123,40 @@ class Batch:
             self.connection.execute(sa.insert(ROWS), self.rows)
         if self.reservations:
             self.connection.execute(sa.insert(RESERVATIONS), self.reservations)
+        if self.covered:
+            gone = [{"gone": reservation} for reservation in self.covered]
+            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), gone)
         for (kind, participant), its in self.totals.items():
             self._add_totals(kind, participant, its)
         for participant, usd in self.more_usd.items():
-            mine = (SPENT.c.study == self.study) & (SPENT.c.participant == participant)
-            if not self.connection.execute(sa.update(SPENT).where(mine).values(usd=SPENT.c.usd + usd)).rowcount:
+            mine = {"of_study": self.study, "of_participant": participant}
+            if not self.connection.execute(_ADD_SPENT, {**mine, "more_usd": usd}).rowcount:
                 self.connection.execute(sa.insert(SPENT).values(study=self.study, participant=participant, usd=usd))
 
     def _add_totals(self, kind: str, participant: str, its: Totals) -> None:
-        values = {"dollars": its.dollars, "failed": its.failed, "unknown": its.unknown}
+        values: dict[str, float] = {"dollars": its.dollars, "failed": its.failed, "unknown": its.unknown}
         for column in AVERAGED:
             values[f"{column}_sum"], values[f"{column}_n"] = its.means.get(column, (0.0, 0))
-        mine = {"study": self.study, "kind": kind, "participant": participant}
-        here = sa.and_(*(TOTALS.c[name] == value for name, value in mine.items()))
-        dearest = sa.case((TOTALS.c.dearest < its.dearest, its.dearest), else_=TOTALS.c.dearest)
-        sums: dict[str, Any] = {name: TOTALS.c[name] + value for name, value in values.items()}
-        if not self.connection.execute(sa.update(TOTALS).where(here).values(**sums, dearest=dearest)).rowcount:
-            self.connection.execute(sa.insert(TOTALS).values(**mine, **values, dearest=its.dearest))
+        mine = {"of_study": self.study, "of_kind": kind, "of_participant": participant}
+        more = {f"more_{name}": value for name, value in values.items()}
+        if not self.connection.execute(_ADD_TOTALS, {**mine, **more, "its_dearest": its.dearest}).rowcount:
+            new = {"study": self.study, "kind": kind, "participant": participant, "dearest": its.dearest}
+            self.connection.execute(sa.insert(TOTALS).values(**new, **values))
+
+
+def _adding(table: sa.Table, *columns: str) -> sa.Update:
+    """Return a statement that adds `more_COLUMN` to columns of the row whose key is given by `of_COLUMN`. It is made
+    once: SQLAlchemy takes longer to make such a statement than SQLite to execute it."""
+    key = [column == sa.bindparam(f"of_{column.name}") for column in table.primary_key]
+    more = {name: table.c[name] + sa.bindparam(f"more_{name}") for name in columns}
+    return sa.update(table).where(*key).values(more)
+
+
+_ADD_SPENT = _adding(SPENT, "usd")
+_DEAREST = sa.bindparam("its_dearest", type_=sa.Double)
+_ADD_TOTALS = _adding(
+    TOTALS, *("dollars", "failed", "unknown"), *(f"{column}_{what}" for column in AVERAGED for what in ("sum", "n"))
+).values(dearest=sa.case((TOTALS.c.dearest < _DEAREST, _DEAREST), else_=TOTALS.c.dearest))
 
 
 Change = Callable[[Batch], Any]
@@ -144,10 +164,12 @@ Change = Callable[[Batch], Any]
 
 @dataclass(frozen=True)
 class Lock:
-    """A named lock of this process. require(): raises TrapsError when it is not this process's any more."""
+    """A named lock of this process. require(): raises TrapsError when it is not this process's any more. is_fresh():
+    whether that can be told at once, without asking a server, which may be away."""
 
     release: Callable[[], None]
     require: Callable[[], None]
+    is_fresh: Callable[[], bool] = lambda: True
 
 
 class Database(ABC):

@@ -250,7 +250,10 @@ class Writer:
 
     async def require(self) -> None:
         """Return if another call may be sent. Raises TrapsError when this writer is not the evaluation's any more."""
-        self._lock.require()
+        if self._lock.is_fresh():
+            self._lock.require()
+        else:  # calls in flight must not wait for a server that is away
+            await asyncio.to_thread(self._lock.require)
 
     async def write(
         self, row: Mapping[str, Any], beside: Mapping[str, str] | None = None, paid_by: Sequence[str] = ()

@@ -150,7 +150,10 @@ class PostgresDatabase(Database):
             with suppress(TrapsError):  # a connection that is gone holds no locks
                 self.run(lambda c: c.execute(sa.select(sa.func.pg_advisory_unlock(number))), patience_s=0.0)
 
-        return Lock(release, lambda: self._require(number))
+        return Lock(release, lambda: self._require(number), self._is_fresh)
+
+    def _is_fresh(self) -> bool:
+        return awake_s() - self._seen_s <= OLD_S
 
     def _is_starting(self, connection: sa.Connection) -> bool:
         up_s = "select extract(epoch from now() - pg_postmaster_start_time())"
@@ -162,7 +165,7 @@ class PostgresDatabase(Database):
         return connection.execute(others).scalar() is not None
 
     def _require(self, number: int) -> None:
-        if awake_s() - self._seen_s > OLD_S:
+        if not self._is_fresh():
             self.beat()
         if not self._held.get(number, False):
             raise TrapsError(
@@ -186,6 +189,11 @@ class PostgresDatabase(Database):
     def now_s(self, connection: sa.Connection) -> float:
         """See `Database.now_s`."""
         return float(connection.execute(sa.text("select extract(epoch from clock_timestamp())")).scalar_one())
+
+    def _prepare(self, connection: sa.Connection) -> None:
+        # Processes that begin at once would each create the tables, or the study's row.
+        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(lock_number("schema"))))
+        super()._prepare(connection)
 
     # --- the connection -----------------------------------------------------------------------------------------------
 

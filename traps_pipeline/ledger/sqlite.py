@@ -19,7 +19,7 @@ import sqlalchemy as sa
 from sqlalchemy import event, exc
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import remedy, require_in_place, try_lock
+from traps_pipeline.base.files import remedy, require_in_place, sync_folder, try_lock
 from traps_pipeline.ledger.database import Database, Lock, sentence
 
 T = TypeVar("T")
@@ -50,7 +50,9 @@ class SqliteDatabase(Database):
     def _open(self) -> sqlite3.Connection:
         # A folder that cannot be written holds a file that nobody changes, and SQLite could not make its log there.
         is_fixed = self.path.exists() and not os.access(self.folder, os.W_OK)
-        uri = f"file:{quote(str(self.path))}" + ("?immutable=1" if is_fixed else "")
+        # A log there is of a process that was killed: what it holds was committed, and `immutable` would not read it.
+        how = "mode=ro" if self.path.with_name(f"{self.path.name}-wal").exists() else "immutable=1"
+        uri = f"file:{quote(str(self.path))}" + (f"?{how}" if is_fixed else "")
         connection = sqlite3.connect(uri, uri=True, timeout=WAIT_S, isolation_level=None, check_same_thread=False)
         if not is_fixed:
             connection.execute("pragma journal_mode=wal")
@@ -97,19 +99,20 @@ class SqliteDatabase(Database):
         return Lock(release, lambda: require_in_place(descriptor, path))
 
     def sync(self) -> None:
-        """See `Database.sync`. SQLite syncs its log when it is copied into the file; here that is done before."""
-        for path in (self.path.with_name(f"{self.path.name}-wal"), self.path):
-            with suppress(FileNotFoundError):
-                try:
-                    descriptor = os.open(path, os.O_RDONLY)
-                    try:
-                        os.fsync(descriptor)
-                    finally:
-                        os.close(descriptor)
-                except FileNotFoundError:
-                    raise
-                except OSError as error:
-                    raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
+        """See `Database.sync`. SQLite syncs its log when it is copied into the file; here that is done before.
+
+        The file itself must not be opened here: closing it would give up the locks by which SQLite tells other
+        processes that this one uses the log, and the next one that ends would remove it.
+        """
+        path = self.path.with_name(f"{self.path.name}-wal")
+        try:
+            with path.open("rb") as log:
+                os.fsync(log.fileno())
+            sync_folder(self.folder)
+        except FileNotFoundError:
+            return  # all of it was copied into the file, which SQLite syncs
+        except OSError as error:
+            raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
 
     def faults(self) -> Iterator[str]:
         """See `Database.faults`: SQLite's own check, which finds rows that its index has and the table does not."""

@@ -70,6 +70,8 @@ def _copy(source: Database, batch: Batch, place: str) -> int:
             f"{place}: holds rows of this study already; bring answers into it with `traps answers export` and "
             "`traps answers import`"
         )
+    # Those that were opened and got no row would be in the way of the source's.
+    batch.connection.execute(sa.delete(EVALUATIONS).where(EVALUATIONS.c.study == batch.study))
     count = 0
     if not source.exists():
         return count
