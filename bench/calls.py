@@ -37,14 +37,15 @@ KEY, DATABASE = "BENCH_KEY", "BENCH_DATABASE"
 def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     """Requests through `ask`: backend, retries, pace, budget and the ledger, on disk or in a database."""
     from traps_pipeline.base.partitions import DATASETS, REGIMES, Cell, Evaluation
+    from traps_pipeline.ledger.ledger import Ledger
+    from traps_pipeline.ledger.postgres import postgres_of
+    from traps_pipeline.ledger.sqlite import SqliteDatabase
     from traps_pipeline.models.api import ApiBackend, load_litellm
     from traps_pipeline.models.ask import Call, Work, run_work
     from traps_pipeline.models.budget import Budget
     from traps_pipeline.models.participants import Participants
     from traps_pipeline.models.registry import Account, Entry, Limits
     from traps_pipeline.models.request import Request
-    from traps_pipeline.storage.database import session_of
-        from traps_pipeline.storage.shared_ledger import SharedLedger
     from traps_pipeline.storage.study import Study
 
     account = Account(key=KEY, base_url=f"{url}/v1")
@@ -65,11 +66,10 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         free = Study(allow_unknown_prices=True)
         participants = Participants({"m": entry}, lambda e: ApiBackend(e, account), free, {"a": account})
-        in_database = DATABASE in os.environ
-        ledger = local(Path(folder))
-        if in_database:
-            ledger = SharedLedger(session_of(DATABASE, f"bench-{os.getpid()}"), "answers")
-        work = Work("responses", ledger, participants, Budget(0, {}, {}), "1", calls, lambda _: None)
+        name = f"bench-{os.getpid()}"
+        database = postgres_of(DATABASE, name) if DATABASE in os.environ else SqliteDatabase(Path(folder), name)
+        ledger = Ledger(database, "answers")
+        work = Work("responses", ledger, participants, Budget(0, {}), "1", calls, lambda _: None)
         return _measured(lambda: list(run_work(work, cells)), answers)
 
 

@@ -35,8 +35,8 @@ from tests.providers.server import Provider
 from traps_pipeline.cli.command import OVER_BUDGET
 from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.cluster.objects import ObjectStore
+from traps_pipeline.ledger.money import Money
 from traps_pipeline.storage.place import scratch_of
-from traps_pipeline.storage.purse import Purse
 
 MODELS, CONNECTIONS = ("seer-a", "seer-b"), 2
 BUDGET_USD = 6.0  # two dead blocks of 16 worst cases are $2.84
@@ -230,13 +230,10 @@ KILLS: dict[str, Callable[[Scene], None]] = {
 
 
 def spent_usd(study: Study) -> dict[str, float]:
-    """What the study has spent by its own count on each model: rows, and blocks that are out."""
-    with study.opened() as workspace:
-        assert workspace.session is not None
-        purse = Purse(workspace.session)
-        standing = purse.open()
-        purse.close()
-        return {model: standing.spent.get(model, 0.0) + standing.out.get(model, 0.0) for model in MODELS}
+    """What the study has spent by its own count on each model: rows, and calls in flight."""
+    with study.opened() as workspace, workspace.ledger.writing():
+        spent = Money(workspace.ledger).spent()
+        return {model: spent.get(model, 0.0) for model in MODELS}
 
 
 def paying(usd: float, *, each: bool = False) -> list[str]:

@@ -1,11 +1,9 @@
 """When the first call of a run goes out: `traps run` on a ledger of 100,000 rows, from the command to the request's
 arrival at the server; CPU seconds too, which a loaded machine does not stretch. Then `traps plan` on the same ledger.
-The first of either reads every row once and keeps totals beside the segments.
 
 python bench/first_call.py [--rows 100000] [--database | --store]    (1600000: a large lab's year)
 
---database: the ledger in PostgreSQL; --store: the study in an object store (moto's server), before and after its
-evaluations became segments there.
+--database: the ledger in PostgreSQL; --store: the study in an object store (moto's server).
 """
 
 from __future__ import annotations
@@ -19,7 +17,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -67,58 +64,13 @@ def ledger_rows(rows: int) -> Iterator[tuple[str, list[Any]]]:
         yield evaluation.key, part
 
 
-def fill(root: Path, rows: int) -> None:
-    """Such a ledger in a study's folder."""
-    from traps_pipeline.storage.segments import SegmentLedger
-
-    for evaluation, part in ledger_rows(rows):
-        with SegmentLedger(root, "answers").writer(evaluation) as writer:
-            for one in part:
-                writer.append(*one)
-
-
-def fill_database(address: str, rows: int) -> None:
-    """Such a ledger in the database of the study at an address, as its hosts would have stored it."""
-    from traps_pipeline.storage.stream import add_up, encoded
+def fill(place: Path | str, rows: int) -> None:
+    """Such a ledger in the study at a place."""
     from traps_pipeline.storage.workspace import Workspace
 
-    session = Workspace.open(address).session
-    assert session is not None
-
-    def store(connection: Any, evaluation: str, part: list[Any]) -> None:
-        slot = [session.study_id, "answers", evaluation]
-        sql = "insert into traps.evaluations (study, kind, name) values (%s, %s, %s) on conflict do nothing"
-        connection.execute(sql, slot)
-        sql = "select id from traps.evaluations where study = %s and kind = %s and name = %s"
-        ((number,),) = connection.execute(sql, slot).fetchall()
-        columns = "evaluation, key, settled, line, digest, reasoning, raw"
-        with connection.cursor().copy(f"copy traps.rows ({columns}) from stdin (format binary)") as copy:
-            copy.set_types(["int4", "text", "bool", "bytea", "bytea", "bytea", "bytea"])
-            for one in map(encoded, part):
-                copy.write_row((number, one.row["key"], True, one.line, sha256(one.line).digest(), *one.beside))
-        add_up(connection, session, (("answers", row) for row, _ in part))
-
+    ledger = Workspace.open(place).answers
     for evaluation, part in ledger_rows(rows):
-        session.run(lambda c, e=evaluation, p=part: store(c, e, p))
-    session.run(lambda c: c.execute("analyze"))  # as the server does by itself after a while
-
-
-def compact(address: str) -> int:
-    """Let every evaluation of the study become segments; how many rows."""
-    from traps_pipeline.storage.shared_ledger import SharedLedger, SharedWriter
-    from traps_pipeline.storage.workspace import Workspace
-
-    ledger, count = Workspace.open(address).answers, 0
-    assert isinstance(ledger, SharedLedger)
-
-    async def one(evaluation: str) -> int:
-        async with ledger.writing(evaluation, print) as writer:
-            assert isinstance(writer, SharedWriter)
-            return await asyncio.to_thread(ledger.segments.compact, writer.claim)
-
-    for evaluation in ledger.evaluations():
-        count += asyncio.run(one(evaluation))
-    return count
+        asyncio.run(ledger.store({evaluation: part}, print))
 
 
 def _cpu_s(pid: int) -> float:
@@ -168,8 +120,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rows", type=int, default=100_000)
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--database", action="store_true", help="move the ledger into PostgreSQL first")
-    where.add_argument("--store", action="store_true", help="the study in an object store, before and after compaction")
+    where.add_argument("--database", action="store_true", help="bring the ledger into PostgreSQL first")
+    where.add_argument("--store", action="store_true", help="the study in an object store")
     arguments = parse(parser, rows=2_000)
     os.environ |= {KEY: SECRET, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "osmesa")}
     with ExitStack() as opened:
@@ -183,21 +135,20 @@ def main() -> None:
         made = study.traps("run", free, *until)  # clips, items and a Dagster history, as before any paid run
         assert made.code == 0, made.err
         began = time.perf_counter()
-        fill_database(ADDRESS, arguments.rows) if arguments.store else fill(study.workspace / "ledger", arguments.rows)
+        fill(ADDRESS if arguments.store else study.workspace, arguments.rows)
         print(f"{arguments.rows} rows written in {time.perf_counter() - began:.1f} s", flush=True)
         if arguments.database:
             os.environ[DATABASE] = opened.enter_context(Postgres.running(durable=True)).address()
             began = time.perf_counter()
-            moved = study.traps("ledger", "move", "--to", DATABASE)
-            assert moved.code == 0, moved.err
+            file = Path(name) / "moved.sqlite"
+            study_yaml = study.workspace / "study.yaml"
+            exported = study.traps("ledger", "export", str(file))
+            study_yaml.write_text(f"{study_yaml.read_text()}database: {DATABASE}\n")
+            moved = study.traps("ledger", "import", str(file))
+            assert exported.code == moved.code == 0, exported.err + moved.err
             print(f"moved into PostgreSQL in {time.perf_counter() - began:.1f} s", flush=True)
         path = experiment(study, ["image-model"], regimes=["standard"])
         first_calls(study, provider, path)
-        if arguments.store:
-            began = time.perf_counter()
-            rows = compact(ADDRESS)
-            print(f"{rows} rows became segments in {time.perf_counter() - began:.1f} s", flush=True)
-            first_calls(study, provider, path)
 
 
 if __name__ == "__main__":

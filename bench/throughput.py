@@ -49,6 +49,8 @@ def main() -> None:
     from tests.providers.server import Provider
     from traps_pipeline.base.digests import file_digest
     from traps_pipeline.base.partitions import Cell, Evaluation
+    from traps_pipeline.ledger.ledger import Ledger
+    from traps_pipeline.ledger.sqlite import SqliteDatabase
     from traps_pipeline.models.api import ApiBackend, load_litellm
     from traps_pipeline.models.ask import Call, Work, run_work
     from traps_pipeline.models.budget import Budget
@@ -56,7 +58,7 @@ def main() -> None:
     from traps_pipeline.models.registry import Account, ModelEntry
     from traps_pipeline.models.request import Request
     from traps_pipeline.storage.media import MediaSpec, MediaStore
-        from traps_pipeline.storage.study import Study
+    from traps_pipeline.storage.study import Study
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--answers", type=int, default=404, help="of each model; the smallest cell has 404")
@@ -90,7 +92,7 @@ def main() -> None:
 
         study = Study(allow_unknown_prices=True)
         participants = Participants(entries, lambda entry: ApiBackend(entry, account), study, {"a": account})
-        ledger, budget = local(folder), Budget(0, {}, {})
+        ledger, budget = Ledger(SqliteDatabase(folder, "bench"), "answers"), Budget(0, {})
         work = Work("responses", ledger, participants, budget, "1", calls, lambda _: None)
         load_litellm()
         began, cpu = time.perf_counter(), sum(resource.getrusage(resource.RUSAGE_SELF)[:2])

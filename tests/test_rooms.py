@@ -18,6 +18,7 @@ PACKAGE = Path(traps_pipeline.__file__).parent
 ROOMS = (
     "base",
     "scenes",
+    "ledger",
     "storage",
     "benchmark",
     "models",
@@ -148,14 +149,14 @@ def test_the_room_for_several_hosts_is_asked_for_in_one_place_and_has_what_is_as
 def test_an_import_counts_in_a_function_and_for_types_too() -> None:
     source = """
 from typing import TYPE_CHECKING
-import traps_pipeline.storage.ledger
+import traps_pipeline.storage.tables
 if TYPE_CHECKING:
     from traps_pipeline import cli
 def late():
     from traps_pipeline.scenes.physics import kit, nothing
     import json
 """
-    found = [(3, "storage.ledger"), (5, "cli"), (7, "scenes.physics.kit"), (7, "scenes.physics")]
+    found = [(3, "storage.tables"), (5, "cli"), (7, "scenes.physics.kit"), (7, "scenes.physics")]
     assert sorted(imported(source, files())) == sorted((line, f"traps_pipeline.{name}") for line, name in found)
 
 

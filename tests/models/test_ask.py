@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -17,6 +18,8 @@ import pytest
 from tests.build.ledger import local
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import Cell, Evaluation
+from traps_pipeline.ledger.database import sentence
+from traps_pipeline.ledger.sqlite import SqliteDatabase
 from traps_pipeline.models import participants
 from traps_pipeline.models.answers import answer_request
 from traps_pipeline.models.ask import STOPS, Call, Settled, Work, run_work, settle
@@ -254,11 +257,17 @@ def test_calls_in_flight_are_recorded_when_another_call_of_the_cell_fails(tmp_pa
 
 
 def test_a_full_disk_ends_the_cell_and_keeps_what_was_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from traps_pipeline.storage import segments
+    real = SqliteDatabase.run
 
-    write = segments.os.write
-    monkeypatch.setattr(segments.os, "write", lambda fd, line: write(fd, line) if b"item-5" not in line else 0)
-    with pytest.raises(TrapsError, match=r"could not be written .*free some space"):
+    def full(database: SqliteDatabase, do: Any) -> Any:
+        """Let SQLite find the disk full once five answers are stored."""
+        if database.exists() and len(local(tmp_path).read(CELL.evaluation.key).rows) >= 5:
+            full_disk = sqlite3.OperationalError("database or disk is full")
+            raise sentence(full_disk, database.place) from full_disk
+        return real(database, do)
+
+    monkeypatch.setattr(SqliteDatabase, "run", full)
+    with pytest.raises(TrapsError, match=r"ledger\.sqlite: .*no space left.*free some space"):
         list(run_work(work(tmp_path, {"m": Answering()}, ten), [CELL]))
     kept = len(local(tmp_path).read(CELL.evaluation.key).rows)
     monkeypatch.undo()

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from tests.build.ledger import answer, write
 from tests.remedies.remedied import command, remedied
 from traps_pipeline.models import own, prompts
 from traps_pipeline.models.local.settings import LocalParams
@@ -244,8 +245,7 @@ def test_another_benchmark_gets_another_folder(tmp_path: Path) -> None:
 
 def test_a_study_of_another_format_goes_on_in_a_new_workspace_with_its_ledger(tmp_path: Path) -> None:
     old = Workspace.create(tmp_path / "old", Study())
-    with old.answers.writer("m__standard__run1") as writer:
-        writer.append({"key": "k", "outcome": "answer", "text": "left"})
+    write(old.answers, answer("k", "left"), evaluation="m__standard__run1")
     file = old.root / "study.yaml"
     file.write_text(file.read_text().replace("format: ", "format: 9"))
 

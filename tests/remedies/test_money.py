@@ -85,7 +85,7 @@ def test_an_account_has_room_once_its_budget_is_raised_its_file_written_or_its_n
     (folder / "budget.yaml").write_text("usd: 1")
     remedied(
         call,
-        "models.budget.Budget._fits_account",
+        "models.budget.Budget.reserve",
         lambda: (folder / "budget.yaml").write_text("usd: 100"),
         error=BudgetReached,
     )

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.storage.conftest import VARIABLE
 
 from tests.build.ledger import answer, local, write
+from tests.ledger.conftest import VARIABLE
 from tests.postgres import Postgres
 from tests.remedies.remedied import refused, remedied
 from tests.storage.test_media import IMAGES, VIDEO, write_clip

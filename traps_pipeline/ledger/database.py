@@ -7,17 +7,14 @@ done when its future is. What differs between SQLite and PostgreSQL is in the tw
 
 from __future__ import annotations
 
-import os
 import secrets
-import socket
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
@@ -25,138 +22,18 @@ import sqlalchemy as sa
 
 from traps_pipeline.base.databases import reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.rows import AVERAGED, Totals
+from traps_pipeline.ledger.batch import Batch
 from traps_pipeline.ledger.schema import (
-    EVALUATIONS,
     METADATA,
-    RESERVATIONS,
-    ROWS,
     SESSIONS,
     SHARERS,
-    SPENT,
     STUDIES,
-    TOTALS,
 )
 
 T = TypeVar("T")
-CENT = 1e-9  # below this, dollars are rounding
 BEAT_S = 0.5  # how often a process that holds something says so
 MOST_CHANGES = 1000  # of one transaction
 SHARE_S, SHARER_S = 2.0, 10.0  # how often a process says that it asks through an account, and how long that holds
-
-
-@dataclass
-class Batch:
-    """One transaction of the thread that commits, and the changes of rows and money that are written at its end."""
-
-    connection: sa.Connection
-    study: int
-    session: str
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    totals: dict[tuple[str, str], Totals] = field(default_factory=dict)
-    more_usd: dict[str, float] = field(default_factory=dict)
-    reservations: list[dict[str, Any]] = field(default_factory=list)
-    covered: dict[str, None] = field(default_factory=dict)  # reservations whose calls' rows are stored
-    _open: dict[str, float] = field(default_factory=dict)  # dollars by reservation, once `reserved` is read
-    _writers: dict[int, bool] = field(default_factory=dict)
-
-    @cached_property
-    def spent(self) -> dict[str, float]:
-        """Dollars spent for good, by participant; kept up to date by `spend`."""
-        query = sa.select(SPENT.c.participant, SPENT.c.usd).where(SPENT.c.study == self.study)
-        spent: dict[str, float] = {row.participant: row.usd for row in self.connection.execute(query)}
-        for participant, usd in self.more_usd.items():
-            spent[participant] = spent.get(participant, 0.0) + usd
-        return spent
-
-    @cached_property
-    def reserved(self) -> dict[str, float]:
-        """Dollars of reservations, by participant; kept up to date by those who add and remove them."""
-        query = sa.select(RESERVATIONS.c.id, RESERVATIONS.c.participant, RESERVATIONS.c.usd)
-        reserved = dict[str, float]()
-        for reservation, participant, usd in self.connection.execute(query.where(RESERVATIONS.c.study == self.study)):
-            if reservation not in self.covered:
-                self._open[reservation] = usd
-                reserved[participant] = reserved.get(participant, 0.0) + usd
-        return reserved
-
-    def spend(self, participant: str, usd: float) -> None:
-        """Count dollars as spent, or as spent no more."""
-        self.more_usd[participant] = self.more_usd.get(participant, 0.0) + usd
-        if "spent" in self.__dict__:
-            self.spent[participant] = self.spent.get(participant, 0.0) + usd
-
-    def reserve(self, reservation: str, participant: str, usd: float) -> None:
-        """Add a reservation."""
-        values = {"id": reservation, "study": self.study, "session": self.session}
-        self.reservations.append({**values, "participant": participant, "usd": usd})
-        self.reserved[participant] = self.reserved.get(participant, 0.0) + usd
-
-    def settle(self, reservation: str, participant: str, was_usd: float, usd: float) -> None:
-        """Put dollars into the place of a reservation's; none: remove it."""
-        its = RESERVATIONS.c.id == reservation
-        if usd > CENT:
-            self.connection.execute(sa.update(RESERVATIONS).where(its).values(usd=usd))
-        else:
-            self.connection.execute(sa.delete(RESERVATIONS).where(its))
-        if "reserved" in self.__dict__:
-            self._open[reservation] = max(usd, 0.0)
-            self.reserved[participant] = self.reserved.get(participant, 0.0) + max(usd, 0.0) - was_usd
-
-    def cover(self, participant: str, reservations: Sequence[str]) -> None:
-        """Remove the reservations of a call whose cost stands in its row now."""
-        self.covered |= dict.fromkeys(reservations)
-        if "reserved" in self.__dict__:
-            was_usd = sum(self._open.pop(reservation, 0.0) for reservation in reservations)
-            self.reserved[participant] = self.reserved.get(participant, 0.0) - was_usd
-
-    def is_writer(self, evaluation: int) -> bool:
-        """Return whether this session may add rows to an evaluation: another one may have taken its lock over."""
-        if evaluation not in self._writers:
-            query = sa.select(EVALUATIONS.c.writer).where(EVALUATIONS.c.id == evaluation)
-            self._writers[evaluation] = self.connection.execute(query).scalar() == self.session
-        return self._writers[evaluation]
-
-    def flush(self) -> None:
-        """Write what was collected."""
-        if self.rows:
-            self.connection.execute(sa.insert(ROWS), self.rows)
-        if self.reservations:
-            self.connection.execute(sa.insert(RESERVATIONS), self.reservations)
-        if self.covered:
-            gone = [{"gone": reservation} for reservation in self.covered]
-            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), gone)
-        for (kind, participant), its in self.totals.items():
-            self._add_totals(kind, participant, its)
-        for participant, usd in self.more_usd.items():
-            mine = {"of_study": self.study, "of_participant": participant}
-            if not self.connection.execute(_ADD_SPENT, {**mine, "more_usd": usd}).rowcount:
-                self.connection.execute(sa.insert(SPENT).values(study=self.study, participant=participant, usd=usd))
-
-    def _add_totals(self, kind: str, participant: str, its: Totals) -> None:
-        values: dict[str, float] = {"dollars": its.dollars, "failed": its.failed, "unknown": its.unknown}
-        for column in AVERAGED:
-            values[f"{column}_sum"], values[f"{column}_n"] = its.means.get(column, (0.0, 0))
-        mine = {"of_study": self.study, "of_kind": kind, "of_participant": participant}
-        more = {f"more_{name}": value for name, value in values.items()}
-        if not self.connection.execute(_ADD_TOTALS, {**mine, **more, "its_dearest": its.dearest}).rowcount:
-            new = {"study": self.study, "kind": kind, "participant": participant, "dearest": its.dearest}
-            self.connection.execute(sa.insert(TOTALS).values(**new, **values))
-
-
-def _adding(table: sa.Table, *columns: str) -> sa.Update:
-    """Return a statement that adds `more_COLUMN` to columns of the row whose key is given by `of_COLUMN`. It is made
-    once: SQLAlchemy takes longer to make such a statement than SQLite to execute it."""
-    key = [column == sa.bindparam(f"of_{column.name}") for column in table.primary_key]
-    more = {name: table.c[name] + sa.bindparam(f"more_{name}") for name in columns}
-    return sa.update(table).where(*key).values(more)
-
-
-_ADD_SPENT = _adding(SPENT, "usd")
-_DEAREST = sa.bindparam("its_dearest", type_=sa.Double)
-_ADD_TOTALS = _adding(
-    TOTALS, *("dollars", "failed", "unknown"), *(f"{column}_{what}" for column in AVERAGED for what in ("sum", "n"))
-).values(dearest=sa.case((TOTALS.c.dearest < _DEAREST, _DEAREST), else_=TOTALS.c.dearest))
 
 
 Change = Callable[[Batch], Any]
@@ -390,18 +267,3 @@ def sentence(error: Exception, place: str) -> TrapsError:
         f"{place}: cannot be read or written ({reason}); {remedy} and run the same command again: everything answered "
         "before is kept, only what was in flight is asked again"
     )
-
-
-def holder() -> str:
-    """Return this process and the time, for those who wait for it."""
-    return f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%H:%M:%S')}"
-
-
-def claim(batch: Batch, kind: str, name: str) -> int:
-    """Make this session the writer of an evaluation, whose lock it holds; the evaluation's number."""
-    mine = {"study": batch.study, "kind": kind, "name": name}
-    here = sa.and_(*(EVALUATIONS.c[column] == value for column, value in mine.items()))
-    values: Mapping[str, Any] = {"writer": batch.session, "holder": holder()}
-    if not batch.connection.execute(sa.update(EVALUATIONS).where(here).values(**values)).rowcount:
-        batch.connection.execute(sa.insert(EVALUATIONS).values(**mine, **values))
-    return batch.connection.execute(sa.select(EVALUATIONS.c.id).where(here)).scalar_one()

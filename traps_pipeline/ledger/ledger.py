@@ -18,7 +18,8 @@ import sqlalchemy as sa
 from sqlalchemy import exc
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.database import Batch, Database, Lock, claim, sentence
+from traps_pipeline.ledger.batch import Batch, claim
+from traps_pipeline.ledger.database import Database, Lock, sentence
 from traps_pipeline.ledger.rows import (
     ASIDES,
     AVERAGED,

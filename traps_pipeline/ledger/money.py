@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.database import CENT, Batch, Database
+from traps_pipeline.ledger.batch import CENT, Batch
+from traps_pipeline.ledger.database import Database
 from traps_pipeline.ledger.schema import RELEASES, RESERVATIONS, TOTALS
 
 

@@ -10,7 +10,8 @@ from typing import Any
 import sqlalchemy as sa
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.ledger.database import Batch, Database
+from traps_pipeline.ledger.batch import Batch
+from traps_pipeline.ledger.database import Database
 from traps_pipeline.ledger.ledger import Ledger
 from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, SPENT, STUDIES, TOTALS
 from traps_pipeline.ledger.sqlite import SqliteDatabase
