@@ -262,7 +262,7 @@ def test_a_run_that_is_asked_for_is_created_once_for_its_own_study(
         with dg.build_sensor_context(instance, cursor=first.cursor) as context:
             second = start_requested_runs(context)
     assert isinstance(second, dg.SensorResult)
-    (request,) = first.run_requests or ()
+    (request,) = first.run_requests or []
     assert request.run_key == request.tags[REQUEST_TAG] == name
     assert request.asset_selection == [asset_key(stage) for stage in stages]
     assert request.tags["dagster/asset_partition_range_end"] == "plinko" and request.tags["traps/make"] == "stale"

@@ -33,7 +33,7 @@ def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_agai
         def killed(*_: object) -> None:
             raise KeyboardInterrupt
 
-        patched.setattr("traps_pipeline.study.store_move.write_anchor", killed)
+        patched.setattr("traps_pipeline.storage.workspace.Workspace.save_study", killed)
         with pytest.raises(KeyboardInterrupt):
             move_to_store(Workspace.open(study.workspace), ADDRESS)
     assert not Workspace.is_there(ADDRESS) and Workspace.open(study.workspace).answers.evaluations()

@@ -22,17 +22,17 @@ MANY = ("clips/", "media/")  # of which a process knows only what it has asked f
 FRESH_S = 0.5  # a look at the rows that is younger is not repeated
 REMOVAL_S = 15.0  # after so long under its lock a process was stopped, and removes nothing
 _TABLES_LOCK = 7_206_551_933  # of PostgreSQL, while a process creates the tables
-_METADATA = sa.MetaData(schema="traps")
+_METADATA = sa.MetaData()
 # removals: how often objects were removed; a content that was brought to the store before may be among them.
 _CHANGES = sa.Table(
-    "changes",
+    "traps_changes",
     _METADATA,
     sa.Column("study", sa.Text, primary_key=True),
     sa.Column("number", sa.BigInteger, nullable=False),
     sa.Column("removals", sa.BigInteger, nullable=False),
 )
 _OBJECTS = sa.Table(
-    "objects",
+    "traps_objects",
     _METADATA,
     sa.Column("study", sa.Text, primary_key=True),
     sa.Column("name", sa.Text, primary_key=True),
@@ -41,7 +41,7 @@ _OBJECTS = sa.Table(
     sa.Column("note", sa.Text),
     sa.Column("number", sa.BigInteger, nullable=False),  # of the change
     sa.Column("at", sa.DateTime(timezone=True), nullable=False, server_default=sa.func.clock_timestamp()),
-    sa.Index("objects_number", "study", "number"),
+    sa.Index("traps_objects_number", "study", "number"),
 )
 
 
