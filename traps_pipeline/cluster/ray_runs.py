@@ -177,10 +177,9 @@ class RayRuns(Runs):
 
     def _take_created(self, requests: list[str], run_ids: list[str]) -> None:
         """Let runs that were created take the place of their requests."""
-        if requests:
-            for run in self._instance.get_runs(dg.RunsFilter(tags={REQUEST_TAG: requests})):
-                requests.remove(run.tags[REQUEST_TAG])
-                run_ids.append(run.run_id)
+        for run in self._instance.get_runs(dg.RunsFilter(tags={REQUEST_TAG: requests})) if requests else ():
+            requests.remove(run.tags[REQUEST_TAG])
+            run_ids.append(run.run_id)
 
     def _report_waiting(self, requests: Collection[str], runs: Sequence[dg.DagsterRun]) -> None:
         """Say once that nothing has begun for a while: no host has what a run takes, or the daemon creates none."""
