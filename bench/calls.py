@@ -44,8 +44,7 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
     from traps_pipeline.models.registry import Account, Entry, Limits
     from traps_pipeline.models.request import Request
     from traps_pipeline.storage.database import session_of
-    from traps_pipeline.storage.segments import SegmentLedger
-    from traps_pipeline.storage.shared_ledger import SharedLedger
+        from traps_pipeline.storage.shared_ledger import SharedLedger
     from traps_pipeline.storage.study import Study
 
     account = Account(key=KEY, base_url=f"{url}/v1")
@@ -67,7 +66,7 @@ def ours(url: str, connections: int, answers: int) -> dict[str, float]:
         free = Study(allow_unknown_prices=True)
         participants = Participants({"m": entry}, lambda e: ApiBackend(e, account), free, {"a": account})
         in_database = DATABASE in os.environ
-        ledger = SegmentLedger(Path(folder), "answers")
+        ledger = local(Path(folder))
         if in_database:
             ledger = SharedLedger(session_of(DATABASE, f"bench-{os.getpid()}"), "answers")
         work = Work("responses", ledger, participants, Budget(0, {}, {}), "1", calls, lambda _: None)

@@ -1,131 +1,124 @@
-"""Ledger writes and reads against SQLite in WAL mode, the same 20,000 rows of 1 KB, one run.
+"""The ledger: CPU seconds to write and read rows of 1 KB, and what a study of 1.6 million rows takes to begin.
 
-Both keep the ledger's promise that a row survives kill -9 as soon as it is written (SQLite: a commit a row, without a
-sync to disk; the ledger also syncs every 100 rows). With `--database` also rows a second of the ledger in a PostgreSQL
-that syncs to the disk, from one process and from two, each of whose 24 connections waits until its row is stored.
+Rows are written as a run writes them: each of so many connections waits until its row is kept, with and without a
+reservation before it, and many at once, as an import writes them. `--database` does the same in a PostgreSQL that syncs
+to the disk, whose own CPU seconds are not counted.
 
-python bench/ledger.py [--database]
+python bench/ledger.py [--database] [--rows 20000] [--study 1600000]
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import sqlite3
-import subprocess
+import asyncio
+import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.quick import parse
-from traps_pipeline.storage.segments import SegmentLedger
+from traps_pipeline.ledger.database import Database
+from traps_pipeline.ledger.ledger import Ledger
+from traps_pipeline.ledger.money import Money
+from traps_pipeline.ledger.sqlite import SqliteDatabase
 
-ROWS = [{"key": f"{number:064x}", "outcome": "answer", "text": "x" * 900} for number in range(20_000)]
-
-
-def ledger_write(folder: Path) -> None:
-    with SegmentLedger(folder, "answers").writer("m__standard__run1") as writer:
-        for row in ROWS:
-            writer.append(row)
+USD, WORST_USD = 0.001, 0.01
+ABOUT = {"outcome": "answer", "cost_usd": USD, "components": {"participant": "m"}, "text": "x" * 850}
 
 
-def ledger_read(folder: Path) -> int:
-    return len(SegmentLedger(folder, "answers").read("m__standard__run1").rows)
+def rows(count: int) -> Iterator[dict[str, Any]]:
+    return ({"key": f"{number:064x}", **ABOUT} for number in range(count))
 
 
-def _connect(folder: Path) -> sqlite3.Connection:
-    connection = sqlite3.connect(folder / "ledger.sqlite")
-    connection.execute("PRAGMA journal_mode=WAL")
-    connection.execute("PRAGMA synchronous=NORMAL")
-    return connection
+@contextmanager
+def measured(what: str) -> Iterator[None]:
+    """Print the CPU seconds of this process, all threads, and the wall seconds that the block takes."""
+    cpu, began = _cpu_s(), time.perf_counter()
+    yield
+    print(f"{what:<46} {_cpu_s() - cpu:>8.2f} s CPU {time.perf_counter() - began:>8.2f} s", flush=True)
 
 
-def sqlite_write(folder: Path) -> None:
-    connection = _connect(folder)
-    connection.execute("CREATE TABLE answers (key TEXT PRIMARY KEY, row TEXT)")
-    for row in ROWS:
-        connection.execute("INSERT INTO answers VALUES (?, ?)", (row["key"], json.dumps(row)))
-        connection.commit()
-    connection.close()
+def _cpu_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
 
 
-def sqlite_read(folder: Path) -> int:
-    rows = _connect(folder).execute("SELECT row FROM answers").fetchall()
-    return len([json.loads(row) for (row,) in rows])
+async def ask(database: Database, evaluation: str, count: int, connections: int, *, paid: bool) -> None:
+    """Write rows as calls that are answered at once do. paid: each is reserved before, under a cap it never meets."""
+    pending, money = rows(count), Money(database)
+    async with Ledger(database, "answers").writing(evaluation, print) as writer:
+
+        async def connection() -> None:
+            for row in pending:
+                reserved = money.reserve("m", WORST_USD, {None: 1e9}) if paid else None
+                reservations = [str(await asyncio.wrap_future(reserved))] if reserved else []
+                await writer.write(row, None, reservations)
+
+        await asyncio.gather(*(connection() for _ in range(connections)))
 
 
-WRITE = """
-import asyncio, sys, time
-from traps_pipeline.storage.database import Session
-from traps_pipeline.storage.shared_ledger import SharedLedger
-address, evaluation, rows = sys.argv[1], sys.argv[2], int(sys.argv[3])
-async def write():
-    numbers = iter(range(rows))
-    async with SharedLedger(Session(address, "BENCH", "bench"), "answers").writing(evaluation, print) as writer:
-        async def connection():
-            for number in numbers:
-                writer.append({"key": f"{number:064x}", "outcome": "answer", "text": "x" * 900})
-                await writer.kept()
-        began = time.perf_counter()
-        await asyncio.gather(*(connection() for _ in range(24)))
-        print(rows / (time.perf_counter() - began))
-asyncio.run(write())
-"""
+async def store(database: Database, evaluation: str, count: int) -> None:
+    async with Ledger(database, "answers").writing(evaluation, print) as writer:
+        await writer.write_all(rows(count))
 
 
-def database_rates() -> None:
-    """Print how many rows a second processes store in one database."""
-    from tests.postgres import Postgres
-    from traps_pipeline.storage.database import Session
-    from traps_pipeline.storage.shared_ledger import SharedLedger
-
-    with Postgres.running(durable=True) as server:
-        with tempfile.TemporaryDirectory() as name:
-            alone = _rate(ledger_write, Path(name))
-            read = _rate(ledger_read, Path(name))
-        print(f"files of one machine: {alone:,.0f} rows/s, read: {read:,.0f} rows/s", flush=True)
-        for count in (1, 2):
-            command = [sys.executable, "-c", WRITE, server.address()]
-            running = [
-                subprocess.Popen([*command, f"m{count}{n}", str(len(ROWS))], stdout=subprocess.PIPE, text=True)
-                for n in range(count)
-            ]
-            rates = [float(process.communicate()[0].splitlines()[-1]) for process in running]
-            said = f"PostgreSQL, {count} processes of 24 connections: {sum(rates):,.0f} rows/s"
-            print(f"{said}, {sum(rates) / alone:.2f} of the files", flush=True)
-        began = time.perf_counter()
-        found = SharedLedger(Session(server.address(), "BENCH", "bench"), "answers").read("m10").rows
-        rate = len(found) / (time.perf_counter() - began)
-        print(f"PostgreSQL, read: {rate:,.0f} rows/s, {rate / read:.2f} of the files")
+def compare(database: Database, count: int) -> None:
+    """Write and read `count` rows in each way."""
+    ledger = Ledger(database, "answers")
+    with database.writing():
+        for connections in (24, 200):
+            for paid in (False, True):
+                what = f"{count:,} rows, {connections} connections" + (", reserved" if paid else "")
+                with measured(what):
+                    asyncio.run(ask(database, f"m{connections}{paid}", count, connections, paid=paid))
+        with measured(f"{count:,} rows at once"):
+            asyncio.run(store(database, "m", count))
+    with measured(f"read {count:,} rows"):
+        assert len(ledger.read("m").rows) == count
+    wanted = [row["key"] for row in islice(rows(count), 0, None, 200)]
+    with measured(f"read {len(wanted):,} of them by key"):
+        assert len(ledger.read("m", wanted).rows) == len(wanted)
 
 
-def _rate(work: Callable[[Path], object], folder: Path) -> float:
-    began = time.perf_counter()
-    work(folder)
-    return len(ROWS) / (time.perf_counter() - began)
+def begin(database: Database, count: int) -> None:
+    """What a study of so many rows reads before its first call, and what it takes to recover one evaluation."""
+    cell = min(100_000, count)
+    for number in range(count // cell):
+        asyncio.run(store(database, f"m{number}", cell))
+    with database.writing(), measured(f"totals and spending of {count:,} rows"):
+        Ledger(database, "answers").totals()
+        Money(database).spent()
+    with measured(f"recover {cell:,} rows by key"):
+        assert len(Ledger(database, "answers").read("m0", [row["key"] for row in rows(cell)]).rows) == cell
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"largest memory of this process: {peak_mb:,.0f} MB")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--database", action="store_true")
-    parser.add_argument("--rows", type=int, default=len(ROWS))
-    arguments = parse(parser, rows=500)
-    del ROWS[arguments.rows :]
-    if arguments.database:
-        database_rates()
-        return
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        print(f"{'':<8} {'ledger, rows/s':>16} {'SQLite WAL':>14} {'ratio':>7}")
-        for what, mine, other in (("write", ledger_write, sqlite_write), ("read", ledger_read, sqlite_read)):
-            a, b = _rate(mine, folder), _rate(other, folder)
-            print(f"{what:<8} {a:>16,.0f} {b:>14,.0f} {a / b:>7.2f}")
-        size = sum(path.stat().st_size for path in (folder / "answers").rglob("*.jsonl"))
-        print(f"size: {size / 1e6:.1f} MB against {(folder / 'ledger.sqlite').stat().st_size / 1e6:.1f} MB")
+    parser.add_argument("--database", action="store_true", help="in PostgreSQL")
+    parser.add_argument("--rows", type=int, default=20_000)
+    parser.add_argument("--study", type=int, default=1_600_000)
+    arguments = parse(parser, rows=500, study=1000)
+    with ExitStack() as opened:
+        if arguments.database:
+            from tests.postgres import Postgres
+            from traps_pipeline.ledger.postgres import PostgresDatabase
+
+            server = opened.enter_context(Postgres.running(durable=True))
+            one, two = (PostgresDatabase(server.address(), "BENCH", study) for study in ("one", "two"))
+        else:
+            folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
+            one, two = SqliteDatabase(folder / "one", "bench"), SqliteDatabase(folder / "two", "bench")
+        compare(one, arguments.rows)
+        begin(two, arguments.study)
 
 
 if __name__ == "__main__":

@@ -56,8 +56,7 @@ def main() -> None:
     from traps_pipeline.models.registry import Account, ModelEntry
     from traps_pipeline.models.request import Request
     from traps_pipeline.storage.media import MediaSpec, MediaStore
-    from traps_pipeline.storage.segments import SegmentLedger
-    from traps_pipeline.storage.study import Study
+        from traps_pipeline.storage.study import Study
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--answers", type=int, default=404, help="of each model; the smallest cell has 404")
@@ -91,7 +90,7 @@ def main() -> None:
 
         study = Study(allow_unknown_prices=True)
         participants = Participants(entries, lambda entry: ApiBackend(entry, account), study, {"a": account})
-        ledger, budget = SegmentLedger(folder, "answers"), Budget(0, {}, {})
+        ledger, budget = local(folder), Budget(0, {}, {})
         work = Work("responses", ledger, participants, budget, "1", calls, lambda _: None)
         load_litellm()
         began, cpu = time.perf_counter(), sum(resource.getrusage(resource.RUSAGE_SELF)[:2])

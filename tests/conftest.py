@@ -8,9 +8,11 @@ import os
 import re
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -116,10 +118,27 @@ class Checkout:
 
     def ledger_rows(self, kind: str) -> list[dict[str, Any]]:
         """Every complete row of a ledger, repeated keys too."""
-        rows = []
-        for segment in sorted((self.workspace / "ledger" / kind).rglob("*.jsonl")):
-            rows += [json.loads(line) for line in segment.read_bytes().split(b"\n")[:-1]]
-        return rows
+        return [json.loads(content) for content in self.ledger_values(kind, "content")]
+
+    def ledger_values(self, kind: str, column: str) -> list[Any]:
+        """A column of all rows of a ledger, read without this project's code."""
+        path = self.workspace / "ledger" / "ledger.sqlite"
+        if not path.exists():
+            return []
+        join = "traps_rows r join traps_evaluations e on r.evaluation = e.id"
+        with closing(sqlite3.connect(path, timeout=600)) as opened:
+            try:
+                values = opened.execute(
+                    f"select r.{column} from {join} where e.kind = ? order by r.id", [kind]
+                ).fetchall()
+            except sqlite3.OperationalError:  # its tables are not there yet
+                return []
+        return [value for (value,) in values]
+
+    def in_flight_usd(self) -> float:
+        """Dollars of calls that are in flight, or were when a process died."""
+        with closing(sqlite3.connect(self.workspace / "ledger" / "ledger.sqlite", timeout=600)) as opened:
+            return opened.execute("select coalesce(sum(usd), 0) from traps_reservations").fetchone()[0]
 
 
 def make_checkout(root: Path) -> Path:

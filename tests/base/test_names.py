@@ -31,7 +31,7 @@ def test_any_other_name_is_a_key_a_file_and_a_text(name: str, tmp_path: Path) ->
     assert check_name(name) == name
     key = Cell("occlusion_ill_posed", Evaluation(name, "standard", 1)).evaluation.key
     assert dg.StaticPartitionsDefinition([key]).get_partition_keys() == [key]
-    (tmp_path / f"{name}@{name}__standard__run1.jsonl.reasoning").touch()
+    (tmp_path / f"{name}@{name}__standard__run1.lock").touch()
     assert yaml.safe_load(f"[{name}]") == [name]
 
 

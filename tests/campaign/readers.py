@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.build.ledger import local, paid, write
 from tests.conftest import ROOT
 from tools.pocket.recipe import load_recipe
 from traps_pipeline.benchmark.composition import load_composition
@@ -18,12 +19,10 @@ from traps_pipeline.judging.confabulation import load_protocol
 from traps_pipeline.judging.robustness import load_attacks
 from traps_pipeline.judging.validation import LABEL_COLUMNS, read_labels
 from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.budget import Journal
 from traps_pipeline.models.judges import load_judges, load_panel
 from traps_pipeline.models.registry import load_accounts, load_models
 from traps_pipeline.models.request import Request
 from traps_pipeline.scenes.worlds.spec import load_trajectory
-from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.study.exchange import checked_answers
 from traps_pipeline.study.experiment import load_experiment
@@ -52,7 +51,7 @@ def _few(path: Path, lines: int = 2) -> bytes:
 
 
 def _ledger(folder: Path) -> Any:
-    ledger = SegmentLedger(folder, "answers")
+    ledger = local(folder)
     return ledger.read("m").rows, ledger.totals(), ledger.reasoning("m")
 
 
@@ -62,12 +61,6 @@ def _accounts(folder: Path) -> Any:
         return budget.spent_usd
     finally:
         budget.close()
-
-
-def _journal(folder: Path) -> Any:
-    journal = Journal(folder / "in_flight.jsonl")
-    journal.close()
-    return journal.lost_usd
 
 
 def _corrected(folder: Path) -> Any:
@@ -93,14 +86,11 @@ LABELS = ",".join(LABEL_COLUMNS).encode() + b"".join(
 )
 
 
-def _segment(folder: Path) -> bytes:
-    """A segment with checksums, as this version writes it."""
-    ledger = SegmentLedger(folder, "answers")
-    with ledger.writer("m") as writer:
-        for n in range(3):
-            writer.append({"key": f"{n}", "outcome": "answer", "text": "left", "cost_usd": 0.25, "latency_s": 1.0})
-    (path,) = ledger.folder("m").glob("*.jsonl")
-    content = path.read_bytes()
+def _written(folder: Path) -> bytes:
+    """The file of a ledger, as this version writes it."""
+    rows = [paid(f"{n}", 0.25) | {"latency_s": 1.0} for n in range(3)]
+    write(local(folder), *rows)
+    content = (folder / "ledger.sqlite").read_bytes()
     shutil.rmtree(folder)
     return content
 
@@ -153,9 +143,7 @@ def readers(scratch: Path) -> dict[str, Reader]:
         "corrections": Reader("review.jsonl", CORRECTIONS, _corrected),
         "answers": Reader("answers.jsonl", ANSWERS, lambda folder: checked_answers(folder / "answers.jsonl", WANTED)),
         "labels": Reader("labels.csv", LABELS, lambda folder: read_labels(folder / "labels.csv", ["a"])),
-        "segment": Reader("answers/m/20261121T000000-000000000-abcdef-v2.jsonl", _segment(scratch / "ledger"), _ledger),
-        "early_segment": Reader("answers/m/20261101T000000.jsonl", ROWS, _ledger),
-        "journal": Reader("in_flight.jsonl", b'["m", 0.5]\n["m", -0.125]\n', _journal),
+        "ledger": Reader("ledger.sqlite", _written(scratch / "ledger"), _ledger),
         "account": Reader("budget.yaml", b"usd: 500\n", _accounts),
         "trajectory": Reader(
             "bounce-0001.npz",

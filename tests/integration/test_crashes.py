@@ -22,7 +22,7 @@ ANSWERS, VOTES = 192, 864  # 4 models x 1 regime x 48 items; 4.5 votes an item
 
 
 def rows_written(study: Checkout, kind: str) -> int:
-    return sum(path.read_bytes().count(b"\n") for path in (study.workspace / "ledger" / kind).rglob("*.jsonl"))
+    return len(study.ledger_values(kind, "id"))
 
 
 def start(study: Checkout) -> subprocess.Popen[str]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import sqlite3
 import subprocess
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -90,27 +92,19 @@ def test_a_truncated_clip_is_noticed_and_rendered_anew_once_deleted(study: Check
     assert clip.read_bytes() == whole
 
 
-def test_a_torn_ledger_line_is_reported_and_its_answer_alone_asked_again(study: Checkout) -> None:
-    segment = next((study.workspace / "ledger" / "answers" / "oracle__json__run1").glob("*.jsonl"))
-    lines = segment.read_bytes().splitlines(keepends=True)
-    segment.write_bytes(b"".join(lines[:-1]) + lines[-1][:40])
-    for table in (study.workspace / "tables" / "responses").glob("*/oracle/json/*.parquet"):
-        table.unlink()
-    run = study.score(EXPERIMENT)
-    assert run.code == 0, run.err
-    assert f"{segment}:{len(lines)}: torn last line ignored" in run.out
-    assert run.counts()["answers"] == 1
-
-
-def test_a_damaged_ledger_line_in_the_middle_is_named_and_its_answer_alone_asked_again(study: Checkout) -> None:
-    segment = next((study.workspace / "ledger" / "answers" / "oracle__json__run1").glob("*.jsonl"))
-    lines = segment.read_bytes().splitlines(keepends=True)
-    segment.write_bytes(b"".join([lines[0], lines[1].replace(b'"answer"', b'"answes"', 1), *lines[2:]]))
+def test_a_damaged_row_of_the_ledger_is_named_and_its_answer_alone_asked_again(study: Checkout) -> None:
+    path = study.workspace / "ledger" / "ledger.sqlite"
+    with closing(sqlite3.connect(path)) as opened:
+        name = "oracle__json__run1"
+        sql = "select min(r.id) from traps_rows r join traps_evaluations e on r.evaluation = e.id where e.name = ?"
+        (row,) = opened.execute(sql, [name]).fetchone()
+        opened.execute("update traps_rows set content = replace(content, 'answer', 'answes') where id = ?", [row])
+        opened.commit()
     for table in (study.workspace / "tables" / "responses").glob("*/oracle/json/*.parquet"):
         table.unlink()
     finished = study.score(EXPERIMENT)
     assert finished.code == 0, finished.err
-    assert f"{segment}:2: not what was written: it is not believed; its answer is asked again" in finished.out
+    assert f"{path}: row {row}: not what was written: it is not believed; its answer is asked again" in finished.out
     assert finished.counts()["answers"] == 1
 
 

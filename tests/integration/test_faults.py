@@ -7,16 +7,17 @@ stage, from records to the report and into a model.
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import re
 import shutil
 import signal
+import sqlite3
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,8 +68,9 @@ class Campaign:
 
 def keys(workspace: Path, kind: str) -> list[str]:
     """The key of every row of a study's ledger."""
-    segments = sorted((workspace / "ledger" / kind).glob("*/*.jsonl"))
-    return [json.loads(line)["key"] for segment in segments for line in segment.read_text().splitlines()]
+    join = "traps_rows r join traps_evaluations e on r.evaluation = e.id"
+    with closing(sqlite3.connect(workspace / "ledger" / "ledger.sqlite")) as opened:
+        return [key for (key,) in opened.execute(f"select r.key from {join} where e.kind = ?", [kind])]
 
 
 def traced(study: Checkout, command: Sequence[str], log: Path | str, *more: str) -> Finished:

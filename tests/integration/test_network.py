@@ -16,7 +16,6 @@ import pytest
 from tests.build.network import ITEMS, ask, entry, experiment, register, responses, settled
 from tests.conftest import SECRET, Checkout, forget_answers
 from tests.providers.server import Provider
-from traps_pipeline.models.budget import Journal
 
 pytestmark = pytest.mark.slow
 
@@ -174,8 +173,9 @@ def test_kills_cost_no_more_than_what_was_in_flight(unasked: Checkout, provider:
     sent = provider.stats()["answered_in_full"]
     print(f"{wanted} wanted, killed at {points}: {sent} answers sent")
     assert sent <= wanted + kills * 24 * len(models)
-    lost = Journal(unasked.workspace / "ledger" / "in_flight.jsonl").lost_usd
-    assert sum(lost.values()) >= (sent - wanted) * min(row["cost_usd"] for row in rows)  # what nobody has is spent too
+    assert unasked.in_flight_usd() >= (sent - wanted) * min(
+        row["cost_usd"] for row in rows
+    )  # what nobody has is spent too
 
 
 def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, provider: Provider) -> None:
@@ -203,7 +203,7 @@ def test_a_stop_sends_nothing_more_and_keeps_what_comes_back(unasked: Checkout, 
         assert time.monotonic() - stopped < 20 and f"{stop.name}: stopping: waiting 30 s at most" in said.decode() + out
         assert provider.stats()["requests"] == requests
         assert provider.stats()["answered_in_full"] == len(settled(unasked))  # nothing that came back is lost
-        assert Journal(unasked.workspace / "ledger" / "in_flight.jsonl").lost_usd == {}
+        assert unasked.in_flight_usd() == 0
         assert not unasked.ledger_rows("votes")
 
 

@@ -18,7 +18,6 @@ from tests.objectstore import S3
 from tests.postgres import Postgres
 from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.cluster.objects import ObjectStore
-from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
 pytestmark = pytest.mark.slow
@@ -97,7 +96,7 @@ def test_hosts_make_one_study_together_and_it_is_that_of_a_single_machine(
     nothing = one.traps("run", EXPERIMENT, "--until", "leaderboard")
     assert (nothing.code, nothing.counts()) == (0, {"answers": 0, "votes": 0, "frames": 0}), nothing.err
     ledger = workspace.answers
-    assert isinstance(ledger, SharedLedger) and ledger.evaluations() == [f"{m}__standard__run1" for m in MODELS]
+    assert ledger.evaluations() == [f"{m}__standard__run1" for m in MODELS]
     strays = [path for host in hosts for path in host.files() if not path.resolve().is_relative_to(host.scratch)]
     assert strays == []
 
@@ -119,7 +118,7 @@ def test_errors_name_the_host_the_study_and_the_remedy(
     monkeypatch.setenv(DATABASE, postgres.address())
     made = one.traps("init", EXPERIMENT, "--workspace", "s3://lab/refusals")
     assert made.code == 0, made.err
-    for command in (("ledger", "move", "--back"), ("annotate", "--who", "jd")):
+    for command in (("ledger", "move", "--store", "s3://lab/other"), ("annotate", "--who", "jd")):
         refused = one.traps(*command, "--workspace", "s3://lab/refusals")
         assert refused.code == 1 and "s3://lab/refusals: " in refused.err, refused.err
     refused = one.traps("status", "--workspace", "ftp://lab/study")

@@ -165,7 +165,7 @@ def test_no_key_is_printed_and_a_refused_one_is_named_by_its_variable(tried: tup
 def test_no_key_is_in_any_file_of_the_study(tried: tuple[Checkout, Finished]) -> None:
     checkout, _ = tried
     files = [path for path in checkout.workspace.parent.rglob("*") if path.is_file() and path.name != "keys"]
-    assert {path.suffix for path in files} >= {".db", ".parquet", ".jsonl", ".raw", ".err"}
+    assert {path.suffix for path in files} >= {".db", ".parquet", ".sqlite", ".err"}
     leaks = {}
     for path in files:
         if path.suffix == ".parquet":

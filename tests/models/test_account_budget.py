@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.build.ledger import paid, write
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.account_budget import AccountBudget
 from traps_pipeline.models.budget import Budget, BudgetReached
@@ -102,8 +103,7 @@ def test_a_second_study_stops_where_the_first_has_spent_the_accounts_money(tmp_p
     entry = get_model("gpt-5-mini")
 
     async def pay(budget: Budget, dollars: float) -> None:
-        await budget.reserve(entry.id, dollars)
-        await budget.settle(entry.id, dollars, dollars - 1)
+        await budget.settle(await budget.reserve(entry.id, dollars), dollars - 1)
 
     with spending(study(tmp_path / "one", folder), [entry]) as one:
         asyncio.run(pay(one, 6))
@@ -116,8 +116,7 @@ def test_a_second_study_stops_where_the_first_has_spent_the_accounts_money(tmp_p
 
 def test_money_spent_before_a_study_named_the_account_counts(tmp_path: Path, folder: Path) -> None:
     workspace = study(tmp_path / "study", folder)
-    with workspace.answers.writer("gpt-5-mini__standard__run1") as writer:
-        writer.append({"key": "k", "cost_usd": 4.0, "components": {"participant": "gpt-5-mini"}})
+    write(workspace.answers, paid("k", 4.0, "gpt-5-mini"))
     for _ in range(2):  # once, not each time
         with spending(workspace, [get_model("gpt-5-mini")]):
             pass

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from tests.build.ledger import local
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.models import participants
@@ -23,7 +24,6 @@ from traps_pipeline.models.budget import Budget
 from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits, get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
-from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -70,7 +70,7 @@ def work(
 
     entries = {name: Entry(id=name, backend="test", limits=limits) for name in backends}
     asked = Participants(entries, lambda entry: backends[entry.id], Study())
-    return Work("responses", SegmentLedger(root, "answers"), asked, Budget(0.0, {}, {}), "1", calls, finish)
+    return Work("responses", local(root), asked, Budget(0.0, {}), "1", calls, finish)
 
 
 def ten(_: Cell) -> list[Request]:
@@ -88,7 +88,7 @@ def test_what_was_answered_is_not_asked_again(tmp_path: Path) -> None:
     (second,) = run_work(work(tmp_path, {"m": backend}, ten), [CELL])
     assert (second["tally"].asked, second["tally"].cached, len(backend.calls)) == (0, 10, 10)
     assert second["rows"] == first["rows"]
-    assert len(SegmentLedger(tmp_path, "answers").reasoning("m__standard__run1")) == 10
+    assert len(local(tmp_path).reasoning("m__standard__run1")) == 10
 
 
 def test_only_the_difference_is_asked(tmp_path: Path) -> None:
@@ -115,16 +115,6 @@ def test_the_calls_of_a_cell_are_made_once_and_handed_on_with_their_rows(tmp_pat
     found = {item: key for of_cell in run_work(of_items, cells) for item, key in of_cell.items()}
     assert sorted(asked) == sorted(cells)
     assert found == {f"item-{c.dataset}-{n}": request(f"{c.dataset}-{n}").key for c in cells for n in range(3)}
-
-
-def test_a_torn_line_costs_one_call(tmp_path: Path) -> None:
-    backend = Answering()
-    list(run_work(work(tmp_path, {"m": backend}, ten), [CELL]))
-    (segment,) = (tmp_path / "answers" / CELL.evaluation.key).glob("*.jsonl")
-    segment.write_bytes(segment.read_bytes()[:-5])
-    backend.calls.clear()
-    (finished,) = run_work(work(tmp_path, {"m": backend}, ten), [CELL])
-    assert len(backend.calls) == finished["tally"].asked == 1
 
 
 def test_a_passing_failure_is_tried_again_and_leaves_no_trace_but_the_count(tmp_path: Path) -> None:
@@ -246,7 +236,7 @@ def test_closing_the_work_early_records_the_calls_in_flight(tmp_path: Path) -> N
     assert next(running)["cell"] == CELL
     running.close()  # type: ignore[attr-defined]
     assert len(backends["n"].calls) == 4
-    assert len(SegmentLedger(tmp_path, "answers").read(other.evaluation.key).rows) == 4
+    assert len(local(tmp_path).read(other.evaluation.key).rows) == 4
 
 
 def test_calls_in_flight_are_recorded_when_another_call_of_the_cell_fails(tmp_path: Path) -> None:
@@ -260,7 +250,7 @@ def test_calls_in_flight_are_recorded_when_another_call_of_the_cell_fails(tmp_pa
     with pytest.raises(ValueError, match="cannot be sent"):
         list(run_work(work(tmp_path, {"m": backend}, ten), [CELL]))
     assert backend.calls == ["item-0", "item-1", "item-2", "item-3"]  # four at once, none begun afterwards
-    assert len(SegmentLedger(tmp_path, "answers").read(CELL.evaluation.key).rows) == 3
+    assert len(local(tmp_path).read(CELL.evaluation.key).rows) == 3
 
 
 def test_a_full_disk_ends_the_cell_and_keeps_what_was_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -270,7 +260,7 @@ def test_a_full_disk_ends_the_cell_and_keeps_what_was_answered(tmp_path: Path, m
     monkeypatch.setattr(segments.os, "write", lambda fd, line: write(fd, line) if b"item-5" not in line else 0)
     with pytest.raises(TrapsError, match=r"could not be written .*free some space"):
         list(run_work(work(tmp_path, {"m": Answering()}, ten), [CELL]))
-    kept = len(SegmentLedger(tmp_path, "answers").read(CELL.evaluation.key).rows)
+    kept = len(local(tmp_path).read(CELL.evaluation.key).rows)
     monkeypatch.undo()
     (finished,) = run_work(work(tmp_path, {"m": Answering()}, ten), [CELL])
     assert kept >= 5
@@ -292,7 +282,7 @@ def test_stopping_records_the_calls_in_flight_and_starts_no_new_one(tmp_path: Pa
     backend = Answering(stopping)
     assert asyncio.run(drain()) == []
     assert sorted(set(backend.calls)) == sorted(backend.calls)
-    rows = SegmentLedger(tmp_path, "answers").read(CELL.evaluation.key).rows
+    rows = local(tmp_path).read(CELL.evaluation.key).rows
     assert {row["components"]["about"]["item_id"] for row in rows.values()} == set(backend.calls)
     assert 6 <= len(backend.calls) <= 8
 
@@ -322,7 +312,7 @@ def test_a_lock_that_is_removed_under_a_run_ends_its_calls_and_keeps_what_was_an
     backend = Answering(removing)
     with pytest.raises(TrapsError, match=r"\.lock: was removed while this run held it"):
         list(run_work(work(tmp_path, {"m": backend}, ten), [CELL]))
-    assert len(backend.calls) == len(SegmentLedger(tmp_path, "answers").read(CELL.evaluation.key).rows) == 4  # at once
+    assert len(backend.calls) == len(local(tmp_path).read(CELL.evaluation.key).rows) == 4  # at once
 
 
 INTERRUPTED = """
@@ -334,7 +324,7 @@ from traps_pipeline.models.participants import Participants
 from traps_pipeline.models.registry import Entry, Limits
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.base.partitions import Cell, Evaluation
-from traps_pipeline.storage.segments import SegmentLedger
+from tests.build.ledger import local
 from traps_pipeline.storage.study import Study
 class Slow:
     asked = 0
@@ -347,7 +337,7 @@ class Slow:
 calls = [Call(Request("m", "test", {}, "s", "u", {"item_id": str(n)})) for n in range(40)]
 entry = Entry(id="m", backend="test", limits=Limits(concurrency=4))
 participants = Participants({"m": entry}, lambda _: Slow(), Study())
-ledger, budget = SegmentLedger(Path(sys.argv[1]), "answers"), Budget(0.0, {}, {})
+ledger, budget = local(Path(sys.argv[1])), Budget(0.0, {})
 work = Work("responses", ledger, participants, budget, "1", lambda _: calls, lambda _: 1)
 try:
     list(run_work(work, [Cell("occlusion", Evaluation("m", "standard", 1))]))
@@ -373,7 +363,7 @@ def test_a_stop_waits_for_the_calls_in_flight_and_goes_on_later(tmp_path: Path, 
     assert run.returncode == 130
     assert f"{stop.name}: stopping: waiting" in err and "for the calls in flight" in err
     assert "Traceback" not in err
-    rows = SegmentLedger(tmp_path, "answers").read(CELL.evaluation.key).rows
+    rows = local(tmp_path).read(CELL.evaluation.key).rows
     assert 6 <= len(rows) <= 8  # four at once: the second four, or two of them, were in flight
     assert out == f"{len(rows)} asked\n"
 
@@ -385,7 +375,7 @@ def test_what_ends_a_process_by_force_later_gets_a_grace_and_ctrl_c_none(tmp_pat
     run.send_signal(signal.SIGTERM)
     out, err = run.communicate(timeout=180)
     assert run.returncode == 130 and 0.9 <= time.monotonic() - began < 10, err
-    rows = SegmentLedger(tmp_path, "answers").read(CELL.evaluation.key).rows
+    rows = local(tmp_path).read(CELL.evaluation.key).rows
     assert len(rows) == 5 and out in ("6 asked\n", "7 asked\n", "8 asked\n", "9 asked\n")
 
 
@@ -402,7 +392,7 @@ def test_a_second_ctrl_c_stops_at_once(tmp_path: Path) -> None:
     _, err = run.communicate(timeout=180)
     assert run.returncode == 130, err
     assert "Traceback" not in err
-    assert len(SegmentLedger(tmp_path, "answers").read(CELL.evaluation.key).rows) == 4
+    assert len(local(tmp_path).read(CELL.evaluation.key).rows) == 4
 
 
 def test_two_runs_that_want_the_same_keys_at_once_ask_each_once(tmp_path: Path) -> None:

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
+from traps_pipeline.ledger.rows import Totals
 from traps_pipeline.models import forecast as forecasts
 from traps_pipeline.models.forecast import Experience, experience, forecast
 from traps_pipeline.models.registry import Account, ModelEntry, get_model
-from traps_pipeline.storage.ledger import Totals
 
 
 def model(**changes: Any) -> ModelEntry:

@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from tests.build.ledger import budget as budget_of
+from tests.build.ledger import budget_in, local
 from tests.conftest import KEY, SECRET
 from tests.providers.server import Provider
 from traps_pipeline.base import progress
@@ -20,11 +22,10 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.models.api import ApiBackend
 from traps_pipeline.models.ask import Call, Work, run_work
-from traps_pipeline.models.budget import Budget, BudgetReached, Journal
+from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.participants import OVERRUN, Allowed, Participants, attempt
 from traps_pipeline.models.registry import Account, Entry, Limits, Prices
 from traps_pipeline.models.request import Outcome, Request, TransientError
-from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 
 # litellm serializes what it was given again; what it says of odd values goes to nobody.
@@ -168,7 +169,7 @@ def booked_for(provider: Provider, model: str) -> tuple[Outcome | None, float]:
     """What came of one call, and what the budget says that it cost."""
 
     async def one() -> tuple[Outcome | None, float]:
-        budget = Budget(10.0, {}, {})
+        budget = budget_of(10.0)
         participant = participants(provider, entry_of(model), 10.0)["m"]
         attempted = await attempt(participant, request(), allowed_by(budget))
         return attempted and attempted[0], budget.spent_usd
@@ -288,13 +289,12 @@ def test_what_is_odd_beside_the_usage_is_typed_and_stored(odd: Provider, tmp_pat
 
 
 def work(provider: Provider, entry: Entry, cap_usd: float, items: int, folder: Path) -> Iterator[Any]:
-    budget = Budget(cap_usd, {}, {}, Journal(folder / "in_flight.jsonl"))
+    ledger = local(folder)
     calls = [Call(request(item)) for item in range(items)]
     asked = participants(provider, entry, cap_usd)
-    done = Work(
-        "responses", SegmentLedger(folder, "answers"), asked, budget, "1", lambda _: calls, lambda settled: settled
-    )
-    return run_work(done, [Cell("occlusion", Evaluation("m", "standard", 1))])
+    with budget_in(ledger, cap_usd) as budget:
+        done = Work("responses", ledger, asked, budget, "1", lambda _: calls, lambda settled: settled)
+        yield from run_work(done, [Cell("occlusion", Evaluation("m", "standard", 1))])
 
 
 def test_three_answers_out_of_order_in_a_row_stop_a_model_and_are_kept_aside(odd: Provider, tmp_path: Path) -> None:
@@ -302,10 +302,9 @@ def test_three_answers_out_of_order_in_a_row_stop_a_model_and_are_kept_aside(odd
     with pytest.raises(TrapsError, match="m is stopped: 3 answers in a row are out of order"):
         list(work(odd, entry_of("m", concurrency=1), 100.0, 20, tmp_path))
     assert odd.stats()["requests"] == 6
-    (kept,) = tmp_path.rglob("*.jsonl.raw")
-    rows = [json.loads(line) for line in kept.read_text().splitlines()]
-    assert [row["raw"] for row in rows] == ["\x1b[2J<h1>***</h1>" + "x" * (4000 - 16)] * 3
-    assert SECRET not in "".join(path.read_text() for path in tmp_path.rglob("*") if path.is_file())
+    raws = [beside["raw"] for _, beside in local(tmp_path).rows("m__standard__run1")]
+    assert raws == ["\x1b[2J<h1>***</h1>" + "x" * (4000 - 16)] * 3
+    assert SECRET not in "".join(path.read_bytes().decode("latin-1") for path in tmp_path.rglob("*") if path.is_file())
 
 
 @pytest.mark.parametrize("connections", [1, 200])
@@ -315,7 +314,7 @@ def test_the_cap_holds_against_fuzzed_answers(odd: Provider, tmp_path: Path, con
     entry = entry_of("m", concurrency=connections)
     entry = entry.model_copy(update={"params": PARAMS | {"max_tokens": 500}})
     participant = participants(odd, entry, 100.0)["m"]
-    cap_usd, budget = 1.0, Budget(1.0, {}, {})
+    cap_usd, budget = 1.0, budget_of(1.0)
 
     async def worker(queue: list[int]) -> None:
         while queue:

@@ -14,6 +14,7 @@ from socketserver import StreamRequestHandler, ThreadingTCPServer
 
 import pytest
 
+from tests.build.ledger import budget as budget_of
 from tests.conftest import KEY, ROOT, SECRET
 from tests.models.test_shapes import allowed_by, body, entry_of, request
 from tests.providers.servers import answering, closed_port, self_signed, silent
@@ -53,7 +54,7 @@ async def asking(base_url: str, budget: Budget, timeout_s: float = 20.0, **limit
 
 def call(base_url: str, timeout_s: float = 20.0, **limits: int) -> tuple[Outcome | None, float]:
     """What came of one call, and what the budget says that it cost."""
-    budget = Budget(10.0, {}, {})
+    budget = budget_of(10.0)
     return asyncio.run(asking(base_url, budget, timeout_s, **limits)), budget.spent_usd
 
 
@@ -170,7 +171,7 @@ def test_a_key_that_no_header_takes_is_refused_before_anything_is_sent(
 
 async def cancelled(base_url: str, reached: asyncio.Event) -> float:
     """What is booked for a call that is cancelled once a server was reached."""
-    budget = Budget(10.0, {}, {})
+    budget = budget_of(10.0)
     task = asyncio.create_task(asking(base_url, budget))
     await reached.wait()
     task.cancel()

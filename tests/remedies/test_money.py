@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import datetime
-import os
 import resource
 from collections.abc import Callable
 from pathlib import Path
 
+from tests.build.ledger import budget as budget_of
 from tests.remedies.remedied import refused, remedied
 from traps_pipeline.models.account_budget import AccountBudget
-from traps_pipeline.models.budget import Budget, BudgetReached, Journal, check_money
+from traps_pipeline.models.budget import Budget, BudgetReached, check_money
 from traps_pipeline.models.participants import allow_connections
 from traps_pipeline.models.registry import Entry, Prices, get_model
 from traps_pipeline.models.request import Outcome
@@ -49,9 +49,9 @@ def spend(budget: Budget, dollars: float) -> None:
 
 def test_a_budget_that_is_raised_leaves_room_for_the_call() -> None:
     remedied(
-        lambda: spend(Budget(1.0, {}, {}, None), 2.0),
-        "models.budget.Budget._fits",
-        again=lambda: spend(Budget(3.0, {}, {}, None), 2.0),
+        lambda: spend(budget_of(1.0), 2.0),
+        "models.budget.Budget.reserve",
+        again=lambda: spend(budget_of(3.0), 2.0),
         error=BudgetReached,
     )
 
@@ -125,19 +125,6 @@ def test_an_account_whose_file_cannot_be_read_is_read_once_that_is_mended(tmp_pa
         "models.account_budget.AccountBudget._held",
         path.rmdir,
     )
-
-
-def test_a_journal_on_a_full_disk_is_written_once_there_is_space(tiny_disk: Path) -> None:
-    journal = Journal(tiny_disk / "in_flight.jsonl")
-    filler = tiny_disk / "filler"
-    filler.write_bytes(b"0" * os.statvfs(tiny_disk).f_bavail * os.statvfs(tiny_disk).f_bsize)
-
-    def add_many() -> None:
-        for _ in range(100):
-            journal.add("m", 0.5)
-
-    remedied(add_many, "models.budget.Journal.add", filler.unlink)
-    journal.close()
 
 
 def test_connections_that_a_shell_does_not_allow_are_lowered() -> None:

@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import asyncio
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.storage.conftest import VARIABLE
 
+from tests.build.ledger import answer, local, write
 from tests.postgres import Postgres
 from tests.remedies.remedied import refused, remedied
-from tests.storage.conftest import VARIABLE
 from tests.storage.test_media import IMAGES, VIDEO, write_clip
 from tests.storage.test_parquet import PARTITION, clip
 from traps_pipeline.benchmark.tables import VIDEOS
+from traps_pipeline.ledger.postgres import PostgresDatabase, postgres_of
+from traps_pipeline.ledger.transfer import export_ledger, import_ledger
 from traps_pipeline.scenes.picture.encode import DamagedClip, count_frames, decode, decode_first
 from traps_pipeline.scenes.worlds.clips import check_clip
 from traps_pipeline.storage import media
-from traps_pipeline.storage.database import Session, session_of
 from traps_pipeline.storage.media import MediaStore, payload
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.place import place_of
-from traps_pipeline.storage.purse import Purse
-from traps_pipeline.storage.segments import SegmentLedger
-from traps_pipeline.storage.study import Study
-from traps_pipeline.storage.workspace import Workspace
-from traps_pipeline.study.ledger_move import move_back, move_to_database
 
 
 @pytest.fixture
@@ -164,44 +161,13 @@ def test_a_study_lies_in_a_folder_or_an_object_store(tmp_path: Path) -> None:
 # --- ledgers ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_ledger_is_read_once_the_line_is_removed_and_its_answer_alone_is_missing(tmp_path: Path) -> None:
-    ledger = SegmentLedger(tmp_path, "answers")
-    ledger.folder("m").mkdir(parents=True)
-    segment = ledger.folder("m") / "20261101T000000.jsonl"
-    segment.write_text('{"key": "a"}\n{not json\n{"key": "c"}\n')
-    known = remedied(
-        lambda: ledger.read("m"),
-        "storage.segments._read_segment",
-        lambda: segment.write_text('{"key": "a"}\n{"key": "c"}\n'),
-    )
-    assert list(known.rows) == ["a", "c"]
-
-
 def test_a_ledger_on_a_full_disk_goes_on_once_there_is_space(tiny_disk: Path) -> None:
-    ledger, kept = SegmentLedger(tiny_disk, "answers"), list[str]()
     filler = tiny_disk / "filler"
-    filler.write_bytes(b"0" * 57_000)
-
-    def ask() -> None:
-        with ledger.writer("m") as writer:
-            for n in range(60):
-                if f"k{n}" not in kept:
-                    writer.append({"key": f"k{n}", "outcome": "answer", "text": "x" * 300})
-                    kept.append(f"k{n}")
-
-    remedied(
-        ask,
-        "storage.segments._writing",
-        filler.unlink,
-    )
-    assert set(ledger.read("m").rows) == {f"k{n}" for n in range(60)}
-
-
-def shared(root: Path, name: str = "") -> Workspace:
-    workspace = Workspace.create(root, Study(name=name or root.name))
-    with workspace.answers.writer("m__standard__run1") as writer:
-        writer.append({"key": "a", "outcome": "answer", "text": "left", "cost_usd": 0.5})
-    return workspace
+    write(local(tiny_disk), answer("k", "left"))
+    filler.write_bytes(b"0" * os.statvfs(tiny_disk).f_bavail * os.statvfs(tiny_disk).f_bsize)
+    rows = [answer(f"k{n}", "x" * 300) for n in range(20)]
+    remedied(lambda: write(local(tiny_disk), *rows), "ledger.database.sentence", filler.unlink)
+    assert set(local(tiny_disk).read("m").rows) == {"k", *(row["key"] for row in rows)}
 
 
 def test_an_address_that_is_exported_and_right_leads_to_the_database(
@@ -210,20 +176,20 @@ def test_an_address_that_is_exported_and_right_leads_to_the_database(
     def export(address: str) -> Callable[[], None]:
         return lambda: monkeypatch.setenv(VARIABLE, address)
 
-    def call() -> Session:
-        return session_of(VARIABLE, "remedied")
+    def call() -> PostgresDatabase:
+        return postgres_of(VARIABLE, "remedied")
 
     monkeypatch.delenv(VARIABLE, raising=False)
-    refused(call, "storage.database.session_of")
+    refused(call, "ledger.postgres.postgres_of")
     export("postgresql://[half")()
-    refused(call, "storage.database.Session._connected")
+    refused(call, "ledger.postgres.PostgresDatabase.__init__")
     export(postgres.address(password="wrong"))()
     session = remedied(
         call,
-        "storage.database.Session.run",
+        "ledger.postgres.PostgresDatabase._sentence",
         export(postgres.address()),
     )
-    assert session.study == "remedied"
+    assert session.study_name == "remedied"
 
 
 def test_a_host_whose_clock_is_an_hour_off_works_once_it_is_set(postgres: Postgres) -> None:
@@ -245,53 +211,22 @@ def test_a_host_whose_clock_is_an_hour_off_works_once_it_is_set(postgres: Postgr
             connection.execute("drop function altered.clock_timestamp()")
 
     session = remedied(
-        lambda: Session(late, VARIABLE, "clocks"),
-        "storage.database.Session._compare_clocks",
+        lambda: PostgresDatabase(late, VARIABLE, "clocks"),
+        "ledger.postgres.PostgresDatabase._compare_clocks",
         set_clock,
     )
-    assert session.study_id > 0
+    assert session.exists()
 
 
-def test_a_ledger_moves_once_what_stands_in_the_way_is_done_as_told(
-    postgres: Postgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(VARIABLE, postgres.address())
-    monkeypatch.setenv("ANOTHER", postgres.address())
-    study = shared(tmp_path / "one")
-    where = VARIABLE
+def test_a_ledger_is_exported_and_imported_once_what_stands_in_the_way_is_gone(tmp_path: Path) -> None:
+    one, two = local(tmp_path / "one").database, local(tmp_path / "two").database
+    write(local(tmp_path / "one"), answer("a", "left"))
+    file = tmp_path / "file.sqlite"
+    file.touch()
+    remedied(lambda: export_ledger(one, file), "ledger.transfer.export_ledger", file.unlink)
     remedied(
-        lambda: move_to_database(study, "postgresql://traps@127.0.0.1/postgres"),
-        "study.ledger_move.move_to_database",
-        again=lambda: move_to_database(study, where),
+        lambda: import_ledger(tmp_path / "none.sqlite", two),
+        "ledger.transfer.import_ledger",
+        again=lambda: import_ledger(file, two),
     )
-    remedied(
-        lambda: move_to_database(Workspace.open(study.root), "ANOTHER"),
-        "study.ledger_move.move_to_database",
-        lambda: move_back(Workspace.open(study.root)),
-    )
-    other = shared(tmp_path / "other", study.study.name)
-    remedied(
-        lambda: move_to_database(Workspace.open(other.root), where),
-        "study.ledger_move._fill",
-        lambda: other.allow(name="other-2"),
-    )
-    assert Workspace.open(other.root).answers.read("m__standard__run1").rows["a"]["text"] == "left"
-
-    async def while_asking() -> None:
-        async with Workspace.open(other.root).answers.writing("m__standard__run1", print):
-            await asyncio.to_thread(
-                lambda: refused(lambda: move_back(Workspace.open(other.root)), "study.ledger_move._nobody_asks")
-            )
-
-    asyncio.run(while_asking())
-    spender = Session(postgres.address(), VARIABLE, "other-2")
-    purse = Purse(spender)
-    purse.open()
-    purse.grant("m", 0.0, 0.5, 0.5, {None: 1.0})
-    remedied(
-        lambda: move_back(Workspace.open(other.root)),
-        "study.ledger_move._move_out",
-        lambda: (purse.give_back({"m": 0.0}, {}), purse.close(), spender.close()),
-    )
-    move_to_database(Workspace.open(other.root), where)
-    assert move_back(Workspace.open(other.root)).rows == 1
+    assert [*local(tmp_path / "two").read("m").rows] == ["a"]

@@ -21,7 +21,6 @@ from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.cluster.database import Database
 from traps_pipeline.cluster.objects import OBJECTS, Bucket, ObjectStore
 from traps_pipeline.cluster.places import SharedFolder
-from traps_pipeline.storage.database import Session
 from traps_pipeline.storage.leases import alone, leased
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.store import LEASES, FolderStore, Store
@@ -80,7 +79,7 @@ def opened(folder: str, *of_database: str) -> Store:
 
 def database(address: str, study: str) -> Database:
     """The database of a study, as a process of its own has it."""
-    return Database(address, Session(address, "TRAPS_TEST_DATABASE", study))
+    return Database(address, "TRAPS_TEST_DATABASE", study)
 
 
 def put(store: Store, name: str, content: bytes) -> Path:

@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from tests.build.ledger import answer, write
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.cli import main
-from traps_pipeline.models.budget import Journal
 from traps_pipeline.scenes.picture.encode import encode
 from traps_pipeline.scoring.tables import LEADERBOARD
 from traps_pipeline.storage.media import MediaSpec
@@ -27,11 +27,7 @@ from traps_pipeline.storage.workspace import Workspace
 def test_each_damaged_file_is_named_by_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     workspace = Workspace.create(tmp_path, Study())
     workspace.tables.write(LEADERBOARD, {}, [], {})
-    with workspace.answers.writer("m__standard__run1") as writer:
-        writer.append({"key": "a", "outcome": "answer"}, {"reasoning": "It rolls left."})
-    journal = Journal(workspace.root / "ledger" / "in_flight.jsonl")
-    journal.add("m", 0.5)
-    journal.close()
+    write(workspace.answers, answer("a", "x" * 3000))
     clip = workspace.clip("plinko-0001", "void", "0" * 64)
     clip.parent.mkdir(parents=True)
     clip.write_bytes(b"a clip")
@@ -43,12 +39,12 @@ def test_each_damaged_file_is_named_by_itself(tmp_path: Path, capsys: pytest.Cap
 
     code, told = verified()
     assert code == 0 and told.count("ok  ") == 7, told
-    files = [path for kind in ("*.parquet", "*.jsonl*", "*.mp4") for path in tmp_path.rglob(kind)]
-    assert len(files) == 5
+    files = [path for kind in ("*.parquet", "*.sqlite", "*.mp4") for path in tmp_path.rglob(kind)]
+    assert len(files) == 3
     for path in files:
         written = path.read_bytes()
         flipped = bytearray(written)
-        flipped[len(flipped) // 2] ^= 4
+        flipped[written.rindex(b"xxxx") if path.suffix == ".sqlite" else len(flipped) // 2] ^= 4
         path.write_bytes(flipped)
         code, told = verified()
         assert code == 1 and told.count("FAIL") == 1 and str(path) in told, told

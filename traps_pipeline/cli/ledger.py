@@ -1,22 +1,26 @@
-"""`traps ledger`: where a study's ledger lies, and what is booked in it for calls that never left."""
+"""`traps ledger`: answers, votes and money, moved as they are, and money given back."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli.command import OK, Commands, open_workspace
 
 
 def add(commands: Commands) -> None:
-    """Add `traps ledger move` and `traps ledger release`."""
+    """Add `traps ledger export`, `import`, `move` and `release`."""
     noun = commands.noun("ledger", "where answers, votes and spending are kept")
-    text = "move the study's answers, votes and spending into a PostgreSQL database that several hosts share, or back"
-    parser = noun.add("move", move, text)
-    where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--to", metavar="VARIABLE", help="variable of the environment that holds the database's address")
-    where.add_argument("--store", metavar="ADDRESS", help="the whole study into an object store: s3://BUCKET/STUDY")
-    where.add_argument("--back", action="store_true", help="into the study's folder again")
+    text = "write answers, votes and money to one file, as they are"
+    noun.add("export", export, text).add_argument(
+        "file", type=Path, metavar="FILE", help="to be made, e.g. ledger.sqlite"
+    )
+    text = "read such a file into a study that has no answers yet: in its folder, or in the database of study.yaml"
+    noun.add("import", import_, text).add_argument("file", type=Path, metavar="FILE")
+    text = "move the whole study into an object store that several hosts share"
+    address = noun.add("move", move, text)
+    address.add_argument("--store", metavar="ADDRESS", required=True, help="s3://BUCKET/STUDY")
 
     text = "give back money that is booked for calls that never left; without arguments: list what may be released"
     parser = noun.add("release", release, text)
@@ -45,24 +49,35 @@ def release(arguments: argparse.Namespace) -> int:
     return OK
 
 
+def export(arguments: argparse.Namespace) -> int:
+    """See `traps ledger export --help`."""
+    from traps_pipeline.ledger.transfer import export_ledger
+
+    count = export_ledger(open_workspace(arguments).ledger, arguments.file.absolute())
+    print(f"{count} rows are in {arguments.file}; `traps ledger import` reads them into another study")
+    return OK
+
+
+def import_(arguments: argparse.Namespace) -> int:
+    """See `traps ledger import --help`."""
+    from traps_pipeline.ledger.transfer import import_ledger
+
+    workspace = open_workspace(arguments)
+    count = import_ledger(arguments.file.absolute(), workspace.ledger)
+    print(f"{count} rows are in {workspace.ledger.place}")
+    return OK
+
+
 def move(arguments: argparse.Namespace) -> int:
     """See `traps ledger move --help`."""
     from traps_pipeline.base.progress import reporting
     from traps_pipeline.cli.progress import TerminalProgress
     from traps_pipeline.storage.place import place_of
     from traps_pipeline.storage.workspace import VARIABLE
-    from traps_pipeline.study.ledger_move import move_back, move_to_database
     from traps_pipeline.study.store_move import move_to_store
 
     workspace = open_workspace(arguments)
-    if arguments.store:
-        with reporting(TerminalProgress()):
-            moved = move_to_store(workspace, place_of(arguments.store))
-    else:
-        moved = move_back(workspace) if arguments.back else move_to_database(workspace, arguments.to)
-    print(f"{moved.rows} rows moved; the ledger of {workspace.study.name} lies in {moved.where} now")
-    if moved.kept:
-        print(f"what lay in the folder before is kept in {moved.kept}, where nothing reads it")
-    if arguments.store:
-        print(f"the study lies at {arguments.store} now; export {VARIABLE}={arguments.store}, here and on other hosts")
+    with reporting(TerminalProgress()):
+        count = move_to_store(workspace, place_of(arguments.store))
+    print(f"{count} rows moved; the study lies at {arguments.store} now: export {VARIABLE}={arguments.store}")
     return OK

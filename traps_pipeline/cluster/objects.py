@@ -18,7 +18,7 @@ from typing import TypeVar
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import is_same_file, link, write_bytes
 from traps_pipeline.cluster.bucket import Bucket, object_name
-from traps_pipeline.cluster.database import Database
+from traps_pipeline.cluster.database import Database, lease
 from traps_pipeline.cluster.names import Current, Names
 from traps_pipeline.storage.place import STUDY
 from traps_pipeline.storage.store import GRACE_DAYS, Lease, Store, UnusedObject, is_hidden
@@ -223,7 +223,7 @@ class ObjectStore(Store):
 
     def lease(self, name: str) -> Lease | None:
         """See `Store`."""
-        return self._database.lease(name)
+        return lease(self._database, name)
 
     def unused(self, *, is_removed: bool = False, grace_days: float | None = None) -> list[UnusedObject]:
         """See `Store`."""

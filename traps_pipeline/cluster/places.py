@@ -9,7 +9,7 @@ import yaml
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cluster.bucket import Bucket
-from traps_pipeline.cluster.database import Database, database_of
+from traps_pipeline.cluster.database import Database, database_of, lease
 from traps_pipeline.cluster.objects import ObjectStore
 from traps_pipeline.storage.place import STUDY, Place
 from traps_pipeline.storage.store import FolderStore, Lease, Store
@@ -28,7 +28,7 @@ class SharedFolder(FolderStore):
 
     def lease(self, name: str) -> Lease | None:
         """See `Store`."""
-        return self._database.lease(name)
+        return lease(self._database, name)
 
 
 def open_store(place: Place, root: Path, study: Study | None = None) -> Store | None:

@@ -16,9 +16,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from traps_pipeline.base.digests import digest
+from traps_pipeline.ledger.ledger import Ledger, LockGivenUp
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.storage.leases import POLL_S
-from traps_pipeline.storage.ledger import Ledger, LockGivenUp
 from traps_pipeline.storage.store import Lease, Store
 
 Make = Callable[[Sequence[Request], Callable[[], bool]], list[Outcome]]  # calls; whether to stop; their outcomes

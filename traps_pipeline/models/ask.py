@@ -20,13 +20,14 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.partitions import Cell, Evaluation
 from traps_pipeline.base.progress import Tally
+from traps_pipeline.ledger.ledger import SYNC_S, Ledger, LockGivenUp, Writer
+from traps_pipeline.ledger.rows import settles
 from traps_pipeline.models.backends import make_backend
 from traps_pipeline.models.budget import Budget, BudgetReached
 from traps_pipeline.models.participants import Allowed, Participant, Participants, Row, attempt, ledger_row
 from traps_pipeline.models.registry import Entry
 from traps_pipeline.models.request import Backend, Request
 from traps_pipeline.models.spending import sharing, spending
-from traps_pipeline.storage.ledger import SYNC_SECONDS, Ledger, LockGivenUp, Writer, settles
 from traps_pipeline.storage.parquet import Made
 from traps_pipeline.storage.workspace import Workspace
 
@@ -133,12 +134,9 @@ class _Asking:
         if attempted is None:
             return False
         row, beside = ledger_row(request, *attempted, self.work.epoch)
-        dollars = row["cost_usd"] or 0.0
-        self.writer.append(row, beside)
-        await self.writer.kept()
-        self.work.budget.booked(name, dollars)
+        await self.writer.write(row, beside, [reservation.id for reservation in allowed.paid_by])
         self.rows[request.key] = _Held(row)
-        progress.current().called(self.work.stage, name, not settles(row), row["latency_s"], dollars)
+        progress.current().called(self.work.stage, name, not settles(row), row["latency_s"], row["cost_usd"] or 0.0)
         participant.breaker.watch(attempted[0])
         return True
 
@@ -148,9 +146,9 @@ class _Asking:
 
     async def sync(self) -> None:
         while True:
-            await asyncio.sleep(SYNC_SECONDS)
+            await asyncio.sleep(SYNC_S)
             try:
-                self.writer.sync_if_due()
+                await self.writer.sync()
             except TrapsError as error:  # a disk that cannot be synced stops new calls, as one that cannot be written
                 self.problems.append(error)
                 return
@@ -161,8 +159,6 @@ class _Asking:
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
         asked = [(self.work.participants[name], queue) for name, queue in queues.items()]
-        if self.missing:
-            self.writer.open()
         syncing = asyncio.create_task(self.sync())
         try:
             async with asyncio.TaskGroup() as group:
@@ -213,18 +209,15 @@ async def settle_evaluation(
     Calls and rows are made and read a cell at a time: none is held once its cell is finished, and a call that two
     cells share (a steered control stands in two datasets) is found by the second.
     """
-    told, is_finished = set[str](), True
+    told = set[str]()
     async with work.ledger.writing(evaluation.key, progress.current().note, stop.is_set) as writer:
         for cell in cells:
             settled = await _settle_cell(work, cell, _Evaluation(writer, told), stop)
             if settled is None:
                 return  # what was answered is in the ledger
-            is_finished &= not settled.tally.errors
             yield settled
             del settled
             await asyncio.sleep(0)  # a cell that was all known must not keep the loop from those that are asked
-        if is_finished:
-            await asyncio.to_thread(writer.finish)
 
 
 async def _settle_cell(
@@ -248,7 +241,7 @@ async def _settle_cell(
     rows |= asking.rows
     if stop.is_set() or len(rows) < len(wanted):
         return None
-    await asyncio.to_thread(its.writer.sync)
+    await its.writer.sync()
     errors = sum(not settles(row) for row in rows.values())
     tally = Tally(asked=len(missing), cached=len(wanted) - len(missing), errors=errors)
     return Settled(cell, calls, {key: rows[key] for key in wanted}, tally)
@@ -358,7 +351,7 @@ class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
     """Route the signals that stop a run to the stop event while a loop works in the main thread, then give them back.
 
     A person who presses Ctrl-C can press it again; what sends SIGTERM or SIGHUP will end the process by force some time
-    later, so calls in flight get GRACE_S to come back. One that is given up stands in the journal as its worst case.
+    later, so calls in flight get GRACE_S to come back. One that is given up stays reserved with its worst case.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
@@ -375,7 +368,7 @@ class _drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
 
     def _interrupt(self, by: signal.Signals) -> None:
         if self._stop.is_set():
-            # What is cancelled now is in the ledger or stands in the journal: how it ends is nobody's news.
+            # What is cancelled now is in the ledger or stays reserved: how it ends is nobody's news.
             self._loop.set_exception_handler(lambda *_: None)
             self._loop.call_soon_threadsafe(self._cancel)
             end = threading.Timer(END_S, os._exit, (INTERRUPTED,))  # whatever still holds the process then

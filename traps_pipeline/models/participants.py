@@ -12,13 +12,14 @@ import resource
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.budget import Budget, BudgetReached, check_money, most_tokens, worst_case_usd
+from traps_pipeline.ledger.rows import ASIDES
+from traps_pipeline.models.budget import Budget, BudgetReached, Reservation, check_money, most_tokens, worst_case_usd
 from traps_pipeline.models.registry import NETWORK, Account, Entry, load_accounts
 from traps_pipeline.models.request import (
     MALFORMED,
@@ -31,7 +32,6 @@ from traps_pipeline.models.request import (
 )
 from traps_pipeline.models.traffic import Breaker, Gate, Meter
 from traps_pipeline.models.transport import watching
-from traps_pipeline.storage.ledger import ASIDES
 from traps_pipeline.storage.study import Study
 
 Row = Mapping[str, Any]
@@ -111,13 +111,17 @@ class Participants:
 
 @dataclass(frozen=True)
 class Allowed:
-    """What a call needs besides its participant. stop: set when the run is to end. halted(): no more calls are to be
-    sent. require(): raises TrapsError when nobody but another process may send this one."""
+    """What a call needs besides its participant, one value a call.
+
+    stop: set when the run is to end. halted(): no more calls are to be sent. require(): raises TrapsError when nobody
+    but another process may send this one. paid_by: is given the reservations of attempts that cost something.
+    """
 
     budget: Budget
     stop: asyncio.Event
     halted: Callable[[], bool]
     require: Callable[[], Awaitable[None]]
+    paid_by: list[Reservation] = field(default_factory=list)
 
 
 async def attempt(participant: Participant, request: Request, allowed: Allowed) -> tuple[Outcome, int, float] | None:
@@ -185,7 +189,7 @@ async def _send(participant: Participant, request: Request, allowed: Allowed) ->
     """
     entry = participant.entry
     worst_usd = worst_case_usd(entry, request)
-    await allowed.budget.reserve(entry.id, worst_usd)
+    reservation = await allowed.budget.reserve(entry.id, worst_usd)
     cost_usd = 0.0
     with watching() as exchange:
         try:
@@ -211,7 +215,9 @@ async def _send(participant: Participant, request: Request, allowed: Allowed) ->
         finally:
             if exchange.never_left:  # a call that is cancelled before it is sent, too
                 cost_usd = 0.0
-            await allowed.budget.settle(entry.id, worst_usd, cost_usd)
+            if reservation is not None and cost_usd > 0:
+                allowed.paid_by.append(reservation)
+            await allowed.budget.settle(reservation, cost_usd)
 
 
 def _believed(cost_usd: float | None, worst_usd: float) -> float:

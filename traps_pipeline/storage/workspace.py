@@ -18,17 +18,15 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import ROOT, WORKSPACES, require_root
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
-from traps_pipeline.storage.database import Session, session_of
-from traps_pipeline.storage.ledger import Ledger
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.place import STUDY, Place, name_of, place_of, scratch_of
-from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.several_hosts import several_hosts
-from traps_pipeline.storage.shared_ledger import SharedLedger
 from traps_pipeline.storage.store import FolderStore, Store
 from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
 
 if TYPE_CHECKING:
+    from traps_pipeline.ledger.database import Database
+    from traps_pipeline.ledger.ledger import Ledger
     from traps_pipeline.storage.media import MediaStore
 
 VARIABLE = "TRAPS_WORKSPACE"
@@ -186,7 +184,7 @@ class Workspace:
 
     @property
     def ledger_folder(self) -> Path:
-        """The ledgers of a study that is on one machine, their locks and the journal of calls in flight."""
+        """The ledger of a study that is on one machine, and its locks."""
         return self.root / "ledger"
 
     @property
@@ -218,24 +216,27 @@ class Workspace:
     @cached_property
     def answers(self) -> Ledger:
         """Every answer ever paid for."""
-        return self._ledger("answers")
+        from traps_pipeline.ledger.ledger import Ledger
+
+        return Ledger(self.ledger, "answers")
 
     @cached_property
     def votes(self) -> Ledger:
         """Every vote ever paid for."""
-        return self._ledger("votes")
+        from traps_pipeline.ledger.ledger import Ledger
 
-    def _ledger(self, kind: str) -> Ledger:
-        shared = self.session
-        if shared is None:
-            return SegmentLedger(self.ledger_folder, kind)
-        return SharedLedger(shared, kind)
+        return Ledger(self.ledger, "votes")
 
-    @property
-    def session(self) -> Session | None:
-        """The connection to the database with the study's ledger and budget; None where they lie in its folder. Raises
-        TrapsError naming the variable and the remedy."""
-        return session_of(self.study.database, self.study.name) if self.study.database else None
+    @cached_property
+    def ledger(self) -> Database:
+        """The database of answers, votes and money: in the study's folder, or in PostgreSQL. Raises TrapsError naming
+        the variable and the remedy."""
+        from traps_pipeline.ledger.postgres import postgres_of
+        from traps_pipeline.ledger.sqlite import SqliteDatabase
+
+        if self.study.database:
+            return postgres_of(self.study.database, self.study.name)
+        return SqliteDatabase(self.ledger_folder, self.study.name)
 
     def failed_check(self, stage: str, check: str, key: str | None) -> Path:
         """File that exists while a check of a partition does not pass; it holds the details."""

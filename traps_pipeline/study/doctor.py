@@ -130,7 +130,7 @@ def examine_files(place: Place) -> Iterator[Finding]:
         damaged = [said for path in files if (said := damage_of(path))]
         shown = "; ".join(damaged[:SHOWN]) + (f"; and {len(damaged) - SHOWN} more" if len(damaged) > SHOWN else "")
         yield Finding(not damaged, what, shown or f"{len(files)} files are what was written")
-    said = [*workspace.answers.damage(), *workspace.votes.damage(), *_damaged_journal(workspace.root)]
+    said = [*workspace.answers.damage(), *workspace.votes.damage()]
     yield Finding(not said, "ledger", "; ".join(said[:SHOWN]) or "all rows are what was written")
     yield Finding(True, "unfinished", _remove_unfinished(workspace.root))
 
@@ -162,14 +162,6 @@ def _damaged_table(path: Path) -> str:
     from traps_pipeline.storage.parquet import altered
 
     return altered(path)
-
-
-def _damaged_journal(root: Path) -> Iterator[str]:
-    from traps_pipeline.storage.segments import JOURNAL, damaged_lines
-
-    path = root / "ledger" / JOURNAL
-    if path.exists() and (lines := damaged_lines(path)):
-        yield f"{path}: line {', '.join(map(str, lines))}: not what was written, and not believed"
 
 
 def _damaged_clip(path: Path) -> str:

@@ -13,11 +13,10 @@ from pathlib import Path
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.database import session_of
+from traps_pipeline.ledger.transfer import copy_ledger
 from traps_pipeline.storage.parquet import note_of
 from traps_pipeline.storage.place import STUDY, Place, scratch_of
 from traps_pipeline.storage.workspace import DATABASE, Workspace
-from traps_pipeline.study.ledger_move import Moved, move_rows
 
 # Dagster's history, lock files, reports and labels belong to a machine, and the ledger is moved by itself.
 STAYS = ("dagster", "ledger", "reports", "labels", STUDY)
@@ -25,15 +24,16 @@ AT_ONCE = 500  # files of one change
 LEFT = "study.moved.yaml"  # what study.yaml of the folder is called then
 
 
-def move_to_store(workspace: Workspace, address: Place) -> Moved:
-    """Move a study from its folder to an address (s3://BUCKET/STUDY). Raises TrapsError, also while anybody asks."""
+def move_to_store(workspace: Workspace, address: Place) -> int:
+    """Move a study from its folder to an address (s3://BUCKET/STUDY); the number of rows of its ledger. Raises
+    TrapsError, also while anybody asks."""
     if not isinstance(address, str):
         raise TrapsError(f"{address}: is a folder; --store names an address in an object store, s3://BUCKET/STUDY")
     if workspace.is_shared or workspace.study.database:
         where = workspace.place if workspace.is_shared else "a database"
         raise TrapsError(
-            f"{workspace.place}: the study's ledger lies in {where}, and not in a folder; a study whose files lie in a "
-            "folder moves its ledger back first (`traps ledger move --back`)"
+            f"{workspace.place}: the study's ledger lies in {where}, and not in a folder; export it first "
+            "(`traps ledger export`), take `database` from study.yaml, and import it again"
         )
     if Workspace.is_there(address):
         raise TrapsError(
@@ -48,7 +48,7 @@ def move_to_store(workspace: Workspace, address: Place) -> Moved:
         target.save_study()  # last: it makes the address a study
         (workspace.root / STUDY).rename(workspace.root / LEFT)
 
-    return move_rows(workspace, session_of(DATABASE, study.name), settle)
+    return copy_ledger(workspace.ledger, target.ledger, settle)
 
 
 def _move_files(workspace: Workspace, target: Workspace) -> None:

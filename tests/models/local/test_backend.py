@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from tests.build.ledger import local
 from tests.local_models import QUESTIONS, SIX_FRAMES, SYSTEM, Family, checkpoint, clip, entry, model
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
@@ -32,7 +33,6 @@ from traps_pipeline.models.participants import Participants, Row
 from traps_pipeline.models.registry import Limits, ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.storage.media import MediaStore
-from traps_pipeline.storage.segments import SegmentLedger
 from traps_pipeline.storage.study import Study
 
 pytestmark = pytest.mark.slow
@@ -120,9 +120,9 @@ def test_a_second_run_asks_nothing(tmp_path: Path, batches: list[int]) -> None:
         calls = [Call(request(of, media, question)) for question in QUESTIONS]
         work = Work(
             "responses",
-            SegmentLedger(tmp_path, "answers"),
+            local(tmp_path),
             participants,
-            Budget(0.0, {}, {}),
+            Budget(0.0, {}),
             "1",
             lambda _: calls,
             finish,
@@ -132,7 +132,7 @@ def test_a_second_run_asks_nothing(tmp_path: Path, batches: list[int]) -> None:
 
     rows, tally = run()
     assert (tally.asked, tally.cached, batches) == (3, 0, [2, 1])
-    written = SegmentLedger(tmp_path, "answers").read(cell.evaluation.key).settled.values()
+    written = local(tmp_path).read(cell.evaluation.key).settled.values()
     assert {row["components"]["params"]["checkpoint_digest"] for row in written} == {model(of.id).checkpoint.digest}
     again, tally = run()
     assert (tally.asked, tally.cached, batches) == (0, 3, [2, 1])

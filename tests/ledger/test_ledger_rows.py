@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from traps_pipeline.storage.rows import MOST_TOKENS, MOST_USD, heal, is_cost, is_count, is_seconds
+from traps_pipeline.ledger.rows import MOST_TOKENS, MOST_USD, heal, is_cost, is_count, is_seconds
 
 
 @pytest.mark.parametrize("value", [0, 1, MOST_TOKENS])

@@ -1,4 +1,4 @@
-"""Ledgers of both kinds, here and in processes of their own."""
+"""Ledgers in both databases, here and in processes of their own."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.postgres import Postgres
-from traps_pipeline.storage.database import Session
-from traps_pipeline.storage.ledger import Ledger
-from traps_pipeline.storage.segments import SegmentLedger
-from traps_pipeline.storage.shared_ledger import SharedLedger
+from traps_pipeline.ledger.ledger import Ledger
+from traps_pipeline.ledger.postgres import PostgresDatabase
+from traps_pipeline.ledger.sqlite import SqliteDatabase
 
 VARIABLE = "TRAPS_TEST_DATABASE"
 
 
 def opened(kind: str, *where: str) -> Ledger:
-    """A ledger of answers: of `segments` in a folder, or of `postgres` at an address, in a study, whose sessions may be
-    silent for so many seconds."""
-    if kind == "segments":
-        return SegmentLedger(Path(where[0]), "answers")
-    return SharedLedger(Session(where[0], VARIABLE, where[1], float(where[2])), "answers")
+    """A ledger of answers: of `sqlite` in a folder, or of `postgres` at an address, in a study, whose connections may
+    be silent for so many seconds."""
+    if kind == "sqlite":
+        return Ledger(SqliteDatabase(Path(where[0]), "study"), "answers")
+    return Ledger(PostgresDatabase(where[0], VARIABLE, where[1], float(where[2])), "answers")
 
 
 @dataclass(frozen=True)
@@ -47,9 +46,10 @@ class Place:
     @contextmanager
     def process(self, code: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
         """A process that runs code with `ledger` defined; `arguments` are in its sys.argv[1:]. Killed at the end."""
-        begin = "import sys\nfrom tests.storage.conftest import opened\nledger = opened(*sys.argv.pop(1).split('|'))\n"
+        begin = "import sys\nfrom tests.ledger.conftest import opened\nledger = opened(*sys.argv.pop(1).split('|'))\n"
         command = [sys.executable, "-c", begin + code, "|".join(self.where), *arguments]
-        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        pipe = subprocess.PIPE
+        process = subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=subprocess.STDOUT, text=True)
         try:
             yield process
         finally:
@@ -62,15 +62,15 @@ def in_database(server: Postgres, idle_s: float = 30.0) -> Place:
     return Place(("postgres", server.address(), f"study-{secrets.token_hex(4)}", str(idle_s)))
 
 
-@pytest.fixture(params=["segments", pytest.param("postgres", marks=pytest.mark.slow)])
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.slow)])
 def place(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
-    """An empty ledger of each kind."""
-    if request.param == "segments":
-        return Place(("segments", str(tmp_path)))
+    """An empty ledger in each database."""
+    if request.param == "sqlite":
+        return Place(("sqlite", str(tmp_path)))
     return in_database(request.getfixturevalue("postgres"))
 
 
 @pytest.fixture
 def ledger(place: Place) -> Ledger:
-    """An empty ledger of each kind, opened."""
+    """An empty ledger in each database, opened."""
     return place.open()

@@ -1,22 +1,28 @@
-"""A call is paid for once: what holds of every ledger, in a folder of one machine or in a database of several."""
+"""A call is paid for once: what holds of the ledger in SQLite and in PostgreSQL."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import os
+import shutil
 import signal
+import subprocess
+import sys
+import tempfile
 import time
+from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 
-from tests.build.ledger import answer, paid, write
-from tests.storage.conftest import Place
+from tests.build.ledger import answer, local, paid, write
+from tests.conftest import ROOT
+from tests.ledger.conftest import Place
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.ledger import Ledger, LockGivenUp, Totals
-from traps_pipeline.storage.lines import checked_line
-from traps_pipeline.storage.segments import SegmentLedger
-from traps_pipeline.storage.shared_ledger import SharedLedger
+from traps_pipeline.ledger.ledger import Ledger, LockGivenUp
+from traps_pipeline.ledger.rows import Totals, digest_of, encoded
+from traps_pipeline.ledger.schema import EVALUATIONS, ROWS, STUDIES
 
 HOLD = """
 import asyncio, time
@@ -31,25 +37,35 @@ import asyncio, itertools
 async def write():
     async with ledger.writing("m", print) as writer:
         for n in itertools.count():
-            writer.append({"key": f"k{n}", "outcome": "answer", "text": "x" * 500})
-            await writer.kept()
+            await writer.write({"key": f"k{n}", "outcome": "answer", "text": "x" * 500})
             print(f"k{n}", flush=True)
 asyncio.run(write())
 """
+FILL = """
+import asyncio, resource, sys
+from pathlib import Path
+from tests.build.ledger import answer, local
+from traps_pipeline.base.errors import TrapsError
+async def fill():
+    stored = 0
+    try:
+        async with local(Path(sys.argv[1])).writing("m", print) as writer:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, 2_000_000))
+            while True:
+                await writer.write(answer(f"k{stored}", "x" * 500))
+                stored += 1
+    except TrapsError as error:
+        print(stored, error, sep="\\n")
+asyncio.run(fill())
+"""
 
 
-def damage(ledger: Ledger, key: str, change: bytes) -> None:
-    """Put something else in the place of the line that begins with a key."""
-    if isinstance(ledger, SegmentLedger):
-        (segment,) = [path for path in ledger.folder("m").glob("*.jsonl") if f'"{key}"' in path.read_text()]
-        lines = segment.read_bytes().splitlines(keepends=True)
-        segment.write_bytes(b"".join(change if f'"{key}"'.encode() in line else line for line in lines))
-    else:
-        assert isinstance(ledger, SharedLedger)
-        sql = """update traps.rows set line = %s where key = %s
-                 and evaluation in (select id from traps.evaluations where study = %s) returning key"""
-        values = [change, key, ledger.session.study_id]
-        assert ledger.session.run(lambda connection: connection.execute(sql, values).fetchall()) == [(key,)]
+def damage(ledger: Ledger, key: str, content: bytes, digest: bytes | None = None) -> None:
+    """Put something else in the place of the content of the row with a key, and of its digest."""
+    values = {"content": content} | ({} if digest is None else {"digest": digest})
+    mine = sa.select(EVALUATIONS.c.id).join(STUDIES).where(STUDIES.c.name == ledger.database.study_name)
+    change = sa.update(ROWS).where(ROWS.c.key == key, ROWS.c.evaluation.in_(mine)).values(**values)
+    assert ledger.database.run(lambda connection: connection.execute(change).rowcount) == 1
 
 
 def test_rows_come_back_by_key_and_evaluation(place: Place) -> None:
@@ -59,17 +75,6 @@ def test_rows_come_back_by_key_and_evaluation(place: Place) -> None:
     assert ledger.read("m").rows == {"a": rows[0], "b": rows[1]}
     assert ledger.read("m").notes == {}
     assert ledger.read("another").rows == {}
-
-
-def test_a_row_is_kept_as_the_line_that_was_written(place: Place) -> None:
-    ledger, row = place.open(), answer("a", "left – 左")
-    write(ledger, row)
-    if isinstance(ledger, SegmentLedger):
-        (kept,) = [path.read_bytes() for path in ledger.folder("m").glob("*.jsonl")]
-    else:
-        assert isinstance(ledger, SharedLedger)
-        kept = ledger.session.run(lambda c: c.execute("select line from traps.rows order by id").fetchall())[-1][0]
-    assert kept == checked_line(row)
 
 
 def test_a_failure_never_takes_the_place_of_an_answer(ledger: Ledger) -> None:
@@ -93,13 +98,15 @@ def test_of_the_rows_only_those_that_are_wanted_are_read(ledger: Ledger) -> None
 def test_what_stands_beside_rows_comes_back_by_key(ledger: Ledger) -> None:
     async def write_both() -> None:
         async with ledger.writing("m", print) as writer:
-            writer.append(answer("a", "left"), {"reasoning": "It rolls left."})
-            writer.append(answer("b", "right"))
-            await writer.kept()
+            await writer.write(answer("a", "left"), {"reasoning": "It rolls left.", "raw": "{\x00"})
+            await writer.write(answer("b", "right"))
 
     asyncio.run(write_both())
     assert ledger.reasoning("m") == {"a": "It rolls left."}
     assert ledger.reasoning("m", {"b"}) == {}
+    first, second = ledger.rows("m")
+    assert first == (answer("a", "left"), {"reasoning": "It rolls left.", "raw": "{\x00"})
+    assert second == (answer("b", "right"), {})
 
 
 def test_totals_are_what_every_row_adds_up_to_repeated_answers_too(place: Place) -> None:
@@ -108,7 +115,7 @@ def test_totals_are_what_every_row_adds_up_to_repeated_answers_too(place: Place)
     for evaluation, cost in (("m__standard__run1", 0.25), ("m__standard__run1", 0.5), ("n__json__run1", 1e-05)):
         name = evaluation.split("__")[0]
         write(ledger, paid("k", cost, name) | {"text": trap}, paid("l", None, name), evaluation=evaluation)
-    assert place.open().totals() == {"m": Totals(0.75, 0.5), "n": Totals(1e-05, 1e-05)}
+    assert place.open().totals() == {"m": Totals(0.75, 0.0, 0.5), "n": Totals(1e-05, 0.0, 1e-05)}
 
 
 def test_means_are_of_settled_rows_with_a_possible_value(ledger: Ledger) -> None:
@@ -123,7 +130,7 @@ def test_means_are_of_settled_rows_with_a_possible_value(ledger: Ledger) -> None
 def test_a_row_that_is_not_what_was_written_is_told_and_asked_again(ledger: Ledger) -> None:
     write(ledger, answer("a", "left"), answer("b", "right"))
     assert list(ledger.damage()) == []
-    damage(ledger, "a", checked_line(answer("a", "left")).replace(b"left", b"lift"))
+    damage(ledger, "a", encoded(answer("a", "left")).replace(b"left", b"lift"))
     known = ledger.read("m")
     assert list(known.rows) == ["b"]
     (note,) = known.notes.values()
@@ -136,7 +143,8 @@ def test_a_row_that_is_not_what_was_written_is_told_and_asked_again(ledger: Ledg
 def test_values_that_no_table_holds_are_unknown_and_told(ledger: Ledger) -> None:
     odd = {"prompt_tokens": 2**63, "completion_tokens": -1, "served_model": 5, "cost_usd": -1000.0}
     write(ledger, answer("a", "left"))
-    damage(ledger, "a", checked_line(answer("a", "left") | odd))  # as no version writes it
+    content = encoded(answer("a", "left") | odd)  # as no version writes it
+    damage(ledger, "a", content, digest_of(content, None, None))
     known = ledger.read("m")
     assert known.rows["a"] == answer("a", "left") | dict.fromkeys(odd)
     (note,) = known.notes.values()
@@ -172,7 +180,7 @@ def test_what_was_kept_survives_the_kill_of_its_writer_and_another_one_goes_on(p
     ledger = place.open()
     kept = list(ledger.read("m").rows)
     assert kept[: len(told)] == told and len(kept) <= len(told) + 1
-    assert set(ledger.read("m").notes.values()) <= {"torn last line ignored (a crash cut it off)"}
+    assert ledger.read("m").notes == {}
     write(ledger, answer("later", "left"))
     assert len(ledger.read("m").rows) == len(kept) + 1
 
@@ -220,8 +228,7 @@ def test_an_import_into_an_evaluation_that_is_being_asked_waits_for_it(ledger: L
     async def scenario() -> list[str]:
         said = list[str]()
         async with ledger.writing("m", print) as writer:
-            writer.append(answer("a", "left"))
-            await writer.kept()
+            await writer.write(answer("a", "left"))
             storing = asyncio.create_task(ledger.store({"m": [(answer("a", "right"), {})]}, said.append))
             await asyncio.sleep(0.5)
             assert not storing.done()
@@ -236,9 +243,84 @@ def test_an_import_into_an_evaluation_that_is_being_asked_waits_for_it(ledger: L
 def test_an_error_in_a_writers_block_is_what_is_raised(ledger: Ledger) -> None:
     async def scenario() -> None:
         async with ledger.writing("m", print) as writer:
-            writer.append(answer("a", "left"))
+            await writer.write(answer("a", "left"))
             raise TrapsError("something else")
 
     with pytest.raises(TrapsError, match="something else"):
         asyncio.run(scenario())
     assert list(ledger.read("m").rows) == ["a"]
+
+
+def test_no_bit_of_a_row_can_flip_unseen(tmp_path: Path) -> None:
+    """Bits all over the file of a small ledger: the rows come back as they were, or something is said."""
+    rows = [answer(f"k{n}", "left") for n in range(3)]
+    ledger = local(tmp_path)
+    write(ledger, *rows)
+    whole, written, silent = ledger.read("m").rows, ledger.database.path.read_bytes(), list[int]()  # pyright: ignore
+    begins = written.index(b'{"key": "k2"')
+    for place in range(8 * begins, 8 * (begins + 3 * 100), 7):  # in seven of eight bytes, each bit in turn
+        flipped = bytearray(written)
+        flipped[place // 8] ^= 1 << place % 8
+        (tmp_path / "ledger.sqlite").write_bytes(flipped)
+        try:
+            known, faults = local(tmp_path).read("m"), [*local(tmp_path).damage()]
+        except TrapsError:
+            continue
+        if any(whole.get(key) != row for key, row in known.rows.items()) or (len(known.rows) < 3 and not faults):
+            silent.append(place)
+    assert silent == []
+
+
+def test_a_row_that_cannot_be_written_is_told_and_the_others_are_kept(tmp_path: Path) -> None:
+    ran = subprocess.run(
+        [sys.executable, "-c", FILL, str(tmp_path)], capture_output=True, check=True, text=True, cwd=ROOT
+    )
+    assert "ledger.sqlite: cannot be read or written" in ran.stdout and "run the same command again" in ran.stdout
+    stored = int(ran.stdout.splitlines()[0])
+    assert stored > 50
+    ledger = local(tmp_path)
+    assert [*ledger.read("m").rows] == [f"k{n}" for n in range(stored)]
+    write(ledger, answer("later", "left"))
+    assert len(ledger.read("m").rows) == stored + 1
+
+
+def test_a_ledger_in_a_folder_that_cannot_be_written_is_read() -> None:
+    folder = Path(tempfile.mkdtemp(dir="/tmp"))  # others may enter it, as they may not enter pytest's
+    write(local(folder), answer("a", "left"))
+    reading = """
+import os, sys
+from pathlib import Path
+from tests.build.ledger import local
+if os.geteuid() == 0:
+    os.setuid(65534)
+print(local(Path(sys.argv[1])).read("m").rows["a"]["text"])
+"""
+    folder.chmod(0o555)
+    ran = subprocess.run([sys.executable, "-c", reading, folder], capture_output=True, text=True, cwd=ROOT)
+    folder.chmod(0o755)
+    shutil.rmtree(folder)
+    assert ran.stdout == "left\n", ran.stderr
+
+
+def test_where_nothing_was_written_nothing_is_made(tmp_path: Path) -> None:
+    ledger = local(tmp_path / "none")
+    assert (ledger.read("m").rows, ledger.totals(), ledger.evaluations(), [*ledger.damage()]) == ({}, {}, [], [])
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_lock_of_a_run_whose_file_is_removed_lets_no_call_go(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with local(tmp_path).writing("m", print) as writer:
+            (tmp_path / "locks" / "answers-m.lock").unlink()
+            await writer.require()
+
+    with pytest.raises(TrapsError, match=r"answers-m\.lock: was removed while this run held it"):
+        asyncio.run(scenario())
+
+
+def test_two_evaluations_are_written_by_two_processes_at_the_same_time(place: Place) -> None:
+    with place.process(WRITE) as other:
+        assert other.stdout is not None and other.stdout.readline() == "k0\n"
+        write(place.open(), *(answer(f"n{n}", "left") for n in range(50)), evaluation="n")
+        assert other.poll() is None
+    assert len(place.open().read("n").rows) == 50

@@ -1,0 +1,407 @@
+"""The database of a study's ledger: transactions, named locks, and a thread in which calls share commits.
+
+Hundreds of calls are in flight at once, and each changes the database twice: before it is sent and when it is
+answered. So changes are put into a queue, and one thread applies all that wait there in one transaction. A change is
+done when its future is. What differs between SQLite and PostgreSQL is in the two modules beside this one.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from queue import Empty, SimpleQueue
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+
+from traps_pipeline.base.databases import reason_and_remedy
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.ledger.rows import AVERAGED, Totals
+from traps_pipeline.ledger.schema import (
+    EVALUATIONS,
+    METADATA,
+    RESERVATIONS,
+    ROWS,
+    SESSIONS,
+    SHARERS,
+    SPENT,
+    STUDIES,
+    TOTALS,
+)
+
+T = TypeVar("T")
+CENT = 1e-9  # below this, dollars are rounding
+BEAT_S = 0.5  # how often a process that holds something says so
+MOST_CHANGES = 1000  # of one transaction
+SHARE_S, SHARER_S = 2.0, 10.0  # how often a process says that it asks through an account, and how long that holds
+
+
+@dataclass
+class Batch:
+    """One transaction of the thread that commits, and the changes of rows and money that are written at its end."""
+
+    connection: sa.Connection
+    study: int
+    session: str
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    totals: dict[tuple[str, str], Totals] = field(default_factory=dict)
+    more_usd: dict[str, float] = field(default_factory=dict)
+    reservations: list[dict[str, Any]] = field(default_factory=list)
+    covered: dict[str, None] = field(default_factory=dict)  # reservations whose calls' rows are stored
+    _open: dict[str, float] = field(default_factory=dict)  # dollars by reservation, once `reserved` is read
+    _writers: dict[int, bool] = field(default_factory=dict)
+
+    @cached_property
+    def spent(self) -> dict[str, float]:
+        """Dollars spent for good, by participant; kept up to date by `spend`."""
+        query = sa.select(SPENT.c.participant, SPENT.c.usd).where(SPENT.c.study == self.study)
+        spent: dict[str, float] = {row.participant: row.usd for row in self.connection.execute(query)}
+        for participant, usd in self.more_usd.items():
+            spent[participant] = spent.get(participant, 0.0) + usd
+        return spent
+
+    @cached_property
+    def reserved(self) -> dict[str, float]:
+        """Dollars of reservations, by participant; kept up to date by those who add and remove them."""
+        query = sa.select(RESERVATIONS.c.id, RESERVATIONS.c.participant, RESERVATIONS.c.usd)
+        reserved = dict[str, float]()
+        for reservation, participant, usd in self.connection.execute(query.where(RESERVATIONS.c.study == self.study)):
+            if reservation not in self.covered:
+                self._open[reservation] = usd
+                reserved[participant] = reserved.get(participant, 0.0) + usd
+        return reserved
+
+    def spend(self, participant: str, usd: float) -> None:
+        """Count dollars as spent, or as spent no more."""
+        self.more_usd[participant] = self.more_usd.get(participant, 0.0) + usd
+        if "spent" in self.__dict__:
+            self.spent[participant] = self.spent.get(participant, 0.0) + usd
+
+    def reserve(self, reservation: str, participant: str, usd: float) -> None:
+        """Add a reservation."""
+        values = {"id": reservation, "study": self.study, "session": self.session}
+        self.reservations.append({**values, "participant": participant, "usd": usd})
+        self.reserved[participant] = self.reserved.get(participant, 0.0) + usd
+
+    def settle(self, reservation: str, participant: str, was_usd: float, usd: float) -> None:
+        """Put dollars into the place of a reservation's; none: remove it."""
+        its = RESERVATIONS.c.id == reservation
+        if usd > CENT:
+            self.connection.execute(sa.update(RESERVATIONS).where(its).values(usd=usd))
+        else:
+            self.connection.execute(sa.delete(RESERVATIONS).where(its))
+        if "reserved" in self.__dict__:
+            self._open[reservation] = max(usd, 0.0)
+            self.reserved[participant] = self.reserved.get(participant, 0.0) + max(usd, 0.0) - was_usd
+
+    def cover(self, participant: str, reservations: Sequence[str]) -> None:
+        """Remove the reservations of a call whose cost stands in its row now."""
+        self.covered |= dict.fromkeys(reservations)
+        if "reserved" in self.__dict__:
+            was_usd = sum(self._open.pop(reservation, 0.0) for reservation in reservations)
+            self.reserved[participant] = self.reserved.get(participant, 0.0) - was_usd
+
+    def is_writer(self, evaluation: int) -> bool:
+        """Return whether this session may add rows to an evaluation: another one may have taken its lock over."""
+        if evaluation not in self._writers:
+            query = sa.select(EVALUATIONS.c.writer).where(EVALUATIONS.c.id == evaluation)
+            self._writers[evaluation] = self.connection.execute(query).scalar() == self.session
+        return self._writers[evaluation]
+
+    def flush(self) -> None:
+        """Write what was collected."""
+        if self.rows:
+            self.connection.execute(sa.insert(ROWS), self.rows)
+        if self.reservations:
+            self.connection.execute(sa.insert(RESERVATIONS), self.reservations)
+        if self.covered:
+            gone = [{"gone": reservation} for reservation in self.covered]
+            self.connection.execute(sa.delete(RESERVATIONS).where(RESERVATIONS.c.id == sa.bindparam("gone")), gone)
+        for (kind, participant), its in self.totals.items():
+            self._add_totals(kind, participant, its)
+        for participant, usd in self.more_usd.items():
+            mine = {"of_study": self.study, "of_participant": participant}
+            if not self.connection.execute(_ADD_SPENT, {**mine, "more_usd": usd}).rowcount:
+                self.connection.execute(sa.insert(SPENT).values(study=self.study, participant=participant, usd=usd))
+
+    def _add_totals(self, kind: str, participant: str, its: Totals) -> None:
+        values: dict[str, float] = {"dollars": its.dollars, "failed": its.failed, "unknown": its.unknown}
+        for column in AVERAGED:
+            values[f"{column}_sum"], values[f"{column}_n"] = its.means.get(column, (0.0, 0))
+        mine = {"of_study": self.study, "of_kind": kind, "of_participant": participant}
+        more = {f"more_{name}": value for name, value in values.items()}
+        if not self.connection.execute(_ADD_TOTALS, {**mine, **more, "its_dearest": its.dearest}).rowcount:
+            new = {"study": self.study, "kind": kind, "participant": participant, "dearest": its.dearest}
+            self.connection.execute(sa.insert(TOTALS).values(**new, **values))
+
+
+def _adding(table: sa.Table, *columns: str) -> sa.Update:
+    """Return a statement that adds `more_COLUMN` to columns of the row whose key is given by `of_COLUMN`. It is made
+    once: SQLAlchemy takes longer to make such a statement than SQLite to execute it."""
+    key = [column == sa.bindparam(f"of_{column.name}") for column in table.primary_key]
+    more = {name: table.c[name] + sa.bindparam(f"more_{name}") for name in columns}
+    return sa.update(table).where(*key).values(more)
+
+
+_ADD_SPENT = _adding(SPENT, "usd")
+_DEAREST = sa.bindparam("its_dearest", type_=sa.Double)
+_ADD_TOTALS = _adding(
+    TOTALS, *("dollars", "failed", "unknown"), *(f"{column}_{what}" for column in AVERAGED for what in ("sum", "n"))
+).values(dearest=sa.case((TOTALS.c.dearest < _DEAREST, _DEAREST), else_=TOTALS.c.dearest))
+
+
+Change = Callable[[Batch], Any]
+
+
+@dataclass(frozen=True)
+class Lock:
+    """A named lock of this process. require(): raises TrapsError when it is not this process's any more. is_fresh():
+    whether that can be told at once, without asking a server, which may be away."""
+
+    release: Callable[[], None]
+    require: Callable[[], None]
+    is_fresh: Callable[[], bool] = lambda: True
+
+
+class Database(ABC):
+    """The ledger's database of one study, as this process uses it. Its methods may be called from any thread."""
+
+    def __init__(self, study: str) -> None:
+        self.study_name = study
+        self.session = ""  # while this process writes: a name for that, which none had before
+        self.study = 0  # the study's number, once there is one
+        self._queue: SimpleQueue[tuple[Change, Future[Any]] | None] = SimpleQueue()
+        self._users, self._guard, self._batch = 0, threading.Lock(), 0
+        self._thread: threading.Thread | None = None
+        self._session_lock: Lock | None = None
+        self.sharers: dict[str, int] = {}  # by account that is asked through: how many processes do so now
+
+    # --- what differs between databases -------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def place(self) -> str:
+        """Where the ledger is, for people; no password is in it."""
+
+    @abstractmethod
+    def exists(self) -> bool:
+        """Return whether there may be something to read."""
+
+    @abstractmethod
+    def read(self) -> sa.Connection:
+        """Return a connection for reading, which the caller closes. Raises TrapsError."""
+
+    @abstractmethod
+    def run(self, work: Callable[[sa.Connection], T]) -> T:
+        """Return what `work` returns, done in one transaction that writes; where a connection breaks it is done again.
+        Raises TrapsError."""
+
+    @abstractmethod
+    def try_lock(self, name: str) -> Lock | None:
+        """Take a named lock until this process ends; None while another session has it. Raises TrapsError."""
+
+    def now_s(self, connection: sa.Connection) -> float:
+        """Return the seconds since 1970 of a clock that all processes of the study share."""
+        return time.time()
+
+    @abstractmethod
+    def sync(self) -> None:
+        """Return when not even a power cut loses what was committed. Raises TrapsError."""
+
+    def faults(self) -> Iterator[str]:
+        """Yield sentences on what is wrong with the database itself, where it can look. Raises TrapsError."""
+        yield from ()
+
+    @abstractmethod
+    def beat(self) -> None:
+        """Do what keeps locks this process's, where they are lost otherwise. Raises TrapsError."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """Close what writing needed."""
+
+    # --- writing ------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Let this process write within the block: it has a session, and a thread that commits. Raises TrapsError."""
+        with self._guard:
+            if not self._users:
+                self._begin()
+            self._users += 1
+        try:
+            yield
+        finally:
+            with self._guard:
+                self._users -= 1
+                if not self._users:
+                    self._close()
+
+    def submit(self, change: Change) -> Future[Any]:
+        """Add a change to the next transaction; its future is done when that is committed. Within `writing`."""
+        future: Future[Any] = Future()
+        self._queue.put((change, future))
+        return future
+
+    def is_dead(self, session: str) -> bool:
+        """Return whether another process, by the id of its session, has ended. Raises TrapsError."""
+        if session == self.session:
+            return False
+        lock = self.try_lock(f"session-{session}")
+        if lock is not None:
+            lock.release()
+        return lock is not None
+
+    @contextmanager
+    def sharing(self, accounts: Collection[str]) -> Iterator[Callable[[str], int]]:
+        """Ask through these accounts within the block. The value tells how many processes do, this one among them, as
+        it was at the last beat. Raises TrapsError."""
+        with self.writing():
+            self.sharers |= dict.fromkeys(accounts, 1)
+            self.submit(self._share).result()
+            try:
+                yield lambda account: max(1, self.sharers.get(account, 1))
+            finally:
+                for account in accounts:
+                    self.sharers.pop(account, None)
+                self.submit(self._unshare).result()
+
+    def _share(self, batch: Batch) -> None:
+        """Say that this process asks through its accounts, and count who does."""
+        now_s = self.now_s(batch.connection)
+        self._unshare(batch)
+        for account in self.sharers:
+            batch.connection.execute(sa.insert(SHARERS).values(session=self.session, account=account, seen_s=now_s))
+        counts = sa.select(SHARERS.c.account, sa.func.count()).where(SHARERS.c.seen_s > now_s - SHARER_S)
+        for account, count in batch.connection.execute(counts.group_by(SHARERS.c.account)):
+            if account in self.sharers:
+                self.sharers[account] = count
+
+    def _unshare(self, batch: Batch) -> None:
+        gone = (SHARERS.c.session == self.session) | (SHARERS.c.seen_s < self.now_s(batch.connection) - SHARER_S)
+        batch.connection.execute(sa.delete(SHARERS).where(gone))
+
+    def _begin(self) -> None:
+        self.session = secrets.token_hex(8)
+        self.run(self._prepare)
+        self._session_lock = self.try_lock(f"session-{self.session}")
+        self._thread = threading.Thread(target=self._work, name="ledger", daemon=True)
+        self._thread.start()
+
+    def _prepare(self, connection: sa.Connection) -> None:
+        """Create missing tables, and the rows of the study and of this session."""
+        METADATA.create_all(connection)
+        self.study = (
+            self._study(connection)
+            or connection.execute(sa.insert(STUDIES).values(name=self.study_name).returning(STUDIES.c.id)).scalar_one()
+        )
+        if connection.execute(sa.select(SESSIONS.c.batch).where(SESSIONS.c.id == self.session)).scalar() is None:
+            connection.execute(sa.insert(SESSIONS).values(id=self.session, study=self.study, batch=self._batch))
+
+    def _study(self, connection: sa.Connection) -> int | None:
+        return connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.name == self.study_name)).scalar()
+
+    def _close(self) -> None:
+        self._queue.put(None)
+        assert self._thread is not None and self._session_lock is not None, "begun before it is closed"
+        self._thread.join()
+        try:
+            self.run(lambda connection: connection.execute(sa.delete(SESSIONS).where(SESSIONS.c.id == self.session)))
+        finally:
+            self._session_lock.release()
+            self.session, self._session_lock, self._batch = "", None, 0
+            self.end()
+
+    def _work(self) -> None:
+        """Commit what is in the queue, until it ends."""
+        shared_at = beaten_at = time.monotonic()
+        while True:
+            changes, is_last = list[tuple[Change, Future[Any]]](), False
+            try:
+                first = self._queue.get(timeout=BEAT_S)
+                while first is not None:
+                    if first[1].set_running_or_notify_cancel():
+                        changes.append(first)
+                    if len(changes) == MOST_CHANGES:
+                        break
+                    first = self._queue.get_nowait()
+                is_last = first is None
+            except Empty:
+                pass
+            if self.sharers and time.monotonic() - shared_at > SHARE_S:
+                shared_at = time.monotonic()
+                changes.append((self._share, Future()))
+            if changes:
+                self._commit(changes)
+            if is_last:
+                return
+            if time.monotonic() - beaten_at > BEAT_S:
+                beaten_at = time.monotonic()
+                with suppress(TrapsError):  # told to the next one who needs the database
+                    self.beat()
+
+    def _commit(self, changes: list[tuple[Change, Future[Any]]]) -> None:
+        """Apply changes in one transaction, and finish their futures. One that raises TrapsError changes nothing."""
+        number = self._batch + 1
+
+        def work(connection: sa.Connection) -> list[Any]:
+            connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.id == self.study).with_for_update())
+            mine = (SESSIONS.c.id == self.session) & (SESSIONS.c.batch == number - 1)
+            if not connection.execute(sa.update(SESSIONS).where(mine).values(batch=number)).rowcount and results:
+                return results  # committed before the connection broke
+            results.clear()
+            batch = Batch(connection, self.study, self.session)
+            for change, _ in changes:
+                try:
+                    results.append(change(batch))
+                except TrapsError as error:
+                    results.append(error)
+            batch.flush()
+            return results
+
+        results = list[Any]()
+        try:
+            self.run(work)
+            self._batch = number
+        except Exception as error:  # noqa: BLE001 - handed to those who wait for these changes
+            for _, future in changes:
+                future.set_exception(error)
+            return
+        for (_, future), result in zip(changes, results, strict=True):
+            if isinstance(result, Exception):
+                future.set_exception(result)
+            else:
+                future.set_result(result)
+
+
+def sentence(error: Exception, place: str) -> TrapsError:
+    """Return the error of a database as a sentence for people, without the statement and its values."""
+    reason, remedy, _ = reason_and_remedy(error)
+    return TrapsError(
+        f"{place}: cannot be read or written ({reason}); {remedy} and run the same command again: everything answered "
+        "before is kept, only what was in flight is asked again"
+    )
+
+
+def holder() -> str:
+    """Return this process and the time, for those who wait for it."""
+    return f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%H:%M:%S')}"
+
+
+def claim(batch: Batch, kind: str, name: str) -> int:
+    """Make this session the writer of an evaluation, whose lock it holds; the evaluation's number."""
+    mine = {"study": batch.study, "kind": kind, "name": name}
+    here = sa.and_(*(EVALUATIONS.c[column] == value for column, value in mine.items()))
+    values: Mapping[str, Any] = {"writer": batch.session, "holder": holder()}
+    if not batch.connection.execute(sa.update(EVALUATIONS).where(here).values(**values)).rowcount:
+        batch.connection.execute(sa.insert(EVALUATIONS).values(**mine, **values))
+    return batch.connection.execute(sa.select(EVALUATIONS.c.id).where(here)).scalar_one()

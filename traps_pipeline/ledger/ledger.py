@@ -1,0 +1,311 @@
+"""The ledger: a call is paid for once.
+
+Answers (and votes) are rows that are added as they come back, before anything counts them as done. An evaluation has
+one writer at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
+from itertools import islice
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy import exc
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.ledger.database import Batch, Database, Lock, claim, sentence
+from traps_pipeline.ledger.rows import (
+    ASIDES,
+    AVERAGED,
+    NOT_WHOLE,
+    Known,
+    Stored,
+    Totals,
+    digest_of,
+    encoded,
+    heal,
+    participant_of,
+    settles,
+)
+from traps_pipeline.ledger.schema import EVALUATIONS, ROWS, STUDIES, TOTALS
+
+LOCK_POLL_S = 0.1
+SYNC_S = 0.5  # how often rows are brought to the disk
+_KEYS = 500  # of one query: SQLite takes 32,766 values
+_FETCHED = 1000  # rows that are fetched together
+
+Waiting = Callable[[str], None]  # is told once who is waited for
+GiveUp = Callable[[], bool]  # whether to wait no longer
+
+
+def never() -> bool:
+    """Wait for ever."""
+    return False
+
+
+class LockGivenUp(Exception):
+    """Waiting for a lock was stopped."""
+
+
+class Ledger:
+    """Append-only rows by key, for each evaluation. kind: what the rows are, `answers` or `votes`."""
+
+    def __init__(self, database: Database, kind: str) -> None:
+        self.database, self.kind = database, kind
+
+    # --- reading ------------------------------------------------------------------------------------------------------
+
+    def read(self, evaluation: str, wanted: Collection[str] | None = None) -> Known:
+        """Return the rows of an evaluation, or of the wanted keys: no others are parsed or held in memory.
+
+        Of a key with several rows the newest counts, but no failure in the place of an answer. Rows that are not what
+        was written, and values that no table can hold, are noted and not believed. Raises TrapsError.
+        """
+        known = Known()
+        for place, row, note in self._parsed(evaluation, wanted):
+            if note:
+                known.notes[place] = note
+            if row is not None:
+                known.add(row)
+        return known
+
+    def reasoning(self, evaluation: str, wanted: Collection[str] | None = None) -> dict[str, str]:
+        """Return reasoning traces by key (of the wanted keys). Raises TrapsError."""
+        return {
+            row.key: row.reasoning.decode()
+            for row in self._rows(evaluation, wanted)
+            if row.reasoning is not None and _is_whole(row)
+        }
+
+    def rows(self, evaluation: str) -> Iterator[Stored]:
+        """Yield every row of an evaluation as it was written, the oldest first, and what stands beside it. Rows that
+        are not what was written are left out. Raises TrapsError."""
+        for row in self._rows(evaluation):
+            if _is_whole(row):
+                asides = {name: getattr(row, name) for name in ASIDES}
+                yield (
+                    json.loads(row.content),
+                    {name: text.decode() for name, text in asides.items() if text is not None},
+                )
+
+    def damage(self) -> Iterator[str]:
+        """Yield a sentence for each row that is not what was written, and for what the database finds wrong in itself.
+        Reads all. Raises TrapsError."""
+        if self.database.exists():
+            yield from self.database.faults()
+        for evaluation in self.evaluations():
+            for row in self._rows(evaluation):
+                if not _is_whole(row):
+                    yield f"{self._place(row)}: {NOT_WHOLE}, and not believed"
+
+    def evaluations(self) -> list[str]:
+        """Return the names of the evaluations that have rows. Raises TrapsError."""
+        has_rows = sa.exists().where(ROWS.c.evaluation == EVALUATIONS.c.id)
+        query = sa.select(EVALUATIONS.c.name).where(self._mine(EVALUATIONS), has_rows).order_by(EVALUATIONS.c.name)
+        return [row.name for row in self._select(query)]
+
+    def totals(self) -> dict[str, Totals]:
+        """Return what every row of every evaluation adds up to, by participant: repeated keys were paid for as well.
+        Raises TrapsError."""
+        totals = dict[str, Totals]()
+        for row in self._select(sa.select(TOTALS).where(self._mine(TOTALS))):
+            its = row._mapping
+            means = {name: (its[f"{name}_sum"], its[f"{name}_n"]) for name in AVERAGED if its[f"{name}_n"]}
+            totals[row.participant] = Totals(row.dollars, row.failed, row.dearest, row.unknown, means)
+        return totals
+
+    def _mine(self, table: sa.Table) -> sa.ColumnElement[bool]:
+        study = sa.select(STUDIES.c.id).where(STUDIES.c.name == self.database.study_name).scalar_subquery()
+        return (table.c.study == study) & (table.c.kind == self.kind)
+
+    def _select(self, query: sa.Select[Any]) -> Iterator[sa.Row[Any]]:
+        """Yield the rows of a query; none where nothing was ever written."""
+        if not self.database.exists():
+            return
+        with self.database.read() as connection:
+            try:
+                yield from connection.execution_options(yield_per=_FETCHED).execute(query)
+            except (exc.OperationalError, exc.ProgrammingError) as error:
+                if not sa.inspect(connection.engine).has_table(STUDIES.name):
+                    return
+                raise sentence(error, self.database.place) from error
+            except exc.DBAPIError as error:
+                raise sentence(error, self.database.place) from error
+
+    def _rows(self, evaluation: str, wanted: Collection[str] | None = None) -> Iterator[sa.Row[Any]]:
+        ids = sa.select(EVALUATIONS.c.id).where(self._mine(EVALUATIONS), EVALUATIONS.c.name == evaluation)
+        query = sa.select(ROWS).where(ROWS.c.evaluation == ids.scalar_subquery()).order_by(ROWS.c.id)
+        if wanted is None:
+            yield from self._select(query)
+            return
+        keys = iter(wanted)
+        while some := [*islice(keys, _KEYS)]:
+            yield from self._select(query.where(ROWS.c.key.in_(some)))
+
+    def _parsed(
+        self, evaluation: str, wanted: Collection[str] | None
+    ) -> Iterator[tuple[str, dict[str, Any] | None, str | None]]:
+        """Yield the place of each row, the row, and what is to be said of it."""
+        for stored in self._rows(evaluation, wanted):
+            if not _is_whole(stored):
+                yield self._place(stored), None, f"{NOT_WHOLE}: it is not believed; its answer is asked again"
+                continue
+            row = json.loads(stored.content)
+            healed = heal(row)
+            yield (
+                self._place(stored),
+                row,
+                f"{', '.join(healed)}: no possible value, counted as unknown" if healed else None,
+            )
+
+    def _place(self, row: sa.Row[Any]) -> str:
+        return f"{self.database.place}: row {row.id}"
+
+    # --- writing ------------------------------------------------------------------------------------------------------
+
+    @asynccontextmanager
+    async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = never) -> AsyncIterator[Writer]:
+        """Be the one writer of an evaluation. While another one is, wait and say once who it is.
+
+        Raises LockGivenUp when `give_up` says so while waiting, and TrapsError.
+        """
+        with self.database.writing():
+            lock = await self._lock(evaluation, waiting, give_up)
+            try:
+                number = await asyncio.wrap_future(
+                    self.database.submit(partial(claim, kind=self.kind, name=evaluation))
+                )
+                yield Writer(self.database, self.kind, number, lock)
+            finally:
+                lock.release()
+
+    async def store(self, rows: Mapping[str, Sequence[Stored]], waiting: Waiting) -> int:
+        """Add rows of evaluations whose keys are not settled, all of them or none; the number of those that settle a
+        key. Nobody else writes to these evaluations meanwhile. Raises TrapsError."""
+        async with AsyncExitStack() as stack:
+            writers = {name: await stack.enter_async_context(self.writing(name, waiting)) for name in sorted(rows)}
+            new = {
+                name: [stored for stored in rows[name] if stored[0]["key"] not in known]
+                for name in writers
+                if (known := self.read(name, {row["key"] for row, _ in rows[name]}).settled) is not None
+            }
+            contents = [(writers[name], _Content.of(*stored)) for name in new for stored in new[name]]
+
+            def change(batch: Batch) -> None:
+                for writer, content in contents:
+                    writer.add(batch, content, ())
+
+            await asyncio.wrap_future(self.database.submit(change))
+            await asyncio.to_thread(self.database.sync)
+        return sum(settles(row) for mine in new.values() for row, _ in mine)
+
+    async def _lock(self, evaluation: str, waiting: Waiting, give_up: GiveUp) -> Lock:
+        is_told = False
+        while (lock := await asyncio.to_thread(self.database.try_lock, f"{self.kind}-{evaluation}")) is None:
+            if not is_told:
+                waiting(
+                    f"{self.kind} of {evaluation} are being asked by {self._holder(evaluation)}; "
+                    "waiting for it to finish"
+                )
+                is_told = True
+            if give_up():
+                raise LockGivenUp(evaluation)
+            await asyncio.sleep(LOCK_POLL_S)
+        return lock
+
+    def _holder(self, evaluation: str) -> str:
+        query = sa.select(EVALUATIONS.c.holder).where(self._mine(EVALUATIONS), EVALUATIONS.c.name == evaluation)
+        return next((row.holder for row in self._select(query) if row.holder), "another process")
+
+
+class _Content:
+    """A row as it is stored, encoded where it is added and not in the thread that commits."""
+
+    def __init__(self, row: Mapping[str, Any], content: bytes, asides: Mapping[str, bytes]) -> None:
+        self.row, self.content, self.asides = row, content, asides
+
+    @classmethod
+    def of(cls, row: Mapping[str, Any], beside: Mapping[str, str] | None) -> _Content:
+        """Raises ValueError for a row that JSON cannot hold."""
+        asides = {name: text.encode("utf-8", "replace") for name, text in (beside or {}).items()}
+        return cls(row, encoded(row), asides)
+
+    def values(self, evaluation: int) -> dict[str, Any]:
+        asides = {name: self.asides.get(name) for name in ASIDES}
+        digest = digest_of(self.content, asides["reasoning"], asides["raw"])
+        return {"evaluation": evaluation, "key": self.row["key"], "content": self.content, "digest": digest, **asides}
+
+
+class Writer:
+    """Adds rows to an evaluation, while nobody else does."""
+
+    def __init__(self, database: Database, kind: str, evaluation: int, lock: Lock) -> None:
+        self._database, self._kind, self._evaluation, self._lock = database, kind, evaluation, lock
+        self._is_synced = True
+
+    async def require(self) -> None:
+        """Return if another call may be sent. Raises TrapsError when this writer is not the evaluation's any more."""
+        if self._lock.is_fresh():
+            self._lock.require()
+        else:  # calls in flight must not wait for a server that is away
+            await asyncio.to_thread(self._lock.require)
+
+    async def write(
+        self, row: Mapping[str, Any], beside: Mapping[str, str] | None = None, paid_by: Sequence[str] = ()
+    ) -> None:
+        """Add a row, what is kept beside it by name in ASIDES, and its cost to what was spent; return when no kill of
+        this process loses them.
+
+        paid_by: reservations that the row's cost takes the place of. Raises TrapsError when nothing was stored, and
+        ValueError for a row that JSON cannot hold.
+        """
+        content = _Content.of(row, beside)
+        stored = self._database.submit(lambda batch: self.add(batch, content, paid_by))
+        await asyncio.shield(asyncio.wrap_future(stored))  # what was paid for is stored, whoever is cancelled
+        self._is_synced = False
+
+    async def write_all(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Add rows as `write` does, many in one transaction."""
+        pending = iter(rows)
+        while some := [_Content.of(row, None) for row in islice(pending, _FETCHED)]:
+
+            def change(batch: Batch, some: Sequence[_Content] = some) -> None:
+                for content in some:
+                    self.add(batch, content, ())
+
+            await asyncio.wrap_future(self._database.submit(change))
+        self._is_synced = False
+
+    def add(self, batch: Batch, content: _Content, paid_by: Sequence[str]) -> None:
+        """Add a row to a transaction. Raises TrapsError where another process writes this evaluation now."""
+        if not batch.is_writer(self._evaluation):
+            raise TrapsError(
+                f"{self._database.place}: another process has begun to ask the same calls, since this one was away; "
+                "nothing more is sent. Run the same command again when the other one has ended"
+            )
+        batch.rows.append(content.values(self._evaluation))
+        participant = participant_of(content.row)
+        its = batch.totals.setdefault((self._kind, participant), Totals())
+        before = its.dollars
+        its.add(content.row)
+        if its.dollars > before:
+            batch.spend(participant, its.dollars - before)
+        batch.cover(participant, paid_by)
+
+    async def sync(self) -> None:
+        """Bring what was written to the disk. Raises TrapsError."""
+        if not self._is_synced:
+            self._is_synced = True
+            await asyncio.to_thread(self._database.sync)
+
+
+def _is_whole(row: sa.Row[Any]) -> bool:
+    try:
+        return digest_of(row.content, row.reasoning, row.raw) == row.digest
+    except TypeError:  # a flipped bit can make another kind of value of a column
+        return False

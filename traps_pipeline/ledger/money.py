@@ -1,0 +1,158 @@
+"""A study's money: what was spent, what calls in flight may cost, and what a person gave back.
+
+A call's worst case is reserved before it is sent. The reservation goes when the row of the call is stored, in the same
+transaction. One whose process dies stays, and counts as spent for good, until a person releases it.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import sqlalchemy as sa
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.ledger.database import CENT, Batch, Database
+from traps_pipeline.ledger.schema import RELEASES, RESERVATIONS, TOTALS
+
+
+@dataclass(frozen=True)
+class Full:
+    """Why a call was not reserved. slot: the participant whose cap leaves no room, None for the study's; taken_usd: of
+    that cap, spent and reserved; others: sessions of other processes that hold reservations."""
+
+    slot: str | None
+    taken_usd: float
+    others: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Releasable:
+    """Dollars of a participant that may be released. in_flight: of calls whose process died; failed: of calls that
+    came to nothing, as their rows have it."""
+
+    in_flight: float
+    failed: float
+
+
+class Money:
+    """The money of one study. Used within `Database.writing`; raises TrapsError."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def reserve(self, participant: str, usd: float, caps: Mapping[str | None, float]) -> Future[str | Full]:
+        """Reserve dollars if every cap that counts leaves room; the reservation's id. caps: of each participant that
+        has one, and of the study (None)."""
+        reservation = secrets.token_hex(8)
+        slots = [slot for slot in (None, participant) if slot in caps]
+
+        def change(batch: Batch) -> str | Full:
+            for slot in slots:
+                taken = sum(sum(_of(its, slot)) for its in (batch.spent, batch.reserved))
+                if caps[slot] - taken < usd - CENT:
+                    return Full(slot, taken, _others(batch))
+            batch.reserve(reservation, participant, usd)
+            return reservation
+
+        return self._database.submit(change)
+
+    def forget(self, pending: Future[str | Full], participant: str, usd: float) -> None:
+        """Remove a reservation that nobody waits for any more, if it was made."""
+        if not pending.cancelled() and pending.exception() is None and isinstance(pending.result(), str):
+            self.settle(str(pending.result()), participant, usd, 0.0)
+
+    def settle(self, reservation: str, participant: str, was_usd: float, usd: float) -> Future[None]:
+        """Put what a call costs into the place of its worst case, until the row of the call is stored."""
+        return self._database.submit(lambda batch: batch.settle(reservation, participant, was_usd, usd))
+
+    def spent(self) -> dict[str, float]:
+        """Return dollars by participant: what rows cost, and what calls in flight may."""
+
+        def change(batch: Batch) -> dict[str, float]:
+            return {
+                name: batch.spent.get(name, 0.0) + batch.reserved.get(name, 0.0)
+                for name in {*batch.spent, *batch.reserved}
+            }
+
+        return self._database.submit(change).result()
+
+    def is_any_alive(self, sessions: Iterable[str]) -> bool:
+        """Return whether any of these sessions goes on, so that its calls may turn out to cost less."""
+        return any(not self._database.is_dead(session) for session in sessions)
+
+    def releasable(self) -> dict[str, Releasable]:
+        """Return what may be released, by participant."""
+        return self._database.submit(self._releasable).result()
+
+    def release(self, participant: str, usd: float | None, why: str, by: str, at: str) -> float:
+        """Release dollars of a participant (None: all of its calls in flight) and record it; how many. Raises
+        TrapsError where less is booked for calls that may never have left."""
+
+        def change(batch: Batch) -> float:
+            room = self._releasable(batch).get(participant, Releasable(0.0, 0.0))
+            most = room.in_flight + room.failed
+            dollars = room.in_flight if usd is None else usd
+            if not CENT < dollars <= most + CENT:
+                raise TrapsError(
+                    f"{participant}: ${dollars:.4f} cannot be released: ${room.in_flight:.4f} are booked for calls in "
+                    f"flight when a process died and ${room.failed:.4f} for failed ones; give --usd with at most "
+                    f"{most:.4f}, or a participant that `traps ledger release` lists"
+                )
+            in_flight = min(dollars, room.in_flight)
+            failed = min(dollars, most) - in_flight
+            self._reduce(batch, participant, in_flight)
+            batch.spend(participant, -failed)
+            values = {"study": batch.study, "participant": participant, "in_flight": in_flight, "failed": failed}
+            batch.connection.execute(sa.insert(RELEASES).values(**values, why=why, by=by, at=at))
+            return in_flight + failed
+
+        return self._database.submit(change).result()
+
+    def releases(self) -> list[Mapping[str, object]]:
+        """Return the records of what was released, the oldest first."""
+        query = sa.select(RELEASES).order_by(RELEASES.c.id)
+        return self._database.submit(
+            lambda batch: [
+                dict(row) for row in batch.connection.execute(query.where(RELEASES.c.study == batch.study)).mappings()
+            ]
+        ).result()
+
+    def _dead(self, batch: Batch) -> set[str]:
+        return {session for session in _others(batch) if self._database.is_dead(session)}
+
+    def _releasable(self, batch: Batch) -> dict[str, Releasable]:
+        dead, in_flight, failed = self._dead(batch), defaultdict[str, float](float), defaultdict[str, float](float)
+        query = sa.select(RESERVATIONS).where(RESERVATIONS.c.study == batch.study, RESERVATIONS.c.session.in_(dead))
+        for row in batch.connection.execute(query):
+            in_flight[row.participant] += row.usd
+        for row in batch.connection.execute(sa.select(TOTALS).where(TOTALS.c.study == batch.study)):
+            failed[row.participant] += row.failed
+        for row in batch.connection.execute(sa.select(RELEASES).where(RELEASES.c.study == batch.study)):
+            failed[row.participant] -= row.failed
+        rooms = {name: Releasable(in_flight[name], max(0.0, failed[name])) for name in sorted({*in_flight, *failed})}
+        return {name: room for name, room in rooms.items() if room.in_flight + room.failed > CENT}
+
+    def _reduce(self, batch: Batch, participant: str, usd: float) -> None:
+        """Take dollars from the reservations of calls whose process died."""
+        query = sa.select(RESERVATIONS).where(
+            RESERVATIONS.c.study == batch.study,
+            RESERVATIONS.c.participant == participant,
+            RESERVATIONS.c.session.in_(self._dead(batch)),
+        )
+        for row in batch.connection.execute(query.order_by(RESERVATIONS.c.id)).all():
+            rest = max(0.0, row.usd - usd)
+            usd -= row.usd - rest
+            batch.settle(row.id, participant, row.usd, rest)
+
+
+def _of(dollars: Mapping[str, float], slot: str | None) -> list[float]:
+    return [*dollars.values()] if slot is None else [dollars.get(slot, 0.0)]
+
+
+def _others(batch: Batch) -> frozenset[str]:
+    query = sa.select(RESERVATIONS.c.session).where(RESERVATIONS.c.study == batch.study).distinct()
+    return frozenset({*batch.connection.execute(query).scalars()} - {batch.session})

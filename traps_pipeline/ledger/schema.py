@@ -1,0 +1,114 @@
+"""The tables of the ledger, the same in SQLite and PostgreSQL.
+
+Money moves in the transaction of the row that it pays for: a call's worst case is a row of `reservations` before the
+call is sent, and the transaction that stores its answer deletes that row and adds the cost to `spent`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import sqlalchemy as sa
+
+from traps_pipeline.ledger.rows import AVERAGED
+
+METADATA = sa.MetaData()
+
+
+def _study(**options: Any) -> sa.Column[int]:
+    return sa.Column("study", sa.Integer, sa.ForeignKey("traps_studies.id"), **options)
+
+
+STUDIES = sa.Table(
+    "traps_studies",
+    METADATA,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("name", sa.Text, nullable=False, unique=True),
+)
+# batch: the number of the last transaction of a session, so that one which is repeated after a lost connection is
+# not applied twice.
+SESSIONS = sa.Table(
+    "traps_sessions",
+    METADATA,
+    sa.Column("id", sa.Text, primary_key=True),
+    _study(nullable=False),
+    sa.Column("batch", sa.BigInteger, nullable=False, default=0),
+)
+# writer: the session that may add rows; a transaction of another one is refused. holder: for people.
+EVALUATIONS = sa.Table(
+    "traps_evaluations",
+    METADATA,
+    sa.Column("id", sa.Integer, primary_key=True),
+    _study(nullable=False),
+    sa.Column("kind", sa.Text, nullable=False),
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("writer", sa.Text),
+    sa.Column("holder", sa.Text),
+    sa.UniqueConstraint("study", "kind", "name"),
+)
+ROWS = sa.Table(
+    "traps_rows",
+    METADATA,
+    sa.Column("id", sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True),
+    sa.Column("evaluation", sa.Integer, sa.ForeignKey("traps_evaluations.id"), nullable=False),
+    sa.Column("key", sa.Text, nullable=False),
+    sa.Column("content", sa.LargeBinary, nullable=False),
+    sa.Column("digest", sa.LargeBinary, nullable=False),
+    sa.Column("reasoning", sa.LargeBinary),
+    sa.Column("raw", sa.LargeBinary),
+    sa.Index("traps_rows_key", "evaluation", "key"),
+)
+TOTALS = sa.Table(
+    "traps_totals",
+    METADATA,
+    _study(primary_key=True),
+    sa.Column("kind", sa.Text, primary_key=True),
+    sa.Column("participant", sa.Text, primary_key=True),
+    sa.Column("dollars", sa.Double, nullable=False),
+    sa.Column("failed", sa.Double, nullable=False),
+    sa.Column("dearest", sa.Double, nullable=False),
+    sa.Column("unknown", sa.Integer, nullable=False),
+    *(
+        sa.Column(f"{column}_{what}", kind, nullable=False)
+        for column in AVERAGED
+        for what, kind in (("sum", sa.Double()), ("n", sa.BigInteger()))
+    ),
+)
+SPENT = sa.Table(
+    "traps_spent",
+    METADATA,
+    _study(primary_key=True),
+    sa.Column("participant", sa.Text, primary_key=True),
+    sa.Column("usd", sa.Double, nullable=False),
+)
+# Those of a session that ended count as spent for good, until a person releases them.
+RESERVATIONS = sa.Table(
+    "traps_reservations",
+    METADATA,
+    sa.Column("id", sa.Text, primary_key=True),
+    _study(nullable=False, index=True),
+    sa.Column("session", sa.Text, nullable=False),
+    sa.Column("participant", sa.Text, nullable=False),
+    sa.Column("usd", sa.Double, nullable=False),
+)
+# in_flight and failed: dollars given back of calls whose process died, and of failed calls.
+RELEASES = sa.Table(
+    "traps_releases",
+    METADATA,
+    sa.Column("id", sa.Integer, primary_key=True),
+    _study(nullable=False),
+    sa.Column("participant", sa.Text, nullable=False),
+    sa.Column("in_flight", sa.Double, nullable=False),
+    sa.Column("failed", sa.Double, nullable=False),
+    sa.Column("why", sa.Text, nullable=False),
+    sa.Column("by", sa.Text, nullable=False),
+    sa.Column("at", sa.Text, nullable=False),
+)
+# Which sessions ask through an account; each says so anew every second or so (`seen_s`, seconds since 1970).
+SHARERS = sa.Table(
+    "traps_sharers",
+    METADATA,
+    sa.Column("session", sa.Text, primary_key=True),
+    sa.Column("account", sa.Text, primary_key=True),
+    sa.Column("seen_s", sa.Double, nullable=False),
+)

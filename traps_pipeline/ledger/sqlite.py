@@ -1,0 +1,145 @@
+"""The ledger of one machine: a SQLite file in the study's folder, with locks that the kernel frees with their process.
+
+What was committed survives a kill of the process at once, and a power cut from the next `sync` on. The file must lie on
+a disk of the machine itself: SQLite's log does not work over a network.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import quote
+
+import sqlalchemy as sa
+from sqlalchemy import event, exc
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.files import remedy, require_in_place, sync_folder, try_lock
+from traps_pipeline.ledger.database import Database, Lock, sentence
+
+T = TypeVar("T")
+FILE = "ledger.sqlite"
+WAIT_S = 600.0  # for another process's transaction, on however slow a disk
+
+
+class SqliteDatabase(Database):
+    """The ledger in a folder. folder: made when something is written."""
+
+    def __init__(self, folder: Path, study: str, file: str = FILE) -> None:
+        super().__init__(study)
+        self.folder, self.path = folder, folder / file
+        self._connection: sa.Connection | None = None
+        self._transaction = threading.RLock()
+        self._engine = sa.create_engine("sqlite://", creator=self._open, poolclass=sa.NullPool)
+        event.listen(self._engine, "begin", _begin)
+
+    @property
+    def place(self) -> str:
+        """See `Database.place`."""
+        return str(self.path)
+
+    def exists(self) -> bool:
+        """See `Database.exists`."""
+        return self.path.is_file()
+
+    def _open(self) -> sqlite3.Connection:
+        # A folder that cannot be written holds a file that nobody changes, and SQLite could not make its log there.
+        is_fixed = self.path.exists() and not os.access(self.folder, os.W_OK)
+        # A log there is of a process that was killed: what it holds was committed, and `immutable` would not read it.
+        how = "mode=ro" if self.path.with_name(f"{self.path.name}-wal").exists() else "immutable=1"
+        uri = f"file:{quote(str(self.path))}" + (f"?{how}" if is_fixed else "")
+        connection = sqlite3.connect(uri, uri=True, timeout=WAIT_S, isolation_level=None, check_same_thread=False)
+        if not is_fixed:
+            connection.execute("pragma journal_mode=wal")
+            connection.execute("pragma synchronous=normal")
+        return connection
+
+    def read(self) -> sa.Connection:
+        """See `Database.read`."""
+        try:
+            return self._engine.connect().execution_options(is_reading=True)
+        except exc.DBAPIError as error:
+            raise sentence(error, self.place) from error
+
+    def run(self, work: Callable[[sa.Connection], T]) -> T:
+        """See `Database.run`."""
+        with self._transaction:
+            try:
+                if self._connection is None:
+                    self.folder.mkdir(parents=True, exist_ok=True)
+                    self._connection = self._engine.connect()
+                with self._connection.begin():
+                    return work(self._connection)
+            except (exc.DBAPIError, sqlite3.Error) as error:
+                self.end()
+                raise sentence(error, self.place) from error
+            except OSError as error:
+                raise TrapsError(f"{self.path}: cannot be written ({error.strerror}); {remedy(error)}") from error
+
+    def try_lock(self, name: str) -> Lock | None:
+        """See `Database.try_lock`. A lock on a file."""
+        path = self.folder / "locks" / f"{name}.lock"
+        try:
+            descriptor = try_lock(path)
+        except OSError as error:
+            raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
+        if descriptor is None:
+            return None
+
+        def release() -> None:
+            with suppress(OSError):
+                path.unlink()  # first: a process that opened it meanwhile sees that its lock is on no file any more
+            os.close(descriptor)
+
+        return Lock(release, lambda: require_in_place(descriptor, path))
+
+    def sync(self) -> None:
+        """See `Database.sync`. SQLite syncs its log when it is copied into the file; here that is done before.
+
+        The file itself must not be opened here: closing it would give up the locks by which SQLite tells other
+        processes that this one uses the log, and the next one that ends would remove it.
+        """
+        path = self.path.with_name(f"{self.path.name}-wal")
+        try:
+            with path.open("rb") as log:
+                os.fsync(log.fileno())
+            sync_folder(self.folder)
+        except FileNotFoundError:
+            return  # all of it was copied into the file, which SQLite syncs
+        except OSError as error:
+            raise TrapsError(f"{path}: could not be written ({error.strerror}); {remedy(error)}") from error
+
+    def faults(self) -> Iterator[str]:
+        """See `Database.faults`: SQLite's own check, which finds rows that its index has and the table does not."""
+        with self.read() as connection:
+            try:
+                for (fault,) in connection.exec_driver_sql("pragma integrity_check(5)"):
+                    if fault != "ok":
+                        yield f"{self.path}: {fault}; export what can be read (`traps answers export`) and begin anew"
+            except exc.DBAPIError as error:
+                raise sentence(error, self.place) from error
+
+    def beat(self) -> None:
+        """See `Database.beat`. The kernel keeps them."""
+
+    def end(self) -> None:
+        """See `Database.end`."""
+        with self._transaction:
+            if self._connection is not None:
+                with suppress(exc.SQLAlchemyError, sqlite3.Error):
+                    self._connection.close()
+                self._connection = None
+
+
+def _begin(connection: sa.Connection) -> None:
+    """Begin a transaction as SQLite does by itself, or at once with the right to write, so that none is refused later.
+
+    The driver's own way to begin is switched off (`isolation_level=None`): it would begin only before a change.
+    """
+    options: Any = connection.get_execution_options()
+    connection.exec_driver_sql("begin" if options.get("is_reading") else "begin immediate")

@@ -1,0 +1,97 @@
+"""A ledger moved as it is: into a file, from a file, or into the database of several hosts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.ledger.database import Batch, Database
+from traps_pipeline.ledger.ledger import Ledger
+from traps_pipeline.ledger.schema import EVALUATIONS, RELEASES, RESERVATIONS, ROWS, SPENT, STUDIES, TOTALS
+from traps_pipeline.ledger.sqlite import SqliteDatabase
+
+KINDS = ("answers", "votes")
+_FETCHED = 1000
+
+
+def export_ledger(ledger: Database, file: Path) -> int:
+    """Write a ledger to a file (SQLite), which must not exist; the number of rows. Raises TrapsError."""
+    if file.exists():
+        raise TrapsError(f"{file}: is there already; name another file")
+    return copy_ledger(ledger, SqliteDatabase(file.parent, ledger.study_name, file.name))
+
+
+def import_ledger(file: Path, ledger: Database) -> int:
+    """Read the ledger of a file into a study that has none; the number of rows. Raises TrapsError."""
+    if not file.is_file():
+        raise TrapsError(f"{file}: no such file; name one that `traps ledger export` wrote")
+    source = SqliteDatabase(file.parent, "", file.name)
+    with source.read() as connection:
+        names = [*connection.execute(sa.select(STUDIES.c.name)).scalars()]
+    if len(names) != 1:
+        raise TrapsError(
+            f"{file}: holds {len(names)} studies, and not one; name a file that `traps ledger export` wrote"
+        )
+    source.study_name = names[0]
+    return copy_ledger(source, ledger)
+
+
+def copy_ledger(source: Database, target: Database, settle: Callable[[], None] = lambda: None) -> int:
+    """Copy rows and money as they are, all or none, while nobody writes to the source; the number of rows.
+
+    settle: called when all is there, before anybody else may write. Raises TrapsError, also where the target has rows.
+    """
+    with ExitStack() as opened:
+        opened.enter_context(target.writing())
+        for kind in KINDS:
+            for evaluation in Ledger(source, kind).evaluations():
+                lock = source.try_lock(f"{kind}-{evaluation}")
+                if lock is None:
+                    raise TrapsError(
+                        f"{source.place}: {kind} of {evaluation} are being asked; wait until that run ends, then run "
+                        "the same command again"
+                    )
+                opened.callback(lock.release)
+        count = target.submit(lambda batch: _copy(source, batch, target.place)).result()
+        target.sync()
+        settle()
+    return count
+
+
+def _copy(source: Database, batch: Batch, place: str) -> int:
+    mine = sa.select(EVALUATIONS.c.id).where(EVALUATIONS.c.study == batch.study)
+    if batch.connection.execute(sa.select(ROWS.c.id).where(ROWS.c.evaluation.in_(mine)).limit(1)).first():
+        raise TrapsError(
+            f"{place}: holds rows of this study already; bring answers into it with `traps answers export` and "
+            "`traps answers import`"
+        )
+    # Those that were opened and got no row would be in the way of the source's.
+    batch.connection.execute(sa.delete(EVALUATIONS).where(EVALUATIONS.c.study == batch.study))
+    count = 0
+    if not source.exists():
+        return count
+    with source.read() as connection:
+        study = connection.execute(sa.select(STUDIES.c.id).where(STUDIES.c.name == source.study_name)).scalar()
+        for evaluation in connection.execute(sa.select(EVALUATIONS).where(EVALUATIONS.c.study == study)).all():
+            values = {"study": batch.study, "kind": evaluation.kind, "name": evaluation.name}
+            insert = sa.insert(EVALUATIONS).values(**values).returning(EVALUATIONS.c.id)
+            number = batch.connection.execute(insert).scalar_one()
+            query = sa.select(ROWS).where(ROWS.c.evaluation == evaluation.id).order_by(ROWS.c.id)
+            for rows in _some(connection, query, "id"):
+                batch.connection.execute(sa.insert(ROWS), [row | {"evaluation": number} for row in rows])
+                count += len(rows)
+        for table, left_out in ((TOTALS, ()), (SPENT, ()), (RELEASES, ("id",)), (RESERVATIONS, ())):
+            for rows in _some(connection, sa.select(table).where(table.c.study == study), *left_out):
+                batch.connection.execute(sa.insert(table), [row | {"study": batch.study} for row in rows])
+    return count
+
+
+def _some(connection: sa.Connection, query: sa.Select[Any], *left_out: str) -> Iterator[list[dict[str, Any]]]:
+    result = connection.execution_options(yield_per=_FETCHED).execute(query)
+    for rows in result.mappings().partitions():
+        yield [{name: value for name, value in row.items() if name not in left_out} for row in rows]
