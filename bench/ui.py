@@ -93,6 +93,9 @@ def study(folder: Path, cells: int, shared: dict[str, str] | None) -> dict[str, 
     } | (shared or {})  # fmt: skip
     command = [sys.executable, "-m", "traps_pipeline.cli", "init", str(folder / "many.yaml")]
     said = subprocess.run(command, cwd=ROOT, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
+    if shared:  # what `traps ui` exports
+        url = shared["TRAPS_DATABASE"].replace("postgresql:", "postgresql+psycopg2:")
+        environment |= {"TRAPS_HISTORY": url, "TRAPS_LOGS": str(folder / "logs")}
     return environment | {"DAGSTER_HOME": said.partition("DAGSTER_HOME=")[2].strip()}
 
 

@@ -101,7 +101,7 @@ def test_a_run_that_waits_for_a_host_goes_on_waiting_and_one_that_waits_for_noth
             "cluster.launcher",
             cluster.start_head,
         )
-        from ray.job_submission import JobSubmissionClient
+        from ray.job_submission import JobSubmissionClient  # pyright: ignore[reportMissingImports]
 
         client = JobSubmissionClient(launcher.address)
         client.submit_job(submission_id=f"dagster-run-{ended.run_id}", entrypoint="false")  # takes no CPU

@@ -27,7 +27,7 @@ from traps_pipeline.benchmark.videos import CLIPS
 from traps_pipeline.cluster.history import HISTORY, LOGS, dagster_yaml, export
 from traps_pipeline.cluster.node import REFUSED_TAG
 from traps_pipeline.cluster.ray_runs import RayRuns, require_cluster
-from traps_pipeline.cluster.requests import REQUEST_TAG, Request, start_requested_runs, submit
+from traps_pipeline.cluster.requests import REQUEST_TAG, start_requested_runs, submit
 from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, own_tags
 from traps_pipeline.cluster.same_code import code_here, installed, require_same_code
 from traps_pipeline.defs import benchmark
@@ -177,8 +177,8 @@ def test_a_host_with_other_code_refuses_a_run_and_names_both() -> None:
     require_same_code(code_here(), "lab")
     require_same_code("", "lab")  # a run of this host's own
     theirs = json.loads(code_here())
-    theirs["files"]["assets"], theirs["versions"]["numpy"], theirs["versions"]["numba"] = "0123", "1.0", "9"
-    del theirs["versions"]["mujoco"]  # which it does not have: what only one of them has is not compared
+    theirs |= {"files of assets": "0123", "numpy": "1.0", "numba": "9"}
+    del theirs["mujoco"]  # which it does not have: what only one of them has is not compared
     with pytest.raises(
         TrapsError, match=rf"^the host .* has other code .* of the study lab: files of assets \w+ here and 0123 there, "
         rf"numpy {installed()['numpy']} here and 1\.0 there\. Install",
@@ -254,15 +254,15 @@ def test_a_run_that_is_asked_for_is_created_once_for_its_own_study(
     monkeypatch.setenv("TRAPS_WORKSPACE", str(Workspace.create(tmp_path / "study", Study(name="lab")).root))
     stages = [SCENE_SPECS.name, VIDEOS.name]
     with dg.DagsterInstance.ephemeral() as instance:
-        submit(instance, "another", Request(stages, {}))
-        name = submit(instance, "lab", Request(stages, {"traps/make": "stale", **range_tags(("dominoes", "plinko"))}))
+        submit(instance, "another", stages, {})
+        name = submit(instance, "lab", stages, {"traps/make": "stale", **range_tags(("dominoes", "plinko"))})
         with dg.build_sensor_context(instance) as context:
             first = start_requested_runs(context)
         assert isinstance(first, dg.SensorResult)
         with dg.build_sensor_context(instance, cursor=first.cursor) as context:
             second = start_requested_runs(context)
     assert isinstance(second, dg.SensorResult)
-    (request,) = first.run_requests or ()
+    (request,) = first.run_requests or []
     assert request.run_key == request.tags[REQUEST_TAG] == name
     assert request.asset_selection == [asset_key(stage) for stage in stages]
     assert request.tags["dagster/asset_partition_range_end"] == "plinko" and request.tags["traps/make"] == "stale"
@@ -336,7 +336,7 @@ def test_a_run_that_breaks_off_is_made_once_more_and_then_told(
 def test_a_run_that_its_node_refuses_is_not_tried_again_and_its_sentence_is_reported(workspace: Workspace) -> None:
     with dg.DagsterInstance.ephemeral() as instance:
         watching = RayRuns(instance, workspace, 1, 0.0, "leave")
-        watching._requests = {"r": Request([], {})}
+        watching._requests = {"r": ([], {})}
         run = instance.create_run_for_job(_nothing, tags={REQUEST_TAG: "r", REFUSED_TAG: "true"})
         instance.report_run_failed(run, "the host two has other code than ..")
         (ran,) = watching._watch(["r"], [])
@@ -444,8 +444,8 @@ def test_an_interrupted_command_leaves_its_runs_or_ends_them_and_the_next_one_co
         next_one = RayRuns(instance, workspace, 1, 0.0, on_interrupt)
         monkeypatch.setattr(next_one, "_watch", lambda _, run_ids: watched.extend(run_ids))
         watched = list[str]()
-        with next_one:
-            assert watched == [again.run_id]
+        next_one.wait_for_earlier()
+        assert watched == [again.run_id]
     datasets = [*DATASET.keys]
     between = abs(datasets.index("occlusion") - datasets.index("chaotic")) + 1
     assert shown.stages == [("runs that were left", 2 * between)]

@@ -1,4 +1,4 @@
-"""A study on a cluster of this machine: PostgreSQL, an S3 server, Ray with a head without CPUs and two nodes."""
+"""A study on a cluster of this machine: PostgreSQL, an S3 server or a shared folder, Ray with a head and two nodes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from tests.postgres import LACKING, programs
 pytestmark = pytest.mark.slow
 
 
-def test_a_run_that_is_killed_on_a_node_changes_nothing_in_the_study(small: Checkout) -> None:
+@pytest.mark.parametrize("in_folder", [False, True])
+def test_a_run_that_is_killed_on_a_node_changes_nothing_in_the_study(small: Checkout, in_folder: bool) -> None:
     """Tables are those of one process, calls are made once, a second run asks nothing, nodes keep to their folders."""
     need("ray", "dagster_ray", "dagster_postgres", what="the extra `cluster` is not installed (`make cluster-setup`)")
     if programs() is None:
@@ -21,4 +22,4 @@ def test_a_run_that_is_killed_on_a_node_changes_nothing_in_the_study(small: Chec
         lack(objectstore.LACKING)
     from bench.cluster_kills import SMALL, kill_each
 
-    assert kill_each(["run"], size=SMALL, clips=small.workspace / "clips") == []
+    assert kill_each(["run"], size=SMALL, clips=small.workspace / "clips", in_folder=in_folder) == []

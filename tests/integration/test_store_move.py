@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -33,7 +34,7 @@ def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_agai
         def killed(*_: object) -> None:
             raise KeyboardInterrupt
 
-        patched.setattr("traps_pipeline.study.store_move.write_anchor", killed)
+        patched.setattr("traps_pipeline.storage.workspace.Workspace.save_study", killed)
         with pytest.raises(KeyboardInterrupt):
             move_to_store(Workspace.open(study.workspace), ADDRESS)
     assert not Workspace.is_there(ADDRESS) and Workspace.open(study.workspace).answers.evaluations()
@@ -54,6 +55,8 @@ def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_agai
     with pytest.raises(TrapsError, match=rf"^{ADDRESS}: the study's ledger lies in {ADDRESS}, and not in a folder"):
         move_to_store(workspace, "s3://lab/elsewhere")
     other = copy_of(one_regime, tmp_path / "other")
+    named = other.workspace / "study.yaml"
+    named.write_text(re.sub(r"(?m)^name: .*$", "name: another", named.read_text()))
     remedied(
         lambda: move_to_store(Workspace.open(other.workspace), ADDRESS),
         "study.store_move.move_to_store",

@@ -49,12 +49,12 @@ def test_a_bucket_that_is_made_and_a_key_that_is_exported_are_used(
 ) -> None:
     s3.empty()
     content = b"frames"
-    remedied(lambda: Bucket(address).put("a", content), "cluster.bucket.Bucket.put", s3.make_bucket)
+    remedied(lambda: Bucket(address).put("a", content), "cluster.bucket.Bucket._used", s3.make_bucket)
     assert Bucket(address).get("a") == content
     monkeypatch.setenv("AWS_ENDPOINT", "http://127.0.0.1:1")
     found = remedied(
         lambda: Bucket(address).get("a"),
-        "cluster.bucket.Bucket.get",
+        "cluster.bucket.Bucket._used",
         lambda: monkeypatch.setenv("AWS_ENDPOINT", s3.environment["AWS_ENDPOINT"]),
     )
     assert found == content
@@ -107,7 +107,7 @@ def test_a_budget_of_an_account_in_a_folder_that_all_hosts_see_is_spent_from(add
     workspace = Workspace.create(address, Study(budget_usd=50, account_budgets={"openai": "openai"}))
     remedied(
         paid(address),
-        "models.spending._shared_budgets",
+        "models.spending.account_budgets",
         lambda: workspace.allow(account_budgets={"openai": str(shared)}),
     )
 

@@ -20,6 +20,7 @@ from traps_pipeline.benchmark.tables import VIDEOS
 from traps_pipeline.cluster.bucket import object_name
 from traps_pipeline.cluster.database import Database
 from traps_pipeline.cluster.objects import OBJECTS, Bucket, ObjectStore
+from traps_pipeline.cluster.places import SharedFolder
 from traps_pipeline.storage.leases import alone, leased
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.store import LEASES, FolderStore, Store
@@ -34,11 +35,14 @@ class Hosts:
     open: Callable[[str], Store]
 
 
-@pytest.fixture(params=["folder", pytest.param("objects", marks=pytest.mark.slow)])
+@pytest.fixture(params=["folder", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("shared", "objects"))])
 def hosts(request: pytest.FixtureRequest, tmp_path: Path) -> Hosts:
-    """Hosts that share a folder, or a bucket."""
+    """Processes that share a folder, and hosts that share a folder and a database, or a bucket."""
     if request.param == "folder":
         return Hosts(lambda name: FolderStore(tmp_path / "study"))
+    if request.param == "shared":
+        address, study = request.getfixturevalue("postgres").address(), f"study-{secrets.token_hex(4)}"
+        return Hosts(lambda name: SharedFolder(tmp_path / "study", database(address, study)))
     return Hosts(_hosts_of_bucket(request, tmp_path))
 
 
@@ -66,12 +70,16 @@ def where(request: pytest.FixtureRequest, tmp_path: Path) -> Sequence[str]:
 def opened(folder: str, *of_database: str) -> Store:
     """A study's files below a folder, as the host of the last name sees them; with the address of a database and the
     study's name before that, in a bucket."""
-    *database, host = of_database
-    if not database:
+    *where, host = of_database
+    if not where:
         return FolderStore(Path(folder) / "study")
-    address, study = database
-    database = Database(address, "TRAPS_TEST_DATABASE", study)
-    return ObjectStore(Path(folder) / host, Bucket(f"s3://lab/{study}"), database, study, b"anchor")
+    address, study = where
+    return ObjectStore(Path(folder) / host, Bucket(f"s3://lab/{study}"), database(address, study), study, b"anchor")
+
+
+def database(address: str, study: str) -> Database:
+    """The database of a study, as a process of its own has it."""
+    return Database(address, "TRAPS_TEST_DATABASE", study)
 
 
 def put(store: Store, name: str, content: bytes) -> Path:

@@ -163,8 +163,7 @@ def _open_runs(arguments: argparse.Namespace, instance: DagsterInstance, workspa
         return
     from traps_pipeline.storage.several_hosts import several_hosts
 
-    with several_hosts().runs(workspace, instance, arguments) as runs:
-        yield runs
+    yield several_hosts().runs(workspace, instance, arguments)
 
 
 def _allow(workspace: Workspace, experiment: Experiment, arguments: argparse.Namespace) -> Workspace:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import datetime
 
 from traps_pipeline.base.errors import TrapsError
@@ -25,7 +26,7 @@ _NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")  # what the services call it;
 
 
 def object_name(digest: bytes) -> str:
-    """Where the content with that SHA-256 lies, in the store and in a scratch folder."""
+    """Return where the content with that SHA-256 lies, in the store and in a scratch folder."""
     return f"{digest.hex()[:2]}/{digest.hex()}"
 
 
@@ -45,72 +46,64 @@ class Bucket:
         except (BaseError, ValueError, TypeError) as error:
             raise self.error(error) from None
 
-    def get(self, name: str) -> bytes | None:
-        """The content of an object; None where there is none. Raises TrapsError."""
-        import obstore
+    @contextmanager
+    def _used(self) -> Iterator[None]:
+        """Within the block the store is used. Raises FileNotFoundError where an object is not there, TrapsError where
+        the store cannot be used."""
         from obstore.exceptions import BaseError, NotFoundError
 
         try:
-            return bytes(obstore.get(self._store, name).bytes())
+            yield
         except (NotFoundError, FileNotFoundError) as error:
-            if _is_no_bucket(error):
+            if any(code in str(error) for code in _NO_BUCKET):
                 raise self.error(error) from None
-            return None
+            raise FileNotFoundError(str(error)) from None
         except BaseError as error:
             raise self.error(error) from None
+
+    def get(self, name: str) -> bytes | None:
+        """Return the content of an object; None where there is none. Raises TrapsError."""
+        import obstore
+
+        with suppress(FileNotFoundError), self._used():
+            return bytes(obstore.get(self._store, name).bytes())
+        return None
+
+    def size(self, name: str) -> int | None:
+        """Return the size of an object in bytes; None where there is none. Raises TrapsError."""
+        import obstore
+
+        with suppress(FileNotFoundError), self._used():
+            return int(obstore.head(self._store, name)["size"])
+        return None
 
     def put(self, name: str, content: bytes) -> None:
         """Write an object. Raises TrapsError."""
         import obstore
-        from obstore.exceptions import BaseError
 
-        try:
+        with self._used():
             obstore.put(self._store, name, content)
-        except (BaseError, FileNotFoundError) as error:
-            raise self.error(error) from None
 
     def delete(self, names: Sequence[str]) -> None:
         """Remove objects. Raises TrapsError."""
         import obstore
-        from obstore.exceptions import BaseError
 
-        try:
+        with suppress(FileNotFoundError), self._used():
             obstore.delete(self._store, names)
-        except (BaseError, FileNotFoundError) as error:
-            raise self.error(error) from None
 
     def names(self, below: str = "") -> Iterator[tuple[str, int, datetime]]:
-        """Name, size in bytes and time of writing of all objects (below a name). Raises TrapsError."""
+        """Yield name, size in bytes and time of writing of all objects (below a name). Raises TrapsError."""
         import obstore
-        from obstore.exceptions import BaseError
 
-        try:
+        with self._used():
             for page in obstore.list(self._store, below or None):
                 yield from ((one["path"], one["size"], one["last_modified"]) for one in page)
-        except (BaseError, FileNotFoundError) as error:
-            raise self.error(error) from None
-
-    def size(self, name: str) -> int | None:
-        """The size of an object in bytes; None where there is none. Raises TrapsError."""
-        import obstore
-        from obstore.exceptions import BaseError, NotFoundError
-
-        try:
-            return int(obstore.head(self._store, name)["size"])
-        except (NotFoundError, FileNotFoundError):
-            return None
-        except BaseError as error:
-            raise self.error(error) from None
 
     def error(self, error: Exception) -> TrapsError:
-        """What a person is told of a store that cannot be used."""
-        said = " ".join(str(error).split())[:300]
+        """Return what a person reads of a store that cannot be used."""
+        reason = " ".join(str(error).split())[:300]
         return TrapsError(
-            f"{self.address}: cannot be used from the host {socket.gethostname()} ({said}). See that the bucket "
+            f"{self.address}: cannot be used from the host {socket.gethostname()} ({reason}). See that the bucket "
             f"exists, that its keys and its address are in the environment ({KEYS[self.address.partition(':')[0]]}), "
             "and that this machine's clock is right; then run the same command again: what is finished is kept"
         )
-
-
-def _is_no_bucket(error: Exception) -> bool:
-    return any(code in str(error) for code in _NO_BUCKET)

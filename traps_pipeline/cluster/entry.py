@@ -6,8 +6,7 @@ What stands above the storage is imported in functions: it opens the study while
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.cluster.places import open_store
@@ -28,14 +27,14 @@ def dagster_yaml(workspace: Workspace) -> dict[str, Any]:
     return history.dagster_yaml(workspace)
 
 
-@contextmanager
-def runs(workspace: Workspace, instance: dg.DagsterInstance, options: argparse.Namespace) -> Iterator[Runs]:
+def runs(workspace: Workspace, instance: dg.DagsterInstance, options: argparse.Namespace) -> Runs:
     """See `SeveralHosts`."""
     from traps_pipeline.cluster.ray_runs import RayRuns, require_cluster
 
     require_cluster(workspace, instance)
-    with RayRuns(instance, workspace, options.runs, options.gpus, options.on_interrupt, options.cpus) as runs:
-        yield runs
+    runs = RayRuns(instance, workspace, options.runs, options.gpus, options.on_interrupt, options.cpus)
+    runs.wait_for_earlier()
+    return runs
 
 
 def sensors() -> Sequence[dg.SensorDefinition]:

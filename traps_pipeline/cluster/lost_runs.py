@@ -9,7 +9,6 @@ sensor asks it of the others.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
 import dagster as dg
 
@@ -27,27 +26,23 @@ _BEFORE = [dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.NOT_STARTED]
 def fail_lost_runs(instance: dg.DagsterInstance, lost_s: float = LOST_S) -> list[str]:
     """Mark runs as failed that will never begin; return their ids. Raises OSError while Ray's head does not answer."""
     failed = list[str]()
-    for run, why in _lost(instance, lost_s):
-        now = instance.get_run_by_id(run.run_id)
-        if now is not None and now.status == run.status:  # it may have begun since
-            instance.report_run_failed(now, f"the run will not begin: {why}")
-            failed.append(run.run_id)
+    for record in instance.get_run_records(dg.RunsFilter(statuses=_BEFORE)):
+        run, is_old = record.dagster_run, time.time() - record.update_timestamp.timestamp() > lost_s
+        if why := _why_lost(instance, run, is_old=is_old):
+            now = instance.get_run_by_id(run.run_id)
+            if now is not None and now.status == run.status:  # it may have begun since
+                instance.report_run_failed(now, f"the run will not begin: {why}")
+                failed.append(run.run_id)
     return failed
 
 
-def _lost(instance: dg.DagsterInstance, lost_s: float) -> Iterator[tuple[dg.DagsterRun, str]]:
-    """Runs that will never begin, and why."""
-    for record in instance.get_run_records(dg.RunsFilter(statuses=_BEFORE)):
-        run, is_old = record.dagster_run, time.time() - record.update_timestamp.timestamp() > lost_s
-        if run.status == dg.DagsterRunStatus.NOT_STARTED:
-            if is_old:
-                yield run, "the command that made it ended before it was in the queue"
-            continue
-        health = instance.run_launcher.check_run_worker_health(run)
-        if health.status.name == "UNKNOWN" and is_old:
-            yield run, f"Ray knows nothing of its job ({health.msg})"
-        elif health.status.name in ("FAILED", "SUCCESS"):
-            yield run, f"its job on Ray has ended ({health.msg})"
+def _why_lost(instance: dg.DagsterInstance, run: dg.DagsterRun, *, is_old: bool) -> str:
+    if run.status == dg.DagsterRunStatus.NOT_STARTED:
+        return "what created it ended before it was in the queue" if is_old else ""
+    health = instance.run_launcher.check_run_worker_health(run)
+    if health.status.name in ("FAILED", "SUCCESS"):
+        return f"its job on Ray has ended ({health.msg})"
+    return f"Ray knows nothing of its job ({health.msg})" if health.status.name == "UNKNOWN" and is_old else ""
 
 
 @dg.sensor(

@@ -26,23 +26,20 @@ def main() -> None:
     run_id, *command = sys.argv[1:]
     try:
         workspace = Workspace.open()
-    except TrapsError as error:
-        raise SystemExit(str(error)) from None  # the head hears of it from Ray
-    try:
         require_same_code(os.environ.get(CODE, ""), workspace.study.name)
     except TrapsError as error:
-        _refuse(workspace, run_id, error)
+        _refuse(run_id, error)
     export(workspace, is_kept=True)
     sys.argv = ["dagster", *command]
     with uploading(workspace, run_id):
         runpy.run_module("dagster", run_name="__main__", alter_sys=True)
 
 
-def _refuse(workspace: Workspace, run_id: str, error: TrapsError) -> NoReturn:
+def _refuse(run_id: str, error: TrapsError) -> NoReturn:
     with suppress(TrapsError):  # then the head hears of it from Ray
         from traps_pipeline.orchestration.run import dagster_history  # reads registries, which may differ, too
 
-        with dagster_history(workspace) as instance:
+        with dagster_history(Workspace.open()) as instance:
             instance.add_run_tags(run_id, {REFUSED_TAG: "true"})
             if run := instance.get_run_by_id(run_id):
                 instance.report_run_failed(run, str(error))

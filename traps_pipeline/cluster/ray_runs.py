@@ -21,7 +21,7 @@ from traps_pipeline.base.databases import database_error
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import missing
 from traps_pipeline.cluster.node import REFUSED_TAG
-from traps_pipeline.cluster.requests import REQUEST_TAG, Request, submit
+from traps_pipeline.cluster.requests import REQUEST_TAG, submit
 from traps_pipeline.cluster.resources import RESOURCES_TAG, STUDY_TAG, keys_in, own_tags
 from traps_pipeline.ledger.postgres import PATIENCE_S
 from traps_pipeline.orchestration.graph import Stage, the_graph
@@ -93,21 +93,18 @@ class RayRuns(Runs):
         self._most, self._gpus, self._cpus = most, gpus, cpus
         self._idle_since, self._is_reported_idle = float("inf"), False  # while all runs wait for a host
         self._keys = frozenset[str | None]()
-        self._requests: dict[str, Request] = {}  # by name: those that are asked for once more if they break off
+        # Stages and tags by name: of runs that are asked for once more if they break off.
+        self._requests: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {}
         self._cursors: dict[str, str | None] = {}
         self._failures: dict[str, list[dg.DagsterEvent]] = {}  # steps of runs that failed
 
-    def __enter__(self) -> RayRuns:
+    def wait_for_earlier(self) -> None:
         """Wait for runs that an earlier command left."""
         ours = dg.RunsFilter(statuses=[*_UNFINISHED], tags={STUDY_TAG: self._workspace.study.name})
         if runs := [*self._instance.get_runs(ours)]:
             progress.current().note(f"{len(runs)} runs of this study go on that were left; waiting for them first")
             progress.current().stage("runs that were left", sum(map(_partitions, runs)))
             self._watch([], [run.run_id for run in runs])
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing is held."""
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> list[Range]:
         """Return ranges for several hosts: so many that all have work, and so few that starting them costs little. What
@@ -125,17 +122,19 @@ class RayRuns(Runs):
         """See `Runs`."""
         if ranges:
             progress.current().stage(", ".join(stage.name for stage in stages), len(self._keys) * len(stages))
-            requests = [self._request(stages, one, tags) for one in ranges]
-            self._requests = {self._submit(request): request for request in requests}
+            names = [stage.name for stage in stages]
+            requests = [
+                (names, {**tags, **self._own_tags(stages, one), **range_tags(one, always=True)}) for one in ranges
+            ]
+            self._requests = {self._submit(*request): request for request in requests}
             yield from self._watch([*self._requests], [])
 
-    def _request(self, stages: Sequence[Stage], of: Range, tags: Mapping[str, str]) -> Request:
+    def _own_tags(self, stages: Sequence[Stage], of: Range) -> dict[str, str]:
         keys = [key for key in keys_in(stages, of) if key in self._keys]
-        own = own_tags(self._workspace, stages, keys, self._cpus, self._gpus)
-        return Request([stage.name for stage in stages], {**tags, **own, **range_tags(of, always=True)})
+        return own_tags(self._workspace, stages, keys, self._cpus, self._gpus)
 
-    def _submit(self, request: Request) -> str:
-        return submit(self._instance, self._workspace.study.name, request)
+    def _submit(self, stages: Sequence[str], tags: Mapping[str, str]) -> str:
+        return submit(self._instance, self._workspace.study.name, stages, tags)
 
     def _watch(self, requests: list[str], run_ids: list[str]) -> list[Ran]:
         """Report what runs do until all have ended: those that were asked for by these names, and those of these ids.
@@ -168,22 +167,19 @@ class RayRuns(Runs):
             if run is not None and not run.is_finished:
                 continue
             run_ids.remove(run_id)
-            name = "" if run is None else run.tags.get(REQUEST_TAG, "")
-            if run is not None and name in self._requests and self._broke_off(run):
-                requests.append(self._submit(self._requests.pop(name)))
+            name, failures = "" if run is None else run.tags.get(REQUEST_TAG, ""), self._failures.get(run_id, [])
+            is_refused = run is not None and REFUSED_TAG in run.tags
+            if run is not None and name in self._requests and not is_refused and broke_off(run, failures):
+                requests.append(self._submit(*self._requests.pop(name)))
                 progress.current().note(f"run {run_id[:8]} broke off, and is made once more")
             else:
-                done.append(self._ended(run_id, run, self._failures.get(run_id, [])))
-
-    def _broke_off(self, run: dg.DagsterRun) -> bool:
-        return REFUSED_TAG not in run.tags and broke_off(run, self._failures.get(run.run_id, []))
+                done.append(self._ended(run_id, run, failures))
 
     def _take_created(self, requests: list[str], run_ids: list[str]) -> None:
         """Let runs that were created take the place of their requests."""
-        if requests:
-            for run in self._instance.get_runs(dg.RunsFilter(tags={REQUEST_TAG: requests})):
-                requests.remove(run.tags[REQUEST_TAG])
-                run_ids.append(run.run_id)
+        for run in self._instance.get_runs(dg.RunsFilter(tags={REQUEST_TAG: requests})) if requests else ():
+            requests.remove(run.tags[REQUEST_TAG])
+            run_ids.append(run.run_id)
 
     def _report_waiting(self, requests: Collection[str], runs: Sequence[dg.DagsterRun]) -> None:
         """Say once that nothing has begun for a while: no host has what a run takes, or the daemon creates none."""
@@ -195,19 +191,13 @@ class RayRuns(Runs):
         if time.monotonic() - self._idle_since <= IDLE_S or self._is_reported_idle:
             return
         self._is_reported_idle = True
+        needs, where = "Dagster's daemon to create them", "the ticks of start_requested_runs in `traps ui` show why"
         if waiting:
             takes = json.loads(waiting[0].tags.get(RESOURCES_TAG, "{}"))
             resources = ", ".join(f"{name} {value}" for name, value in takes.items() if name != "runtime_env")
-            message = (
-                f"{len(waiting)} runs have waited {IDLE_S:.0f} s for a host that is free and has {resources or 'a CPU'}"
-                "; `ray status` on the head shows what there is"
-            )
-        else:
-            message = (
-                f"{len(requests)} runs have waited {IDLE_S:.0f} s for Dagster's daemon to create them; the ticks of "
-                "the sensor start_requested_runs in `traps ui` show why"
-            )
-        progress.current().note(message)
+            needs = f"a host that is free and has {resources or 'a CPU'}"
+            where = "`ray status` on the head shows what there is"
+        progress.current().note(f"{len(waiting or requests)} runs have waited {IDLE_S:.0f} s for {needs}; {where}")
 
     def _report(self, run_id: str) -> None:
         """Report partitions that a run has made since the last time, and remember steps that failed."""
@@ -233,17 +223,13 @@ class RayRuns(Runs):
         name = f"run {run_id[:8]} of the study {self._workspace.study.name}"
         if run is None:
             return Ran([f"{name} is in Dagster's history no more"], over_budget=False)
-        ran = problems_of(failures)
-        if run.status == dg.DagsterRunStatus.SUCCESS:
-            return Ran([], over_budget=False)
-        if not ran.problems:
+        ran = problems_of([] if run.status == dg.DagsterRunStatus.SUCCESS else failures)
+        if run.status != dg.DagsterRunStatus.SUCCESS and not ran.problems:
             message = " ".join(self._last_message(run_id).split())
             # The beginning names what failed, and at its end a log has the cause.
             why = message if len(message) <= 2 * ENDS else f"{message[:ENDS]} ... {message[-ENDS:]}"
-            if REFUSED_TAG in run.tags:
-                ran.problems.append(message)
-            else:
-                ran.problems.append(f"{name} ended as {run.status.value.lower()} ({why}); see its log in `traps ui`")
+            ended = f"{name} ended as {run.status.value.lower()} ({why}); see its log in `traps ui`"
+            ran.problems.append(message if REFUSED_TAG in run.tags else ended)
         return ran
 
     def _last_message(self, run_id: str) -> str:

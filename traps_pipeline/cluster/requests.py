@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 import dagster as dg
@@ -23,18 +22,10 @@ AT_ONCE = 100  # requests that one tick turns into runs
 _BODY = "run"
 
 
-@dataclass(frozen=True)
-class Request:
-    """A run that is asked for: names of its stages, and its tags."""
-
-    stages: Sequence[str]
-    tags: Mapping[str, str]
-
-
-def submit(instance: dg.DagsterInstance, study: str, request: Request) -> str:
-    """Ask for a run of a study; return the request's name, which the run carries as its `REQUEST_TAG`."""
+def submit(instance: dg.DagsterInstance, study: str, stages: Sequence[str], tags: Mapping[str, str]) -> str:
+    """Ask for a run of stages, with these tags; return the request's name, which the run has as its `REQUEST_TAG`."""
     name = secrets.token_hex(8)
-    body = {"name": name, "stages": [*request.stages], "tags": dict(request.tags)}
+    body = {"name": name, "stages": [*stages], "tags": dict(tags)}
     instance.report_runless_asset_event(dg.AssetObservation(_key(study), metadata={_BODY: json.dumps(body)}))
     return name
 
@@ -48,15 +39,11 @@ def _study_here() -> str:
     return Workspace.open().study.name
 
 
-def _requests(result: dg.EventRecordsResult) -> Iterator[dg.RunRequest]:
-    for record in result.records:
-        assert record.asset_observation is not None, "only observations are fetched"
-        body = json.loads(str(record.asset_observation.metadata[_BODY].value))
-        yield dg.RunRequest(
-            run_key=body["name"],
-            asset_selection=[asset_key(name) for name in body["stages"]],
-            tags={**body["tags"], REQUEST_TAG: body["name"]},
-        )
+def _run_request(record: dg.EventLogRecord) -> dg.RunRequest:
+    assert record.asset_observation is not None, "only observations are fetched"
+    body = json.loads(str(record.asset_observation.metadata[_BODY].value))
+    selection = [asset_key(name) for name in body["stages"]]
+    return dg.RunRequest(body["name"], asset_selection=selection, tags={**body["tags"], REQUEST_TAG: body["name"]})
 
 
 @dg.sensor(
@@ -70,4 +57,4 @@ def start_requested_runs(context: dg.SensorEvaluationContext) -> dg.SensorResult
     study, cursors = _study_here(), json.loads(context.cursor or "{}")
     result = context.instance.fetch_observations(_key(study), AT_ONCE, cursors.get(study), ascending=True)
     cursors[study] = result.cursor
-    return dg.SensorResult([*_requests(result)], cursor=json.dumps(cursors))
+    return dg.SensorResult([*map(_run_request, result.records)], cursor=json.dumps(cursors))

@@ -6,7 +6,6 @@ import json
 import re
 import socket
 import sys
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -24,8 +23,7 @@ def code_here() -> str:
     """Return this host's code, as JSON: digests of the package's own files and of those that people edit (`assets/`,
     `scene_specs/`), and the versions of Python and of every package that `pyproject.toml` names and that is here."""
     folders = {"the package": PACKAGE, "assets": ASSETS, "scene_specs": SCENE_SPECS}
-    files = {name: _digest_of(folder) for name, folder in folders.items()}
-    return json.dumps({"files": files, "versions": installed()}, sort_keys=True)
+    return json.dumps({f"files of {name}": _digest_of(folder) for name, folder in folders.items()} | installed())
 
 
 def installed() -> dict[str, str]:
@@ -52,7 +50,7 @@ def require_same_code(submitted: str, study: str) -> None:
     """
     if not submitted:
         return
-    here, there = _flat(code_here()), _flat(submitted)
+    here, there = json.loads(code_here()), json.loads(submitted)
     if differences := [name for name in sorted(here.keys() & there.keys()) if here[name] != there[name]]:
         described = ", ".join(f"{name} {here[name]} here and {there[name]} there" for name in differences)
         raise TrapsError(
@@ -62,16 +60,7 @@ def require_same_code(submitted: str, study: str) -> None:
         )
 
 
-def _flat(code: str) -> dict[str, str]:
-    parsed = json.loads(code)
-    return {f"files of {name}": digest for name, digest in parsed["files"].items()} | parsed["versions"]
-
-
 def _digest_of(folder: Path) -> str:
-    return digest({path.relative_to(folder).as_posix(): file_digest(path) for path in _files(folder)})[:12]
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and "__pycache__" not in path.parts and not path.is_relative_to(SHIPPED):
-            yield path
+    files = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+    own = (path for path in files if not path.is_relative_to(SHIPPED))
+    return digest({path.relative_to(folder).as_posix(): file_digest(path) for path in own})[:12]

@@ -6,7 +6,6 @@ It is found by its name, and only where a study has a database that hosts share.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
@@ -37,9 +36,9 @@ class SeveralHosts(Protocol):
         """Return the `dagster.yaml` of a study whose runs go to Ray, and export the variables that it names."""
         ...
 
-    def runs(self, workspace: Any, instance: dg.DagsterInstance, options: Any) -> AbstractContextManager[Any]:
-        """Return the `Runs` that hosts of a cluster make (`orchestration/runs.py`). options: of `traps run`. Raises
-        TrapsError where no run can be submitted from this host."""
+    def runs(self, workspace: Any, instance: dg.DagsterInstance, options: Any) -> Any:
+        """Return the `Runs` that hosts of a cluster make (`orchestration/runs.py`), once those of earlier commands have
+        ended. options: of `traps run`. Raises TrapsError where no run can be submitted from this host."""
         ...
 
     def sensors(self) -> Sequence[dg.SensorDefinition]:
